@@ -1,0 +1,27 @@
+"""A series: one unbroken stretch of a recording, cut to the columns that a task reads and predicts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.recording import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Inputs and targets of one unbroken stretch, in SI units.
+
+    Attributes:
+        name: the recording it comes from (with the row range when it is a part of one).
+        inputs: float32 ``(time, input)``; row t is what is known at tick t.
+        targets: float32 ``(time, target)``; row t is the target channel *at* t (a horizon k asks for row t + k).
+    """
+
+    name: str
+    inputs: FloatArray
+    targets: FloatArray
+
+    @property
+    def samples(self) -> int:
+        """Number of ticks."""
+        return self.inputs.shape[0]

@@ -1,0 +1,37 @@
+"""Errors a user can act on: each message says what came, where, what must hold and what to change."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class EdpError(Exception):
+    """Base of every error that is the user's to mend; the command line prints it without a traceback."""
+
+
+class DataError(EdpError):
+    """A recording, its channels, units or time stamps cannot be used as they are."""
+
+
+class ConfigError(EdpError):
+    """A configuration value, key or combination is not valid."""
+
+
+class BundleError(EdpError):
+    """A bundle on disk is missing, damaged, or of an unknown schema."""
+
+
+class StorageError(EdpError):
+    """Writing or reading a file failed (disk full, read-only folder, missing path)."""
+
+
+def closest(name: str, options: Iterable[str]) -> str:
+    """A suffix for messages: ``; did you mean 'x'?`` or ``; known: a, b, c``."""
+    known = sorted(options)
+    lower = {option.lower(): option for option in known}
+    match = difflib.get_close_matches(name.lower(), list(lower), n=1, cutoff=0.6)
+    if match:
+        return f"; did you mean '{lower[match[0]]}'?"
+    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+    return f"; known: {shown}" if known else ""

@@ -1,0 +1,106 @@
+"""A recording: uniformly sampled channels of one session, with its source and the hash of its content."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, closest
+from edp.signals import Channel
+
+FloatArray = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Uniformly sampled channels of one session, in SI units.
+
+    Attributes:
+        name: short name, unique in a data set.
+        channels: the channels, in the order of the columns.
+        values: float32, shape ``(time, channel)``, SI units; NaN marks a missing value.
+        rate_hz: samples per second.
+        source: where it came from (file path, or ``sim:M22`` and the like).
+        meta: plain JSON facts (seed, scenario, machine, repairs made).
+    """
+
+    name: str
+    channels: tuple[Channel, ...]
+    values: FloatArray
+    rate_hz: float
+    source: str = ""
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or self.values.shape[1] != len(self.channels):
+            raise DataError(
+                f"recording '{self.name}': values have shape {self.values.shape}, "
+                f"expected (time, {len(self.channels)}) for {len(self.channels)} channels"
+            )
+        if self.values.dtype != np.float32:
+            raise DataError(f"recording '{self.name}': values are {self.values.dtype}, expected float32")
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise DataError(f"recording '{self.name}': rate {self.rate_hz} Hz, expected a positive number")
+        names = self.channel_names
+        if len(set(names)) != len(names):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise DataError(f"recording '{self.name}': channel(s) {', '.join(twice)} occur twice")
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Channel names in column order."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples (time steps)."""
+        return self.values.shape[0]
+
+    @property
+    def duration_s(self) -> float:
+        """Length in seconds."""
+        return self.samples / self.rate_hz
+
+    @cached_property
+    def digest(self) -> str:
+        """blake2b of rate, channels and values: equal content gives an equal digest whatever the file."""
+        state = hashlib.blake2b(digest_size=16)
+        state.update(repr((float(self.rate_hz), [(c.name, str(c.kind)) for c in self.channels])).encode())
+        state.update(np.ascontiguousarray(self.values).tobytes())
+        return state.hexdigest()
+
+    def index(self, name: str) -> int:
+        """Column of the named channel.
+
+        Raises:
+            DataError: no such channel; the closest name is offered.
+        """
+        try:
+            return self.channel_names.index(name)
+        except ValueError:
+            raise DataError(
+                f"recording '{self.name}' ({self.source}) has no channel '{name}'{closest(name, self.channel_names)}"
+            ) from None
+
+    def column(self, name: str) -> FloatArray:
+        """Values of one channel, shape ``(time,)``."""
+        return self.values[:, self.index(name)]
+
+    def select(self, names: Sequence[str]) -> FloatArray:
+        """Values of several channels, shape ``(time, len(names))``, in the order asked for."""
+        return self.values[:, [self.index(name) for name in names]]
+
+    def rows(self, start: int, stop: int, name: str | None = None) -> Recording:
+        """The samples ``start <= t < stop`` as a recording of their own."""
+        if not 0 <= start < stop <= self.samples:
+            raise DataError(
+                f"recording '{self.name}': rows {start}:{stop} asked for, it has {self.samples}; "
+                "0 <= start < stop <= samples must hold"
+            )
+        return replace(self, values=self.values[start:stop], name=name or f"{self.name}[{start}:{stop}]")

@@ -1,0 +1,249 @@
+"""Channels, their kinds and units, the built-in names of Table A.1, and maps from anyone's columns to channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from edp.errors import ConfigError, closest
+
+
+class Kind(StrEnum):
+    """What a channel measures; it fixes the SI unit, the scaler and the plausibility limits."""
+
+    VELOCITY = "velocity"
+    ACCELERATION = "acceleration"
+    POSITION = "position"
+    PRESSURE = "pressure"
+    PILOT_PRESSURE = "pilot_pressure"
+    ANGLE = "angle"
+    ANGULAR_VELOCITY = "angular_velocity"
+    FORCE = "force"
+    FLOW = "flow"
+    MASS = "mass"
+    TEMPERATURE = "temperature"
+    VOLTAGE = "voltage"
+    CURRENT = "current"
+    RATIO = "ratio"
+    GENERIC = "generic"
+
+
+@dataclass(frozen=True)
+class KindFacts:
+    """SI unit, unit of reports with its factor (report = SI * factor), plausible SI limits, nominal SI size."""
+
+    si_unit: str
+    report_unit: str
+    report_factor: float
+    plausible: tuple[float, float]
+    nominal: float
+    bounded: bool = False
+
+
+_INF = float("inf")
+KINDS: Mapping[Kind, KindFacts] = {
+    Kind.VELOCITY: KindFacts("m/s", "mm/s", 1e3, (-5.0, 5.0), 0.1),
+    Kind.ACCELERATION: KindFacts("m/s^2", "m/s^2", 1.0, (-500.0, 500.0), 1.0),
+    Kind.POSITION: KindFacts("m", "mm", 1e3, (-50.0, 50.0), 1.0, bounded=True),
+    Kind.PRESSURE: KindFacts("Pa", "bar", 1e-5, (-2e5, 1e8), 1e7),
+    Kind.PILOT_PRESSURE: KindFacts("Pa", "bar", 1e-5, (-2e5, 1e7), 2e6),
+    Kind.ANGLE: KindFacts("rad", "deg", 57.29577951308232, (-100.0, 100.0), 1.0, bounded=True),
+    Kind.ANGULAR_VELOCITY: KindFacts("rad/s", "deg/s", 57.29577951308232, (-100.0, 100.0), 0.2),
+    Kind.FORCE: KindFacts("N", "kN", 1e-3, (-1e7, 1e7), 1e5),
+    Kind.FLOW: KindFacts("m^3/s", "L/min", 6e4, (-1.0, 1.0), 3e-3),
+    Kind.MASS: KindFacts("kg", "kg", 1.0, (-1e5, 1e6), 1e3),
+    Kind.TEMPERATURE: KindFacts("K", "degC", 1.0, (200.0, 500.0), 20.0),
+    Kind.VOLTAGE: KindFacts("V", "V", 1.0, (-1e3, 1e3), 1.0),
+    Kind.CURRENT: KindFacts("A", "A", 1.0, (-1e3, 1e3), 1.0),
+    Kind.RATIO: KindFacts("1", "1", 1.0, (-1e6, 1e6), 1.0, bounded=True),
+    Kind.GENERIC: KindFacts("1", "1", 1.0, (-_INF, _INF), 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """SI value = value * factor + offset."""
+
+    kinds: tuple[Kind, ...]
+    factor: float
+    offset: float = 0.0
+
+
+_PRESSURES = (Kind.PRESSURE, Kind.PILOT_PRESSURE)
+UNITS: Mapping[str, Unit] = {
+    "m/s": Unit((Kind.VELOCITY,), 1.0),
+    "cm/s": Unit((Kind.VELOCITY,), 1e-2),
+    "mm/s": Unit((Kind.VELOCITY,), 1e-3),
+    "m/s^2": Unit((Kind.ACCELERATION,), 1.0),
+    "mm/s^2": Unit((Kind.ACCELERATION,), 1e-3),
+    "g": Unit((Kind.ACCELERATION,), 9.80665),
+    "m": Unit((Kind.POSITION,), 1.0),
+    "cm": Unit((Kind.POSITION,), 1e-2),
+    "mm": Unit((Kind.POSITION,), 1e-3),
+    "Pa": Unit(_PRESSURES, 1.0),
+    "kPa": Unit(_PRESSURES, 1e3),
+    "MPa": Unit(_PRESSURES, 1e6),
+    "bar": Unit(_PRESSURES, 1e5),
+    "psi": Unit(_PRESSURES, 6894.757293168361),
+    "rad": Unit((Kind.ANGLE,), 1.0),
+    "deg": Unit((Kind.ANGLE,), 0.017453292519943295),
+    "rad/s": Unit((Kind.ANGULAR_VELOCITY,), 1.0),
+    "deg/s": Unit((Kind.ANGULAR_VELOCITY,), 0.017453292519943295),
+    "rpm": Unit((Kind.ANGULAR_VELOCITY,), 0.10471975511965977),
+    "N": Unit((Kind.FORCE,), 1.0),
+    "kN": Unit((Kind.FORCE,), 1e3),
+    "m^3/s": Unit((Kind.FLOW,), 1.0),
+    "L/min": Unit((Kind.FLOW,), 1.0 / 6e4),
+    "kg": Unit((Kind.MASS,), 1.0),
+    "t": Unit((Kind.MASS,), 1e3),
+    "K": Unit((Kind.TEMPERATURE,), 1.0),
+    "degC": Unit((Kind.TEMPERATURE,), 1.0, 273.15),
+    "degF": Unit((Kind.TEMPERATURE,), 5.0 / 9.0, 273.15 - 32.0 * 5.0 / 9.0),
+    "V": Unit((Kind.VOLTAGE,), 1.0),
+    "mV": Unit((Kind.VOLTAGE,), 1e-3),
+    "A": Unit((Kind.CURRENT,), 1.0),
+    "mA": Unit((Kind.CURRENT,), 1e-3),
+    "1": Unit((Kind.RATIO, Kind.GENERIC), 1.0),
+    "%": Unit((Kind.RATIO,), 1e-2),
+}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One signal of a recording; values are always in the SI unit of its kind."""
+
+    name: str
+    kind: Kind
+    description: str = ""
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the stored values."""
+        return KINDS[self.kind].si_unit
+
+
+def conversion(unit: str, kind: Kind, where: str) -> Unit:
+    """The conversion from `unit` to the SI unit of `kind`.
+
+    Raises:
+        ConfigError: the unit is unknown or does not measure `kind`; `where` names the column and the file.
+    """
+    known = UNITS.get(unit)
+    fitting = [name for name, entry in UNITS.items() if kind in entry.kinds]
+    if known is None:
+        raise ConfigError(f"{where}: unknown unit '{unit}' for kind '{kind}'{closest(unit, fitting)}")
+    if kind not in known.kinds:
+        raise ConfigError(f"{where}: unit '{unit}' does not measure '{kind}'; expected one of {', '.join(fitting)}")
+    return known
+
+
+_CYLINDERS = ("Boom", "Arm", "Bucket")
+_PILOTS = {
+    "BmUp": "Boom pilot pressure (raise)",
+    "BmDwn": "Boom pilot pressure (lower)",
+    "AmIn": "Arm pilot pressure (retract)",
+    "AmOut": "Arm pilot pressure (extend)",
+    "BktIn": "Bucket pilot pressure (curl)",
+    "BktOut": "Bucket pilot pressure (dump)",
+}
+
+
+def _table_a1() -> dict[str, Channel]:
+    channels = [Channel(f"CylVels_{i + 1}", Kind.VELOCITY, f"{c} cylinder velocity") for i, c in enumerate(_CYLINDERS)]
+    channels += [
+        Channel(f"CylAcc_{i + 1}", Kind.ACCELERATION, f"{c} cylinder acceleration") for i, c in enumerate(_CYLINDERS)
+    ]
+    for first, side in ((1, "piston-side pressure (P_A)"), (5, "rod-side pressure (P_B)")):
+        channels += [
+            Channel(f"CylPressures_{first + i}", Kind.PRESSURE, f"{c} cylinder {side}")
+            for i, c in enumerate(_CYLINDERS)
+        ]
+    channels += [Channel(name, Kind.PILOT_PRESSURE, text) for name, text in _PILOTS.items()]
+    channels += [
+        Channel(f"{name}Conf", Kind.PILOT_PRESSURE, text.replace("pilot", "conflux pilot"))
+        for name, text in _PILOTS.items()
+    ]
+    return {channel.name: channel for channel in channels}
+
+
+TABLE_A1: Mapping[str, Channel] = _table_a1()
+"""The 24 logged names of Table A.1 (thesis, appendix A), in its order: the built-in vocabulary and FG1."""
+
+_JOINTS = ("boom", "arm", "bucket")
+
+
+def _truth() -> dict[str, Channel]:
+    channels = [Channel("PumpPressure_1", Kind.PRESSURE, "Pump 1 delivery pressure")]
+    channels += [Channel("PumpPressure_2", Kind.PRESSURE, "Pump 2 delivery pressure")]
+    for i, joint in enumerate(_JOINTS, start=1):
+        channels += [
+            Channel(f"CylStroke_{i}", Kind.POSITION, f"{joint} cylinder stroke from closed"),
+            Channel(f"JointAngle_{i}", Kind.ANGLE, f"{joint} relative joint angle"),
+            Channel(f"JointVel_{i}", Kind.ANGULAR_VELOCITY, f"{joint} relative joint velocity"),
+        ]
+    return {channel.name: channel for channel in channels}
+
+
+EXTRA_CHANNELS: Mapping[str, Channel] = _truth()
+"""Further names that the simulator logs; never model inputs by default."""
+
+VOCABULARY: Mapping[str, Channel] = {**TABLE_A1, **EXTRA_CHANNELS}
+
+
+@dataclass(frozen=True)
+class ChannelMap:
+    """How one channel is found in a file: its column, unit and kind; a constant where the machine lacks it."""
+
+    name: str
+    column: str
+    unit: str | None = None
+    kind: Kind | None = None
+    constant: float | None = None
+    scale: float = 1.0
+    description: str = ""
+
+    def channel(self) -> Channel:
+        """The channel this entry yields; a name outside the vocabulary needs a kind (default generic)."""
+        known = VOCABULARY.get(self.name)
+        if known is not None and self.kind in (None, known.kind):
+            return known
+        return Channel(self.name, self.kind or Kind.GENERIC, self.description)
+
+
+@dataclass(frozen=True)
+class SignalMap:
+    """Anyone's columns to channels; an empty map takes every column whose name is in the vocabulary.
+
+    Attributes:
+        channels: the wanted channels, in order.
+        time: name of the time column; None looks for ``time``, ``t``, ``Time`` and the like.
+        time_unit: ``s``, ``ms``, ``us`` or ``ns``.
+        sample_time_s: step when the file has no time column (or overrides it: rows are taken as uniform).
+        rate_hz: wanted rate; None keeps the file's own.
+        header: False for a file without a header row; `columns` then names its columns.
+        columns: column names of a headerless file.
+        variable: the variable of a MAT file that holds the signals, when there are several.
+    """
+
+    channels: tuple[ChannelMap, ...] = ()
+    time: str | None = None
+    time_unit: str = "s"
+    sample_time_s: float | None = None
+    rate_hz: float | None = None
+    header: bool = True
+    columns: tuple[str, ...] = ()
+    variable: str | None = None
+    delimiter: str | None = None
+    decimal: str = "."
+
+    def __post_init__(self) -> None:
+        names = [entry.name for entry in self.channels]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ConfigError(f"signal map names channel(s) twice: {', '.join(twice)}; keep one entry each")
+        if self.time_unit not in TIME_UNITS:
+            raise ConfigError(f"signal map: time_unit '{self.time_unit}' is not one of {', '.join(TIME_UNITS)}")
+
+
+TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
