@@ -1,0 +1,78 @@
+"""Linear by-pass: a finite impulse response from the scaled features straight to the output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor, nn
+
+from edp.blocks.base import BLOCKS, Slot
+from edp.errors import ConfigError, closest
+from edp.streaming import Cost, State, Streaming, parameters_of
+
+
+@BLOCKS.register("linear_bypass")
+@dataclass(frozen=True, kw_only=True)
+class LinearBypass:
+    """Add ``sum_i A_i x[t - i] + b`` to the standardised output, outside the output activation.
+
+    Attributes:
+        taps: samples of history, the present one included.
+        start: ``ridge`` starts from the ridge regression on the training data, ``zero`` from nothing.
+        trained: False keeps the start values, so that the network learns what the linear map leaves.
+
+    Raises:
+        ConfigError: taps below 1, unknown start, or a by-pass that is zero and not trained.
+    """
+
+    slot: ClassVar[Slot] = Slot.BYPASS
+    space: ClassVar[dict[str, Any]] = {"taps": (5, 50), "start": ("ridge", "zero")}
+    taps: int = 25
+    start: str = "ridge"
+    trained: bool = True
+
+    def __post_init__(self) -> None:
+        if self.taps < 1:
+            raise ConfigError(f"linear_bypass: taps = {self.taps}; at least 1 must hold")
+        if self.start not in ("ridge", "zero"):
+            raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, ('ridge', 'zero'))}")
+        if self.start == "zero" and not self.trained:
+            raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
+
+    def build(self, features: int, horizons: int, outputs: int) -> Streaming:
+        """The by-pass, at zero; training puts the ridge solution in."""
+        return Bypass(features, horizons, outputs, self)
+
+
+class Bypass(Streaming):
+    """Causal linear filter; ``weight`` has shape ``(horizon * output, feature, tap)``, the last tap is the present."""
+
+    def __init__(self, features: int, horizons: int, outputs: int, spec: LinearBypass) -> None:
+        super().__init__()
+        self.spec, self.features, self.horizons, self.outputs = spec, features, horizons, outputs
+        self.weight = nn.Parameter(torch.zeros(horizons * outputs, features, spec.taps), requires_grad=spec.trained)
+        self.bias = nn.Parameter(torch.zeros(horizons * outputs), requires_grad=spec.trained)
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        return like.new_zeros(batch, self.spec.taps - 1, self.features)
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        history = torch.cat([state, x], dim=1)
+        y = functional.conv1d(history.transpose(1, 2), self.weight, self.bias).transpose(1, 2)
+        return y.unflatten(-1, (self.horizons, self.outputs)), history[:, x.shape[1] :]
+
+    def costs(self) -> list[Cost]:
+        wide = self.horizons * self.outputs
+        return [
+            Cost(
+                "linear by-pass",
+                parameters_of(self),
+                per_prediction=self.weight.numel(),
+                width_in=self.features,
+                width_out=wide,
+                per_time_step=False,
+            )
+        ]

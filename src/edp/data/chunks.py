@@ -1,0 +1,176 @@
+"""Chunks for training: long pieces of recordings, walked in parallel lanes with carried state; windows are a case."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.errors import ConfigError, DataError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChunkSpec:
+    """How a recording is cut for training.
+
+    Attributes:
+        regime: ``chunk`` walks lanes with carried state, one target per sample; ``window`` draws windows of
+            `length` samples, each from reset with one target at its last sample (thesis 3.1.4, stride 1).
+        length: samples per chunk, or W.
+        batch: lanes in parallel, or windows per update.
+        burn_in: samples after a reset that give no loss (chunk regime).
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    regime: str = "chunk"
+    length: int = 128
+    batch: int = 16
+    burn_in: int = 50
+
+    def __post_init__(self) -> None:
+        if self.regime not in ("chunk", "window"):
+            raise ConfigError(f"regime = '{self.regime}'; 'chunk' or 'window' must hold")
+        if self.length < 1 or self.batch < 1 or self.burn_in < 0:
+            raise ConfigError(
+                f"chunks: length = {self.length}, batch = {self.batch}, burn_in = {self.burn_in}; "
+                "length and batch of at least 1 and burn_in of at least 0 must hold"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """One training step.
+
+    Attributes:
+        inputs: ``(batch, time, input)`` SI units.
+        future: ``(batch, time, horizon, target)``: the target channels at t + k, SI units.
+        valid: ``(batch, time)``: where a loss is taken.
+        reset: ``(batch,)``: streams that start anew with this chunk.
+    """
+
+    inputs: NDArray[np.float32]
+    future: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    reset: NDArray[np.bool_]
+
+    @property
+    def targets_seen(self) -> int:
+        """Ticks with a loss."""
+        return int(self.valid.sum())
+
+
+class ChunkSampler:
+    """Batches of one epoch as a pure function of (seed, epoch), so that a resumed run sees the same ones.
+
+    Args:
+        series: the training stretches.
+        horizons: look-ahead samples.
+        spec: chunk length, lanes, burn-in.
+        seed: root of the random order.
+
+    Raises:
+        DataError: a stretch shorter than burn-in (or window) plus the largest horizon.
+    """
+
+    def __init__(self, series: Sequence[Series], horizons: Sequence[int], spec: ChunkSpec, seed: int) -> None:
+        self.series, self.horizons, self.spec, self.seed = list(series), tuple(horizons), spec, seed
+        lead = spec.burn_in if spec.regime == "chunk" else spec.length - 1
+        for part in self.series:
+            if part.samples <= lead + max(horizons):
+                raise DataError(
+                    f"recording '{part.name}' has {part.samples} samples, shorter than the burn-in of {lead} plus the "
+                    f"horizon of {max(horizons)}; give a longer recording, or a smaller burn_in or window"
+                )
+
+    def epoch(self, number: int) -> Iterator[Batch]:
+        """The batches of epoch `number`."""
+        rng = np.random.default_rng([self.seed, number])
+        return self._windows(rng) if self.spec.regime == "window" else self._lanes(rng)
+
+    def updates(self, number: int = 0) -> int:
+        """How many batches an epoch has."""
+        if self.spec.regime == "window":
+            total = sum(part.samples - self.spec.length + 1 - max(self.horizons) for part in self.series)
+            return -(-total // self.spec.batch)
+        return max(_ticks(lane) for lane in self._plan(np.random.default_rng([self.seed, number]))) // self.spec.length
+
+    def _plan(self, rng: np.random.Generator) -> list[list[tuple[int, int, int]]]:
+        """Pieces (series, start, stop), multiples of the chunk length, dealt to lanes of nearly equal load."""
+        length, lanes = self.spec.length, self.spec.batch
+        total = sum(part.samples for part in self.series)
+        # At least a few chunks per piece, so that burn-in stays a small share; at most an even share of a lane.
+        piece = max(8, -(-total // (lanes * length * 4))) * length
+        pieces = []
+        for i in rng.permutation(len(self.series)):
+            samples = self.series[i].samples
+            start = int(rng.integers(0, min(length, max(1, samples // 8))))
+            while start < samples - self.spec.burn_in - max(self.horizons):
+                rest = -(-(samples - start) // length) * length
+                size = min(piece, rest)
+                pieces.append((int(i), start, start + size))
+                # The next piece overlaps by the burn-in, so that every sample gets a loss.
+                start += size - self.spec.burn_in if size < rest else size
+        queue = [pieces[i] for i in rng.permutation(len(pieces))]
+        plan: list[list[tuple[int, int, int]]] = [[] for _ in range(lanes)]
+        load = np.zeros(lanes, dtype=np.int64)
+        for entry in sorted(queue, key=lambda p: p[1] - p[2]):
+            lane = int(load.argmin())
+            plan[lane].append(entry)
+            load[lane] += entry[2] - entry[1]
+        return [[lane[i] for i in rng.permutation(len(lane))] for lane in plan]
+
+    def _lanes(self, rng: np.random.Generator) -> Iterator[Batch]:
+        length, burn_in = self.spec.length, self.spec.burn_in
+        steps = []
+        for lane in self._plan(rng):
+            steps.append([(i, at, at - start) for i, start, stop in lane for at in range(start, stop, length)])
+        for step in range(max(len(lane) for lane in steps)):
+            rows, resets = [], []
+            for lane_steps in steps:
+                i, at, age = lane_steps[step] if step < len(lane_steps) else (0, -1, 0)
+                rows.append(self._cut(i, at, age, burn_in))
+                resets.append(age == 0)
+            yield _stack(rows, resets)
+
+    def _windows(self, rng: np.random.Generator) -> Iterator[Batch]:
+        length = self.spec.length
+        ends = np.cumsum([part.samples - length + 1 - max(self.horizons) for part in self.series])
+        order = rng.permutation(ends[-1])
+        for first in range(0, len(order), self.spec.batch):
+            chosen = order[first : first + self.spec.batch]
+            owners = np.searchsorted(ends, chosen, side="right")
+            rows = [
+                self._cut(int(i), int(j - (ends[i - 1] if i else 0)), 0, length - 1)
+                for i, j in zip(owners, chosen, strict=True)
+            ]
+            yield _stack(rows, [True] * len(rows))
+
+    def _cut(self, number: int, at: int, age: int, burn_in: int) -> tuple[Any, Any, Any]:
+        """Inputs, future targets and validity of one chunk; rows past the end repeat the last and count nothing."""
+        part, length = self.series[number], self.spec.length
+        if at < 0:
+            at, age, burn_in = 0, 0, length
+        inside = at + length + max(self.horizons) <= part.samples
+        rows = np.arange(at, at + length)
+        valid = (rows - at + age >= burn_in) & (rows + max(self.horizons) < part.samples)
+        if inside:
+            future = np.stack([part.targets[at + k : at + k + length] for k in self.horizons], axis=1)
+            return part.inputs[at : at + length], future, valid
+        last = part.samples - 1
+        future = np.stack([part.targets[np.minimum(rows + k, last)] for k in self.horizons], axis=1)
+        return part.inputs[np.minimum(rows, last)], future, valid
+
+
+def _ticks(lane: list[tuple[int, int, int]]) -> int:
+    return sum(stop - start for _, start, stop in lane)
+
+
+def _stack(rows: list[tuple[Any, Any, Any]], resets: list[bool]) -> Batch:
+    inputs, future, valid = (np.stack(parts) for parts in zip(*rows, strict=True))
+    return Batch(inputs, future, valid, np.array(resets))

@@ -1,0 +1,102 @@
+"""Scaling to a uniform numerical range, fitted on training data only (eq. 3.4, 3.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.features import derive
+from edp.data.series import Series
+from edp.data.task import TargetMode, Task
+from edp.signals import KINDS, Kind
+
+# A standard deviation below this share of the kind's nominal size is a constant channel, not a signal.
+CONSTANT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Scaler:
+    """Affine maps to the network's space: ``scaled = (physical - offset) / scale``.
+
+    Attributes:
+        feature_offset: ``(feature,)``, SI units.
+        feature_scale: ``(feature,)``, SI units, positive.
+        target_offset: ``(horizon, target)``; zero in delta mode, so that the inverse is ``sigma * y``.
+        target_scale: ``(horizon, target)``, positive.
+        constant: names of features that did not move in the training data; they scale by the nominal size of
+            their kind.
+    """
+
+    feature_offset: NDArray[np.float64]
+    feature_scale: NDArray[np.float64]
+    target_offset: NDArray[np.float64]
+    target_scale: NDArray[np.float64]
+    constant: tuple[str, ...] = ()
+
+
+def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
+    """Features of a whole stretch, ``(time, feature)``: logged channels, then derived ones."""
+    inputs = task.features.inputs
+    columns = [series.inputs[:, i] for i in range(len(task.features.channels))]
+    for entry in task.features.derived:
+        columns.append(derive(entry, series.inputs[:, inputs.index(entry.source)], task.rate_hz))
+    return np.stack(columns, axis=1)
+
+
+def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Scaler:
+    """Fit on the training stretches: min-max to [-1, 1] for bounded kinds (position, angle, ratio), else z-score.
+
+    Args:
+        task: what is read and predicted.
+        train: the training stretches, nothing else.
+        kinds: kind of each feature, in order.
+    """
+    low, high, mean, std = _moments([feature_matrix(task, series) for series in train])
+    offset, scale = mean.copy(), std.copy()
+    constant = []
+    for i, kind in enumerate(kinds):
+        facts = KINDS[kind]
+        if std[i] <= CONSTANT * facts.nominal:
+            scale[i] = facts.nominal
+            constant.append(task.features.features[i])
+        elif facts.bounded:
+            offset[i], scale[i] = (low[i] + high[i]) / 2, (high[i] - low[i]) / 2
+    target_offset = np.zeros((len(task.horizons), len(task.targets)))
+    target_scale = np.ones_like(target_offset)
+    for row, horizon in enumerate(task.horizons):
+        wanted = [_encoded(task, series, horizon) for series in train]
+        _, _, target_mean, target_std = _moments([values for values in wanted if len(values)])
+        if task.mode is TargetMode.ABSOLUTE:
+            target_offset[row] = target_mean
+        target_scale[row] = np.where(target_std > 0, target_std, 1.0)
+    return Scaler(offset, scale, target_offset, target_scale, tuple(constant))
+
+
+def _encoded(task: Task, series: Series, horizon: int) -> NDArray[np.float32]:
+    future = series.targets[horizon:]
+    if task.mode is TargetMode.DELTA:
+        return future - series.targets[: len(future)]
+    return future
+
+
+Vector = NDArray[np.float64]
+
+
+def _moments(parts: Sequence[NDArray[np.float32]]) -> tuple[Vector, Vector, Vector, Vector]:
+    """Minimum, maximum, mean and standard deviation per column, merged over parts in double precision."""
+    count = sum(len(part) for part in parts)
+    low = np.min([part.min(axis=0) for part in parts], axis=0).astype(np.float64)
+    high = np.max([part.max(axis=0) for part in parts], axis=0).astype(np.float64)
+    mean = sum(part.sum(axis=0, dtype=np.float64) for part in parts) / count
+    spread = sum(_squares(part, mean) for part in parts) / count
+    return low, high, np.asarray(mean), np.sqrt(spread)
+
+
+def _squares(part: NDArray[np.float32], mean: Vector) -> Vector:
+    total = np.zeros_like(mean)
+    for start in range(0, len(part), 65536):  # double-precision copies of a block, not of the whole recording
+        total += np.square(part[start : start + 65536] - mean).sum(axis=0)
+    return total

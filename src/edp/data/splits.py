@@ -1,0 +1,186 @@
+"""Splits: which stretches train, validate and test; whole recordings, or time blocks with a gap between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from edp.errors import ConfigError, DataError, closest
+from edp.recording import Recording
+from edp.registry import Registry
+
+PARTS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Rows ``start:stop`` of recording number `recording`."""
+
+    recording: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Split:
+    """Stretches of each part; none is empty."""
+
+    train: tuple[Stretch, ...]
+    validation: tuple[Stretch, ...]
+    test: tuple[Stretch, ...]
+
+
+class SplitSpec(Protocol):
+    """A rule that divides a data set."""
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Divide; `gap` samples (W + k) are left out between neighbouring stretches of one recording."""
+        ...
+
+
+SPLITS: Registry[type] = Registry("split")
+
+
+@SPLITS.register("recordings")
+@dataclass(frozen=True, kw_only=True)
+class ByRecording:
+    """Whole recordings, drawn at random with a seed, or named.
+
+    Attributes:
+        validation_share: share of the recordings that validate (when not named).
+        test_share: share that tests.
+        seed: of the draw.
+        validation: names of recordings that validate; `test` likewise. A recording named in neither trains.
+        tail_share: share of every training recording, at its end, that validates where no recording does.
+    """
+
+    validation_share: float = 0.15
+    test_share: float = 0.2
+    seed: int = 0
+    validation: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    tail_share: float = 0.2
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Divide by recording."""
+        names = [recording.name for recording in recordings]
+        for wanted in (*self.validation, *self.test):
+            if wanted not in names:
+                raise DataError(f"split: there is no recording '{wanted}'{closest(wanted, names)}")
+        if set(self.validation) & set(self.test):
+            raise DataError("split: a recording is named both in validation and in test; keep it in one")
+        test, validation = list(self.test), list(self.validation)
+        free = [name for name in names if name not in {*test, *validation}]
+        order = np.random.default_rng(self.seed).permutation(len(free))
+        drawn = [free[i] for i in order]
+        if not test:
+            test, drawn = _take(drawn, self.test_share, len(names))
+        if not validation and len(drawn) >= 3:
+            validation, drawn = _take(drawn, self.validation_share, len(names))
+        whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
+        parts = {
+            "train": [s for s in whole if names[s.recording] in drawn],
+            "validation": [s for s in whole if names[s.recording] in validation],
+            "test": [s for s in whole if names[s.recording] in test],
+        }
+        if not parts["validation"]:
+            parts = _hold_tail(parts, self.tail_share, gap)
+        return _checked(parts, recordings)
+
+
+@SPLITS.register("time")
+@dataclass(frozen=True, kw_only=True)
+class ByTime:
+    """The beginning of every recording trains, then a part validates, the end tests; a gap lies between.
+
+    Attributes:
+        validation_share: share of each recording.
+        test_share: share of each recording.
+    """
+
+    validation_share: float = 0.15
+    test_share: float = 0.2
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Divide each recording by time."""
+        if self.validation_share + self.test_share >= 1:
+            raise ConfigError("split: validation_share + test_share must be below 1")
+        parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
+        for i, recording in enumerate(recordings):
+            n = recording.samples
+            test = n - round(n * self.test_share)
+            validation = test - round(n * self.validation_share)
+            parts["train"].append(Stretch(i, 0, validation - gap))
+            parts["validation"].append(Stretch(i, validation, test - gap))
+            parts["test"].append(Stretch(i, test, n))
+        return _checked(parts, recordings)
+
+
+@SPLITS.register("blocks")
+@dataclass(frozen=True, kw_only=True)
+class ByBlocks:
+    """Blocks of equal duration in turn: every `every`-th block tests, the last share of each other block validates.
+
+    Attributes:
+        block_s: duration of a block in seconds.
+        every: a block out of so many tests.
+        validation_share: share of the other blocks, taken as whole blocks, that validate.
+    """
+
+    block_s: float = 20.0
+    every: int = 3
+    validation_share: float = 0.2
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Divide each recording into blocks."""
+        if self.every < 2 or self.block_s <= 0:
+            raise ConfigError("split: every >= 2 and block_s > 0 must hold")
+        parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
+        step = max(2, round(1 / self.validation_share)) if self.validation_share > 0 else 0
+        other = 0
+        for i, recording in enumerate(recordings):
+            size = round(self.block_s * recording.rate_hz)
+            for number, start in enumerate(range(0, recording.samples, size)):
+                stop = min(start + size, recording.samples)
+                if number % self.every == self.every - 1:
+                    parts["test"].append(Stretch(i, start, stop))
+                    continue
+                other += 1
+                part = "validation" if step and other % step == 0 else "train"
+                parts[part].append(Stretch(i, start, stop - min(gap, size // 4)))
+        return _checked(parts, recordings)
+
+
+def _take(names: list[str], share: float, total: int) -> tuple[list[str], list[str]]:
+    count = max(1, round(share * total))
+    return names[:count], names[count:]
+
+
+def _hold_tail(parts: dict[str, list[Stretch]], share: float, gap: int) -> dict[str, list[Stretch]]:
+    """The end of each training recording validates: for data sets with too few recordings to spare one."""
+    train, validation = [], []
+    for stretch in parts["train"]:
+        cut = stretch.stop - round(share * (stretch.stop - stretch.start))
+        train.append(Stretch(stretch.recording, stretch.start, cut - gap))
+        validation.append(Stretch(stretch.recording, cut, stretch.stop))
+    return {"train": train, "validation": validation, "test": parts["test"]}
+
+
+def _checked(parts: dict[str, list[Stretch]], recordings: Sequence[Recording]) -> Split:
+    for part in PARTS:
+        if not parts[part]:
+            raise DataError(
+                f"split: no recording is left for {part}; {len(recordings)} recording(s) given. Give more recordings, "
+                'or split by time (kind = "time")'
+            )
+        for stretch in parts[part]:
+            if stretch.stop <= stretch.start:
+                raise DataError(
+                    f"split: recording '{recordings[stretch.recording].name}' is too short "
+                    f"({recordings[stretch.recording].samples} samples) to leave a stretch for {part}; "
+                    "give a longer recording or another split"
+                )
+    return Split(tuple(parts["train"]), tuple(parts["validation"]), tuple(parts["test"]))

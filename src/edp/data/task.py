@@ -1,0 +1,116 @@
+"""A task: what is read, what is predicted, how far ahead and in which form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from edp.data.features import Derived, FeatureSet, column, kind_of
+from edp.data.series import Series
+from edp.errors import ConfigError, DataError, closest
+from edp.recording import Recording
+from edp.signals import Kind
+
+
+class TargetMode(StrEnum):
+    """How the network encodes its target (thesis 3.2.1): the value itself, or its change from the present value."""
+
+    ABSOLUTE = "absolute"
+    DELTA = "delta"
+
+
+@dataclass(frozen=True)
+class Task:
+    """Predict `targets` at ``t + k`` for every k of `horizons` from the inputs up to and including t.
+
+    Attributes:
+        features: the feature set.
+        targets: names of logged or derived channels.
+        horizons: look-ahead in samples, increasing; 0 means the present value from inputs alone (simulation).
+        mode: absolute or delta encoding.
+        rate_hz: samples per second of every recording.
+        derived_targets: derived channels that serve as targets only.
+        integrate: target name to the logged position whose rate it is; scores then also judge the free run of
+            the integral from its first value.
+
+    Raises:
+        ConfigError: a horizon or combination that cannot hold.
+    """
+
+    features: FeatureSet
+    targets: tuple[str, ...]
+    horizons: tuple[int, ...]
+    mode: TargetMode
+    rate_hz: float
+    derived_targets: tuple[Derived, ...] = ()
+    integrate: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.targets:
+            raise ConfigError("task: no targets; name at least one channel to predict")
+        if not self.horizons or min(self.horizons) < 0 or list(self.horizons) != sorted(set(self.horizons)):
+            raise ConfigError(
+                f"task: horizons = {list(self.horizons)}; samples >= 0, increasing, each once, at least one"
+            )
+        blind = [name for name in self.targets if name not in self.features.features]
+        if self.mode is TargetMode.DELTA and blind:
+            raise ConfigError(
+                f"task: mode = 'delta' predicts the change from the present value, but {', '.join(blind)} is not a "
+                "feature; add it to the features or set mode = 'absolute'"
+            )
+        seen = [name for name in self.targets if name in self.features.features]
+        if 0 in self.horizons and seen:
+            raise ConfigError(
+                f"task: horizon 0 asks for the present value of {', '.join(seen)}, which is also a feature; "
+                "remove it from the features or ask for horizons >= 1"
+            )
+        for target, _ in self.integrate:
+            if target not in self.targets:
+                raise ConfigError(f"task: integrate names '{target}', not a target{closest(target, self.targets)}")
+
+    @property
+    def derived(self) -> tuple[Derived, ...]:
+        """Every derived channel of the task."""
+        return self.features.derived + self.derived_targets
+
+    @property
+    def reach(self) -> int:
+        """The largest horizon in samples."""
+        return max(self.horizons)
+
+    @property
+    def present(self) -> tuple[int | None, ...]:
+        """For each target the feature column that holds its present value, None where it is not measured."""
+        names = self.features.features
+        return tuple(names.index(target) if target in names else None for target in self.targets)
+
+    def kinds(self, recording: Recording | None = None) -> tuple[Kind, ...]:
+        """Kind of each target."""
+        return tuple(kind_of(name, recording, self.derived) for name in self.targets)
+
+    def series(self, recording: Recording, start: int = 0, stop: int | None = None, name: str | None = None) -> Series:
+        """The stretch ``start:stop`` of a recording as inputs and targets.
+
+        Raises:
+            DataError: another rate, a missing channel, or a value that is not finite.
+        """
+        if abs(recording.rate_hz - self.rate_hz) > 1e-6 * self.rate_hz:
+            raise DataError(
+                f"recording '{recording.name}' has {recording.rate_hz:g} Hz, the task {self.rate_hz:g} Hz; all rates "
+                "must be equal: set rate_hz in the signal map"
+            )
+        rows = slice(start, stop)
+        inputs = np.ascontiguousarray(recording.select(self.features.inputs)[rows])
+        targets = np.stack([column(recording, target, self.derived) for target in self.targets], axis=1)[rows]
+        for values, names in ((inputs, self.features.inputs), (targets, self.targets)):
+            bad = ~np.isfinite(values)
+            if bad.any():
+                row, which = (int(i) for i in np.argwhere(bad)[0])
+                raise DataError(
+                    f"recording '{recording.name}' ({recording.source}): channel '{names[which]}' has "
+                    f"{int(bad[:, which].sum())} missing or infinite value(s), the first at row {start + row}; "
+                    'mend the log or ask for a repair (nan = "hold")'
+                )
+        return Series(name or recording.name, inputs, np.ascontiguousarray(targets))

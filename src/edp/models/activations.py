@@ -1,0 +1,106 @@
+"""Output activations g in standardised space (thesis 3.2.2.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from edp.errors import ConfigError
+from edp.registry import Registry
+
+
+class ActivationSpec(Protocol):
+    """Options of an output activation."""
+
+    def build(self, outputs: int) -> nn.Module:
+        """A module on ``(..., output)``."""
+        ...
+
+    def bound(self) -> float | None:
+        """The largest magnitude it can reach, None where there is no limit."""
+        ...
+
+
+ACTIVATIONS: Registry[type] = Registry("activation")
+
+
+@ACTIVATIONS.register("identity")
+@dataclass(frozen=True, kw_only=True)
+class Identity:
+    """``g(x) = x``."""
+
+    def build(self, outputs: int) -> nn.Module:
+        """A module that changes nothing."""
+        return nn.Identity()
+
+    def bound(self) -> float | None:
+        """No limit."""
+        return None
+
+
+@ACTIVATIONS.register("tanh")
+@dataclass(frozen=True, kw_only=True)
+class Tanh:
+    """``g(x) = tanh(x)``: targets beyond one standard deviation cannot be reached."""
+
+    def build(self, outputs: int) -> nn.Module:
+        """The hyperbolic tangent."""
+        return nn.Tanh()
+
+    def bound(self) -> float | None:
+        """One standard deviation of the target."""
+        return 1.0
+
+
+@ACTIVATIONS.register("stanh")
+@dataclass(frozen=True, kw_only=True)
+class ScaledTanh:
+    """``g_i(x) = a_i tanh(x)`` with a learned amplitude per output (eq. 3.28).
+
+    The amplitude is a smooth function of a free number, so it stays inside its limits without clamping, which
+    would stop its gradient there.
+
+    Attributes:
+        start: amplitude at the start of training, in standard deviations of the target.
+        low: smallest amplitude.
+        high: largest amplitude.
+
+    Raises:
+        ConfigError: unless ``0 < low < start < high``.
+    """
+
+    start: float = 2.5
+    low: float = 1.01
+    high: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.low < self.start < self.high:
+            raise ConfigError(
+                f"stanh: low = {self.low}, start = {self.start}, high = {self.high}; 0 < low < start < high must hold"
+            )
+
+    def build(self, outputs: int) -> nn.Module:
+        """The activation for `outputs` targets."""
+        return _ScaledTanh(outputs, self)
+
+    def bound(self) -> float | None:
+        """The largest amplitude it can learn."""
+        return self.high
+
+
+class _ScaledTanh(nn.Module):
+    def __init__(self, outputs: int, spec: ScaledTanh) -> None:
+        super().__init__()
+        self.spec = spec
+        share = (spec.start - spec.low) / (spec.high - spec.low)
+        self.free = nn.Parameter(torch.full((outputs,), share).logit())
+
+    def amplitude(self) -> Tensor:
+        """Learned amplitudes, ``(output,)``."""
+        return self.spec.low + (self.spec.high - self.spec.low) * torch.sigmoid(self.free)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.amplitude() * torch.tanh(x)

@@ -1,0 +1,78 @@
+"""From logged channels in SI units to scaled features, as a stream: the first layer of every predictor."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from edp.data.features import DERIVATIONS
+from edp.data.scaling import Scaler
+from edp.data.task import Task
+from edp.streaming import Cost, State, Streaming
+
+
+class FrontEnd(Streaming):
+    """Derived channels and scaling (eq. 3.1, 3.4, 3.5), with its numbers kept as buffers.
+
+    Maps inputs ``(batch, time, input)`` in SI units to physical features ``(batch, time, feature)``; `scale` gives
+    the standardised ones. State: the previous tick's inputs and whether there was one; at the first tick after a
+    reset every derived value is 0.
+    """
+
+    offset: Tensor
+    width: Tensor
+
+    def __init__(self, task: Task, scaler: Scaler) -> None:
+        super().__init__()
+        inputs = task.features.inputs
+        self.logged = len(task.features.channels)
+        self.inputs = len(inputs)
+        self.rate_hz = task.rate_hz
+        self.derived = [(DERIVATIONS[entry.how], inputs.index(entry.source)) for entry in task.features.derived]
+        self.register_buffer("offset", torch.tensor(scaler.feature_offset, dtype=torch.get_default_dtype()))
+        self.register_buffer("width", torch.tensor(scaler.feature_scale, dtype=torch.get_default_dtype()))
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        return like.new_zeros(batch, 1, self.inputs), like.new_zeros(batch, 1, 1)
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        previous, seen = state
+        first = torch.where(seen > 0.5, previous, x[:, :1])
+        before = torch.cat([first, x[:, :-1]], dim=1)
+        columns = [x[..., : self.logged]]
+        for how, source in self.derived:
+            columns.append(how(x[..., source], before[..., source], self.rate_hz).unsqueeze(-1))
+        return torch.cat(columns, dim=-1), (x[:, -1:], torch.ones_like(seen))
+
+    def scale(self, features: Tensor) -> Tensor:
+        """Standardised features."""
+        return (features - self.offset) / self.width
+
+    def costs(self) -> list[Cost]:
+        return [Cost("features and scaling", 0, width_in=self.inputs, width_out=int(self.offset.numel()))]
+
+
+class TargetCode(nn.Module):
+    """Between SI targets and the network's standardised ones (thesis 3.2.1)."""
+
+    offset: Tensor
+    width: Tensor
+
+    def __init__(self, task: Task, scaler: Scaler) -> None:
+        super().__init__()
+        self.delta = task.mode == "delta"
+        self.present = [index for index in task.present if index is not None]
+        self.register_buffer("offset", torch.tensor(scaler.target_offset, dtype=torch.get_default_dtype()))
+        self.register_buffer("width", torch.tensor(scaler.target_scale, dtype=torch.get_default_dtype()))
+
+    def _base(self, features: Tensor) -> Tensor | float:
+        """Present target values ``(batch, time, 1, target)`` in delta mode, else 0."""
+        return features[..., self.present].unsqueeze(-2) if self.delta else 0.0
+
+    def encode(self, future: Tensor, features: Tensor) -> Tensor:
+        """Standardised targets from future SI values ``(batch, time, horizon, target)``."""
+        return (future - self._base(features) - self.offset) / self.width
+
+    def decode(self, code: Tensor, features: Tensor) -> Tensor:
+        """SI predictions from the network's output, same shape."""
+        return code * self.width + self.offset + self._base(features)

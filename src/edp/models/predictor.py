@@ -1,0 +1,144 @@
+"""The predictor: front end, backbone, heads and activation as one causal network in SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from edp.blocks.base import BLOCKS, Slot
+from edp.data.scaling import Scaler
+from edp.data.task import Task
+from edp.errors import ConfigError
+from edp.models.activations import ActivationSpec, Identity
+from edp.models.backbones import BackboneSpec, HybridSpec, in_slot
+from edp.models.frontend import FrontEnd, TargetCode
+from edp.models.heads import HeadSpec
+from edp.streaming import Cost, State, Streaming, parameters_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSpec:
+    """The network: a backbone, heads, an output activation and an ordered tuple of blocks.
+
+    Attributes:
+        backbone: options of a registered backbone.
+        head: options of the per-output heads.
+        activation: options of a registered output activation.
+        blocks: options of registered blocks; absent means not built.
+        window: W, samples of trailing context of pooling, and the length of the window regime.
+    """
+
+    backbone: BackboneSpec = field(default_factory=HybridSpec)
+    head: HeadSpec = field(default_factory=HeadSpec)
+    activation: ActivationSpec = field(default_factory=Identity)
+    blocks: tuple[object, ...] = ()
+    window: int = 50
+
+    def __post_init__(self) -> None:
+        if self.window < 1:
+            raise ConfigError(f"model: window = {self.window}; at least 1 must hold")
+        offered = {*self.backbone.slots(), Slot.GATE, Slot.BYPASS}
+        for block in self.blocks:
+            slot = getattr(block, "slot", None)
+            if slot not in offered:
+                raise ConfigError(
+                    f"block '{BLOCKS.name_of(block)}' needs the slot '{slot}', which this backbone does not offer "
+                    f"(it has {', '.join(sorted(offered))}); remove the block or choose another backbone"
+                )
+        for single in (Slot.BRANCHES, Slot.GATE, Slot.BYPASS):
+            names = [BLOCKS.name_of(block) for block in in_slot(self.blocks, single)]
+            if len(names) > 1:
+                raise ConfigError(f"blocks {', '.join(names)} share the slot '{single}'; keep one of them")
+
+
+class Predictor(Streaming):
+    """A look-ahead predictor (eq. 3.6) that reads and writes SI units.
+
+    ``forward`` maps inputs ``(batch, time, input)`` to standardised predictions ``(batch, time, horizon, target)``;
+    ``predict`` gives them in SI units. Both obey the streaming contract.
+    """
+
+    def __init__(self, task: Task, spec: ModelSpec, scaler: Scaler) -> None:
+        super().__init__()
+        self.task, self.spec = task, spec
+        features, outputs, horizons = len(task.features.features), len(task.targets), len(task.horizons)
+        self.front = FrontEnd(task, scaler)
+        self.code = TargetCode(task, scaler)
+        self.backbone, width = spec.backbone.build(features, spec.window, spec.blocks)
+        gates = in_slot(spec.blocks, Slot.GATE)
+        self.gate: Streaming | None = gates[0].build(width, outputs) if gates else None  # type: ignore[attr-defined]
+        self.heads = spec.head.build(width, outputs, horizons)
+        self.activation = spec.activation.build(outputs)
+        bypasses = in_slot(spec.blocks, Slot.BYPASS)
+        self.bypass: Streaming | None = (
+            bypasses[0].build(features, horizons, outputs) if bypasses else None  # type: ignore[attr-defined]
+        )
+
+    def _parts(self) -> dict[str, Streaming]:
+        parts = {"backbone": self.backbone, "gate": self.gate, "heads": self.heads, "bypass": self.bypass}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        """State at reset for `batch` streams."""
+        state = {"front": self.front.initial_state(batch, like)}
+        return state | {name: part.initial_state(batch, like) for name, part in self._parts().items()}
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Standardised predictions ``(batch, time, horizon, target)`` and the next state."""
+        code, _, new = self.run(x, state)
+        return code, new
+
+    def run(self, x: Tensor, state: State) -> tuple[Tensor, Tensor, State]:
+        """Standardised predictions, physical features ``(batch, time, feature)`` and the next state."""
+        new: dict[str, State] = {}
+        features, new["front"] = self.front(x, state["front"])
+        scaled = self.front.scale(features)
+        y, new["backbone"] = self.backbone(scaled, state["backbone"])
+        if self.gate is not None:
+            y, new["gate"] = self.gate(y, state["gate"])
+        y, new["heads"] = self.heads(y, state["heads"])
+        y = self.activation(y)
+        if self.bypass is not None:
+            direct, new["bypass"] = self.bypass(scaled, state["bypass"])
+            y = y + direct
+        return y, features, new
+
+    def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
+        code, features, new = self.run(x, state)
+        return self.code.decode(code, features), new
+
+    def costs(self) -> list[Cost]:
+        """Analytic costs of every part."""
+        rows = self.front.costs()
+        for part in self._parts().values():
+            rows += part.costs()
+        amplitudes = parameters_of(self.activation)
+        if amplitudes:
+            rows.append(
+                Cost("output amplitudes", amplitudes, foldable=amplitudes, width_out=amplitudes, per_time_step=False)
+            )
+        return rows
+
+
+def build_model(task: Task, spec: ModelSpec, scaler: Scaler, seed: int) -> Predictor:
+    """A predictor with freshly drawn weights; the same seed gives the same weights."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Predictor(task, spec, scaler)
+
+
+def trainable(module: nn.Module) -> list[nn.Parameter]:
+    """Parameters that training changes."""
+    return [parameter for parameter in module.parameters() if parameter.requires_grad]
+
+
+def describe(spec: ModelSpec, names: Sequence[str] = ()) -> str:
+    """A short label for tables, for example ``hybrid + temporal_difference``."""
+    from edp.models.backbones import BACKBONES
+
+    labels = [BACKBONES.name_of(spec.backbone), *(BLOCKS.name_of(block) for block in spec.blocks), *names]
+    return " + ".join(labels)

@@ -1,0 +1,101 @@
+"""The LSTM and attention pooling as streams."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from edp.streaming import Cost, State, Streaming, parameters_of
+
+# A score that no softmax notices; finite, because inf - inf is NaN.
+UNSEEN = -1e30
+# Query rows per block of the banded softmax: memory stays linear in the sequence length.
+BLOCK = 128
+
+
+class Lstm(Streaming):
+    """Multi-layer LSTM (eq. 2.2 to 2.7, 3.32), PyTorch's gate order and two bias vectors.
+
+    Maps ``(batch, time, width_in)`` to hidden states ``(batch, time, units)``; state ``(h, c)``, each
+    ``(batch, layer, units)``, zero at reset.
+    """
+
+    def __init__(self, width_in: int, units: int, layers: int, dropout: float) -> None:
+        super().__init__()
+        self.cell = nn.LSTM(width_in, units, layers, batch_first=True, dropout=dropout if layers > 1 else 0.0)
+        with torch.no_grad():
+            for layer in range(layers):
+                # A forget gate open at the start carries gradients through the first epochs.
+                self.cell.get_parameter(f"bias_ih_l{layer}")[units : 2 * units].add_(1.0)
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        zeros = like.new_zeros(batch, self.cell.num_layers, self.cell.hidden_size)
+        return zeros, zeros.clone()
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        h, c = (part.transpose(0, 1).contiguous() for part in state)
+        y, (h, c) = self.cell(x, (h, c))
+        return y, (h.transpose(0, 1), c.transpose(0, 1))
+
+    def costs(self) -> list[Cost]:
+        rows = []
+        width, units = self.cell.input_size, self.cell.hidden_size
+        for layer in range(self.cell.num_layers):
+            macs = 4 * units * (width + units)
+            rows.append(
+                Cost(
+                    f"LSTM layer {layer + 1}, {width}->{units}",
+                    macs + 8 * units,
+                    per_column=macs,
+                    width_in=width,
+                    width_out=units,
+                )
+            )
+            width = units
+        return rows
+
+
+class AttentionPooling(Streaming):
+    """Softmax-weighted mean of the hidden states of the last `window` ticks (eq. 3.33, 3.34), with h itself.
+
+    Maps ``(batch, time, units)`` to ``[pooled ; h]``, ``(batch, time, 2 units)`` (eq. 3.35). In a stream the mean
+    runs over the trailing window; before `window` ticks have passed, over those seen. At the last tick of a window
+    from reset this is the thesis's sum over the whole window. State: ring of states and of scores.
+    """
+
+    def __init__(self, units: int, window: int) -> None:
+        super().__init__()
+        self.units, self.window = units, window
+        self.score = nn.Linear(units, 1)
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        past = self.window - 1
+        return like.new_zeros(batch, past, self.units), like.new_full((batch, past), UNSEEN)
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        states = torch.cat([state[0], x], dim=1)
+        scores = torch.cat([state[1], self.score(x).squeeze(-1)], dim=1)
+        ticks = x.shape[1]
+        blocks = [self._pool(states, scores, at, min(at + BLOCK, ticks)) for at in range(0, ticks, BLOCK)]
+        pooled = blocks[0] if len(blocks) == 1 else torch.cat(blocks, dim=1)
+        return torch.cat([pooled, x], dim=-1), (states[:, ticks:], scores[:, ticks:])
+
+    def _pool(self, states: Tensor, scores: Tensor, start: int, stop: int) -> Tensor:
+        """Pooled states for ticks start..stop: a softmax over a band of `window` columns."""
+        keys = slice(start, stop + self.window - 1)
+        ticks, columns = stop - start, stop - start + self.window - 1
+        lag = torch.arange(columns, device=scores.device) - torch.arange(ticks, device=scores.device)[:, None]
+        band = (lag >= 0) & (lag < self.window)
+        weights = scores[:, None, keys].masked_fill(~band, 2 * UNSEEN).softmax(dim=-1)
+        return weights @ states[:, keys]
+
+    def costs(self) -> list[Cost]:
+        return [
+            Cost(
+                f"attention pooling over {self.window}",
+                parameters_of(self),
+                pooling=(self.window + 1) * self.units,
+                width_in=self.units,
+                width_out=2 * self.units,
+            )
+        ]
