@@ -1,0 +1,1 @@
+"""Judging a trained network: scores, rollouts, baselines and footprint."""

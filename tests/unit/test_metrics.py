@@ -1,0 +1,109 @@
+import json
+
+import numpy as np
+import pytest
+from sklearn import metrics as sk
+
+from edp.errors import DataError
+from edp.metrics import COMPOSITE_WEIGHTS, Scores, composite, mean_scores, score, spread
+
+
+@pytest.fixture
+def pair() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(3)
+    truth = rng.normal(20.0, 100.0, size=4001)
+    return truth + rng.standard_t(3, size=4001) + 0.5, truth
+
+
+def test_scores_match_independent_formulas(pair):
+    prediction, truth = pair
+    got = score(prediction, truth)
+    assert got.mae == pytest.approx(sk.mean_absolute_error(truth, prediction), rel=1e-12)
+    assert got.rmse == pytest.approx(sk.root_mean_squared_error(truth, prediction), rel=1e-12)
+    assert got.r2 == pytest.approx(sk.r2_score(truth, prediction), rel=1e-12)
+    ordered = np.sort(np.abs(prediction - truth))
+    # 4000 intervals, so both percentiles are samples and need no interpolation.
+    assert got.p95 == ordered[3800]
+    assert got.p99 == ordered[3960]
+    assert got.bias == pytest.approx(prediction.mean() - truth.mean(), abs=1e-10)
+    assert got.count == 4001
+
+
+def test_composite_is_equation_3_41():
+    assert composite(1.0, 2.0, 3.0, 4.0) == pytest.approx(0.4 + 0.3 + 0.75 + 0.8)
+    assert sum(COMPOSITE_WEIGHTS.values()) == pytest.approx(1.0)
+    assert score(np.full(50, 3.0), np.arange(50) * 0.0).composite == pytest.approx(3.0)
+
+
+def test_arguments_are_left_as_they_were(pair):
+    prediction, truth = (values.copy() for values in pair)
+    score(prediction, truth)
+    np.testing.assert_array_equal(prediction, pair[0])
+    np.testing.assert_array_equal(truth, pair[1])
+
+
+def test_float32_is_summed_in_double_precision():
+    truth = np.full(2_000_000, 1e5, dtype=np.float32)
+    truth[0] = 0.0
+    got = score(truth + np.float32(0.125), truth)
+    assert got.mae == 0.125
+    assert got.bias == 0.125
+    assert got.r2 is not None
+
+
+def test_constant_truth_has_no_r2_and_fits_into_json():
+    got = score(np.array([0.1, 0.2, 0.3]), np.full(3, 0.1))
+    assert got.r2 is None
+    assert json.loads(json.dumps(got.to_json(), allow_nan=False))["r2"] is None
+
+
+def test_perfect_prediction():
+    truth = np.array([1.0, 2.0, 4.0])
+    assert score(truth, truth) == Scores(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite_are_refused(bad):
+    values = np.zeros(5)
+    broken = values.copy()
+    broken[3] = bad
+    with pytest.raises(DataError, match=r"prediction holds 1 .* first at index 3"):
+        score(broken, values)
+    with pytest.raises(DataError, match="truth holds"):
+        score(values, broken)
+
+
+@pytest.mark.parametrize(
+    ("prediction", "truth", "message"),
+    [([], [], "empty"), ([1.0], [1.0, 2.0], "1 predictions .* 2 true"), ([[1.0]], [[1.0]], "one output at a time")],
+)
+def test_shapes_are_checked(prediction, truth, message):
+    with pytest.raises(DataError, match=message):
+        score(prediction, truth)
+
+
+def test_mean_over_outputs(pair):
+    first, second = score(*pair), score(pair[0] * 1.1, pair[1])
+    mean = mean_scores([first, second])
+    assert mean.mae == pytest.approx((first.mae + second.mae) / 2)
+    assert mean.r2 == pytest.approx((first.r2 + second.r2) / 2)
+    assert mean.composite == pytest.approx(composite(mean.mae, mean.rmse, mean.p95, mean.p99))
+    assert mean.count == 8002
+    still = score([1.0, 2.0], [1.0, 1.0])
+    assert mean_scores([first, still]).r2 is None
+    with pytest.raises(DataError, match="no scores"):
+        mean_scores([])
+
+
+def test_spread():
+    assert spread([4.0, 1.0, 2.0, 3.0, 5.0]) == {
+        "median": 3.0,
+        "q25": 2.0,
+        "q75": 4.0,
+        "min": 1.0,
+        "max": 5.0,
+        "std": pytest.approx(2.5**0.5),
+    }
+    assert spread([2.0])["std"] is None
+    with pytest.raises(DataError, match="NaN"):
+        spread([1.0, float("nan")])
