@@ -1,0 +1,93 @@
+"""One offline HTML page from a run folder: plotly inlined once, no network, safe names."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from edp.report import facts as run
+from edp.report import tables
+from edp.report.plots import plots_of
+from edp.storage import write_bytes
+
+
+def build_report(run_folder: str | Path, output: str | Path | None = None, title: str | None = None) -> Path:
+    """Write the report of a run as one HTML file that opens with no network.
+
+    Args:
+        run_folder: Folder that training and evaluation wrote; what is missing in it is named on the page.
+        output: Where to write; ``report.html`` in the run folder by default.
+        title: Heading of the page; the task's name by default.
+
+    Returns:
+        The file written.
+
+    Raises:
+        StorageError: the folder or one of its files cannot be read, or the page cannot be written.
+        DataError: predictions and scores do not belong together.
+    """
+    facts = run.read_facts(run_folder)
+    target = Path(output) if output is not None else facts.folder / "report.html"
+    write_bytes(target, render(facts, title).encode())
+    return target
+
+
+def render(facts: run.Facts, title: str | None = None) -> str:
+    """The page's text."""
+    environment = Environment(
+        loader=PackageLoader("edp.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html.jinja").render(**context(facts, title))
+
+
+def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
+    """Everything the template shows."""
+    plots = plots_of(facts)
+    task = (facts.scores or {}).get("task", {})
+    network = run.label_of(facts, run.NETWORK) if run.NETWORK in facts.models else ""
+    return {
+        "title": title or task.get("name") or facts.folder.resolve().name,
+        "network": network,
+        "run_name": facts.folder.resolve().name,
+        "created": (facts.provenance or {}).get("created", ""),
+        "headline": run.headline(facts),
+        "verdict": run.verdict_lines(facts),
+        "tiles": tables.key_figures(facts),
+        "comparisons": tables.comparison_tables(facts),
+        "outputs": tables.output_table(facts),
+        "spread": run.spread_text(facts),
+        "worst": tables.worst_recordings_table(facts),
+        "plots": plots,
+        "specs": _script_json([plot.spec() for plot in plots.values()]),
+        "checks": tables.budget_checks(facts),
+        "budget": (facts.footprint or {}).get("budget", {}),
+        "parts": tables.parts_table(facts),
+        "footprint": tables.footprint_rows(facts),
+        "provenance": tables.provenance_rows(facts),
+        "config": facts.config,
+        "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
+        "absent": facts.absent,
+        "style": Markup(_asset("page.css")),
+        "script": Markup(_asset("page.js")),
+        "plotly": Markup(get_plotlyjs()),
+    }
+
+
+def _asset(name: str) -> str:
+    return resources.files("edp.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _script_json(value: Any) -> Markup:
+    """JSON that cannot end its script element, whatever names it holds."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))

@@ -1,0 +1,56 @@
+"""Numbers and names as a reader wants them: few digits, one precision per column, units beside the figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+MISSING = "–"
+
+
+def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
+    """Decimals that show the smallest non-zero magnitude of a column with `significant` digits, 0 to 6."""
+    sizes = [abs(value) for value in values if value is not None and math.isfinite(value) and value != 0]
+    if not sizes:
+        return 1
+    return min(max(significant - 1 - math.floor(math.log10(min(sizes))), 0), 6)
+
+
+def number(value: float | None, decimals: int | None = None, signed: bool = False) -> str:
+    """A figure with thousands separated and a true minus sign; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return MISSING
+    places = decimals_for([value]) if decimals is None else decimals
+    text = f"{value:{'+' if signed else ''},.{places}f}"
+    if float(text.replace(",", "")) == 0:
+        text = text.lstrip("+-")
+    return text.replace("-", "−")
+
+
+def percent(share: float | None, signed: bool = False) -> str:
+    """A share of one as a percentage: one decimal below ten percent, none above."""
+    if share is None or not math.isfinite(share):
+        return MISSING
+    return number(100 * share, 1 if abs(share) < 0.0995 else 0, signed) + " %"
+
+
+def whole(value: float | None) -> str:
+    """A count: no decimals, thousands separated."""
+    return number(value, 0)
+
+
+def duration(seconds: float | None) -> str:
+    """A time span in the unit a person would say it in."""
+    if seconds is None or not math.isfinite(seconds):
+        return MISSING
+    if seconds < 60:
+        return f"{number(seconds)} s"
+    if seconds < 3600:
+        return f"{seconds / 60:.1f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def listed(parts: Iterable[str]) -> str:
+    """``a``, ``a and b`` or ``a, b and c``."""
+    items = list(parts)
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
