@@ -1,0 +1,53 @@
+"""Where each number lies in the flat arrays that the compiled code reads and writes.
+
+Compiled functions take four arrays: `axes` (one row per cylinder), `plant` (one value per name), `state`
+(the 19 plant states) and `valves` (one row per spool: boom, arm, bucket, then their conflux spools).
+"""
+
+from __future__ import annotations
+
+AXES = 3
+SPOOLS = 6
+
+# state
+PSI, RATE, HEAD, ROD, PUMP, BRISTLE, DISPLACEMENT = 0, 3, 6, 9, 12, 14, 17
+STATES = 19
+
+# valves[spool, ...]: pilot (value, rate), play output, spool (value, rate), all as a share of full, extension positive
+PILOT, PILOT_RATE, PLAY, SPOOL, SPOOL_RATE = range(5)
+
+# axes[cylinder, ...]
+(
+    LENGTH, MASS, COM_RADIUS, COM_ANGLE, INERTIA,
+    HEAD_AREA, ROD_AREA, STROKE, CLOSED, HEAD_DEAD, ROD_DEAD,
+    CUSHION_LENGTH, CUSHION_AREA, STOP_STIFFNESS, STOP_DAMPING,
+    COULOMB, STATIC, STRIBECK, VISCOUS, SIGMA0, SIGMA1,
+    PISTON_LEAK, SPOOL_LEAK, RELIEF_HEAD, RELIEF_ROD,
+    IN_EXTEND, IN_RETRACT, CONFLUX_EXTEND, CONFLUX_RETRACT, OUT_EXTEND, OUT_RETRACT, REGEN_EXTEND, REGEN_RETRACT,
+    DEAD_BAND, CONFLUX_DEAD_BAND, PRIMARY_PUMP, CONFLUX_PUMP, DEMAND_EXTEND, DEMAND_RETRACT,
+    CONFLUX_SHARE_EXTEND, CONFLUX_SHARE_RETRACT,
+) = range(41)  # fmt: skip
+AXIS_VALUES = 41
+
+# plant[...]
+(
+    GRAVITY, BOOM_BASE, BOOM_ROD, BOOM_OFFSET, ARM_BASE, ARM_ROD, ARM_OFFSET,
+    PIVOT_X, PIVOT_Y, PIN_X, ROCKER, LINK, LUG, LUG_ANGLE, CYLINDER_X, CYLINDER_Y,
+    BULK_MODULUS, AIR, TANK, CHECK, ANTI_CAVITATION, PORT_SLOPE,
+    MAX_FLOW, EFFICIENCY, POWER_LIMIT, MIN_DISPLACEMENT, PUMP_TIME, LINE_VOLUME, PUMP_RELIEF, RELIEF_SLOPE,
+    BYPASS, BYPASS_CLOSED, HYSTERESIS, LEVER_DEAD_ZONE, CONFLUX_START,
+) = range(35)  # fmt: skip
+PLANT_VALUES = 35
+
+# conductance[cylinder, ...]: openings of one step, m^3/s/sqrt(Pa)
+HEAD_IN_1, HEAD_IN_2, ROD_IN_1, ROD_IN_2, HEAD_OUT, ROD_OUT, HEAD_TO_ROD, ROD_TO_HEAD = range(8)
+OPENINGS = 8
+
+# flow[cylinder, ...]: net inflow of head and rod chamber and its derivatives by head, rod and pump pressures
+Q_HEAD, Q_ROD, HEAD_BY_HEAD, HEAD_BY_ROD, ROD_BY_HEAD, ROD_BY_ROD, HEAD_BY_1, HEAD_BY_2, ROD_BY_1, ROD_BY_2 = range(10)
+DRAWN_1, DRAWN_2 = 10, 11
+FLOWS = 12
+
+ATMOSPHERE = 1.013e5
+LOWEST_PRESSURE = 0.1e5 - ATMOSPHERE
+"""Gauge pressure of 0.1 bar absolute: the floor at which pressures are clamped, and counted."""

@@ -1,0 +1,243 @@
+"""A machine: the numbers of one excavator front, read from `machines/<name>.toml`."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib import resources
+from typing import Any, TypeVar
+
+from edp.errors import ConfigError, closest
+
+Triple = tuple[float, float, float]
+Rating = tuple[float, float]
+"""A flow in L/min at a pressure difference in bar."""
+Ratings = tuple[Rating, Rating, Rating]
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Boom, arm and bucket as planar rigid bodies: SI units, centre of mass in the body's own frame."""
+
+    length: Triple
+    mass: Triple
+    com_x: Triple
+    com_y: Triple
+    inertia: Triple
+
+
+@dataclass(frozen=True)
+class PinTriangle:
+    """A cylinder between two pins around a joint (cosine law); lengths in m."""
+
+    base_radius: float
+    rod_radius: float
+    offset_deg: float
+    closed_length: float
+
+
+@dataclass(frozen=True)
+class BucketLinkage:
+    """Rocker and link between bucket cylinder and bucket, in the arm frame; lengths in m, angle in rad."""
+
+    pivot_to_pin: float
+    pivot_offset: float
+    rocker: float
+    link: float
+    lug: float
+    lug_angle: float
+    cylinder_pin: tuple[float, float]
+    closed_length: float
+
+
+@dataclass(frozen=True)
+class Cylinders:
+    """Sizes, cushions, stops and leakage; SI units."""
+
+    count: Triple
+    bore: Triple
+    rod: Triple
+    stroke: Triple
+    hose_volume: Triple
+    dead_length: float
+    cushion_length: Triple
+    cushion_area: Triple
+    stop_stiffness: float
+    stop_damping: float
+    piston_leakage: Triple
+    spool_leakage: Triple
+
+
+@dataclass(frozen=True)
+class Friction:
+    """LuGre parameters; Coulomb and static force as a share of head area times 34.3 MPa."""
+
+    coulomb_fraction: float
+    static_fraction: float
+    viscous: Triple
+    stribeck_velocity: float
+    bristle_stiffness: Triple
+    bristle_damping: Triple
+
+
+@dataclass(frozen=True)
+class Oil:
+    """Oil and tank; SI units, temperature in degC."""
+
+    bulk_modulus: float
+    air_fraction: float
+    viscosity: float
+    temperature: float
+    tank_pressure: float
+
+
+@dataclass(frozen=True)
+class Pumps:
+    """Two equal pumps with electronic positive control; SI units."""
+
+    max_flow: float
+    volumetric_efficiency: float
+    power_limit: float
+    min_displacement: float
+    time_constant: float
+    line_volume: float
+    relief: float
+    relief_slope: float
+    bypass: Rating
+    bypass_closed_at: float
+
+
+@dataclass(frozen=True)
+class Valves:
+    """Command path and main control valve; ratings are (L/min, bar) at full opening."""
+
+    pilot_pressure: float
+    pilot_frequency: Triple
+    spool_frequency: Triple
+    conflux_spool_frequency: Triple
+    dead_time: Triple
+    conflux_extra_dead_time: float
+    dead_band: Triple
+    conflux_dead_band: Triple
+    hysteresis: float
+    lever_dead_zone: float
+    conflux_start: float
+    conflux_extend: Triple
+    conflux_retract: Triple
+    pump_demand_extend: Triple
+    pump_demand_retract: Triple
+    primary_pump: Triple
+    conflux_pump: Triple
+    meter_in_extend: Ratings
+    meter_in_retract: Ratings
+    conflux_in_extend: Ratings
+    conflux_in_retract: Ratings
+    meter_out_extend: Ratings
+    meter_out_retract: Ratings
+    regeneration_extend: Ratings
+    regeneration_retract: Ratings
+    check_leakage: float
+    port_relief_head: Triple
+    port_relief_rod: Triple
+    port_relief_slope: float
+    anti_cavitation: Rating
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """White noise (rms, SI) and the bandwidth of the differentiated velocity in Hz."""
+
+    velocity: float
+    pressure: float
+    acceleration_bandwidth: float
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One parameter set of the simulator; order of triples: boom, arm, bucket."""
+
+    name: str
+    description: str
+    gravity: float
+    bodies: Bodies
+    boom_cylinder: PinTriangle
+    arm_cylinder: PinTriangle
+    bucket_linkage: BucketLinkage
+    cylinders: Cylinders
+    friction: Friction
+    oil: Oil
+    pumps: Pumps
+    valves: Valves
+    sensors: Sensors
+
+
+_SECTIONS: dict[str, type] = {
+    "bodies": Bodies,
+    "boom_cylinder": PinTriangle,
+    "arm_cylinder": PinTriangle,
+    "bucket_linkage": BucketLinkage,
+    "cylinders": Cylinders,
+    "friction": Friction,
+    "oil": Oil,
+    "pumps": Pumps,
+    "valves": Valves,
+    "sensors": Sensors,
+}
+Section = TypeVar("Section")
+
+
+def machine_names() -> tuple[str, ...]:
+    """Names of the machines that come with the package."""
+    files = resources.files("edp.sim").joinpath("machines").iterdir()
+    return tuple(sorted(f.name.removesuffix(".toml").upper() for f in files if f.name.endswith(".toml")))
+
+
+@cache
+def load_machine(name: str) -> Machine:
+    """The machine of this name (upper or lower case).
+
+    Raises:
+        ConfigError: no such machine (the closest name is offered), or its file lacks or misnames a key.
+    """
+    known = machine_names()
+    if name.upper() not in known:
+        raise ConfigError(f"unknown machine '{name}'{closest(name, known)}")
+    source = resources.files("edp.sim").joinpath("machines").joinpath(f"{name.lower()}.toml")
+    return parse_machine(source.read_text(encoding="utf-8"), f"{name.lower()}.toml")
+
+
+def parse_machine(text: str, where: str) -> Machine:
+    """Read a machine from TOML text; `where` names the file in messages.
+
+    Raises:
+        ConfigError: not TOML, or a key is missing, unknown, or a list has the wrong length.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"machine file {where} is not valid TOML: {error}") from error
+    parts: dict[str, Any] = {
+        key: _section(_SECTIONS[key], value, f"{where} [{key}]") if key in _SECTIONS else value
+        for key, value in table.items()
+    }
+    return _section(Machine, parts, where)
+
+
+def _section(kind: type[Section], table: dict[str, Any], where: str) -> Section:
+    known = {field.name: str(field.type) for field in fields(kind)}  # type: ignore[arg-type]
+    missing = sorted(set(known) - set(table))
+    if missing:
+        raise ConfigError(f"machine file {where}: missing {', '.join(missing)}")
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in known:
+            raise ConfigError(f"machine file {where}: unknown key '{key}'{closest(key, known)}")
+        if known[key] in ("Triple", "Ratings") and (not isinstance(value, list) or len(value) != 3):
+            raise ConfigError(f"machine file {where}: {key} = {value!r} must list boom, arm, bucket")
+        values[key] = _frozen(value)
+    return kind(**values)
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(part) for part in value) if isinstance(value, list) else value

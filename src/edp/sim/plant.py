@@ -1,0 +1,166 @@
+"""The plant as a whole: its arrays, its state at rest, and running it sample by sample."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError
+from edp.sim import dynamics, integrator, linkage, valve
+from edp.sim import layout as at
+from edp.sim.jit import compiled
+from edp.sim.machine import Machine
+from edp.sim.parameters import pack
+
+Array = NDArray[np.float64]
+
+# columns of one logged sample
+LOG_DEMAND = at.STATES
+LOG_STROKE = LOG_DEMAND + at.SPOOLS
+LOG_VELOCITY = LOG_STROKE + 3
+LOG_COLUMNS = LOG_VELOCITY + 3
+FINE = 4
+"""A step is cut in this many near the ends of the stroke, where cushions and stops are stiff."""
+RESTING_PRESSURE = 10e5
+LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
+"""Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
+
+
+@compiled
+def write_log(state: Array, demand: Array, axes: Array, plant: Array, row: Array) -> None:
+    """One sample: plant state, spool demands, cylinder strokes (m from closed) and velocities (m/s)."""
+    for n in range(at.STATES):
+        row[n] = state[n]
+    for j in range(at.SPOOLS):
+        row[LOG_DEMAND + j] = demand[j]
+    for i in range(at.AXES):
+        length, lever = linkage.cylinder(i, state[at.PSI + i], plant)
+        row[LOG_STROKE + i] = length - axes[i, at.CLOSED]
+        row[LOG_VELOCITY + i] = lever * state[at.RATE + i]
+
+
+@compiled
+def near_end(row: Array, axes: Array) -> bool:
+    """Whether any cylinder of a logged sample moves within, or will soon reach, a cushion or stop."""
+    for i in range(at.AXES):
+        v, stroke = row[LOG_VELOCITY + i], row[LOG_STROKE + i]
+        margin = axes[i, at.CUSHION_LENGTH] + 0.02 * abs(v)
+        if min(stroke, axes[i, at.STROKE] - stroke) < margin and abs(v) > 1e-3:
+            return True
+    return False
+
+
+@compiled
+def run_samples(
+    state: Array, valves: Array, demands: Array, first: int, delays: Array, clocks: Array, setup: tuple, log: Array
+) -> int:
+    """Run one sample per row of `log`; returns the number of clamped pressures."""
+    axes, plant, work = setup
+    held = np.empty(at.SPOOLS)
+    clamps = 0
+    for k in range(log.shape[0]):
+        write_log(state, demands[first + k], axes, plant, log[k])
+        fine = 1 if near_end(log[k], axes) else 0
+        steps = int(clocks[fine, 0])
+        for n in range(steps):
+            for j in range(at.SPOOLS):
+                # whole samples of delay, plus the part of a sample that is left, at mid-step
+                when = first + k + (n + 0.5) / steps - delays[j]
+                held[j] = demands[max(int(np.floor(when)), 0), j]
+            clamps += integrator.step(state, valves, held, clocks[fine, 1:], axes, plant, work)
+    return clamps
+
+
+@compiled
+def smooth_levers(targets: Array, hand: Array, step_s: float, out: Array) -> None:
+    """Lever targets to lever positions, shapes (samples, 3): 2nd-order low-pass with limited rate, state in `hand`."""
+    omega = 2.0 * np.pi * LEVER_BANDWIDTH_HZ
+    for k in range(targets.shape[0]):
+        for i in range(at.AXES):
+            pull = omega * omega * (targets[k, i] - hand[i, 0]) - 2.0 * omega * hand[i, 1]
+            hand[i, 1] = min(max(hand[i, 1] + step_s * pull, -LEVER_RATE), LEVER_RATE)
+            hand[i, 0] += step_s * hand[i, 1]
+            out[k, i] = hand[i, 0]
+
+
+class Plant:
+    """One machine in motion: levers in, logged samples out.
+
+    Args:
+        machine: the parameter set.
+        strokes: initial strokes as a share of each cylinder's stroke, shape (3,).
+        rate_hz: logging and command rate.
+        step_s: integration step; a whole number of them must fill a sample.
+
+    Raises:
+        ConfigError: the step does not divide the sample time.
+    """
+
+    def __init__(self, machine: Machine, strokes: Array, rate_hz: float = 100.0, step_s: float = 1e-3) -> None:
+        steps = round(1.0 / (rate_hz * step_s))
+        if steps < 1 or abs(steps * step_s * rate_hz - 1.0) > 1e-9:
+            raise ConfigError(
+                f"step_s = {step_s} s does not divide the sample time {1.0 / rate_hz} s of rate_hz = {rate_hz}; "
+                "choose a step such as 0.001 or 0.0005"
+            )
+        self.machine = machine
+        self.rate_hz = rate_hz
+        self.axes, self.plant = pack(machine)
+        self.state = resting_state(strokes, self.axes, self.plant)
+        self.valves = np.zeros((at.SPOOLS, 5))
+        self.hand = np.zeros((at.AXES, 2))
+        self.work = integrator.new_work()
+        self.clamps = 0
+        self._delays = valve.dead_times(machine) * rate_hz
+        self._past = int(np.ceil(self._delays.max())) + 1
+        self._demands = np.zeros((self._past, at.SPOOLS))
+        self._clocks = np.array(
+            [np.concatenate(([n * steps], integrator.clock_row(machine, step_s / n))) for n in (1, FINE)]
+        )
+
+    @property
+    def strokes(self) -> Array:
+        """Strokes as a share of each cylinder's stroke, shape (3,)."""
+        lengths = [linkage.cylinder(i, self.state[at.PSI + i], self.plant)[0] for i in range(at.AXES)]
+        return (np.array(lengths) - self.axes[:, at.CLOSED]) / self.axes[:, at.STROKE]
+
+    def run(self, levers: Array) -> Array:
+        """Run one sample per row of lever positions, shape (samples, 3), in [-1, 1]; returns the log.
+
+        The log has shape (samples, LOG_COLUMNS); row k is the state at the instant at which lever k is applied.
+        """
+        fresh = np.zeros((len(levers), at.SPOOLS))
+        for k, lever in enumerate(levers):
+            valve.shape_demand(lever, self.axes, self.plant, fresh[k])
+        demands = np.concatenate((self._demands, fresh))
+        log = np.empty((len(levers), LOG_COLUMNS))
+        setup = (self.axes, self.plant, self.work)
+        self.clamps += run_samples(self.state, self.valves, demands, self._past, self._delays, self._clocks, setup, log)
+        self._demands = demands[-self._past :].copy()
+        return log
+
+    def follow(self, targets: Array) -> Array:
+        """Like `run`, with the operator's hand between targets and levers."""
+        levers = np.empty_like(targets)
+        smooth_levers(targets, self.hand, 1.0 / self.rate_hz, levers)
+        return self.run(levers)
+
+
+def resting_state(strokes: Array, axes: Array, plant: Array) -> Array:
+    """State at rest in equilibrium at these strokes (shares of full), shape (STATES,)."""
+    state = np.zeros(at.STATES)
+    for i in range(at.AXES):
+        state[at.PSI + i] = linkage.angle_at_stroke(i, strokes[i] * axes[i, at.STROKE], axes, plant)
+    psi, load = state[at.PSI : at.PSI + 3], np.empty(3)
+    dynamics.gravity_torque(psi, axes, plant[at.GRAVITY], load)
+    for i in range(at.AXES):
+        force = load[i] / linkage.cylinder(i, psi[i], plant)[1]
+        head = (force + axes[i, at.ROD_AREA] * RESTING_PRESSURE) / axes[i, at.HEAD_AREA]
+        rod = RESTING_PRESSURE
+        if head < RESTING_PRESSURE:
+            head = RESTING_PRESSURE
+            rod = (axes[i, at.HEAD_AREA] * head - force) / axes[i, at.ROD_AREA]
+        state[at.HEAD + i], state[at.ROD + i] = head, rod
+    state[at.PUMP : at.PUMP + 2] = RESTING_PRESSURE
+    state[at.DISPLACEMENT : at.DISPLACEMENT + 2] = plant[at.MIN_DISPLACEMENT]
+    return state

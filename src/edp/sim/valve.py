@@ -1,0 +1,116 @@
+"""Command path: ECU shaping, dead time, pilot and spool filters with play between them, and the openings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from edp.sim import layout as at
+from edp.sim.jit import compiled
+from edp.sim.machine import Machine
+
+Array = NDArray[np.float64]
+PILOT_DAMPING = 0.9
+SPOOL_DAMPING = 1.0
+
+
+@compiled
+def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
+    """Lever positions in [-1, 1], shape (3,), to signed spool demands, shape (6,): primary, then conflux spools."""
+    zone, start = plant[at.LEVER_DEAD_ZONE], plant[at.CONFLUX_START]
+    for i in range(at.AXES):
+        size = min(max((abs(lever[i]) - zone) / (1.0 - zone), 0.0), 1.0)
+        second = min(max((size - start) / (1.0 - start), 0.0), 1.0)
+        sign = 1.0 if lever[i] >= 0.0 else -1.0
+        share = axes[i, at.CONFLUX_SHARE_EXTEND] if sign > 0 else axes[i, at.CONFLUX_SHARE_RETRACT]
+        out[i] = sign * size
+        out[i + 3] = sign * second * share
+
+
+def _oscillator(frequency_hz: float, damping: float, step_s: float) -> Array:
+    """Exact transition of (error, rate) of a second-order low-pass over one step, row by row, shape (4,)."""
+    omega = 2.0 * math.pi * frequency_hz
+    return expm(np.array([[0.0, 1.0], [-omega * omega, -2.0 * damping * omega]]) * step_s).ravel()
+
+
+def spool_filters(machine: Machine, step_s: float) -> Array:
+    """Transitions over `step_s` of pilot and spool, shape (6, 2, 4)."""
+    valves = machine.valves
+    pilots = valves.pilot_frequency * 2
+    spools = valves.spool_frequency + valves.conflux_spool_frequency
+    return np.array(
+        [
+            [_oscillator(pilot, PILOT_DAMPING, step_s), _oscillator(spool, SPOOL_DAMPING, step_s)]
+            for pilot, spool in zip(pilots, spools, strict=True)
+        ]
+    )
+
+
+def dead_times(machine: Machine) -> Array:
+    """Dead time of each spool's command, shape (6,), s."""
+    first = np.array(machine.valves.dead_time)
+    return np.concatenate((first, first + machine.valves.conflux_extra_dead_time))
+
+
+@compiled
+def pilot_half_step(demand: Array, filters: Array, hysteresis: float, valves: Array) -> None:
+    """Advance the pilots by half a step, then move the play operator's output."""
+    for j in range(at.SPOOLS):
+        f = filters[j, 0]
+        error, rate = valves[j, at.PILOT] - demand[j], valves[j, at.PILOT_RATE]
+        valves[j, at.PILOT] = demand[j] + f[0] * error + f[1] * rate
+        valves[j, at.PILOT_RATE] = f[2] * error + f[3] * rate
+        pilot = valves[j, at.PILOT]
+        valves[j, at.PLAY] = max(pilot - hysteresis, min(pilot + hysteresis, valves[j, at.PLAY]))
+
+
+@compiled
+def spool_half_step(filters: Array, valves: Array) -> None:
+    """Advance the spools by half a step towards the play operator's output."""
+    for j in range(at.SPOOLS):
+        f = filters[j, 1]
+        error, rate = valves[j, at.SPOOL] - valves[j, at.PLAY], valves[j, at.SPOOL_RATE]
+        valves[j, at.SPOOL] = valves[j, at.PLAY] + f[0] * error + f[1] * rate
+        valves[j, at.SPOOL_RATE] = f[2] * error + f[3] * rate
+
+
+@compiled
+def opening(spool: float, dead_band: float) -> float:
+    """Share of the full area behind the dead band: r (0.25 + 0.75 r), fine control near closed."""
+    r = min(max((abs(spool) - dead_band) / (1.0 - dead_band), 0.0), 1.0)
+    return r * (0.25 + 0.75 * r)
+
+
+@compiled
+def cushion(distance: float, length: float, least: float) -> float:
+    """Share of the outflow area left at a distance (m) from the stop: a smoothstep down to `least`."""
+    r = min(max(distance / length, 0.0), 1.0)
+    return least + (1.0 - least) * r * r * (3.0 - 2.0 * r)
+
+
+@compiled
+def open_spools(valves: Array, stroke: Array, axes: Array, out: Array) -> None:
+    """Conductances of this step from spool positions and cushions, `out` shape (3, OPENINGS)."""
+    out[:] = 0.0
+    for i in range(at.AXES):
+        a = axes[i]
+        spool, second = valves[i, at.SPOOL], valves[i + 3, at.SPOOL]
+        area, second_area = opening(spool, a[at.DEAD_BAND]), opening(second, a[at.CONFLUX_DEAD_BAND])
+        pump, second_pump = int(a[at.PRIMARY_PUMP]), int(a[at.CONFLUX_PUMP])
+        if second > 0.0:
+            out[i, at.HEAD_IN_1 + second_pump] = a[at.CONFLUX_EXTEND] * second_area
+        else:
+            out[i, at.ROD_IN_1 + second_pump] = a[at.CONFLUX_RETRACT] * second_area
+        if spool > 0.0:
+            left = cushion(a[at.STROKE] - stroke[i], a[at.CUSHION_LENGTH], a[at.CUSHION_AREA])
+            out[i, at.HEAD_IN_1 + pump] = a[at.IN_EXTEND] * area
+            out[i, at.ROD_OUT] = a[at.OUT_EXTEND] * area * left
+            out[i, at.ROD_TO_HEAD] = a[at.REGEN_EXTEND] * area * left
+        else:
+            left = cushion(stroke[i], a[at.CUSHION_LENGTH], a[at.CUSHION_AREA])
+            out[i, at.ROD_IN_1 + pump] = a[at.IN_RETRACT] * area
+            out[i, at.HEAD_OUT] = a[at.OUT_RETRACT] * area * left
+            out[i, at.HEAD_TO_ROD] = a[at.REGEN_RETRACT] * area * left
