@@ -32,8 +32,8 @@ class Task:
         mode: absolute or delta encoding.
         rate_hz: samples per second of every recording.
         derived_targets: derived channels that serve as targets only.
-        integrate: target name to the logged position whose rate it is; scores then also judge the free run of
-            the integral from its first value.
+        integrate: targets at horizon 0 whose running integral is judged too: a plant that integrates (a position
+            behind a velocity) is predicted through its rate and integrated outside.
 
     Raises:
         ConfigError: a horizon or combination that cannot hold.
@@ -45,7 +45,7 @@ class Task:
     mode: TargetMode
     rate_hz: float
     derived_targets: tuple[Derived, ...] = ()
-    integrate: tuple[tuple[str, str], ...] = ()
+    integrate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.targets:
@@ -66,9 +66,11 @@ class Task:
                 f"task: horizon 0 asks for the present value of {', '.join(seen)}, which is also a feature; "
                 "remove it from the features or ask for horizons >= 1"
             )
-        for target, _ in self.integrate:
+        for target in self.integrate:
             if target not in self.targets:
                 raise ConfigError(f"task: integrate names '{target}', not a target{closest(target, self.targets)}")
+        if self.integrate and 0 not in self.horizons:
+            raise ConfigError("task: integrate judges a free run, which needs horizon 0; add it to horizons")
 
     @property
     def derived(self) -> tuple[Derived, ...]:

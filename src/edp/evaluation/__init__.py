@@ -1,1 +1,1 @@
-"""Judging a trained network: scores, rollouts, baselines and footprint."""
+"""Judging: held-out scores beside baselines, and what a predictor costs."""

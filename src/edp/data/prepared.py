@@ -1,0 +1,91 @@
+"""A data set made ready for a task: the series of each part, and a digest of what went in."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from edp.data.features import kind_of
+from edp.data.scaling import Scaler, fit_scaler
+from edp.data.series import Series
+from edp.data.splits import SplitSpec, Stretch
+from edp.data.task import Task
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Series by part, with the facts of the channels.
+
+    Attributes:
+        task: what is read and predicted.
+        train: training stretches; `validation` and `test` likewise.
+        inputs: the logged input channels.
+        feature_kinds: kind of each feature, in order.
+        target_kinds: kind of each target.
+        descriptions: description of each target.
+        digest: blake2b over the recordings and stretches.
+    """
+
+    task: Task
+    train: list[Series]
+    validation: list[Series]
+    test: list[Series]
+    inputs: tuple[Channel, ...]
+    feature_kinds: tuple[Kind, ...]
+    target_kinds: tuple[Kind, ...]
+    descriptions: tuple[str, ...]
+    digest: str
+
+    def scaler(self) -> Scaler:
+        """Fitted on the training stretches only."""
+        return fit_scaler(self.task, self.train, self.feature_kinds)
+
+
+def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, window: int) -> Prepared:
+    """Cut recordings into the series of each part.
+
+    Args:
+        recordings: the data set, all at the rate of the task.
+        task: what is read and predicted.
+        split: how to divide.
+        window: W; the gap between neighbouring stretches is ``W + k``.
+
+    Raises:
+        DataError: a channel is missing, a value is not finite, rates differ, or a part would be empty.
+    """
+    first = recordings[0]
+    parts = split.split(recordings, window + task.reach)
+    state = hashlib.blake2b(digest_size=16)
+    for recording in recordings:
+        state.update(recording.digest.encode())
+    state.update(repr(parts).encode())
+
+    def series(stretches: Sequence[Stretch]) -> list[Series]:
+        made = []
+        for stretch in stretches:
+            recording = recordings[stretch.recording]
+            whole = stretch.start == 0 and stretch.stop == recording.samples
+            name = recording.name if whole else f"{recording.name}[{stretch.start}:{stretch.stop}]"
+            made.append(task.series(recording, stretch.start, stretch.stop, name))
+        return made
+
+    return Prepared(
+        task=task,
+        train=series(parts.train),
+        validation=series(parts.validation),
+        test=series(parts.test),
+        inputs=tuple(first.channels[first.index(name)] for name in task.features.inputs),
+        feature_kinds=tuple(kind_of(name, first, task.derived) for name in task.features.features),
+        target_kinds=task.kinds(first),
+        descriptions=tuple(_description(first, name) for name in task.targets),
+        digest=state.hexdigest(),
+    )
+
+
+def _description(recording: Recording, name: str) -> str:
+    if name in recording.channel_names:
+        return recording.channels[recording.index(name)].description
+    return ""

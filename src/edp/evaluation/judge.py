@@ -1,0 +1,214 @@
+"""Judge a predictor on held-out recordings beside honest baselines, on the same ticks and in the same units."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.errors import DataError
+from edp.evaluation.baselines import BASELINES, BaselineTask
+from edp.metrics import Scores, mean_scores, score, spread
+from edp.models.predictor import Predictor
+from edp.models.running import stream_predictions
+from edp.signals import KINDS
+
+Predictions = list[NDArray[np.float32]]
+ALL_BASELINES = ("persistence", "ridge_arx", "boosted_trees", "small_mlp")
+LABELS = {
+    "persistence": "Persistence",
+    "ridge_arx": "Ridge ARX",
+    "boosted_trees": "Boosted trees",
+    "small_mlp": "Small MLP",
+}
+SPEED_BINS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeSpec:
+    """How to judge.
+
+    Attributes:
+        baselines: names of registered baselines.
+        history: samples of history that baselines may use.
+        skip: first ticks of each stretch that are not scored; None leaves out a whole window (start-up).
+        seed: of the baselines' row sampling and initial weights.
+    """
+
+    baselines: tuple[str, ...] = ALL_BASELINES
+    history: int = 50
+    skip: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in self.baselines:
+            _ = BASELINES[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Scores of every model, and the predictions that pictures need.
+
+    Attributes:
+        scores: the content of ``scores.json`` (schema 1).
+        predictions: by model, one array ``(time, horizon, target)`` for each series.
+        series: the judged series.
+    """
+
+    scores: dict[str, Any]
+    predictions: dict[str, Predictions]
+    series: list[Series]
+
+
+def judge(
+    predictor: Predictor,
+    data: Prepared,
+    spec: JudgeSpec,
+    label: str,
+    seconds: float = 0.0,
+    on_step: Callable[[str], None] | None = None,
+) -> Evaluation:
+    """Score the predictor and the baselines on ``data.test``.
+
+    Args:
+        predictor: the network.
+        data: prepared series; baselines train on ``data.train`` and choose sizes on ``data.validation``.
+        spec: which baselines, how much history, which ticks.
+        label: how reports call the network.
+        seconds: its training time.
+        on_step: called with the name of each model before it runs.
+
+    Raises:
+        DataError: no tick of the test series can be scored.
+    """
+    say = on_step or (lambda name: None)
+    say("network")
+    predictions = {"network": stream_predictions(predictor, data.test)}
+    names, times = {"network": label}, {"network": seconds}
+    task = baseline_task(data, spec)
+    for name in spec.baselines:
+        say(name)
+        began = time.perf_counter()
+        baseline = BASELINES[name](task)
+        baseline.fit(data.train, data.validation)
+        predictions[name] = [baseline.predict(series) for series in data.test]
+        names[name], times[name] = LABELS.get(name, name), time.perf_counter() - began
+    skip = predictor.spec.window if spec.skip is None else spec.skip
+    ruler = _Ruler(data, skip)
+    models = {
+        name: {"label": names[name], "seconds": times[name], **ruler.measure(predicted)}
+        for name, predicted in predictions.items()
+    }
+    return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
+
+
+def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
+    """The baselines' task: present values only where a logged input measures them."""
+    inputs = data.task.features.inputs
+    present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
+    longest = min(series.samples for series in [*data.train, *data.test]) - data.task.reach - 1
+    history = max(1, min(spec.history, longest // 2))
+    return BaselineTask(horizons=data.task.horizons, present=present, history=history, seed=spec.seed)
+
+
+class _Ruler:
+    """Measures predictions in report units; the same ticks for every model that reaches them."""
+
+    def __init__(self, data: Prepared, skip: int) -> None:
+        self.data, self.skip = data, skip
+        self.task = data.task
+        facts = [KINDS[kind] for kind in data.target_kinds]
+        self.units = [fact.report_unit for fact in facts]
+        self.factors = np.array([fact.report_factor for fact in facts])
+        reach = self.task.reach
+        self.truth = []
+        for series in data.test:
+            ticks = max(0, series.samples - reach)
+            future = np.stack([series.targets[k : k + ticks] for k in self.task.horizons], axis=1)
+            self.truth.append(future.astype(np.float64) * self.factors)
+        if sum(max(0, len(truth) - skip) for truth in self.truth) == 0:
+            raise DataError(
+                f"no tick of the test recordings can be scored: the longest has {max(map(len, self.truth))} ticks "
+                f"before the horizon, the first {skip} are start-up; give longer recordings"
+            )
+        pooled = np.concatenate([np.abs(truth[skip:, 0]).ravel() for truth in self.truth])
+        self.edges = np.linspace(0.0, float(np.quantile(pooled, 0.995)) or 1.0, SPEED_BINS + 1)
+
+    def header(self) -> dict[str, Any]:
+        targets = zip(self.task.targets, self.data.descriptions, self.units, self.factors, strict=True)
+        return {
+            "schema": 1,
+            "task": {
+                "name": self.task.features.name,
+                "horizons": list(self.task.horizons),
+                "rate_hz": self.task.rate_hz,
+                "mode": str(self.task.mode),
+                "skip": self.skip,
+            },
+            "targets": [
+                {"name": name, "description": text, "unit": unit, "factor": float(factor)}
+                for name, text, unit, factor in targets
+            ],
+        }
+
+    def measure(self, predictions: Predictions) -> dict[str, Any]:
+        """Scores of one model: overall, by recording with spread, by speed, and of running integrals."""
+        predicted = [values[: len(truth)] * self.factors for values, truth in zip(predictions, self.truth, strict=True)]
+        overall, recordings, spreads, speeds = {}, {}, {}, {}
+        for h, horizon in enumerate(self.task.horizons):
+            pairs = [self._ticks(p[:, h], t[:, h]) for p, t in zip(predicted, self.truth, strict=True)]
+            overall[str(horizon)] = self._scores([p for p, _ in pairs], [t for _, t in pairs])
+            by_name = {}
+            for series, (p, t) in zip(self.data.test, pairs, strict=True):
+                if len(t):
+                    by_name[series.name] = {str(horizon): {"mean": self._scores([p], [t])["mean"]}}
+            for name, entry in by_name.items():
+                recordings.setdefault(name, {}).update(entry)
+            spreads[str(horizon)] = spread([entry[str(horizon)]["mean"]["mae"] for entry in by_name.values()])
+            speeds[str(horizon)] = self._by_speed(pairs)
+        found = {"overall": overall, "recordings": recordings, "spread": spreads, "by_speed": speeds}
+        return found | ({"integrated": self._integrated(predicted)} if self.task.integrate else {})
+
+    def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Scored ticks: after start-up and where the model has its history."""
+        predicted, truth = predicted[self.skip :], truth[self.skip :]
+        known = np.isfinite(predicted).all(axis=1)
+        return predicted[known], truth[known]
+
+    def _scores(self, predicted: Sequence[NDArray[Any]], truth: Sequence[NDArray[Any]]) -> dict[str, Any]:
+        p, t = np.concatenate(predicted), np.concatenate(truth)
+        each = [score(p[:, i], t[:, i]) for i in range(p.shape[1])]
+        named: dict[str, Scores] = {"mean": mean_scores(each), **dict(zip(self.task.targets, each, strict=True))}
+        return {name: values.to_json() for name, values in named.items()}
+
+    def _by_speed(self, pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]]) -> list[dict[str, Any]]:
+        """Mean absolute error in bins of the target's magnitude, outputs pooled."""
+        truth = np.concatenate([np.abs(t).ravel() for _, t in pairs])
+        error = np.concatenate([np.abs(p - t).ravel() for p, t in pairs])
+        place = np.clip(np.digitize(truth, self.edges) - 1, 0, SPEED_BINS - 1)
+        rows = []
+        for i in range(SPEED_BINS):
+            inside = place == i
+            mae = float(error[inside].mean()) if inside.any() else None
+            low, high = float(self.edges[i]), float(self.edges[i + 1])
+            rows.append({"low": low, "high": high, "count": int(inside.sum()), "mae": mae})
+        return rows
+
+    def _integrated(self, predicted: Predictions) -> dict[str, Any]:
+        """Root mean square of the running integral's error, in report unit times seconds, per integrated target."""
+        h = self.task.horizons.index(0)
+        found = {}
+        for target in self.task.integrate:
+            column = self.task.targets.index(target)
+            errors = []
+            for p, t in zip(predicted, self.truth, strict=True):
+                difference = (p[:, h, column] - t[:, h, column])[self.skip :]
+                errors.append(np.nancumsum(difference) / self.task.rate_hz)
+            found[target] = {"rmse": float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))}
+        return found

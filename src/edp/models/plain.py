@@ -1,0 +1,126 @@
+"""Tasks and network specs as plain JSON values and back: what bundles store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from enum import StrEnum
+from typing import Any
+
+from edp.blocks import BLOCKS
+from edp.data.features import Derived, FeatureSet
+from edp.data.task import TargetMode, Task
+from edp.errors import BundleError, ConfigError
+from edp.models.activations import ACTIVATIONS
+from edp.models.backbones import BACKBONES
+from edp.models.heads import HeadSpec
+from edp.models.predictor import ModelSpec
+from edp.registry import Registry
+from edp.signals import Kind
+
+Plain = dict[str, Any]
+
+
+def listed(value: Any) -> Any:
+    """Tuples as lists and enums as strings, recursively."""
+    if isinstance(value, StrEnum):
+        return str(value)
+    if isinstance(value, tuple | list):
+        return [listed(item) for item in value]
+    return value
+
+
+def options(spec: Any) -> Plain:
+    """The options of a spec, plain."""
+    return {field.name: listed(getattr(spec, field.name)) for field in fields(spec)}
+
+
+def tagged(spec: Any, registry: Registry[type]) -> Plain:
+    """The options of a registered spec with its name under ``kind``."""
+    return {"kind": registry.name_of(spec), **options(spec)}
+
+
+def untagged(plain: Mapping[str, Any], registry: Registry[type]) -> Any:
+    """A registered spec from its plain form.
+
+    Raises:
+        BundleError: an option that this version does not know.
+    """
+    rest = {key: _tupled(value) for key, value in plain.items() if key != "kind"}
+    try:
+        return registry[plain["kind"]](**rest)
+    except (TypeError, KeyError) as error:
+        raise BundleError(f"{registry.what} {dict(plain)} is not understood by this version: {error}") from error
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(_tupled(item) for item in value) if isinstance(value, list) else value
+
+
+def model_to_plain(spec: ModelSpec) -> Plain:
+    """A network spec as JSON values."""
+    return {
+        "backbone": tagged(spec.backbone, BACKBONES),
+        "head": options(spec.head),
+        "activation": tagged(spec.activation, ACTIVATIONS),
+        "blocks": [tagged(block, BLOCKS) for block in spec.blocks],
+        "window": spec.window,
+    }
+
+
+def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
+    """A network spec from JSON values."""
+    return ModelSpec(
+        backbone=untagged(plain["backbone"], BACKBONES),
+        head=HeadSpec(**plain["head"]),
+        activation=untagged(plain["activation"], ACTIVATIONS),
+        blocks=tuple(untagged(block, BLOCKS) for block in plain["blocks"]),
+        window=plain["window"],
+    )
+
+
+def task_to_plain(task: Task) -> Plain:
+    """A task as JSON values."""
+    features = task.features
+    return {
+        "features": {
+            "name": features.name,
+            "channels": list(features.channels),
+            "hidden": list(features.hidden),
+            "derived": [options(entry) for entry in features.derived],
+        },
+        "targets": list(task.targets),
+        "horizons": list(task.horizons),
+        "mode": str(task.mode),
+        "rate_hz": task.rate_hz,
+        "derived_targets": [options(entry) for entry in task.derived_targets],
+        "integrate": listed(task.integrate),
+    }
+
+
+def task_from_plain(plain: Mapping[str, Any]) -> Task:
+    """A task from JSON values.
+
+    Raises:
+        BundleError: a value that this version does not understand.
+    """
+    try:
+        held = plain["features"]
+        features = FeatureSet(
+            held["name"], tuple(held["channels"]), tuple(map(_derived, held["derived"])), tuple(held["hidden"])
+        )
+        return Task(
+            features=features,
+            targets=tuple(plain["targets"]),
+            horizons=tuple(plain["horizons"]),
+            mode=TargetMode(plain["mode"]),
+            rate_hz=float(plain["rate_hz"]),
+            derived_targets=tuple(map(_derived, plain["derived_targets"])),
+            integrate=tuple(plain["integrate"]),
+        )
+    except (KeyError, TypeError, ValueError, ConfigError) as error:
+        raise BundleError(f"the bundle's task is not understood by this version: {error}") from error
+
+
+def _derived(plain: Mapping[str, Any]) -> Derived:
+    return Derived(plain["name"], plain["source"], plain["how"], Kind(plain["kind"]))

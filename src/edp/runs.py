@@ -1,0 +1,113 @@
+"""Run folders: everything needed to repeat a training and to go on with it after a stop."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from edp import __version__
+from edp.errors import StorageError
+from edp.storage import make_folder, read_json, storage_error, write_bytes, write_json
+
+RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
+
+
+def environment(threads: int) -> dict[str, str]:
+    """Versions and machine facts that can change a result; flat strings."""
+    facts = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
+    for name in RECORDED:
+        try:
+            facts[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            facts[name] = "absent"
+    return facts | {"threads": str(threads)}
+
+
+def run_key(config: Mapping[str, Any], data_digest: str) -> str:
+    """Content address of a run: equal settings, data and code version give an equal key."""
+    plain = {"config": config, "data": data_digest, "edp": __version__}
+    text = json.dumps(plain, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+class RunFolder:
+    """A folder that holds one run; locked while a process writes to it.
+
+    Args:
+        path: the folder; made when absent.
+
+    Raises:
+        StorageError: the folder cannot be made or another process holds it.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = make_folder(path)
+        lock = self.path / ".lock"
+        try:
+            self._lock = lock.open("a+")
+        except OSError as error:
+            raise storage_error(lock, error, "write") from error
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._lock.seek(0)
+            holder = self._lock.read().strip() or "unknown"
+            self._lock.close()
+            raise StorageError(
+                f"run folder '{self.path}' is in use by process {holder}; wait for it or choose another folder"
+            ) from None
+        self._lock.truncate(0)
+        self._lock.write(str(os.getpid()))
+        self._lock.flush()
+
+    def __enter__(self) -> RunFolder:
+        """The folder itself; leaving the block frees the lock."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Free the lock."""
+        self._lock.close()
+
+    def file(self, name: str) -> Path:
+        """Path of a file in the folder."""
+        return self.path / name
+
+    def claim(self, key: str, config_text: str) -> bool:
+        """Bind the folder to a run; True when the same run was begun here before and can go on.
+
+        Raises:
+            StorageError: the folder holds a run with other settings, data or code version.
+        """
+        identity = self.file("run.json")
+        if identity.exists():
+            held = read_json(identity)
+            if held.get("key") != key:
+                raise StorageError(
+                    f"run folder '{self.path}' holds another run (other settings, data or version); nothing was "
+                    "changed. Choose another folder with --out, or remove this one"
+                )
+            return True
+        write_bytes(self.file("config.toml"), config_text.encode())
+        write_json(identity, {"schema": 1, "key": key, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")})
+        return False
+
+    def write_history(self, rows: list[dict[str, Any]]) -> None:
+        """Write all epochs so far, a JSON line each."""
+        write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def command_line() -> str:
+    """The command as a user would type it."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

@@ -1,0 +1,147 @@
+"""Bundles: a trained predictor on disk as safetensors and JSON; loading one executes nothing."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+
+from edp import __version__
+from edp.data.prepared import Prepared
+from edp.data.scaling import Scaler
+from edp.data.task import Task
+from edp.errors import BundleError, StorageError
+from edp.models.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain
+from edp.models.predictor import Predictor
+from edp.signals import Channel, Kind
+from edp.storage import make_folder, read_json, write_bytes, write_json
+
+SCHEMA = 1
+HEADER = "bundle.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """A trained predictor with what a user of it must know.
+
+    Attributes:
+        predictor: the network with its scaler, in evaluation mode.
+        inputs: the channels to feed at each tick, in order, SI units.
+        target_kinds: kind of each target.
+        descriptions: description of each target.
+        provenance: data digest, environment, settings, training time.
+        scores: held-out scores of the network, by horizon and target; empty before evaluation.
+    """
+
+    predictor: Predictor
+    inputs: tuple[Channel, ...]
+    target_kinds: tuple[Kind, ...]
+    descriptions: tuple[str, ...]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    scores: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def task(self) -> Task:
+        """What the predictor reads and predicts."""
+        return self.predictor.task
+
+
+def make_bundle(
+    predictor: Predictor, data: Prepared, provenance: Mapping[str, Any], scores: Mapping[str, Any] | None = None
+) -> Bundle:
+    """A bundle of a predictor trained on `data`."""
+    return Bundle(predictor, data.inputs, data.target_kinds, data.descriptions, provenance, scores or {})
+
+
+def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
+    """Write a bundle; the header is renamed into place last, so a reader sees the old bundle or the new one.
+
+    Raises:
+        StorageError: the folder cannot be written.
+    """
+    path = make_folder(folder)
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in bundle.predictor.state_dict().items()}
+    data = save(tensors)
+    digest = hashlib.blake2b(data, digest_size=16).hexdigest()
+    weights = f"weights-{digest[:12]}.safetensors"
+    write_bytes(path / weights, data)
+    task = bundle.task
+    header = {
+        "schema": SCHEMA,
+        "edp": __version__,
+        "task": task_to_plain(task),
+        "model": model_to_plain(bundle.predictor.spec),
+        "inputs": [
+            {"name": c.name, "kind": str(c.kind), "unit": c.unit, "description": c.description} for c in bundle.inputs
+        ],
+        "outputs": [
+            {"name": name, "kind": str(kind), "description": text}
+            for name, kind, text in zip(task.targets, bundle.target_kinds, bundle.descriptions, strict=True)
+        ],
+        "weights": {"file": weights, "blake2b": digest},
+        "provenance": dict(bundle.provenance),
+        "scores": dict(bundle.scores),
+    }
+    write_json(path / HEADER, header)
+    for old in path.glob("weights-*.safetensors"):
+        if old.name != weights:
+            old.unlink(missing_ok=True)
+    return path
+
+
+def load_bundle(folder: str | Path) -> Bundle:
+    """Read a bundle, check its schema and the digest of its weights.
+
+    Raises:
+        BundleError: not a bundle, a newer schema, damaged weights, or parts that this version does not know.
+    """
+    path = Path(folder)
+    path = path / "bundle" if (path / "bundle" / HEADER).is_file() else path
+    if not (path / HEADER).is_file():
+        raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
+    try:
+        header = read_json(path / HEADER)
+        _check_schema(header, path)
+        spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
+        data = _weights(path, header["weights"])
+        inputs = tuple(Channel(c["name"], Kind(c["kind"]), c["description"]) for c in header["inputs"])
+        kinds = tuple(Kind(c["kind"]) for c in header["outputs"])
+        texts = tuple(c["description"] for c in header["outputs"])
+        predictor = Predictor(task, spec, _blank_scaler(task))
+        predictor.load_state_dict(load(data))
+        return Bundle(predictor.eval(), inputs, kinds, texts, header["provenance"], header["scores"])
+    except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError, StorageError) as error:
+        raise BundleError(f"bundle '{path}' is damaged: {error}; restore it or train again") from error
+
+
+def _check_schema(header: Any, path: Path) -> None:
+    schema = header.get("schema") if isinstance(header, dict) else None
+    if schema != SCHEMA:
+        newer = isinstance(schema, int) and schema > SCHEMA
+        raise BundleError(
+            f"bundle '{path}' has schema {schema}, this version of EDP ({__version__}) reads schema {SCHEMA}; "
+            + ("install a newer EDP" if newer else "the header is not that of a bundle")
+        )
+
+
+def _weights(path: Path, entry: Mapping[str, str]) -> bytes:
+    file = path / Path(entry["file"]).name  # never a path out of the bundle
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise BundleError(f"bundle '{path}' lacks its weights '{file.name}': {error.strerror}") from error
+    if hashlib.blake2b(data, digest_size=16).hexdigest() != entry["blake2b"]:
+        raise BundleError(f"weights '{file}' do not match their digest: cut off or changed; restore the bundle")
+    return data
+
+
+def _blank_scaler(task: Task) -> Scaler:
+    """Placeholders of the right shape; the weights file holds the fitted numbers."""
+    features, shape = len(task.features.features), (len(task.horizons), len(task.targets))
+    return Scaler(np.zeros(features), np.ones(features), np.zeros(shape), np.ones(shape))

@@ -1,0 +1,152 @@
+"""Learning-rate schedules as pure functions of progress, plus one that watches the validation error."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from edp.errors import ConfigError
+from edp.registry import Registry
+
+
+@dataclass
+class ScheduleState:
+    """What a schedule remembers between epochs; plain numbers, kept in checkpoints."""
+
+    factor: float = 1.0
+    best: float = math.inf
+    waited: int = 0
+
+
+class ScheduleSpec(Protocol):
+    """Options of a schedule."""
+
+    def factor(self, progress: float, state: ScheduleState) -> float:
+        """Share of the base learning rate at `progress` in [0, 1] of the run."""
+        ...
+
+    def observe(self, validation: float, state: ScheduleState) -> None:
+        """Take notice of the validation score after an epoch."""
+        ...
+
+
+SCHEDULES: Registry[type] = Registry("schedule")
+
+
+def _ramp(progress: float, share: float) -> float:
+    return min(1.0, (progress + 1e-3) / share) if share > 0 else 1.0
+
+
+@SCHEDULES.register("constant")
+@dataclass(frozen=True, kw_only=True)
+class Constant:
+    """The base rate throughout, after a warm-up.
+
+    Attributes:
+        warmup: share of the run in which the rate rises from zero.
+    """
+
+    warmup: float = 0.0
+
+    def factor(self, progress: float, state: ScheduleState) -> float:
+        return _ramp(progress, self.warmup)
+
+    def observe(self, validation: float, state: ScheduleState) -> None:
+        """Nothing to remember."""
+
+
+@SCHEDULES.register("cosine")
+@dataclass(frozen=True, kw_only=True)
+class Cosine:
+    """Half a cosine from the base rate to `floor` of it, after a warm-up.
+
+    Attributes:
+        warmup: share of the run in which the rate rises from zero.
+        floor: share of the base rate at the end.
+    """
+
+    warmup: float = 0.03
+    floor: float = 0.01
+
+    def __post_init__(self) -> None:
+        _shares(warmup=self.warmup, floor=self.floor)
+
+    def factor(self, progress: float, state: ScheduleState) -> float:
+        if progress < self.warmup:
+            return _ramp(progress, self.warmup)
+        done = (progress - self.warmup) / max(1e-9, 1.0 - self.warmup)
+        return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
+
+    def observe(self, validation: float, state: ScheduleState) -> None:
+        """Nothing to remember."""
+
+
+@SCHEDULES.register("one_cycle")
+@dataclass(frozen=True, kw_only=True)
+class OneCycle:
+    """Rise from `start` to the base rate over `rise` of the run, then fall to `floor`, both along a cosine.
+
+    Attributes:
+        rise: share of the run that rises.
+        start: share of the base rate at the beginning.
+        floor: share of the base rate at the end.
+    """
+
+    rise: float = 0.3
+    start: float = 0.04
+    floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _shares(rise=self.rise, start=self.start, floor=self.floor)
+
+    def factor(self, progress: float, state: ScheduleState) -> float:
+        if progress < self.rise:
+            return _between(self.start, 1.0, progress / self.rise)
+        return _between(1.0, self.floor, min(1.0, (progress - self.rise) / max(1e-9, 1.0 - self.rise)))
+
+    def observe(self, validation: float, state: ScheduleState) -> None:
+        """Nothing to remember."""
+
+
+@SCHEDULES.register("plateau")
+@dataclass(frozen=True, kw_only=True)
+class Plateau:
+    """Multiply the rate by `shrink` when the validation score has not improved for `patience` epochs.
+
+    Attributes:
+        shrink: factor of each reduction.
+        patience: epochs without improvement before a reduction.
+        threshold: relative improvement that counts.
+        floor: smallest share of the base rate.
+    """
+
+    shrink: float = 0.5
+    patience: int = 5
+    threshold: float = 1e-4
+    floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _shares(shrink=self.shrink, floor=self.floor)
+
+    def factor(self, progress: float, state: ScheduleState) -> float:
+        return state.factor
+
+    def observe(self, validation: float, state: ScheduleState) -> None:
+        """Count epochs without improvement."""
+        if validation < state.best * (1.0 - self.threshold):
+            state.best, state.waited = validation, 0
+            return
+        state.waited += 1
+        if state.waited > self.patience:
+            state.factor, state.waited = max(self.floor, state.factor * self.shrink), 0
+
+
+def _between(start: float, end: float, share: float) -> float:
+    return end + (start - end) * 0.5 * (1.0 + math.cos(math.pi * share))
+
+
+def _shares(**values: float) -> None:
+    for name, value in values.items():
+        if not 0 <= value <= 1:
+            raise ConfigError(f"schedule: {name} = {value}; 0 <= {name} <= 1 must hold")
