@@ -1,0 +1,37 @@
+"""Recordings in and out: readers and writers, units, time stamps, repairs and quality reports."""
+
+from edp.logs import csv, mat, parquet
+from edp.logs.detect import format_for, known_suffixes, open_log
+from edp.logs.inspection import inspect_log
+from edp.logs.mat_layouts import LAYOUTS
+from edp.logs.quality import ChannelFacts, Finding, QualityReport, inspect
+from edp.logs.raw import FORMATS, LogFormat, RawLog, RawSignal, WriteOptions
+from edp.logs.read import find_recordings, read_data_set, read_recording
+from edp.logs.repair import Repair, split_at_gaps
+from edp.logs.write import write_recording
+
+__all__ = [
+    "FORMATS",
+    "LAYOUTS",
+    "ChannelFacts",
+    "Finding",
+    "LogFormat",
+    "QualityReport",
+    "RawLog",
+    "RawSignal",
+    "Repair",
+    "WriteOptions",
+    "csv",
+    "find_recordings",
+    "format_for",
+    "inspect",
+    "inspect_log",
+    "known_suffixes",
+    "mat",
+    "open_log",
+    "parquet",
+    "read_data_set",
+    "read_recording",
+    "split_at_gaps",
+    "write_recording",
+]

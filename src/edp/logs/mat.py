@@ -1,0 +1,179 @@
+"""MAT files: v4, v5 and v7.3; arrays, structs, Simulink logs, timeseries, Dataset and timetable objects."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import matio
+import numpy as np
+import scipy.io
+
+from edp.errors import DataError, closest
+from edp.logs.mat_layouts import INFO, LAYOUTS
+from edp.logs.mat_objects import Found, collect
+from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, time_factor
+from edp.recording import Recording
+from edp.signals import Kind, SignalMap
+
+_MAGIC = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
+_VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
+
+
+class MatFormat:
+    """MATLAB's MAT file."""
+
+    name = "mat"
+    suffixes: tuple[str, ...] = (".mat",)
+    content = "a MAT file"
+
+    def claims(self, head: bytes) -> bool:
+        """The text header of v5 and v7.3 (also when cut off), or the numbers of a v4 header."""
+        if any(head.startswith(magic) or magic.startswith(head) for magic in _MAGIC):
+            return True
+        return _is_v4(head)
+
+    def read(self, path: Path, signal_map: SignalMap) -> RawLog:
+        """Read all variables, or the one that the map names."""
+        variables = _load(path)
+        info = _info(variables.pop(INFO, None), path)
+        if signal_map.variable is not None:
+            if signal_map.variable not in variables:
+                raise DataError(
+                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, variables)}; "
+                    "set 'variable' in the signal map to an existing one"
+                )
+            variables = {signal_map.variable: variables[signal_map.variable]}
+        found = collect(variables)
+        if not found.signals:
+            raise DataError(
+                f"'{path}' holds no signals (variables: {', '.join(list(variables)[:12]) or 'none'}); expected "
+                "numeric vectors, structs of them, timeseries, a Dataset or a timetable"
+            )
+        return _raw_log(path, found, info, signal_map)
+
+    def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
+        """Write one variable ``log`` in the wanted layout, and ``edp_info``, a JSON text with units and facts."""
+        if options.mat_version not in _VERSIONS:
+            known = closest(options.mat_version, _VERSIONS)
+            raise DataError(f"MAT version '{options.mat_version}' cannot be written{known}")
+        long = [name for name in recording.channel_names if not name.isidentifier() or len(name) > 63]
+        if long:
+            raise DataError(
+                f"channel(s) {', '.join(long)} cannot be MATLAB names (letters, digits, underscore, at most 63); "
+                "rename them in the signal map"
+            )
+        layout = LAYOUTS[options.mat_layout]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                matio.save_to_mat(
+                    str(path),
+                    {"log": layout.build(recording), INFO: _info_text(recording)},
+                    version=_VERSIONS[options.mat_version],
+                    saveobj_classes=list(layout.saveobj_classes) or None,
+                )
+            except RuntimeError as error:
+                # h5py reports a failed write (disk full) as RuntimeError.
+                raise OSError(str(error)) from error
+
+
+FORMATS.register("mat")(MatFormat())
+
+
+def _is_v4(head: bytes) -> bool:
+    if len(head) < 20:
+        return False
+    for order in ("<", ">"):
+        kind, rows, columns, imaginary, name = (int(x) for x in np.frombuffer(head[:20], dtype=f"{order}i4"))
+        digits = [int(digit) for digit in f"{kind:04d}"] if 0 <= kind < 5000 else []
+        sizes_fit = rows >= 0 and columns >= 0 and imaginary in (0, 1) and 1 < name < 64
+        if digits and digits[1] == 0 and digits[2] <= 5 and digits[3] <= 2 and sizes_fit:
+            text = head[20 : 20 + name]
+            return len(text) == name and text.endswith(b"\0") and text[:1].isalpha()
+    return False
+
+
+def _load(path: Path) -> dict[str, Any]:
+    with path.open("rb") as stream:
+        head = stream.read(128)
+    if any(magic.startswith(head[: len(magic)]) for magic in _MAGIC) and len(head) < 128:
+        raise DataError(f"'{path}' is a MAT file that ends inside its header (truncated); copy or export it again")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            if _is_v4(head):
+                variables = scipy.io.loadmat(str(path))
+            else:
+                variables = matio.load_from_mat(str(path), add_table_attrs=True)
+        except Exception as error:
+            # The parsers meet damaged bytes with any exception there is; every one means the same to the user.
+            raise DataError(
+                f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {error}); it may be truncated or "
+                "damaged: copy or export it again"
+            ) from error
+    failed = [str(item.message) for item in caught if "Failed to load" in str(item.message)]
+    if failed:
+        raise DataError(f"'{path}': an object in this MAT file is damaged ({failed[0]}); copy or export it again")
+    return {name: value for name, value in variables.items() if not name.startswith("__")}
+
+
+def _info(value: Any, path: Path) -> dict[str, Any]:
+    if value is None:
+        return {}
+    try:
+        facts = json.loads(str(np.asarray(value).ravel()[0]))
+    except (ValueError, IndexError) as error:
+        raise DataError(f"'{path}': its variable '{INFO}' is not valid JSON ({error})") from error
+    if not isinstance(facts, dict) or "rate_hz" not in facts:
+        raise DataError(f"'{path}': its variable '{INFO}' states no rate_hz")
+    return facts
+
+
+def _info_text(recording: Recording) -> str:
+    channels = [
+        {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in recording.channels
+    ]
+    facts = {
+        "name": recording.name,
+        "rate_hz": recording.rate_hz,
+        "source": recording.source,
+        "meta": dict(recording.meta),
+        "channels": channels,
+    }
+    return json.dumps(facts)
+
+
+def _raw_log(path: Path, found: Found, info: dict[str, Any], signal_map: SignalMap) -> RawLog:
+    known = {entry["name"]: entry for entry in info.get("channels", [])}
+    names = [part.name for part in found.signals]
+    timeless = [part.name for part in found.signals if part.time is None]
+    time_name = None if info else find_time(timeless, signal_map, path)
+    time: Column | None = None
+    if time_name is not None:
+        part = found.signals[names.index(time_name)]
+        time = np.asarray(part.values, dtype=np.float64) * time_factor(time_name, None, signal_map)
+    signals: dict[str, RawSignal] = {}
+    for part in found.signals:
+        if part.name == time_name:
+            continue
+        entry = known.get(part.name, {})
+        own_time = part.time if signal_map.sample_time_s is None else None
+        if own_time is None and time is not None and len(time) == len(part.values):
+            own_time = time
+        signals[part.name] = RawSignal(
+            part.name,
+            partial(np.asarray, part.values, dtype=np.float64),
+            len(part.values),
+            own_time,
+            unit=part.unit or entry.get("unit"),
+            kind=Kind(entry["kind"]) if entry else None,
+            description=entry.get("description", ""),
+        )
+    if info:
+        signals = {name: signals[name] for name in known if name in signals}
+    rate = info.get("rate_hz")
+    return RawLog(path, signals, found.scalars, rate, info.get("name"), info.get("source", ""), info.get("meta", {}))

@@ -1,0 +1,151 @@
+"""What a file holds before any map, unit or time rule is applied, and the registry of file formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, closest
+from edp.recording import Recording
+from edp.registry import Registry
+from edp.signals import TIME_UNITS, Kind, SignalMap
+
+Column = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RawSignal:
+    """One column as the file has it.
+
+    Attributes:
+        name: the file's own name.
+        load: returns the values, float64, shape ``(time,)``; called when needed so that columns pass one by one.
+        samples: number of values.
+        time_s: its time stamps in seconds, shape ``(time,)``; columns of one table share the same array.
+        unit: the unit the file gives, None when it says nothing.
+        kind: the kind the file gives (only files that EDP wrote do).
+        description: the file's description.
+    """
+
+    name: str
+    load: Callable[[], Column]
+    samples: int
+    time_s: Column | None = None
+    unit: str | None = None
+    kind: Kind | None = None
+    description: str = ""
+
+    @property
+    def values(self) -> Column:
+        """The values, read now; not kept."""
+        return self.load()
+
+
+@dataclass(frozen=True)
+class RawLog:
+    """All columns of one file.
+
+    Attributes:
+        path: the file.
+        signals: columns by the file's names, in the file's order.
+        scalars: single numbers of a MAT file (gains and the like); used only where a map names them.
+        rate_hz: the rate the file itself states; its rows are then uniform.
+        name: the recording's name as the file states it.
+        source: where the recording came from as the file states it.
+        meta: facts the file carries.
+    """
+
+    path: Path
+    signals: Mapping[str, RawSignal]
+    scalars: Mapping[str, float] = field(default_factory=dict)
+    rate_hz: float | None = None
+    name: str | None = None
+    source: str = ""
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    def signal(self, name: str) -> RawSignal:
+        """The named column.
+
+        Raises:
+            DataError: no such column; the closest name is offered.
+        """
+        if name not in self.signals:
+            raise DataError(
+                f"'{self.path}' has no column '{name}'{closest(name, [*self.signals, *self.scalars])}; "
+                "name an existing column in the signal map"
+            )
+        return self.signals[name]
+
+
+@dataclass(frozen=True)
+class WriteOptions:
+    """How a MAT file is laid out; other formats have one layout.
+
+    Attributes:
+        mat_layout: a name in `edp.logs.mat_layouts.LAYOUTS`.
+        mat_version: ``v5`` or ``v7.3``.
+    """
+
+    mat_layout: str = "struct"
+    mat_version: str = "v5"
+
+
+class LogFormat(Protocol):
+    """One file format; instances are entered in `FORMATS`."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    content: str
+
+    def claims(self, head: bytes) -> bool:
+        """Whether a file that begins with `head` (up to 4 KiB) holds this format."""
+
+    def read(self, path: Path, signal_map: SignalMap) -> RawLog:
+        """Read a file; raises `DataError` for anything it cannot be read for."""
+
+    def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
+        """Write a recording to `path`, which need not carry the format's suffix."""
+
+
+FORMATS: Registry[LogFormat] = Registry("file format")
+
+_TIME_NAMES = ("time_s", "time", "timestamp", "timestamps", "tout", "time_ms", "time_us", "time_ns")
+_TIME_UNIT_NAMES = {"sec": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
+
+
+def find_time(names: Sequence[str], signal_map: SignalMap, path: Path) -> str | None:
+    """The name of the time column among `names`; None where rows are uniform by the map or nothing looks like time.
+
+    Raises:
+        DataError: the map names a time column that the file lacks.
+    """
+    if signal_map.sample_time_s is not None:
+        return None
+    if signal_map.time is not None:
+        if signal_map.time not in names:
+            raise DataError(
+                f"'{path}' has no time column '{signal_map.time}'{closest(signal_map.time, names)}; "
+                "set 'time' in the signal map to an existing column, or set 'sample_time_s'"
+            )
+        return signal_map.time
+    for wanted in _TIME_NAMES:
+        for name in names:
+            if name.lower() == wanted:
+                return name
+    return "t" if "t" in names else None
+
+
+def time_factor(name: str, unit: str | None, signal_map: SignalMap) -> float:
+    """Seconds per unit of the time column: the map's unit, else the header's, else the name's ending, else s."""
+    stated = _TIME_UNIT_NAMES.get(unit or "", unit or "")
+    ending = name.lower().rpartition("_")[2]
+    if signal_map.time_unit != "s":
+        return TIME_UNITS[signal_map.time_unit]
+    if stated in TIME_UNITS:
+        return TIME_UNITS[stated]
+    return TIME_UNITS.get(ending, 1.0)

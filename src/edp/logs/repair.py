@@ -1,0 +1,156 @@
+"""Repairs that are made only where asked for; each one made is written into the recording's meta."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, DataError
+from edp.logs.timebase import Clock, Rows, Stamps, judge
+from edp.recording import Recording
+
+Mask = NDArray[np.bool_]
+
+_CHOICES = {
+    "nan": ("refuse", "hold", "keep"),
+    "gaps": ("refuse", "hold", "cut", "keep"),
+    "duplicates": ("refuse", "last"),
+    "falling": ("refuse", "sort"),
+}
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What may be mended while reading; by default nothing is.
+
+    Attributes:
+        nan: missing or infinite values: ``hold`` the last good value, or ``keep`` them as NaN.
+        gaps: gaps in time: ``hold`` the last sample, ``cut`` to the longest stretch without one, or ``keep`` NaN.
+        duplicates: equal time stamps: keep the ``last`` row of each.
+        falling: time stamps that go back: ``sort`` rows by time.
+    """
+
+    nan: str = "refuse"
+    gaps: str = "refuse"
+    duplicates: str = "refuse"
+    falling: str = "refuse"
+
+    def __post_init__(self) -> None:
+        for name, allowed in _CHOICES.items():
+            value = getattr(self, name)
+            if value not in allowed:
+                raise ConfigError(f"repair: {name} = '{value}' is not one of {', '.join(allowed)}")
+
+
+def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows | None, list[dict[str, Any]]]:
+    """Judge stamps and mend falling and duplicate ones where allowed.
+
+    Returns:
+        the clock, the rows kept in their new order (None: all, as they are), and the repairs made.
+
+    Raises:
+        DataError: a defect that `repair` does not allow to mend.
+    """
+    clock = judge(stamps, where)
+    made: list[dict[str, Any]] = []
+    order: Rows | None = None
+    if len(clock.falling):
+        if repair.falling == "refuse":
+            raise DataError(
+                f"{where}: time goes back in {len(clock.falling)} row(s), first in row {clock.falling[0]} "
+                f'(t = {stamps[clock.falling[0]]:g} s); mend the file or set repair falling = "sort"'
+            )
+        made.append({"repair": "falling = sort", "count": len(clock.falling), "row": int(clock.falling[0])})
+        order = np.argsort(stamps, kind="stable")
+        stamps = stamps[order]
+        clock = judge(stamps, where)
+    if len(clock.duplicates):
+        if repair.duplicates == "refuse":
+            raise DataError(
+                f"{where}: {len(clock.duplicates)} duplicate time stamp(s), first in row {clock.duplicates[0]} "
+                f'(t = {stamps[clock.duplicates[0]]:g} s); mend the file or set repair duplicates = "last"'
+            )
+        made.append({"repair": "duplicates = last", "count": len(clock.duplicates), "row": int(clock.duplicates[0])})
+        last = np.append(np.diff(stamps) > 0, True)
+        order = np.flatnonzero(last) if order is None else order[last]
+        clock = judge(stamps[last], where)
+    return clock, order, made
+
+
+def mend_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, Any]]]:
+    """The rows to keep and the repairs made, given the ticks in gaps, shape ``(time,)``.
+
+    Raises:
+        DataError: there are gaps and `repair` does not allow them.
+    """
+    starts, stops = runs(missing)
+    if not len(starts):
+        return slice(None), []
+    longest = float((stops - starts).max() / rate_hz)
+    if repair.gaps == "refuse":
+        raise DataError(
+            f"{where}: {len(starts)} gap(s) in time, first at row {starts[0]} (t = {starts[0] / rate_hz:g} s), longest "
+            f'{longest:g} s; set repair gaps = "hold", "cut" (keep the longest stretch) or "keep" (NaN)'
+        )
+    fact = {"repair": f"gaps = {repair.gaps}", "count": len(starts), "row": int(starts[0]), "longest_s": longest}
+    if repair.gaps != "cut":
+        return slice(None), [fact]
+    good_starts, good_stops = runs(~missing)
+    best = int(np.argmax(good_stops - good_starts))
+    return slice(int(good_starts[best]), int(good_stops[best])), [fact]
+
+
+def mend_values(
+    values: NDArray[np.float32], missing: Mask, names: Sequence[str], rate_hz: float, repair: Repair, where: str
+) -> list[dict[str, Any]]:
+    """Check for NaN and infinity outside gaps, shape ``(time, channel)``, and hold them in place where allowed.
+
+    Raises:
+        DataError: there are some and `repair` does not allow them, or a channel starts with one.
+    """
+    made: list[dict[str, Any]] = []
+    for column, name in enumerate(names):
+        bad = ~np.isfinite(values[:, column])
+        if not bad.any():
+            continue
+        own = bad & ~missing if repair.gaps in ("keep", "refuse") else bad
+        rows = np.flatnonzero(own)
+        if not len(rows) or repair.nan == "keep":
+            continue
+        first = int(rows[0])
+        if repair.nan == "refuse":
+            raise DataError(
+                f"{where}: channel '{name}' has {len(rows)} missing or infinite value(s), first in row {first} "
+                f'(t = {first / rate_hz:g} s); mend the file or set repair nan = "hold"'
+            )
+        if bad[0]:
+            raise DataError(
+                f"{where}: channel '{name}' starts with a missing value, nothing earlier can be held; "
+                f"start the rows at {int(np.argmin(bad))} or later"
+            )
+        source = np.maximum.accumulate(np.where(bad, 0, np.arange(len(bad))))
+        values[own, column] = values[source[own], column]
+        made.append({"repair": "nan = hold", "channel": name, "count": len(rows), "row": first})
+    return made
+
+
+def runs(mask: Mask) -> tuple[Rows, Rows]:
+    """Starts and stops (exclusive) of the runs of True in a mask, shape ``(time,)``."""
+    edges = np.diff(np.concatenate(([False], mask, [False])).astype(np.int8))
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+
+
+def split_at_gaps(recording: Recording, min_samples: int = 2) -> list[Recording]:
+    """The stretches between gaps (rows where every channel is NaN), each a recording of its own.
+
+    Read with ``Repair(gaps="keep")`` to have the gaps as NaN. Stretches shorter than `min_samples` are left out.
+    """
+    gap: Mask = np.asarray(np.isnan(recording.values).all(axis=1))
+    parts = [(a, b) for a, b in zip(*runs(~gap)) if b - a >= min_samples]
+    if len(parts) == 1 and parts[0] == (0, recording.samples):
+        return [recording]
+    return [recording.rows(int(a), int(b), f"{recording.name}.{i}") for i, (a, b) in enumerate(parts)]

@@ -1,0 +1,82 @@
+"""From a file's columns to the wanted channels: the built-in vocabulary or a signal map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, EdpError, closest
+from edp.logs.raw import RawLog, RawSignal
+from edp.logs.units import unit_for
+from edp.signals import VOCABULARY, Channel, ChannelMap, SignalMap, Unit
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """One channel and where its values come from: a column with its conversion, or a constant in SI."""
+
+    channel: Channel
+    signal: RawSignal | None
+    unit: Unit
+    scale: float = 1.0
+    constant: float = float("nan")
+
+    def convert(self, values: NDArray[np.float64]) -> NDArray[np.float32]:
+        """File values to SI, float32."""
+        if self.scale != 1.0 or self.unit.factor != 1.0:
+            values = values * (self.scale * self.unit.factor)
+        if self.unit.offset:
+            values = values + self.unit.offset
+        # Too large for float32 becomes infinite, which the value check then reports.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return values.astype(np.float32)
+
+
+def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[Wanted], list[EdpError]]:
+    """The wanted channels in order, and what is wrong with the map or the file for those that cannot be had."""
+    wanted: list[Wanted] = []
+    problems: list[EdpError] = []
+    if not signal_map.channels:
+        entries = _vocabulary_entries(raw)
+        if not entries:
+            problems.append(_nothing_known(raw))
+    else:
+        entries = list(signal_map.channels)
+    for entry in entries:
+        try:
+            wanted.append(_one(raw, entry))
+        except EdpError as error:
+            problems.append(error)
+    return wanted, problems
+
+
+def _vocabulary_entries(raw: RawLog) -> list[ChannelMap]:
+    """Columns whose names are known; files that state kinds (EDP's own) are taken whole."""
+    stated = [signal for signal in raw.signals.values() if signal.kind is not None]
+    if stated:
+        return [ChannelMap(s.name, s.name, kind=s.kind, description=s.description) for s in stated]
+    return [ChannelMap(name, name) for name in VOCABULARY if name in raw.signals]
+
+
+def _nothing_known(raw: RawLog) -> DataError:
+    names = list(raw.signals)
+    near = [f"'{name}'{hint}" for name in names if (hint := closest(name, VOCABULARY)).startswith("; did")]
+    shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    text = near[0] if near else "none is in the built-in vocabulary (Table A.1)"
+    return DataError(f"'{raw.path}' has the columns {shown}: {text}; rename columns or give a signal map")
+
+
+def _one(raw: RawLog, entry: ChannelMap) -> Wanted:
+    channel = entry.channel()
+    where = f"'{raw.path}', column '{entry.column}'"
+    present = entry.column in raw.signals
+    if not present and entry.column in raw.scalars:
+        unit = unit_for(entry.unit, channel.kind, where)
+        value = raw.scalars[entry.column] * entry.scale * unit.factor + unit.offset
+        return Wanted(channel, None, unit, constant=value)
+    if not present and entry.constant is not None:
+        return Wanted(channel, None, Unit((channel.kind,), 1.0), constant=entry.constant)
+    signal = raw.signal(entry.column)
+    return Wanted(channel, signal, unit_for(entry.unit or signal.unit, channel.kind, where), entry.scale)

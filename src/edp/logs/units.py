@@ -1,0 +1,62 @@
+"""Spellings of units found in files, brought to the names of `edp.signals.UNITS`."""
+
+from __future__ import annotations
+
+from edp.errors import ConfigError, DataError
+from edp.signals import UNITS, Kind, Unit, conversion
+
+_ALIASES = {
+    "m/s²": "m/s^2",
+    "m/s2": "m/s^2",
+    "m/s/s": "m/s^2",
+    "mm/s²": "mm/s^2",
+    "mm/s2": "mm/s^2",
+    "m³/s": "m^3/s",
+    "m3/s": "m^3/s",
+    "l/min": "L/min",
+    "lpm": "L/min",
+    "°": "deg",
+    "degree": "deg",
+    "degrees": "deg",
+    "°/s": "deg/s",
+    "deg/sec": "deg/s",
+    "rad/sec": "rad/s",
+    "m/sec": "m/s",
+    "°C": "degC",
+    "°F": "degF",
+    "Bar": "bar",
+    "pa": "Pa",
+    "Volt": "V",
+    "volt": "V",
+    "Ampere": "A",
+    "-": "1",
+    "µs": "us",
+    "sec": "s",
+    "seconds": "s",
+}
+
+
+def normalise_unit(text: str | None) -> str | None:
+    """The unit under its usual name; None for an empty text; an unknown unit stays as it is."""
+    unit = (text or "").strip()
+    if not unit:
+        return None
+    return _ALIASES.get(unit, unit)
+
+
+def unit_for(stated: str | None, kind: Kind, where: str) -> Unit:
+    """The conversion for a unit that a file or a map states; nothing stated means SI.
+
+    A generic channel has no unit of its own: its numbers are taken as they are.
+
+    Raises:
+        DataError: the unit is unknown or does not measure `kind`.
+    """
+    unit = normalise_unit(stated)
+    if unit is None or kind is Kind.GENERIC:
+        return Unit((kind,), 1.0)
+    try:
+        return conversion(unit, kind, where)
+    except ConfigError as error:
+        known = "" if unit not in UNITS else "; correct the unit or the kind in the signal map"
+        raise DataError(f"{error}{known}") from error
