@@ -282,8 +282,9 @@ def verdict_lines(facts: Facts) -> list[str]:
     checks = (facts.footprint or {}).get("verdict", [])
     if checks:
         over = [str(check["what"]) for check in checks if not check["fits"]]
-        name = (facts.footprint or {}).get("budget", {}).get("name", "the controller")
-        lines.append(f"Budget of {name}: " + (f"exceeded in {listed(over)}." if over else "it fits on every count."))
+        name = (facts.footprint or {}).get("budget", {}).get("name") or "the controller"
+        verdict = f"exceeded in {listed(over)}" if over else "met on every count"
+        lines.append(f"Budget ({name}): {verdict}.")
     return lines
 
 

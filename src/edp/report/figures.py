@@ -14,7 +14,7 @@ from tsdownsample import MinMaxLTTBDownsampler
 from edp.report.facts import NETWORK, TRUTH, Facts, main_horizon, score
 
 WHOLE, EXCERPT = "whole", "excerpt"
-POINT_BUDGET = 160_000  # of all prediction traces together: about 2 MB of the page
+POINT_BUDGET = 250_000  # of all prediction traces together: about 2 MB of the page
 RECORDINGS_SHOWN, HORIZONS_SHOWN = 6, 4
 EXCERPT_SECONDS = 20.0
 Array = NDArray[np.floating]
@@ -246,6 +246,16 @@ def learning_curves(facts: Facts) -> dict[str, list[float | None]]:
         if row.get("best"):
             columns["best"] = [columns["epoch"][-1]]
     return columns
+
+
+def log_ticks(values: Sequence[float | None]) -> list[float]:
+    """Ticks of a logarithmic axis at 1, 2 and 5 per decade, or 1 alone over many; none where a value is <= 0."""
+    known = [value for value in values if value is not None]
+    if not known or min(known) <= 0:
+        return []
+    low, high = math.floor(math.log10(min(known))), math.ceil(math.log10(max(known)))
+    steps = (1, 2, 5) if high - low <= 3 else (1,)
+    return [step * 10.0**decade for decade in range(low, high + 1) for step in steps]
 
 
 def headline_first(facts: Facts) -> list[int]:

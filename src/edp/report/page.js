@@ -3,8 +3,10 @@
 (function () {
   const config = {
     displaylogo: false,
+    plotlyServerURL: "", // nothing on this page may leave it: no "share chart" that uploads the data
+    showSendToCloud: false,
     responsive: true,
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d"],
+    modeBarButtonsToRemove: ["sendChartToCloud", "sendDataToCloud", "select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d"],
     toImageButtonOptions: { scale: 2 },
   };
 

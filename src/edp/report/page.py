@@ -13,7 +13,8 @@ from plotly.offline import get_plotlyjs
 
 from edp.report import facts as run
 from edp.report import tables
-from edp.report.plots import plots_of
+from edp.report.plots import DOTS_AT_MOST, plots_of
+from edp.report.wording import moment, unbroken
 from edp.storage import write_bytes
 
 
@@ -59,18 +60,19 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "title": title or task.get("name") or facts.folder.resolve().name,
         "network": network,
         "run_name": facts.folder.resolve().name,
-        "created": (facts.provenance or {}).get("created", ""),
-        "headline": run.headline(facts),
+        "created": moment((facts.provenance or {}).get("created")),
+        "headline": unbroken(run.headline(facts)),
         "verdict": run.verdict_lines(facts),
         "tiles": tables.key_figures(facts),
         "comparisons": tables.comparison_tables(facts),
         "outputs": tables.output_table(facts),
         "spread": run.spread_text(facts),
+        "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
         "worst": tables.worst_recordings_table(facts),
         "plots": plots,
         "specs": _script_json([plot.spec() for plot in plots.values()]),
         "checks": tables.budget_checks(facts),
-        "budget": (facts.footprint or {}).get("budget", {}),
+        "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
         "parts": tables.parts_table(facts),
         "footprint": tables.footprint_rows(facts),
         "provenance": tables.provenance_rows(facts),

@@ -63,7 +63,7 @@ def prediction_plot(facts: Facts) -> Plot | None:
         if line.horizon is not None:
             meta["horizon"] = str(line.horizon)
         along = {"x": line.x} if line.x is not None else {"x0": line.start, "dx": line.step}
-        width = 2.0 if line.model == TRUTH else 1.6 if line.model == NETWORK else 1.1
+        width = 3.0 if line.model == TRUTH else 1.6 if line.model == NETWORK else 1.1
         figure.add_scatter(
             **along,
             y=line.y,
@@ -75,7 +75,8 @@ def prediction_plot(facts: Facts) -> Plot | None:
             legendgroup=line.model,
             showlegend=line.target == 0,
             line={"color": colour(facts, line.model), "width": width},
-            opacity=0.85 if line.model == TRUTH else 1.0,
+            opacity=1.0 if line.model == NETWORK else 0.75,
+            legendrank={TRUTH: 1, NETWORK: 2}.get(line.model, 3),
             hovertemplate="%{y:.4~g}",
             visible=all(meta.get(key, value) == value for key, value in shown.items()),
         )
@@ -273,9 +274,9 @@ def learning_plot(facts: Facts) -> Plot | None:
     styled(figure, 340, hovermode="x unified")
     if curves["best"]:
         figure.add_vline(x=curves["best"][0], line={"color": INK, "width": 1, "dash": "dot"}, row=1, col="all")
-    losses = [value for key in ("train_loss", "validation_loss") for value in curves[key] if value is not None]
-    if losses and min(losses) > 0:
-        figure.update_yaxes(type="log", dtick="D2" if max(losses) < 100 * min(losses) else 1, row=1, col=1)
+    ticks = figures.log_ticks([*curves["train_loss"], *curves["validation_loss"]])
+    if ticks:
+        figure.update_yaxes(type="log", tickvals=ticks, ticktext=[f"{tick:g}" for tick in ticks], row=1, col=1)
     figure.update_xaxes(title_text="Epoch")
     figure.update_layout(margin_t=66)
     return Plot("learning", figure)

@@ -8,7 +8,7 @@ from typing import Any
 
 from edp.report.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.figures import recording_errors
-from edp.report.wording import MISSING, decimals_for, duration, number, percent, whole
+from edp.report.wording import MISSING, decimals_for, duration, moment, number, percent, whole
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def _comparison(facts: Facts, horizon: int) -> Table:
     with_bias, with_r2, with_time = _any(rows, "bias"), _any(rows, "r2"), _any(rows, "seconds")
     columns = [("Model", ""), *((names[metric], unit) for metric in shown)]
     columns += [("Bias", unit)] * with_bias + [("R²", "")] * with_r2
-    columns += [("Network against it", "")] + [("Fitted in", "")] * with_time
+    columns += [("Network relative to it", "MAE")] + [("Fitted in", "")] * with_time
     lines = []
     for row in rows:
         cells = [row["label"], *(number(row[metric], places[metric]) for metric in shown)]
@@ -162,14 +162,16 @@ def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
 
 def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
     """Where the run came from: command, seed, data, machine, versions."""
-    source = facts.provenance or {}
+    if facts.provenance is None:
+        return []
+    source = facts.provenance
     rows: list[tuple[str, str]] = []
 
     def add(label: str, value: object) -> None:
         if value is not None and value != "":
             rows.append((label, str(value)))
 
-    add("Created", source.get("created"))
+    add("Created", moment(source.get("created")))
     add("Command", source.get("command"))
     add("Version", source.get("edp_version"))
     add("Seed", source.get("seed"))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
+from datetime import datetime
 
 MISSING = "–"
 
@@ -43,11 +45,28 @@ def duration(seconds: float | None) -> str:
     """A time span in the unit a person would say it in."""
     if seconds is None or not math.isfinite(seconds):
         return MISSING
+    if seconds == 0:
+        return "0 s"
     if seconds < 60:
         return f"{number(seconds)} s"
     if seconds < 3600:
         return f"{seconds / 60:.1f} min"
     return f"{seconds / 3600:.1f} h"
+
+
+def moment(created: object) -> str:
+    """An ISO 8601 time as ``2026-03-04 10:20 UTC``; anything else as it is."""
+    text = str(created or "")
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        return text
+    return f"{when:%Y-%m-%d %H:%M} {when.tzname() or ''}".rstrip()
+
+
+def unbroken(sentence: str) -> str:
+    """A sentence whose figures stay on one line with the word before and the unit after them."""
+    return re.sub(r"(?<=\d) (?=[a-zA-Z%°]+/?[a-zA-Z]*\b)|(?<=\w) (?=[−\d][\d.,]*(?:;|\.$))", "\u00a0", sentence)
 
 
 def listed(parts: Iterable[str]) -> str:

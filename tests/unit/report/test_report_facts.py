@@ -1,0 +1,151 @@
+import json
+
+import pytest
+
+from edp.errors import DataError, StorageError
+from edp.report.facts import (
+    NETWORK,
+    comparison_rows,
+    headline,
+    horizon_text,
+    read_facts,
+    recordings_won,
+    spread_text,
+    verdict_lines,
+)
+from edp.report.wording import decimals_for, duration, listed, number, percent, unbroken
+
+
+def edit_scores(folder, change):
+    scores = json.loads((folder / "scores.json").read_text())
+    change(scores)
+    (folder / "scores.json").write_text(json.dumps(scores))
+
+
+def mae(value):
+    return {"mean": {"mae": value, "rmse": value, "r2": None, "p95": value, "p99": value, "bias": 0.0}}
+
+
+def test_headline_states_the_scores_of_the_longest_horizon(run_folder):
+    def change(scores):
+        scores["models"] = {
+            "persistence": {"label": "persistence", "overall": {"10": mae(21.41)}},
+            "network": {"label": "TCN", "overall": {"10": mae(7.08), "1": mae(0.2)}},
+            "ridge_arx": {"label": "ridge", "overall": {"10": mae(13.0)}},
+        }
+
+    edit_scores(run_folder, change)
+    said = headline(read_facts(run_folder))
+    assert said == "At 100 ms ahead the network is off by 7.1 mm/s on average; ridge 13.0; persistence 21.4."
+
+
+def test_comparison_sorts_by_error_and_relates_the_network_to_each_model(run_folder):
+    rows = comparison_rows(read_facts(run_folder), horizon=5)
+    errors = [row["mae"] for row in rows]
+    assert errors == sorted(errors)
+    network = next(row for row in rows if row["is_network"])
+    assert network["change"] is None
+    for row in rows:
+        if not row["is_network"]:
+            assert row["change"] == pytest.approx(network["mae"] / row["mae"] - 1)
+
+
+def test_a_network_worse_than_a_baseline_is_called_worse(run_folder):
+    def change(scores):
+        scores["models"]["network"]["overall"]["10"] = mae(50.0)
+
+    edit_scores(run_folder, change)
+    facts = read_facts(run_folder)
+    assert "higher than the best baseline" in verdict_lines(facts)[0]
+    assert comparison_rows(facts)[-1]["model"] == NETWORK
+
+
+def test_outputs_in_different_units_have_no_common_unit(run_folder):
+    def change(scores):
+        scores["targets"][1]["unit"] = "bar"
+
+    edit_scores(run_folder, change)
+    facts = read_facts(run_folder)
+    assert facts.unit == ""
+    assert "mm/s in boom cylinder velocity on average" in headline(facts)
+
+
+def test_verdict_names_what_exceeds_the_budget(run_folder):
+    assert any("exceeded in" in line and "Flash" in line for line in verdict_lines(read_facts(run_folder)))
+
+
+def test_recordings_won_counts_only_recordings_both_have(run_folder):
+    def change(scores):
+        recordings = scores["models"]["persistence"]["recordings"]
+        recordings.pop(next(iter(recordings)))
+
+    edit_scores(run_folder, change)
+    assert recordings_won(read_facts(run_folder), "persistence") == (3, 3)
+
+
+def test_spread_is_a_sentence_with_the_median(run_folder):
+    facts = read_facts(run_folder)
+    median = facts.models[NETWORK]["spread"]["10"]["median"]
+    assert f"median of {median:.2f}" in spread_text(facts)
+
+
+def test_a_cut_off_last_line_of_history_is_left_out(run_folder):
+    path = run_folder / "history.jsonl"
+    whole = path.read_text()
+    path.write_text(whole[: len(whole) - 30])
+    assert len(read_facts(run_folder).history) == len(whole.splitlines()) - 1
+
+
+def test_a_damaged_line_inside_history_is_named(run_folder):
+    path = run_folder / "history.jsonl"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], "{broken", *lines[1:]]))
+    with pytest.raises(StorageError, match="line 2"):
+        read_facts(run_folder)
+
+
+@pytest.mark.parametrize("name", ["scores.json", "predictions.safetensors", "footprint.json"])
+def test_a_damaged_part_is_named(run_folder, name):
+    (run_folder / name).write_bytes(b"half a fi")
+    with pytest.raises(StorageError, match=name):
+        read_facts(run_folder)
+
+
+def test_scores_and_predictions_of_different_evaluations_are_refused(run_folder):
+    edit_scores(run_folder, lambda scores: scores["task"].update(horizons=[1, 10]))
+    with pytest.raises(DataError, match="edp evaluate"):
+        read_facts(run_folder)
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    with pytest.raises(StorageError, match="not a run folder"):
+        read_facts(tmp_path)
+    with pytest.raises(StorageError, match="no run folder"):
+        read_facts(tmp_path / "nowhere")
+
+
+def test_without_a_rate_horizons_are_in_samples(run_folder):
+    edit_scores(run_folder, lambda scores: scores["task"].pop("rate_hz"))
+    (run_folder / "provenance.json").unlink()
+    facts = read_facts(run_folder)
+    assert [horizon_text(facts, k) for k in (1, 10)] == ["1 sample", "10 samples"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(720000.0, "720,000"), (13.04, "13.0"), (-0.0123, "−0.0123"), (None, "–"), (float("nan"), "–"), (0.0, "0.0")],
+)
+def test_numbers_show_three_digits(value, text):
+    assert number(value) == text
+
+
+def test_wording_of_columns_shares_and_spans():
+    assert decimals_for([12.0, 7.1, None, 0.0]) == 2
+    assert number(-0.001, 2, signed=True) == "0.00"
+    assert (percent(-0.394), percent(0.0623, signed=True)) == ("−39 %", "+6.2 %")
+    assert (duration(0.0), duration(90.0), duration(7200.0)) == ("0 s", "1.5 min", "2.0 h")
+    assert (listed(["a"]), listed(["a", "b", "c"]), listed([])) == ("a", "a, b and c", "")
+
+
+def test_figures_stay_on_the_line_of_their_unit_and_name():
+    assert unbroken("off by 7.1 mm/s on average; ridge 13.0.") == "off by 7.1\u00a0mm/s on average; ridge\u00a013.0."

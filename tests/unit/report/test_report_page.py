@@ -1,0 +1,141 @@
+import json
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from edp.errors import StorageError
+from edp.report import build_report
+from edp.report.facts import MAKERS, read_facts
+from edp.report.page import context, render
+
+LOADS = {"src", "href", "srcset", "data", "poster", "action", "formaction", "background"}
+
+
+class Page(HTMLParser):
+    """Tags, attributes that load something, visible text, and the figures' JSON."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.loads, self.tags, self.words, self.scripts, self.inside = [], [], [], [], None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.inside = tag
+        self.loads += [value for name, value in attributes if name in LOADS]
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag):
+        self.inside = None
+
+    def handle_data(self, data):
+        if self.inside == "script":
+            self.scripts[-1] += data
+        elif self.inside != "style":
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+def test_the_page_is_one_file_that_loads_nothing(run_folder):
+    path = build_report(run_folder)
+    assert path == run_folder / "report.html"
+    assert path.stat().st_size < 8e6
+    text = path.read_text()
+    page = Page(text)
+    assert all(load.startswith("#") for load in page.loads)
+    assert not {"link", "iframe", "img", "object", "embed"} & set(page.tags)
+    assert "default-src 'none'" in text
+    assert "@import" not in text.split("</style>")[0]
+    assert text.count("plotly.js v") == 1
+    assert sorted(path.name for path in run_folder.iterdir() if path.name.startswith(".")) == []
+
+
+def test_the_page_says_the_verdict_and_every_section(run_folder):
+    page = Page(render(read_facts(run_folder)))
+    assert "At 100 ms ahead the network is off by" in page.text
+    for heading in ("Against the baselines", "Prediction against truth", "Residuals", "Learning curves", "Footprint"):
+        assert heading in page.text
+    for name in ("Hybrid TCN-LSTM", "Ridge ARX", "Persistence", "hybrid_tcn_lstm", "edp train quick --seed 7"):
+        assert name in page.text
+    assert page.tags.count("main") == 1
+    assert page.tags.count("h1") == 1
+
+
+def test_every_figure_has_its_place(run_folder):
+    text = render(read_facts(run_folder))
+    specs = json.loads(Page(text).scripts[1])
+    assert len(specs) == 6
+    for spec in specs:
+        assert f'id="figure-{spec["name"]}"' in text
+        for key in spec["controls"]:
+            assert f'data-figure="{spec["name"]}" data-key="{key}"' in text
+
+
+@pytest.mark.parametrize("name", list(MAKERS))
+def test_a_missing_part_is_named_with_the_command_that_makes_it(run_folder, name):
+    (run_folder / name).unlink()
+    page = Page(render(read_facts(run_folder)))
+    assert f"This run has no {name}" in page.text
+    assert f"{MAKERS[name]} {run_folder}" in page.text
+
+
+@pytest.mark.parametrize("kept", list(MAKERS))
+def test_one_part_alone_makes_a_page(run_folder, kept):
+    for name in MAKERS:
+        if name != kept:
+            (run_folder / name).unlink()
+    assert "Learning curves" in Page(render(read_facts(run_folder))).text
+
+
+def test_a_run_that_stopped_in_its_first_epoch_makes_a_page(run_folder):
+    (run_folder / "history.jsonl").write_text('{"epoch": 1, "train_lo')
+    assert "holds no finished epoch" in Page(render(read_facts(run_folder))).text
+
+
+def test_names_from_files_cannot_become_markup(run_folder):
+    evil = "</script><script>alert(1)</script><b>&"
+    scores = json.loads((run_folder / "scores.json").read_text())
+    scores["task"]["name"] = scores["models"]["ridge_arx"]["label"] = scores["targets"][0]["description"] = evil
+    recordings = scores["models"]["network"]["recordings"]
+    recordings[evil] = recordings.pop(next(iter(recordings)))
+    (run_folder / "scores.json").write_text(json.dumps(scores))
+    (run_folder / "config.toml").write_text(f'name = "{evil}"')
+    text = render(read_facts(run_folder), title=evil)
+    page = Page(text)
+    assert len(page.scripts) == 3
+    assert "<script>alert" not in text
+    assert evil in "".join(page.words)
+    names = {trace["name"] for spec in json.loads(page.scripts[1]) for trace in spec["figure"]["data"]}
+    assert not any("<" in name for name in names)
+
+
+def test_output_and_title_can_be_chosen(run_folder, tmp_path):
+    path = build_report(run_folder, output=tmp_path / "shown" / "page.html", title="Spring trials")
+    assert path == tmp_path / "shown" / "page.html"
+    assert "<title>Spring trials: report</title>" in path.read_text()
+
+
+def test_unknown_keys_are_ignored_and_unscored_metrics_are_dashes(run_folder):
+    scores = json.loads((run_folder / "scores.json").read_text())
+    scores["models"]["persistence"]["integrated"] = {"10": {}}
+    scores["models"]["persistence"]["overall"]["10"]["mean"]["r2"] = None
+    (run_folder / "scores.json").write_text(json.dumps(scores))
+    table = context(read_facts(run_folder))["comparisons"][0]
+    r2 = [heading for heading, _ in table.columns].index("R²")
+    assert next(row for row in table.rows if row[0] == "Persistence")[r2] == "–"
+
+
+def test_the_table_marks_the_network_and_leads_with_the_longest_horizon(run_folder):
+    tables = context(read_facts(run_folder))["comparisons"]
+    assert [table.caption for table in tables] == ["100 ms ahead", "10 ms ahead", "50 ms ahead"]
+    assert all(table.rows[place][0] == "Hybrid TCN-LSTM" for table in tables for place in table.marked)
+
+
+def test_a_page_that_cannot_be_written_says_so(run_folder):
+    with pytest.raises(StorageError, match="cannot"):
+        build_report(run_folder, output=run_folder / "config.toml" / "report.html")
