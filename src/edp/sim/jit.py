@@ -16,6 +16,7 @@ FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 def compiled(function: Function) -> Function:
     """Compile with Numba; cache the machine code on disk, or do without where no folder is writable."""
     try:
-        return numba.njit(cache=True, fastmath=FASTMATH, error_model="numpy")(function)
+        fast: Any = numba.njit(cache=True, fastmath=FASTMATH, error_model="numpy")(function)
     except RuntimeError:  # Numba found neither a writable source folder nor a writable user cache
-        return numba.njit(fastmath=FASTMATH, error_model="numpy")(function)
+        fast = numba.njit(fastmath=FASTMATH, error_model="numpy")(function)
+    return fast  # type: ignore[no-any-return]

@@ -34,32 +34,34 @@ def extend_probability(stroke: float, pull: float = 1.1) -> float:
 class AxisStream:
     """One lever: moves of random size, sign and length, with pauses between them.
 
+    Its vigour changes every few moves, from careful positioning to full-lever work, so that a data set holds both.
+
     Args:
         rng: source of randomness.
         rate_hz: samples per second.
-        levels: smallest and largest lever position of a move.
-        hold_s: shortest and longest hold of a move or pause.
         pause: chance that a hold is a pause.
     """
 
-    def __init__(
-        self,
-        rng: np.random.Generator,
-        rate_hz: float,
-        levels: tuple[float, float] = (0.15, 1.0),
-        hold_s: tuple[float, float] = (0.25, 1.6),
-        pause: float = 0.45,
-    ) -> None:
-        self._rng, self._rate, self._levels, self._hold, self._pause = rng, rate_hz, levels, hold_s, pause
+    LEVELS = (0.15, 1.0)
+    HOLD_S = (0.25, 1.6)
+    VIGOUR = (0.2, 1.0)
+    CHANGE = 0.1
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float, pause: float = 0.45) -> None:
+        self._rng, self._rate, self._pause = rng, rate_hz, pause
+        self._vigour = rng.uniform(*self.VIGOUR)
 
     def hold(self) -> int:
         """Length of the next hold in samples."""
-        return max(1, round(self._rng.uniform(*self._hold) * self._rate))
+        return max(1, round(self._rng.uniform(*self.HOLD_S) * self._rate))
 
     def move(self, stroke: float) -> float:
         """Lever position of a move."""
+        if self._rng.random() < self.CHANGE:
+            self._vigour = self._rng.uniform(*self.VIGOUR)
         sign = 1.0 if self._rng.random() < extend_probability(stroke) else -1.0
-        return sign * self._rng.uniform(*self._levels)
+        low, high = self.LEVELS
+        return sign * (low + (high - low) * self._vigour * self._rng.random())
 
     def next(self, stroke: float) -> tuple[float, int]:
         """Lever position and its length in samples: a pause or a move."""
@@ -73,7 +75,7 @@ class Isolated:
 
     def __init__(self, rng: np.random.Generator, rate_hz: float) -> None:
         self._rng = rng
-        self._stream = AxisStream(rng, rate_hz, pause=0.3)
+        self._stream = AxisStream(rng, rate_hz, pause=0.2)
         self._axis = 0
 
     def block(self, strokes: Array) -> Array:

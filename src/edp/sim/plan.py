@@ -15,7 +15,7 @@ from edp.recording import Recording
 from edp.sim.operator import EXCITATIONS
 from edp.sim.simulate import Scenario, SimulationError, simulate
 
-DEFAULT_MIX: Mapping[str, float] = {"isolated": 0.38, "combined": 0.47, "reversals": 0.08, "end_stops": 0.07}
+DEFAULT_MIX: Mapping[str, float] = {"isolated": 0.40, "combined": 0.48, "reversals": 0.05, "end_stops": 0.07}
 """Share of the recordings by excitation."""
 
 
