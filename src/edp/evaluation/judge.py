@@ -160,7 +160,10 @@ class _Ruler:
     def measure(self, predictions: Predictions) -> dict[str, Any]:
         """Scores of one model: overall, by recording with spread, by speed, and of running integrals."""
         predicted = [values[: len(truth)] * self.factors for values, truth in zip(predictions, self.truth, strict=True)]
-        overall, recordings, spreads, speeds = {}, {}, {}, {}
+        overall: dict[str, Any] = {}
+        recordings: dict[str, Any] = {}
+        spreads: dict[str, Any] = {}
+        speeds: dict[str, Any] = {}
         for h, horizon in enumerate(self.task.horizons):
             pairs = [self._ticks(p[:, h], t[:, h]) for p, t in zip(predicted, self.truth, strict=True)]
             overall[str(horizon)] = self._scores([p for p, _ in pairs], [t for _, t in pairs])

@@ -1,0 +1,342 @@
+"""The typed tree of settings: TOML in, validated specs out, every problem reported at once with the closest key."""
+
+from __future__ import annotations
+
+import tomllib
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pydantic
+import tomli_w
+
+from edp.blocks import BLOCKS
+from edp.data.features import FEATURE_SETS, Derived, FeatureSet
+from edp.data.splits import SPLITS, ByRecording, SplitSpec
+from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError, StorageError, closest
+from edp.evaluation.judge import JudgeSpec
+from edp.logs.repair import Repair
+from edp.losses import LOSSES
+from edp.models.activations import ACTIVATIONS
+from edp.models.backbones import BACKBONES
+from edp.models.plain import options
+from edp.models.predictor import ModelSpec
+from edp.registry import Registry
+from edp.signals import ChannelMap, SignalMap
+from edp.training.fit import TrainingSpec
+from edp.training.optimizers import OPTIMIZERS
+from edp.training.schedules import SCHEDULES
+
+TAGGED: Mapping[str, Registry[type]] = {
+    "backbone": BACKBONES,
+    "activation": ACTIVATIONS,
+    "blocks": BLOCKS,
+    "loss": LOSSES,
+    "optimizer": OPTIMIZERS,
+    "schedule": SCHEDULES,
+    "split": SPLITS,
+}
+"""Fields whose tables say with ``kind = "..."`` which registered part they set."""
+
+PRESETS = ("quick", "standard", "thesis")
+Table = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureSettings:
+    """A user's own feature set; see `edp.data.features.FeatureSet`."""
+
+    name: str = "own"
+    channels: tuple[str, ...] = ()
+    derived: tuple[Derived, ...] = ()
+    hidden: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskSettings:
+    """The task before the data's rate is known.
+
+    Attributes:
+        features: ``FG1``, ``FG2``, ``all`` (every channel of the recordings), or a table.
+        targets: names of the predicted channels.
+        horizons: look-ahead in samples.
+        mode: ``delta`` or ``absolute``.
+        derived_targets: derived channels that serve as targets only.
+        integrate: targets whose running integral is judged too.
+    """
+
+    features: str | FeatureSettings = "FG2"
+    targets: tuple[str, ...] = ("CylVels_1", "CylVels_2", "CylVels_3")
+    horizons: tuple[int, ...] = (10,)
+    mode: TargetMode = TargetMode.DELTA
+    derived_targets: tuple[Derived, ...] = ()
+    integrate: tuple[str, ...] = ()
+
+    def resolve(self, rate_hz: float, channels: Sequence[str] = ()) -> Task:
+        """The task for recordings of `rate_hz` with these channels."""
+        chosen = self.features
+        if isinstance(chosen, FeatureSettings):
+            features = FeatureSet(chosen.name, chosen.channels, chosen.derived, chosen.hidden)
+        elif chosen == "all":
+            features = FeatureSet("all", tuple(channels))
+        elif chosen in FEATURE_SETS:
+            features = FEATURE_SETS[chosen]
+        else:
+            hint = closest(chosen, [*FEATURE_SETS, "all"])
+            raise ConfigError(f"task.features: there is no feature set '{chosen}'{hint}")
+        return Task(features, self.targets, self.horizons, self.mode, rate_hz, self.derived_targets, self.integrate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Everything that settles a training and its judgement.
+
+    Attributes:
+        task: what is read and predicted.
+        split: how recordings are divided.
+        model: the network.
+        training: how it is trained.
+        judge: how it is judged.
+    """
+
+    task: TaskSettings = field(default_factory=TaskSettings)
+    split: SplitSpec = field(default_factory=ByRecording)
+    model: ModelSpec = field(default_factory=ModelSpec)
+    training: TrainingSpec = field(default_factory=TrainingSpec)
+    judge: JudgeSpec = field(default_factory=JudgeSpec)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingEntry:
+    """One recording of a data-set file.
+
+    Attributes:
+        path: the log, relative to the data-set file.
+        name: unique name; the file's stem by default.
+        rows: ``[start, stop]`` to use a part of the log.
+        map: signal map for this log: a table, or the path of a map file; the data set's map by default.
+    """
+
+    path: str
+    name: str | None = None
+    rows: tuple[int, int] | None = None
+    map: str | SignalMap | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSetSettings:
+    """A data-set file: its recordings, the map that they share, and allowed repairs."""
+
+    recordings: tuple[RecordingEntry, ...] = ()
+    map: str | SignalMap | None = None
+    repair: Repair = field(default_factory=Repair)
+
+
+def load_experiment(
+    path: str | Path | None = None, preset: str = "standard", overrides: Sequence[str] = ()
+) -> Experiment:
+    """Settings from a preset, changed by a TOML file, changed by ``key.path=value`` overrides.
+
+    Raises:
+        ConfigError: names every unknown key, wrong type and impossible value at once.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(f"there is no preset '{preset}'{closest(preset, PRESETS)}")
+    text = resources.files("edp").joinpath(f"presets/{preset}.toml").read_text(encoding="utf-8")
+    table = tomllib.loads(text)
+    where = f"preset '{preset}'"
+    if path is not None:
+        table = merged(table, read_toml(path))
+        where = f"'{path}'"
+    for text in overrides:
+        table = merged(table, _override(text))
+    return build(Experiment, table, where)
+
+
+def load_signal_map(path: str | Path) -> SignalMap:
+    """A signal map from a TOML file.
+
+    Raises:
+        ConfigError: unknown keys or wrong values, all at once.
+    """
+    return build(SignalMap, _map_table(read_toml(path)), f"'{path}'")
+
+
+def load_data_set(path: str | Path) -> DataSetSettings:
+    """A data-set file; `map` entries that name files are left as paths relative to it."""
+    table = read_toml(path)
+    for entry in [table, *table.get("recordings", [])]:
+        if isinstance(entry, dict) and isinstance(entry.get("map"), dict):
+            entry["map"] = _map_table(entry["map"])
+    settings = build(DataSetSettings, table, f"'{path}'")
+    if not settings.recordings:
+        raise ConfigError(f"'{path}' lists no [[recordings]]; give at least one with its path")
+    return settings
+
+
+def experiment_toml(experiment: Experiment) -> str:
+    """The whole settings as TOML, defaults included: what a run folder keeps."""
+    return tomli_w.dumps(plain_tree(experiment))
+
+
+def plain_tree(value: Any, name: str = "") -> Any:
+    """Nested plain values of a spec tree; registered parts carry their ``kind``; None is left out."""
+    if name in TAGGED and is_dataclass(value):
+        return {"kind": TAGGED[name].name_of(value)} | _plain_fields(value)
+    if name in TAGGED and isinstance(value, tuple):
+        return [plain_tree(item, name) for item in value]
+    if is_dataclass(value):
+        return _plain_fields(value)
+    if isinstance(value, tuple | list):
+        return [plain_tree(item) for item in value]
+    return str(value) if isinstance(value, TargetMode) or hasattr(value, "value") else value
+
+
+def _plain_fields(value: Any) -> Table:
+    held = {entry: getattr(value, entry) for entry in options(value)}
+    return {key: plain_tree(item, key) for key, item in held.items() if item is not None}
+
+
+def read_toml(path: str | Path) -> Table:
+    """A TOML file.
+
+    Raises:
+        StorageError: it cannot be read.
+        ConfigError: it is not TOML.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            return tomllib.load(stream)
+    except OSError as error:
+        raise StorageError(f"cannot read settings '{path}': {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"'{path}' is not valid TOML: {error}") from error
+
+
+def merged(base: Table, change: Mapping[str, Any]) -> Table:
+    """`base` with `change` laid over it; a table of another kind replaces the old one whole."""
+    result = dict(base)
+    for key, value in change.items():
+        old = result.get(key)
+        same = (
+            isinstance(old, dict) and isinstance(value, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+        )
+        result[key] = merged(old, value) if same and isinstance(old, dict) else value
+    return result
+
+
+def _override(text: str) -> Table:
+    key, sign, value = text.partition("=")
+    if not sign or not key.strip():
+        raise ConfigError(f"--set '{text}': write key.path=value, for example training.epochs=10")
+    try:
+        return tomllib.loads(f"{key.strip()} = {value.strip()}")
+    except tomllib.TOMLDecodeError:
+        try:
+            return tomllib.loads(f'{key.strip()} = "{value.strip()}"')
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(f"--set '{text}' is not understood: {error}") from error
+
+
+def _map_table(table: Table) -> Table:
+    """The user's form ``[channels.NAME] column = ...`` as a list of entries."""
+    channels = table.get("channels")
+    if not isinstance(channels, dict):
+        return table
+    entries = [
+        {"name": name, "column": name} | (dict(entry) if isinstance(entry, dict) else {"column": entry})
+        for name, entry in channels.items()
+    ]
+    return {**table, "channels": entries}
+
+
+T = typing.TypeVar("T")
+
+
+def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """A spec tree from a table.
+
+    Raises:
+        ConfigError: every problem found, with its key path and the closest known key.
+    """
+    problems: list[str] = []
+    made = _build(cls, table, "", problems)
+    if problems:
+        listed = "\n  - ".join(problems)
+        count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
+        raise ConfigError(f"settings {where}: {count}\n  - {listed}")
+    return typing.cast(T, made)
+
+
+def _build(cls: type, table: Any, path: str, problems: list[str]) -> Any:
+    if not isinstance(table, Mapping):
+        problems.append(f"{path}: expected a table, got {table!r}")
+        return None
+    hints = typing.get_type_hints(cls)
+    known = [entry.name for entry in fields(cls)]
+    before = len(problems)
+    for key in table:
+        if key not in known:
+            problems.append(f"unknown key '{_join(path, key)}'{closest(key, known)}")
+    for entry in fields(cls):
+        required = entry.default is MISSING and entry.default_factory is MISSING
+        if required and entry.name not in table:
+            problems.append(f"'{_join(path, entry.name)}' is missing; it must be given")
+    values = {
+        name: _value(name, hints[name], table[name], _join(path, name), problems) for name in known if name in table
+    }
+    if len(problems) > before:
+        return None
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        problems.append(f"{path or 'top level'}: {error}")
+        return None
+
+
+def _value(name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
+    if name in TAGGED:
+        if name == "blocks":
+            items = value if isinstance(value, list) else [value]
+            return tuple(_tagged(name, item, f"{path}[{i}]", problems) for i, item in enumerate(items))
+        return _tagged(name, value, path, problems)
+    choices = typing.get_args(hint) if typing.get_origin(hint) is not tuple else ()
+    table_type = hint if is_dataclass(hint) else next((c for c in choices if is_dataclass(c)), None)
+    if table_type is not None and isinstance(value, Mapping):
+        return _build(typing.cast(type, table_type), value, path, problems)
+    item_type = next(iter(typing.get_args(hint)), None) if typing.get_origin(hint) is tuple else None
+    if is_dataclass(item_type) and isinstance(value, list):
+        made = [_build(typing.cast(type, item_type), v, f"{path}[{i}]", problems) for i, v in enumerate(value)]
+        return tuple(made)
+    try:
+        return pydantic.TypeAdapter(hint).validate_python(value)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        problems.append(f"{path} = {value!r}: {first['msg'][0].lower()}{first['msg'][1:]}")
+        return None
+
+
+def _tagged(name: str, table: Any, path: str, problems: list[str]) -> Any:
+    registry = TAGGED[name]
+    if isinstance(table, str):
+        table = {"kind": table}
+    if not isinstance(table, Mapping) or "kind" not in table:
+        problems.append(f'{path}: say which {registry.what} with kind = "..."{closest("", registry)}')
+        return None
+    try:
+        cls = registry[table["kind"]]
+    except ConfigError as error:
+        problems.append(f"{path}.kind: {error}")
+        return None
+    return _build(cls, {key: value for key, value in table.items() if key != "kind"}, path, problems)
+
+
+def _join(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key
+
+
+__all__ = ["ChannelMap", "DataSetSettings", "Experiment", "load_data_set", "load_experiment", "load_signal_map"]
