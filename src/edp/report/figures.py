@@ -16,7 +16,7 @@ from edp.report.facts import NETWORK, TRUTH, Facts, main_horizon, score
 WHOLE, EXCERPT = "whole", "excerpt"
 POINT_BUDGET = 250_000  # of all prediction traces together: about 2 MB of the page
 RECORDINGS_SHOWN, HORIZONS_SHOWN = 6, 4
-EXCERPT_SECONDS = 20.0
+EXCERPT_SECONDS = 12.0
 Array = NDArray[np.floating]
 
 

@@ -186,7 +186,7 @@ def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
     for part in ("train", "validation", "test"):
         held = data.get(part)
         if isinstance(held, Mapping):
-            hours = f", {number(held['hours'])} h" if held.get("hours") is not None else ""
+            hours = f", {number(held['hours'], 2)} h" if held.get("hours") is not None else ""
             add(part.capitalize(), f"{whole(held.get('recordings'))} recordings{hours}")
     for key, value in source.get("environment", {}).items():
         add(key.replace("_", " ").capitalize(), value)

@@ -139,7 +139,7 @@ def write_footprint(folder: Path) -> None:
         "weight_bytes_fp32": 165132, "weight_bytes_int8": 41283, "peak_activation_bytes": 6144, "state_bytes": 25056,
         "peak_activation_bytes_window": 51200,
         "rows": [dict(zip(("part", "parameters", "macs_tick", "macs_window"), row, strict=True)) for row in rows],
-        "budget": {"name": "180 MHz controller, 4 of 10 ms", "cycles": 720000, "parameter_bytes": 100000, "ram_bytes": 500000},
+        "budget": {"name": "180 MHz, 4 ms per tick", "cycles": 720000, "parameter_bytes": 100000, "ram_bytes": 500000},
         "verdict": [
             {"what": what, "value": value, "limit": limit, "unit": unit, "fits": value <= limit, "note": note}
             for what, value, limit, unit, note in checks
