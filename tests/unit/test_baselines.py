@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from sklearn.linear_model import Ridge
 
+from edp.data.ridge import ridge_solution
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
-from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask, RidgeArx, ridge_solution
+from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask, RidgeArx
 
 AHEAD = BaselineTask(horizons=(1, 3), present=(2, None), history=12, seed=5)
 NOW = BaselineTask(horizons=(0,), present=(None, None), history=12, seed=5)

@@ -157,7 +157,7 @@ class _Loop:
                 )
         scaler = data.scaler()
         self.net = build_model(data.task, model, scaler, spec.seed)
-        start_bypass(self.net, data.train)
+        start_bypass(self.net, data.train, data.validation)
         self.net.to(self.device)
         named = [(name, parameter) for name, parameter in self.net.named_parameters() if parameter.requires_grad]
         self.optimizer = spec.optimizer.build(named)

@@ -4,58 +4,57 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from edp.blocks.linear_bypass import Bypass
+from edp.data.lags import LagTask, origins
+from edp.data.ridge import ridge_solution
 from edp.data.series import Series
+from edp.errors import DataError
 from edp.models.predictor import Predictor
 
-BLOCK = 8192  # rows of the design matrix at a time: memory stays bounded for any length of data
-RIDGE = 1e-4  # relative to the row count, on standardised features
 
+def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequence[Series]) -> None:
+    """Set the by-pass to the ridge regression on the logged channels, so that training starts from that baseline.
 
-def start_bypass(predictor: Predictor, train: Sequence[Series]) -> None:
-    """Set the by-pass to ``argmin sum |y - A x|^2 + ridge |A|^2`` over all training ticks, in double precision.
+    Does nothing where the predictor has no by-pass, it starts from zero, or no logged channel is a feature.
 
-    Does nothing where the predictor has no by-pass or it starts from zero.
+    Args:
+        predictor: with its fitted scaler.
+        train: the map is fitted here.
+        validation: chooses penalty and history for each horizon and target.
+
+    Raises:
+        DataError: no training stretch is as long as the taps plus the largest horizon.
     """
-    bypass = predictor.bypass
-    if not isinstance(bypass, Bypass) or bypass.spec.start != "ridge":
+    bypass, task = predictor.bypass, predictor.task
+    channels = len(task.features.channels)
+    if not isinstance(bypass, Bypass) or bypass.spec.start != "ridge" or channels == 0:
         return
-    taps, features = bypass.spec.taps, bypass.features
-    size = taps * features + 1
-    outputs = bypass.horizons * bypass.outputs
-    gram = torch.zeros(size, size, dtype=torch.float64)
-    moment = torch.zeros(size, outputs, dtype=torch.float64)
-    rows = 0
+    # A derived feature is no input: the regression then finds that target's level from the channels themselves.
+    present = tuple(column if column is not None and column < channels else None for column in task.present)
+    lags = LagTask(task.horizons, present, bypass.spec.taps)
+    logged = [
+        [Series(part.name, part.inputs[:, :channels], part.targets) for part in parts] for parts in (train, validation)
+    ]
+    if not any(len(origins(part, lags)) for part in logged[0]):
+        raise DataError(
+            f"linear_bypass: the longest training stretch has {max(part.samples for part in train)} samples, fewer "
+            f"than its {bypass.spec.taps} taps plus the horizon of {task.reach}; give longer recordings or fewer taps"
+        )
+    solution = ridge_solution(logged[0], lags, logged[1])
+    # SI to network units: scaled = (x - offset) / width on both sides.
+    offset, width = (tensor.double().cpu().numpy() for tensor in (predictor.front.offset, predictor.front.width))
+    maps = np.zeros((bypass.spec.taps, len(offset), *solution.intercept.shape))
+    maps[:, :channels] = solution.weights
+    if predictor.code.delta:
+        for target, column in enumerate(predictor.code.present):
+            maps[0, column, :, target] -= 1.0
+    level = solution.intercept + np.einsum("hfkc,f->kc", maps, offset) - predictor.code.offset.double().cpu().numpy()
+    unit = predictor.code.width.double().cpu().numpy()
+    weight = (maps * width[:, None, None] / unit).reshape(bypass.spec.taps, len(offset), -1)
     with torch.no_grad():
-        for part in train:
-            scaled, target = _scaled(predictor, part)
-            for start in range(taps - 1, len(target), BLOCK):
-                stop = min(start + BLOCK, len(target))
-                lags = scaled[start - taps + 1 : stop].unfold(0, taps, 1).flatten(1)
-                design = torch.cat([lags, torch.ones(len(lags), 1, dtype=lags.dtype)], dim=1)
-                gram += design.T @ design
-                moment += design.T @ target[start:stop]
-                rows += stop - start
-        if rows == 0:
-            return
-        gram.diagonal()[:-1] += RIDGE * rows
-        solution = torch.linalg.solve(gram, moment)
-        weight = solution[:-1].T.reshape(outputs, features, taps)
-        bypass.weight.copy_(weight.to(bypass.weight))
-        bypass.bias.copy_(solution[-1].to(bypass.bias))
-
-
-def _scaled(predictor: Predictor, part: Series) -> tuple[Tensor, Tensor]:
-    """Scaled features ``(time, feature)`` and standardised targets ``(time - reach, horizon * target)``."""
-    like = next(predictor.parameters())
-    x = torch.from_numpy(part.inputs).to(like)[None]
-    features, _ = predictor.front(x, predictor.front.initial_state(1, like))
-    horizons = predictor.task.horizons
-    ticks = max(0, part.samples - max(horizons))
-    values = torch.from_numpy(part.targets).to(like)
-    future = torch.stack([values[k : k + ticks] for k in horizons], dim=1)[None]
-    code = predictor.code.encode(future, features[:, :ticks])[0].flatten(1)
-    return predictor.front.scale(features)[0].double().cpu(), code.double().cpu()
+        # The by-pass filters forward in time: its last tap is lag 0.
+        bypass.weight.copy_(torch.from_numpy(weight[::-1].transpose(2, 1, 0).copy()))
+        bypass.bias.copy_(torch.from_numpy((level / unit).ravel()))

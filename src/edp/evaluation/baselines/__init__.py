@@ -3,7 +3,7 @@
 from edp.evaluation.baselines.base import BASELINES, Baseline, BaselineTask
 from edp.evaluation.baselines.boosted_trees import BoostedTrees
 from edp.evaluation.baselines.persistence import Persistence
-from edp.evaluation.baselines.ridge_arx import RidgeArx, RidgeSolution, ridge_solution
+from edp.evaluation.baselines.ridge_arx import RidgeArx
 from edp.evaluation.baselines.small_mlp import SmallMlp
 
 __all__ = [
@@ -13,7 +13,5 @@ __all__ = [
     "BoostedTrees",
     "Persistence",
     "RidgeArx",
-    "RidgeSolution",
     "SmallMlp",
-    "ridge_solution",
 ]

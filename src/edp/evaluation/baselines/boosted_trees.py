@@ -8,8 +8,9 @@ from itertools import islice
 import numpy as np
 from sklearn.ensemble import HistGradientBoostingRegressor
 
+from edp.data.lags import DoubleArray, target_means
 from edp.data.series import Series
-from edp.evaluation.baselines.base import BASELINES, Baseline, BaselineTask, DoubleArray, target_means
+from edp.evaluation.baselines.base import BASELINES, Baseline, BaselineTask
 from edp.evaluation.baselines.lags import LagTable, predict_from_lags, sample_table
 from edp.recording import FloatArray
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.data.lags import DoubleArray, anchors, future, origins
 from edp.data.series import Series
-from edp.evaluation.baselines.base import BaselineTask, DoubleArray, anchors, future, origins
+from edp.evaluation.baselines.base import BaselineTask
 from edp.recording import FloatArray
 
 LAGS = (0, 1, 2, 4, 8, 16, 32)

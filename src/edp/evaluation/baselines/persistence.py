@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from edp.data.lags import DoubleArray, anchors, target_means
 from edp.data.series import Series
-from edp.evaluation.baselines.base import BASELINES, Baseline, DoubleArray, anchors, target_means
+from edp.evaluation.baselines.base import BASELINES, Baseline
 from edp.recording import FloatArray
 
 

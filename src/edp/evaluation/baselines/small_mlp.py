@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from sklearn.neural_network import MLPRegressor
 
+from edp.data.lags import DoubleArray, target_means
 from edp.data.series import Series
-from edp.evaluation.baselines.base import BASELINES, Baseline, BaselineTask, DoubleArray, target_means
+from edp.evaluation.baselines.base import BASELINES, Baseline, BaselineTask
 from edp.evaluation.baselines.lags import LagTable, predict_from_lags, sample_table
 from edp.recording import FloatArray
 

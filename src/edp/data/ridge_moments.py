@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edp.data.lags import DoubleArray, LagTask, anchors, future, origins
 from edp.data.series import Series
-from edp.evaluation.baselines.base import BaselineTask, DoubleArray, anchors, future, origins
 
 BLOCK_ROWS = 8_192
 
@@ -65,7 +65,7 @@ def standard_of(train: Sequence[Series], means: DoubleArray) -> Standard:
     return Standard(np.asarray(centre), np.where(still, 1.0, scale), means)
 
 
-def moments_of(series: Sequence[Series], task: BaselineTask, standard: Standard) -> Moments:
+def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> Moments:
     """Moments over all ticks with a full history and a known future (see `origins`), for ``task.history`` lags."""
     lags, inputs = task.history, len(standard.centre)
     first = np.zeros((lags, inputs + task.outputs, inputs))
@@ -101,7 +101,7 @@ def _blocks(train: Sequence[Series]) -> Iterator[DoubleArray]:
             yield series.inputs[start : start + BLOCK_ROWS].astype(np.float64)
 
 
-def _changes(series: Series, task: BaselineTask, standard: Standard, ticks: np.ndarray) -> DoubleArray:
+def _changes(series: Series, task: LagTask, standard: Standard, ticks: np.ndarray) -> DoubleArray:
     """Future minus anchor at `ticks`, ``(tick, horizon * target)``."""
     start = anchors(series.inputs[ticks], task, standard.means)
     return (future(series, task, ticks) - start[:, None, :]).reshape(len(ticks), task.outputs)

@@ -1,0 +1,87 @@
+"""Lag tasks: predictions at a tick from the rows of the last few ticks, and the sums that all such maps need."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.errors import ConfigError
+from edp.recording import FloatArray
+
+DoubleArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LagTask:
+    """Predict each target at t + horizon from the inputs of the last `history` ticks, all in SI units.
+
+    Attributes:
+        horizons: ticks ahead, each 0 or more; 0 estimates the target at the tick itself.
+        present: per target the input column with its present value, or None when no input measures it.
+        history: samples up to and including the present one that a prediction may use.
+
+    Raises:
+        ConfigError: no or negative or repeated horizons, no targets, no history, or a horizon of 0 for a target
+            that the inputs already hold.
+    """
+
+    horizons: tuple[int, ...]
+    present: tuple[int | None, ...]
+    history: int
+
+    def __post_init__(self) -> None:
+        if not self.horizons or min(self.horizons) < 0 or len(set(self.horizons)) != len(self.horizons):
+            raise ConfigError(f"lag task horizons are {self.horizons}; give one or more distinct values, 0 or above")
+        if not self.present:
+            raise ConfigError("the lag task has no targets; name at least one")
+        if self.history < 1:
+            raise ConfigError(f"lag history is {self.history} samples; it must be at least 1 (the present one)")
+        held = [target for target, column in enumerate(self.present) if column is not None]
+        if 0 in self.horizons and held:
+            raise ConfigError(
+                f"horizon 0 asks for target {held[0]} at the very tick at which input column "
+                f"{self.present[held[0]]} holds it; drop that input or predict from horizon 1"
+            )
+
+    @property
+    def outputs(self) -> int:
+        """Number of predicted values per tick: horizons times targets."""
+        return len(self.horizons) * len(self.present)
+
+
+def origins(series: Series, task: LagTask) -> range:
+    """Ticks with a full history behind them and the longest horizon before them: the same ones for all horizons."""
+    return range(task.history - 1, max(task.history - 1, series.samples - max(task.horizons)))
+
+
+def future(series: Series, task: LagTask, ticks: NDArray[np.int64]) -> DoubleArray:
+    """What is to be predicted at `ticks`: targets at tick + horizon, ``(tick, horizon, target)``."""
+    return np.stack([series.targets[ticks + horizon] for horizon in task.horizons], axis=1).astype(np.float64)
+
+
+def target_means(series: Sequence[Series]) -> DoubleArray:
+    """Mean of each target over all ticks, ``(target,)``."""
+    total = sum(one.targets.sum(axis=0, dtype=np.float64) for one in series)
+    return np.asarray(total / sum(one.samples for one in series), dtype=np.float64)
+
+
+def anchors(inputs: FloatArray, task: LagTask, means: DoubleArray) -> DoubleArray:
+    """Value that each prediction starts from: the present value, or the training mean where none is measured.
+
+    Args:
+        inputs: ``(row, input)``.
+        task: says which column holds which target's present value.
+        means: training means ``(target,)``.
+
+    Returns:
+        ``(row, target)``.
+    """
+    starts = np.tile(means, (len(inputs), 1))
+    for target, column in enumerate(task.present):
+        if column is not None:
+            starts[:, target] = inputs[:, column]
+    return starts

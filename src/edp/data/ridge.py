@@ -1,0 +1,147 @@
+"""Ridge regression of each horizon and target on the last samples of all inputs, with its map in SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from edp.data.lags import DoubleArray, LagTask, target_means
+from edp.data.ridge_moments import Moments, Standard, moments_of, standard_of
+from edp.data.series import Series
+from edp.errors import ConfigError
+from edp.recording import FloatArray
+
+PENALTIES = tuple(10.0**power for power in range(-6, 2))
+"""Ridge penalties per training row on standardised features, from almost none to strong."""
+
+HISTORIES = (5, 20)
+"""Histories tried beside the task's own."""
+
+BLOCK_ROWS = 16_384
+
+
+@dataclass(frozen=True, eq=False)
+class RidgeSolution:
+    """A linear map in SI units: y[t + horizon] = intercept + sum over lags of inputs[t - lag] @ weights[lag].
+
+    Attributes:
+        weights: ``(history, input, horizon, target)``; index 0 is the present sample. Lags that an output does not
+            use are zero.
+        intercept: ``(horizon, target)``.
+        penalty: chosen penalty per output ``(horizon, target)``.
+        history: chosen history per output ``(horizon, target)``, in samples.
+    """
+
+    weights: DoubleArray
+    intercept: DoubleArray
+    penalty: DoubleArray
+    history: NDArray[np.int64]
+
+    def predict(self, inputs: FloatArray) -> DoubleArray:
+        """Predictions at ticks ``history - 1`` and later: ``(time - history + 1, horizon, target)``."""
+        lags, channels, horizons, targets = self.weights.shape
+        maps = self.weights.reshape(lags, channels, horizons * targets)
+        used = int(self.history.max())
+        prediction = np.tile(self.intercept.ravel(), (len(inputs) - lags + 1, 1))
+        for start in range(lags - 1, len(inputs), BLOCK_ROWS):
+            stop = min(start + BLOCK_ROWS, len(inputs))
+            block = inputs[start - used + 1 : stop].astype(np.float64)
+            for lag in range(used):
+                part = block[used - 1 - lag : len(block) - lag] @ maps[lag]
+                prediction[start - lags + 1 : stop - lags + 1] += part
+        return prediction.reshape(-1, horizons, targets)
+
+
+def ridge_solution(
+    train: Sequence[Series],
+    task: LagTask,
+    validation: Sequence[Series] = (),
+    penalties: Sequence[float] = PENALTIES,
+    histories: Sequence[int] | None = None,
+) -> RidgeSolution:
+    """Ridge-regularised least squares for every horizon and target, in physical units.
+
+    The map is fitted to the change from the present value where an input measures it, so a strong penalty leads back
+    to persistence. Memory is a few Gram matrices of ``(history * input)`` squared, whatever the length of the series.
+
+    Args:
+        train: at least one series with a full history and the longest horizon.
+        task: what to predict from what.
+        validation: chooses penalty and history by squared error; when it has no usable tick, the smallest penalty and
+            longest history are taken.
+        penalties: penalties per row on standardised features, each above 0.
+        histories: histories to choose from, in samples; cut to the task's. By default 5, 20 and the task's.
+
+    Raises:
+        ConfigError: a penalty too small for inputs that are copies of each other.
+    """
+    tried = sorted({min(history, task.history) for history in (histories or (*HISTORIES, task.history))})
+    standard = standard_of(train, target_means(train))
+    fitted, held_out = moments_of(train, task, standard), moments_of(validation, task, standard)
+    inputs, outputs = len(standard.centre), task.outputs
+    best = np.full(outputs, np.inf)
+    weights = np.zeros((task.history * inputs, outputs))
+    penalty, history = np.zeros(outputs), np.zeros(outputs, dtype=np.int64)
+    # Longest history and smallest penalty first: these stay where validation cannot tell.
+    for samples in reversed(tried):
+        for relative in sorted(penalties):
+            candidate = _solve(fitted, samples * inputs, relative)
+            loss = _squared_error(held_out, fitted, candidate)
+            better = loss < best
+            best[better], penalty[better], history[better] = loss[better], relative, samples
+            weights[:, better] = 0.0
+            weights[: samples * inputs, better] = candidate[:, better]
+    return _physical(weights, fitted, standard, task, (penalty, history))
+
+
+def _solve(fitted: Moments, size: int, relative: float) -> DoubleArray:
+    """Weights ``(size, output)`` on the first `size` standardised features, with an unpenalised intercept."""
+    x, y = fitted.x[:size] / fitted.rows, fitted.y / fitted.rows
+    covariance = fitted.xx[:size, :size] / fitted.rows - np.outer(x, x)
+    # The penalty also makes the matrix definite when inputs are constant or copies of each other.
+    covariance[np.diag_indices(size)] += relative
+    cross = fitted.xy[:size] / fitted.rows - np.outer(x, y)
+    try:
+        factor = linalg.cho_factor(covariance, overwrite_a=True, check_finite=False)
+    except linalg.LinAlgError as error:
+        raise ConfigError(
+            f"ridge penalty {relative:g} is too small for these inputs, which depend on one another; use 1e-9 or above"
+        ) from error
+    return np.asarray(linalg.cho_solve(factor, cross, check_finite=False))
+
+
+def _squared_error(held_out: Moments, fitted: Moments, weights: DoubleArray) -> DoubleArray:
+    """Mean squared validation error per output, from the moments; zero when there is no validation row."""
+    if held_out.rows == 0:
+        return np.zeros(weights.shape[1])
+    size, rows = len(weights), held_out.rows
+    offset = (fitted.y - fitted.x[:size] @ weights) / fitted.rows
+    x, y, xy = held_out.x[:size] / rows, held_out.y / rows, held_out.xy[:size] / rows
+    quadratic = np.einsum("io,io->o", weights, (held_out.xx[:size, :size] / rows) @ weights)
+    linear = offset * (2.0 * (x @ weights) - 2.0 * y + offset) - 2.0 * np.einsum("io,io->o", weights, xy)
+    return held_out.yy / rows + linear + quadratic
+
+
+def _physical(
+    weights: DoubleArray,
+    fitted: Moments,
+    standard: Standard,
+    task: LagTask,
+    chosen: tuple[DoubleArray, NDArray[np.int64]],
+) -> RidgeSolution:
+    """Undo the standardisation and add the anchors; `chosen` is penalty and history per output."""
+    shape = (len(task.horizons), len(task.present))
+    offset = (fitted.y - fitted.x @ weights) / fitted.rows
+    maps = weights.reshape(task.history, len(standard.centre), task.outputs) / standard.scale[:, None]
+    intercept = (offset - np.einsum("i,hio->o", standard.centre, maps)).reshape(shape)
+    maps = maps.reshape(task.history, len(standard.centre), *shape)
+    for target, column in enumerate(task.present):
+        if column is None:
+            intercept[:, target] += standard.means[target]
+        else:
+            maps[0, column, :, target] += 1.0
+    return RidgeSolution(maps, intercept, chosen[0].reshape(shape), chosen[1].reshape(shape))

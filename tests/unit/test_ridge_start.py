@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+import torch
+
+from edp.blocks import LinearBypass
+from edp.data.features import Derived, FeatureSet
+from edp.data.lags import LagTask
+from edp.data.ridge import ridge_solution
+from edp.data.scaling import fit_scaler
+from edp.data.series import Series
+from edp.data.task import TargetMode, Task
+from edp.errors import DataError
+from edp.models.backbones import TcnSpec
+from edp.models.heads import HeadSpec
+from edp.models.predictor import ModelSpec, Predictor, build_model
+from edp.signals import Kind
+from edp.training.ridge_start import start_bypass
+
+TAPS = 6
+# Column 3 never moves; the fourth channel is an input only, as the source of a derived feature.
+FEATURES = FeatureSet(
+    "test",
+    ("speed", "lever", "dead", "rod"),
+    (Derived("push", "load"), Derived("drate", "lever", "derivative")),
+    hidden=("load",),
+)
+
+
+def recording(seed: int, samples: int = 400) -> np.ndarray:
+    """A driven first-order lag with noise; columns as the inputs of FEATURES."""
+    rng = np.random.default_rng(seed)
+    lever, load = rng.normal(size=(2, samples))
+    speed = np.zeros(samples)
+    for t in range(3, samples):
+        speed[t] = 0.8 * speed[t - 1] + 0.2 * lever[t - 2] + 0.05 * load[t - 1]
+    speed += 0.01 * rng.normal(size=samples)
+    return np.stack([0.1 * speed, 2e6 * lever + 1e7, np.full(samples, 3.0), 4.0 + np.cumsum(speed), load], axis=1)
+
+
+def series(task: Task, seed: int, samples: int = 400) -> Series:
+    values = recording(seed, samples).astype(np.float32)
+    derived = np.diff(values[:, 4], prepend=values[0, 4])
+    known = {"speed": values[:, 0], "rod": values[:, 3], "push": derived}
+    return Series(f"s{seed}", values, np.stack([known[name] for name in task.targets], axis=1).astype(np.float32))
+
+
+def start(task: Task, **options: object) -> tuple[Predictor, list[Series], list[Series]]:
+    """A predictor whose heads say nothing, in double precision, after the start."""
+    train, validation = [series(task, 1), series(task, 2)], [series(task, 3)]
+    kinds = (Kind.VELOCITY, Kind.PRESSURE, Kind.GENERIC, Kind.POSITION, Kind.GENERIC, Kind.GENERIC)
+    spec = ModelSpec(
+        backbone=TcnSpec(channels=(4,)),
+        head=HeadSpec(hidden=4),
+        window=3,
+        blocks=(LinearBypass(taps=TAPS, **options),),  # type: ignore[arg-type]
+    )
+    predictor = build_model(task, spec, fit_scaler(task, train, kinds), seed=0).double().eval()
+    with torch.no_grad():
+        for parameter in (predictor.heads.weights[-1], predictor.heads.biases[-1]):
+            parameter.zero_()
+    start_bypass(predictor, train, validation)
+    return predictor, train, validation
+
+
+@pytest.mark.parametrize("mode", list(TargetMode))
+@pytest.mark.parametrize("targets", [("speed",), ("rod", "speed"), ("push", "speed")])
+@pytest.mark.parametrize("horizons", [(1,), (2, 5, 9)])
+def test_without_its_network_the_predictor_is_the_ridge_regression(mode, targets, horizons):
+    task = Task(FEATURES, targets, horizons, mode, 100.0)
+    predictor, train, validation = start(task)
+    columns = {"speed": 0, "rod": 3, "push": None}
+    lags = LagTask(horizons, tuple(columns[name] for name in targets), TAPS)
+
+    def logged(parts):
+        return [Series(part.name, part.inputs[:, :4], part.targets) for part in parts]
+
+    wanted = ridge_solution(logged(train), lags, logged(validation))
+    test = series(task, 4, 90)
+    x = torch.from_numpy(test.inputs).double()[None]
+    with torch.no_grad():
+        found = predictor.predict(x, predictor.initial_state(1, x))[0][0].numpy()
+    spread = test.targets.std(axis=0)
+    # The scaler's numbers are float32 buffers before .double(); the map itself is exact in double precision.
+    np.testing.assert_allclose(
+        found[TAPS - 1 :] / spread, wanted.predict(test.inputs[:, :4]) / spread, rtol=1e-9, atol=1e-9
+    )
+
+
+def test_it_beats_persistence_from_the_start():
+    task = Task(FEATURES, ("speed",), (3,), TargetMode.DELTA, 100.0)
+    predictor, _, _ = start(task)
+    test = series(task, 5)
+    x = torch.from_numpy(test.inputs).double()[None]
+    with torch.no_grad():
+        found = predictor.predict(x, predictor.initial_state(1, x))[0][0, :, 0, 0].numpy()
+    future = test.targets[TAPS + 3 :, 0]
+    ridge = np.mean((found[TAPS:-3] - future) ** 2)
+    assert ridge < 0.5 * np.mean((test.targets[TAPS:-3, 0] - future) ** 2)
+
+
+def test_a_start_from_zero_stays_zero():
+    task = Task(FEATURES, ("speed",), (3,), TargetMode.DELTA, 100.0)
+    predictor, _, _ = start(task, start="zero")
+    assert not predictor.bypass.weight.any()
+
+
+def test_recordings_shorter_than_the_taps_are_refused():
+    task = Task(FEATURES, ("speed",), (3,), TargetMode.DELTA, 100.0)
+    predictor, _, _ = start(task)
+    with pytest.raises(DataError, match="8 samples, fewer than its 6 taps plus the horizon of 3"):
+        start_bypass(predictor, [series(task, 1, 8)], [])
