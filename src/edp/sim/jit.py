@@ -1,8 +1,17 @@
-"""Compiling the simulator's inner loops, with an on-disk cache where one can be kept."""
+"""Compiling the simulator's inner loops, with an on-disk cache where one can be kept.
+
+Numba's cache knows a function by its own file, not by the files of the functions it calls: after an edit to one file,
+callers elsewhere would keep running the old code. The cache folder therefore carries a fingerprint of every source
+file of this package.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
@@ -10,13 +19,36 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # No "nnan"/"ninf": a diverging state must stay visible as NaN.
-FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+OPTIONS: dict[str, Any] = {"fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"}, "error_model": "numpy"}
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Where compiled code is kept: below NUMBA_CACHE_DIR or the user's cache folder; None where neither is writable."""
+    state = hashlib.blake2b(digest_size=8)
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        state.update(source.name.encode() + b"\0" + source.read_bytes())
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    try:
+        base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edp"
+        folder = base / f"sim-{state.hexdigest()}"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # read-only, or a user without a home
+        return None
+    return folder if os.access(folder, os.W_OK) else None
 
 
 def compiled(function: Function) -> Function:
     """Compile with Numba; cache the machine code on disk, or do without where no folder is writable."""
+    folder = cache_folder()
+    if folder is None:
+        plain: Any = numba.njit(**OPTIONS)(function)
+        return plain  # type: ignore[no-any-return]
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(folder)
     try:
-        fast: Any = numba.njit(cache=True, fastmath=FASTMATH, error_model="numpy")(function)
-    except RuntimeError:  # Numba found neither a writable source folder nor a writable user cache
-        fast = numba.njit(fastmath=FASTMATH, error_model="numpy")(function)
+        fast: Any = numba.njit(cache=True, **OPTIONS)(function)
+    finally:
+        config.CACHE_DIR = before
     return fast  # type: ignore[no-any-return]

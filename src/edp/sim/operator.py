@@ -119,7 +119,7 @@ class Reversals:
         rng = self._rng
         active = rng.random(AXES) < 0.5
         active[rng.integers(AXES)] = True
-        towards = np.array([1.0 if rng.random() < extend_probability(s, 2.0) else -1.0 for s in strokes])
+        towards = np.array([1.0 if rng.random() < extend_probability(s, 3.0) else -1.0 for s in strokes])
         pieces = []
         for flip in range(int(rng.integers(4, 11))):
             levels = rng.uniform(0.3, 1.0, AXES) * active * towards * (-1.0) ** flip
