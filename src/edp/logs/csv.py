@@ -195,10 +195,9 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
 def _is_unit_row(row: list[str], decimal: str) -> bool:
     cells = [cell.strip().strip("[]()") for cell in row]
     filled = [cell for cell in cells if cell]
-    if not filled or all(_is_number(cell, decimal) and cell != "1" for cell in filled):
-        return False
-    known = [normalise_unit(cell) in UNITS or cell in TIME_UNITS for cell in filled]
-    return any(known) and not any(_is_number(cell, decimal) and cell != "1" for cell in filled)
+    words = [cell for cell in filled if cell != "1"]
+    known = [normalise_unit(cell) in UNITS or normalise_unit(cell) in TIME_UNITS for cell in words]
+    return any(known) and not any(_is_number(cell, decimal) for cell in words)
 
 
 def _stated_columns(

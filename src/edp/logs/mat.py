@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matio
 import numpy as np
 import scipy.io
 
 from edp.errors import DataError, closest
 from edp.logs.mat_layouts import INFO, LAYOUTS
 from edp.logs.mat_objects import Found, collect
+from edp.logs.matlab import matio
 from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, time_factor
 from edp.recording import Recording
 from edp.signals import Kind, SignalMap
@@ -76,6 +76,10 @@ class MatFormat:
                     version=_VERSIONS[options.mat_version],
                     saveobj_classes=list(layout.saveobj_classes) or None,
                 )
+                if options.mat_version == "v7.3":
+                    # mat-io leaves the text of a v5 header there; MATLAB goes by the version number behind it.
+                    with path.open("rb+") as stream:
+                        stream.write(_MAGIC[1])
             except RuntimeError as error:
                 # h5py reports a failed write (disk full) as RuntimeError.
                 raise OSError(str(error)) from error

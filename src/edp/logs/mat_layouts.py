@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]
-from matio.utils import MatlabOpaque
 
+from edp.logs.matlab import MatlabOpaque
+from edp.logs.matlab import pandas as pd
 from edp.recording import Recording
 from edp.registry import Registry
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]
-from matio.utils import MatlabOpaque
 from numpy.typing import NDArray
 
+from edp.logs.matlab import MatlabOpaque
+from edp.logs.matlab import pandas as pd
 from edp.logs.units import normalise_unit
 
 _TIME_FIELDS = ("time_s", "time", "Time", "t", "tout")

@@ -89,14 +89,14 @@ def judge(stamps: Stamps, where: str) -> Clock:
     if not near and step > 0 and (found := _rounded_line(stamps, median)) is not None:
         near, (start, step) = True, found
     if near:
-        rate = nice_rate(step, len(stamps))
+        rate = nice_rate(step, len(stamps), jitter)
         line = start + np.arange(len(stamps)) / rate
         return Clock(line, True, rate, 1.0 / rate, jitter, none, none, none)
     gaps = np.flatnonzero(steps > max(GAP_STEPS * median, GAP_SECONDS))
     return Clock(
         stamps,
         False,
-        nice_rate(median, 100),
+        nice_rate(median, 100, jitter),
         median,
         jitter,
         gaps,
@@ -149,14 +149,18 @@ def _printed_digit(stamps: Stamps, floor: float) -> float:
     return 0.0
 
 
-def nice_rate(step_s: float, samples: int) -> float:
-    """1 / step, rounded to a plain number where that shifts the last of `samples` rows by less than a quarter step."""
+def nice_rate(step_s: float, samples: int, jitter: float) -> float:
+    """1 / step, rounded to a plain number where that shifts the last of `samples` rows no more than stamps jitter.
+
+    The shift is at most a quarter step, and the rate changes by at most 0.1 %.
+    """
+    allowed = float(np.clip(jitter, 1e-6, 0.25))
     rate = 1.0 / step_s
     candidates = [round(rate, digits) for digits in range(4)]
     candidates += [1.0 / step for digits in range(7) if (step := round(step_s, digits))]
     for candidate in candidates:
         off = abs(candidate - rate) / rate
-        if candidate > 0 and off <= 1e-3 and off * samples <= 0.25:
+        if candidate > 0 and off <= 1e-3 and off * samples <= allowed:
             return float(candidate)
     return rate
 
