@@ -115,6 +115,13 @@ def test_csv_spellings_give_the_same_recording(tmp_path, text, encoding):
     np.testing.assert_allclose(read.values, [[1e5, 0.1], [2e5, 0.2], [3e5, 0.3]], rtol=1e-6)
 
 
+def test_csv_in_a_windows_code_page(tmp_path):
+    rows = "".join(f"{i};{i},5\n" for i in range(400))
+    (tmp_path / "a.csv").write_bytes(f"time;Öl (°C)\n{rows}".encode("cp1252"))
+    read = read_recording(tmp_path / "a.csv", SignalMap((ChannelMap("Oil", "Öl", kind=Kind.TEMPERATURE),)))
+    assert read.values[2, 0] == np.float32(275.65)
+
+
 def test_csv_without_header_by_a_map(tmp_path):
     (tmp_path / "a.csv").write_text("0,1,5\n0.1,2,6\n0.2,3,7\n")
     signal_map = SignalMap((ChannelMap("x", "load", scale=2.0),), header=False, columns=("t", "ref", "load"))

@@ -43,7 +43,7 @@ class CsvFormat:
     """Comma, semicolon or tab separated text."""
 
     name = "csv"
-    suffixes: tuple[str, ...] = (".csv", ".tsv", ".txt")
+    suffixes: tuple[str, ...] = (".csv", ".tsv")
     content = "CSV text"
 
     def claims(self, head: bytes) -> bool:

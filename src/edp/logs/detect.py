@@ -17,6 +17,7 @@ _EXPORT = {
     ".mcap": "convert the wanted topics to CSV or Parquet",
     ".bag": "convert the wanted topics to CSV or Parquet",
     ".db3": "convert the wanted topics to CSV or Parquet",
+    ".txt": "rename it to .csv if it holds a table",
     ".xlsx": "save the sheet as CSV",
     ".xls": "save the sheet as CSV",
 }

@@ -121,6 +121,8 @@ def _clock_key(signal: RawSignal) -> int:
 def _timelines(
     raw: RawLog, wanted: Sequence[Wanted], signal_map: SignalMap, repair: Repair
 ) -> tuple[dict[int, _Timeline], Grid, list[dict[str, Any]]]:
+    if signal_map.rate_hz is not None and not 0 < signal_map.rate_hz < np.inf:
+        raise DataError(f"signal map: rate_hz is {signal_map.rate_hz}; it must be a positive number")
     signals = [entry.signal for entry in wanted if entry.signal is not None]
     if not signals:
         raise DataError(f"'{raw.path}': no channel is read from the file; map at least one to a column")
