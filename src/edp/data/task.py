@@ -98,7 +98,7 @@ class Task:
         Raises:
             DataError: another rate, a missing channel, or a value that is not finite.
         """
-        if abs(recording.rate_hz - self.rate_hz) > 1e-6 * self.rate_hz:
+        if abs(recording.rate_hz - self.rate_hz) > 1e-3 * self.rate_hz:
             raise DataError(
                 f"recording '{recording.name}' has {recording.rate_hz:g} Hz, the task {self.rate_hz:g} Hz; all rates "
                 "must be equal: set rate_hz in the signal map"

@@ -113,7 +113,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         inputs = tuple(Channel(c["name"], Kind(c["kind"]), c["description"]) for c in header["inputs"])
         kinds = tuple(Kind(c["kind"]) for c in header["outputs"])
         texts = tuple(c["description"] for c in header["outputs"])
-        predictor = Predictor(task, spec, _blank_scaler(task))
+        predictor = Predictor(task, spec, blank_scaler(task))
         predictor.load_state_dict(load(data))
         return Bundle(predictor.eval(), inputs, kinds, texts, header["provenance"], header["scores"])
     except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError, StorageError) as error:
@@ -141,7 +141,7 @@ def _weights(path: Path, entry: Mapping[str, str]) -> bytes:
     return data
 
 
-def _blank_scaler(task: Task) -> Scaler:
+def blank_scaler(task: Task) -> Scaler:
     """Placeholders of the right shape; the weights file holds the fitted numbers."""
     features, shape = len(task.features.features), (len(task.horizons), len(task.targets))
     return Scaler(np.zeros(features), np.ones(features), np.zeros(shape), np.ones(shape))

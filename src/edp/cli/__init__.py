@@ -1,0 +1,48 @@
+"""The command line: one file a command, each parses, calls the workflow and prints."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from edp import __version__
+from edp.cli import demo, evaluate, footprint, inspect, report, simulate, train
+from edp.cli.console import run_app
+
+app = typer.Typer(
+    name="edp",
+    help="Fast, accurate plant models of hydraulic machines, learned from recordings and run as a stream.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+app.command("demo")(demo.demo)
+app.command("simulate")(simulate.simulate)
+app.command("inspect")(inspect.inspect)
+app.command("train")(train.train)
+app.command("evaluate")(evaluate.evaluate)
+app.command("footprint")(footprint.footprint)
+app.command("report")(report.report)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Recordings in, a judged and deployable plant model out."""
+
+
+def main() -> None:
+    """Entry point of ``edp``."""
+    sys.exit(run_app(app))

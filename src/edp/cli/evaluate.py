@@ -1,0 +1,81 @@
+"""``edp evaluate``: held-out scores beside baselines."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from edp.workflow import DataSource
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Run folder of edp train.")],
+    data: Annotated[Path | None, typer.Option(help="Other recordings to judge on; default: the held-out ones.")] = None,
+    baselines: Annotated[
+        str | None, typer.Option(help="Comma-separated names, or 'none'; default: those of the settings.")
+    ] = None,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Score a trained model on held-out recordings beside honest baselines.
+
+    Example: `edp evaluate runs/first` or `edp evaluate runs/first --data logs/monday --map mine.toml`
+    """
+    names = None if baselines is None else [n for n in baselines.split(",") if n and n != "none"]
+    source = None if data is None else source_of(data, signal_map, repair)
+    folder, scores = run_evaluation(run, source, names, as_json)
+
+    def show() -> None:
+        score_table(scores)
+        out.print(f"scores in {folder / 'scores.json'}")
+        out.print(f"next: edp report {folder}")
+
+    emit(as_json, {"folder": str(folder), **scores}, show)
+
+
+def run_evaluation(
+    run: Path, source: DataSource | None = None, names: list[str] | None = None, quiet: bool = False
+) -> tuple[Path, dict[str, Any]]:
+    """Judge with a progress display; returns the folder of the scores and the scores."""
+    from edp.storage import read_json
+    from edp.workflow import evaluate as judge_run
+
+    steps, began = Steps(quiet, every_s=0.0), time.monotonic()
+    with progress(quiet) as shown:
+        bar = shown.add_task("evaluate", total=None, note="")
+
+        def on_step(name: str) -> None:
+            shown.update(bar, note=name)
+            steps.say(f"evaluate: {name}, {duration(time.monotonic() - began)} so far")
+
+        folder = judge_run(run, source, names, on_step)
+    return folder, read_json(folder / "scores.json")
+
+
+def score_table(scores: dict[str, Any]) -> None:
+    """Print a table a horizon: every model's mean scores, best first."""
+    rate = scores["task"]["rate_hz"]
+    units = {target["unit"] for target in scores["targets"]}
+    unit = units.pop() if len(units) == 1 else "mixed units"
+    for horizon in scores["task"]["horizons"]:
+        rows = []
+        for model in scores["models"].values():
+            s = model["overall"][str(horizon)]["mean"]
+            r2 = "-" if s["r2"] is None else f"{s['r2']:.4f}"
+            figures = [f"{s[key]:.4g}" for key in ("mae", "rmse", "p95", "p99", "composite")]
+            rows.append((s["mae"], [model["label"], *figures, r2]))
+        rows.sort(key=lambda row: row[0])
+        ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
+        heads = ["model", "MAE", "RMSE", "P95", "P99", "composite", "R2"]
+        table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
+    for name, model in scores["models"].items():
+        for target, found in model.get("integrated", {}).items():
+            out.print(f"free run of the integral of {target}, {name}: RMSE {found['rmse']:.4g} {unit} s")

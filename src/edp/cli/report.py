@@ -1,0 +1,32 @@
+"""``edp report``: the page of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, emit, out
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="Run folder of edp train.")],
+    output: Annotated[Path | None, typer.Option("--out", help="The page; default: report.html in the run.")] = None,
+    title: Annotated[str | None, typer.Option(help="Title of the page.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write one offline page: predictions, errors, baselines, footprint, settings.
+
+    Example: `edp report runs/first`
+    """
+    from edp.report import build_report, headline, read_facts
+
+    page = build_report(run, output, title)
+    line = headline(read_facts(run))
+
+    def show() -> None:
+        out.print(line)
+        out.print(f"report: {page.resolve()}")
+
+    emit(as_json, {"report": str(page), "headline": line}, show)

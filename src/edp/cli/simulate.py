@@ -1,0 +1,73 @@
+"""``edp simulate``: a data set from the built-in excavator."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
+
+if TYPE_CHECKING:
+    from edp.recording import Recording
+
+
+def simulate(
+    folder: Annotated[Path, typer.Argument(help="Folder for the logs; an unfinished data set goes on.")],
+    machine: Annotated[str, typer.Option(help="Machine parameter set.")] = "M22",
+    minutes: Annotated[float, typer.Option(help="Length of all recordings together.")] = 60.0,
+    recordings: Annotated[int, typer.Option(help="How many recordings.")] = 30,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same bits.")] = 0,
+    form: Annotated[str, typer.Option("--format", help="Ending of the logs: parquet, csv or mat.")] = "parquet",
+    workers: Annotated[int, typer.Option(help="Processes; 0 for one a core.")] = 0,
+    as_json: JsonFlag = False,
+) -> None:
+    """Simulate recordings of the built-in excavator in free air.
+
+    Example: `edp simulate data/m22 --minutes 90 --recordings 30 --seed 1`
+    """
+    paths = run(folder, machine, minutes, recordings, seed, form, workers, as_json)
+    facts = {"folder": str(folder), "recordings": len(paths), "minutes": minutes, "machine": machine, "seed": seed}
+
+    def show() -> None:
+        out.print(f"{len(paths)} recordings of {machine}, {minutes:g} min, in {folder}")
+        out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
+
+    emit(as_json, facts, show)
+
+
+def run(
+    folder: Path,
+    machine: str = "M22",
+    minutes: float = 60.0,
+    recordings: int = 30,
+    seed: int = 0,
+    form: str = "parquet",
+    workers: int = 0,
+    quiet: bool = False,
+) -> list[Path]:
+    """Simulate with a progress display."""
+    from edp.errors import ConfigError, closest
+    from edp.logs import known_suffixes
+    from edp.workflow import simulate_data_set
+
+    suffix = f".{form.lstrip('.')}"
+    if suffix not in known_suffixes():
+        raise ConfigError(f"there is no log format '{form}'{closest(form, [s.lstrip('.') for s in known_suffixes()])}")
+    began, steps, made = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
+    with progress(quiet) as shown:
+        bar = shown.add_task("simulate", total=recordings, note="")
+
+        def on_done(recording: Recording, kept: bool) -> None:
+            made["kept" if kept else "new"] += 1
+            made["seconds"] += 0.0 if kept else recording.duration_s
+            elapsed = time.monotonic() - began
+            done = made["kept"] + made["new"]
+            left = elapsed / max(1, made["new"]) * (recordings - done)
+            note = f"{made['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
+            shown.update(bar, advance=1, note=note)
+            steps.say(f"simulate: {done:g} of {recordings} recordings, {note}, {duration(left)} left")
+
+        return simulate_data_set(folder, machine, minutes, recordings, seed, suffix, workers, on_done)

@@ -1,0 +1,109 @@
+"""``edp train``: recordings to a bundle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from edp.training import Bundle, Event
+    from edp.workflow import DataSource
+
+MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
+RepairOption = Annotated[
+    list[str], typer.Option("--repair", help="Mend logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort.")
+]
+
+
+def train(
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run in it goes on.")],
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset.")] = None,
+    preset: Annotated[str, typer.Option(help="quick, standard or thesis.")] = "standard",
+    changes: Annotated[list[str], typer.Option("--set", help="One setting, for example training.epochs=10.")] = [],  # noqa: B006
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Train a causal network on recordings and write a bundle.
+
+    Example: `edp train data/m22 --out runs/first --preset quick --set "task.horizons=[1, 10]"`
+    """
+    bundle, best = run(data, folder, config, preset, changes, source_of(data, signal_map, repair), as_json)
+    facts = {
+        "run": str(folder),
+        "bundle": str(folder / "bundle"),
+        "parameters": sum(parameter.numel() for parameter in bundle.predictor.parameters()),
+        "seconds": bundle.provenance["seconds"],
+        "validation_mae": best,
+    }
+
+    def show() -> None:
+        tail = "" if best is None else f", validation MAE {best:.4g} (report units)"
+        out.print(f"trained in {duration(bundle.provenance['seconds'])}{tail}; bundle in {folder / 'bundle'}")
+        out.print(f"next: edp evaluate {folder}")
+
+    emit(as_json, facts, show)
+
+
+def run(
+    data: Path,
+    folder: Path,
+    config: Path | None = None,
+    preset: str = "standard",
+    changes: Sequence[str] = (),
+    source: DataSource | None = None,
+    quiet: bool = False,
+) -> tuple[Bundle, float | None]:
+    """Train with a progress display; returns the bundle and the best validation error."""
+    from edp.config import load_experiment
+    from edp.workflow import DataSource
+    from edp.workflow import train as run_training
+
+    experiment = load_experiment(config, preset, changes)
+    with progress(quiet) as shown:
+        display = TrainingDisplay(shown, Steps(quiet))
+        bundle = run_training(source or DataSource.of(data), experiment, folder, display.on_event)
+    return bundle, display.best
+
+
+def source_of(data: Path, signal_map: Path | None, repair: list[str]) -> DataSource:
+    """A data source from command-line options."""
+    from edp.config import build
+    from edp.errors import ConfigError
+    from edp.logs.repair import Repair
+    from edp.workflow import DataSource
+
+    table: dict[str, str] = {}
+    for text in repair:
+        key, sign, value = text.partition("=")
+        if not sign:
+            raise ConfigError(f"--repair '{text}': write what=how, for example nan=hold")
+        table[key] = value
+    return DataSource.of(data, signal_map, build(Repair, table, "--repair") if table else None)
+
+
+class TrainingDisplay:
+    """Shows training events as a bar on a terminal, as lines elsewhere."""
+
+    def __init__(self, shown: Progress, steps: Steps) -> None:
+        self.shown, self.steps = shown, steps
+        self.bar = shown.add_task("train", total=1.0, note="")
+        self.best: float | None = None
+
+    def on_event(self, event: Event) -> None:
+        """Show one event."""
+        if event.row is not None and event.row["best"]:
+            self.best = event.row["validation_mae"]
+        done = ((event.epoch - 1) * event.updates + event.update) / (event.epochs * event.updates)
+        score = "" if self.best is None else f", validation MAE {self.best:.4g}"
+        note = f"epoch {event.epoch}/{event.epochs}, {event.targets_per_s:,.0f} targets/s{score}"
+        self.shown.update(self.bar, completed=done, note=note)
+        self.steps.say(f"train: {note}, {duration(event.seconds_left)} left", force=event.row is not None)

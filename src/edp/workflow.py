@@ -1,0 +1,316 @@
+"""The main jobs as functions: simulate, train, evaluate, report. The command line and scripts call the same ones."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import save
+
+from edp import __version__
+from edp.config import (
+    Experiment,
+    build,
+    experiment_toml,
+    load_data_set,
+    load_experiment,
+    load_signal_map,
+    plain_tree,
+)
+from edp.data.prepared import Prepared, prepare
+from edp.errors import DataError, StorageError
+from edp.evaluation.footprint import Budget, Footprint, footprint
+from edp.evaluation.judge import Evaluation, JudgeSpec, judge
+from edp.logs import find_recordings, read_data_set, read_recording, write_recording
+from edp.logs.repair import Repair
+from edp.models.predictor import ModelSpec, Predictor, build_model, describe
+from edp.recording import Recording
+from edp.report import build_report
+from edp.runs import RunFolder, command_line, environment, run_key
+from edp.signals import SignalMap
+from edp.storage import make_folder, read_json, write_bytes, write_json
+from edp.training import Bundle, Event, fit, load_bundle, make_bundle, save_bundle
+from edp.training.bundle import blank_scaler
+from edp.training.fit import thread_count
+
+SHOWN_RECORDINGS = 6
+SHOWN_TICKS = 60_000
+MANIFEST = "data_set.json"
+
+
+@dataclass(frozen=True)
+class DataSource:
+    """Where recordings come from.
+
+    Attributes:
+        path: a log, a folder of logs, or a data-set file (``.toml``).
+        signal_map: columns to channels; None takes the vocabulary's names.
+        repair: what may be mended.
+    """
+
+    path: Path
+    signal_map: SignalMap | None = None
+    repair: Repair | None = None
+
+    @staticmethod
+    def of(path: str | Path, map_file: str | Path | None = None, repair: Repair | None = None) -> DataSource:
+        """A source from paths."""
+        return DataSource(Path(path), None if map_file is None else load_signal_map(map_file), repair)
+
+    def to_plain(self) -> dict[str, Any]:
+        """What provenance keeps, to read the same data again."""
+        kept: dict[str, Any] = {"path": str(self.path.resolve())}
+        if self.signal_map is not None:
+            kept["map"] = plain_tree(self.signal_map)
+        if self.repair is not None:
+            kept["repair"] = plain_tree(self.repair)
+        return kept
+
+    @staticmethod
+    def from_plain(plain: dict[str, Any]) -> DataSource:
+        """The source that `to_plain` described."""
+        signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
+        repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
+        return DataSource(Path(plain["path"]), signal_map, repair)
+
+    def read(self) -> list[Recording]:
+        """All recordings, at one rate.
+
+        Raises:
+            DataError: nothing to read, or a log that cannot be used as it is.
+        """
+        if self.path.suffix == ".toml":
+            return _read_listed(self.path, self.signal_map)
+        return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
+
+
+def _read_listed(path: Path, signal_map: SignalMap | None) -> list[Recording]:
+    """The recordings of a data-set file; paths in it are relative to it."""
+    settings = load_data_set(path)
+
+    def resolved(entry: str | SignalMap | None) -> SignalMap | None:
+        return load_signal_map(path.parent / entry) if isinstance(entry, str) else entry
+
+    shared = signal_map or resolved(settings.map)
+    recordings = []
+    for entry in settings.recordings:
+        chosen = resolved(entry.map) or shared
+        log = Path(entry.path) if Path(entry.path).is_absolute() else path.parent / entry.path
+        recordings.append(read_recording(log, chosen, name=entry.name, rows=entry.rows, repair=settings.repair))
+    names = [recording.name for recording in recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DataError(f"'{path}': recording name(s) {', '.join(twice)} occur twice; set name = \"...\" for each")
+    rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
+    if max(rates) > 1.001 * min(rates):
+        shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
+        raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
+    return recordings
+
+
+def simulate_data_set(
+    out: str | Path,
+    machine: str = "M22",
+    minutes: float = 60.0,
+    recordings: int = 30,
+    seed: int = 0,
+    suffix: str = ".parquet",
+    workers: int = 0,
+    on_done: Callable[[Recording, bool], None] | None = None,
+) -> list[Path]:
+    """Simulate a data set into a folder, a log each; logs already there from the same plan are kept.
+
+    Args:
+        out: folder; it may hold nothing but an earlier part of the same data set.
+        machine: machine parameter set.
+        minutes: length of all recordings together.
+        recordings: how many recordings.
+        seed: the same seed gives the same bits, whatever `workers`.
+        suffix: ending of the logs, which settles their format.
+        workers: processes; 0 for one a core.
+        on_done: called with each recording and whether it was there already.
+
+    Raises:
+        StorageError: the folder holds another data set or cannot be written.
+    """
+    from edp.sim import plan_data_set, simulate_many
+
+    folder = make_folder(out)
+    plan = plan_data_set(machine, minutes, recordings, seed)
+    identity = {"schema": 1, "edp": __version__, "machine": machine, "plan": [asdict(entry) for entry in plan]}
+    manifest = folder / MANIFEST
+    if manifest.exists() and read_json(manifest) != identity:
+        raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
+    write_json(manifest, identity)
+    paths = [folder / f"{scenario.name}{suffix}" for scenario in plan]
+    missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
+    for scenario, path in zip(plan, paths, strict=True):
+        if on_done is not None and scenario not in missing:
+            on_done(read_recording(path), True)
+    count = workers or os.cpu_count() or 1
+    for recording in simulate_many(missing, min(count, max(1, len(missing)))):
+        write_recording(recording, folder / f"{recording.name}{suffix}")
+        if on_done is not None:
+            on_done(recording, False)
+    return paths
+
+
+def prepare_data(source: DataSource, experiment: Experiment) -> Prepared:
+    """Read and cut a data set for an experiment."""
+    recordings = source.read()
+    first = recordings[0]
+    task = experiment.task.resolve(first.rate_hz, first.channel_names)
+    return prepare(recordings, task, experiment.split, experiment.model.window)
+
+
+def train(
+    source: DataSource,
+    experiment: Experiment,
+    out: str | Path,
+    on_event: Callable[[Event], None] | None = None,
+) -> Bundle:
+    """Train on a data set and write a run folder with its bundle; an interrupted run goes on where it stopped.
+
+    Args:
+        source: where the recordings are.
+        experiment: the settings.
+        out: run folder.
+        on_event: called with progress.
+
+    Raises:
+        EdpError: the data, settings or folder cannot be used; what was on disk stays.
+    """
+    data = prepare_data(source, experiment)
+    key = run_key(plain_tree(experiment), data.digest)
+    with RunFolder(out) as run:
+        run.claim(key, experiment_toml(experiment))
+        fitted = fit(data, experiment.model, experiment.training, (run, key), on_event)
+        provenance = _provenance(source, experiment, data, fitted.seconds)
+        write_json(run.file("provenance.json"), provenance)
+        write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json(Budget()))
+        bundle = make_bundle(fitted.predictor, data, provenance)
+        save_bundle(bundle, run.file("bundle"))
+    return bundle
+
+
+def _provenance(source: DataSource, experiment: Experiment, data: Prepared, seconds: float) -> dict[str, Any]:
+    rate = data.task.rate_hz
+
+    def part(series: Sequence[Any]) -> dict[str, Any]:
+        hours = sum(entry.samples for entry in series) / rate / 3600
+        return {"recordings": len(series), "hours": round(hours, 4), "names": [entry.name for entry in series]}
+
+    return {
+        "edp_version": __version__,
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": command_line(),
+        "seed": experiment.training.seed,
+        "environment": environment(thread_count(experiment.training)),
+        "regime": experiment.training.chunks.regime,
+        "seconds": round(seconds, 2),
+        "device": experiment.training.device,
+        "data": {
+            "source": str(source.path),
+            "reader": source.to_plain(),
+            "rate_hz": rate,
+            "train": part(data.train),
+            "validation": part(data.validation),
+            "test": part(data.test),
+            "digest": data.digest,
+        },
+    }
+
+
+def evaluate(
+    run: str | Path,
+    source: DataSource | None = None,
+    baselines: Sequence[str] | None = None,
+    on_step: Callable[[str], None] | None = None,
+) -> Path:
+    """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
+
+    Args:
+        run: run folder.
+        source: other recordings; all of them are judged.
+        baselines: names; None takes those of the settings.
+        on_step: called with the name of each model before it runs.
+
+    Returns:
+        The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
+    """
+    folder = Path(run)
+    bundle = load_bundle(folder)
+    if not (folder / "provenance.json").is_file():
+        raise StorageError(f"'{folder}' is not a run folder: it has no provenance.json; give the folder of edp train")
+    provenance = read_json(folder / "provenance.json")
+    experiment = load_experiment(folder / "config.toml")
+    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment)
+    if data.digest != provenance["data"]["digest"]:
+        raise DataError(
+            f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "
+            "split would not be the same: train again, or judge other recordings with --data"
+        )
+    target = folder
+    if source is not None:
+        data = replace(data, test=[bundle.task.series(recording) for recording in source.read()])
+        target = make_folder(folder / f"on_{source.path.stem}")
+    chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
+    found = judge(bundle.predictor, data, chosen, describe(bundle.predictor.spec), provenance["seconds"], on_step)
+    write_json(target / "scores.json", found.scores)
+    write_bytes(target / "predictions.safetensors", save(_shown(found)))
+    if source is None:
+        own = found.scores["models"]["network"]["overall"]
+        save_bundle(replace(bundle, scores=own), folder / "bundle")
+    return target
+
+
+def _shown(found: Evaluation) -> dict[str, np.ndarray]:
+    """Truth and predictions of a few recordings, for the report."""
+    tensors: dict[str, np.ndarray] = {}
+    for i, series in enumerate(found.series[:SHOWN_RECORDINGS]):
+        tensors[f"{series.name}/truth"] = np.ascontiguousarray(series.targets[:SHOWN_TICKS])
+        for name in ("network", "ridge_arx"):
+            if name in found.predictions:
+                tensors[f"{series.name}/{name}"] = np.ascontiguousarray(found.predictions[name][i][:SHOWN_TICKS])
+    return tensors
+
+
+def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:
+    """Judge a bundle on ``data.test`` without touching the disk."""
+    return judge(bundle.predictor, data, spec or JudgeSpec(), describe(bundle.predictor.spec))
+
+
+def footprint_of(path: str | Path) -> tuple[Footprint, str]:
+    """Footprint of a bundle, a run folder, or a settings file, and what it is called.
+
+    Raises:
+        EdpError: neither a bundle nor valid settings.
+    """
+    source = Path(path)
+    if source.suffix == ".toml":
+        experiment = load_experiment(source)
+        task = experiment.task.resolve(100.0)
+        return footprint(_untrained(experiment.model, task)), source.stem
+    bundle = load_bundle(source)
+    return footprint(bundle.predictor), describe(bundle.predictor.spec)
+
+
+def _untrained(model: ModelSpec, task: Any) -> Predictor:
+    return build_model(task, model, blank_scaler(task), seed=0)
+
+
+__all__ = [
+    "DataSource",
+    "build_report",
+    "evaluate",
+    "footprint_of",
+    "judge_bundle",
+    "prepare_data",
+    "simulate_data_set",
+    "train",
+]
