@@ -48,7 +48,8 @@ class TrainingSpec:
         clip_norm: largest global gradient norm.
         ema: decay of the weight average that is validated and kept; 0 keeps the weights themselves.
         seed: root of every random choice.
-        threads: CPU threads; 0 for all cores. Another count gives other bits.
+        threads: CPU threads, 0 for all cores; more than one pays for wide networks on an idle machine only, and
+            another count gives other bits.
         device: ``auto``, ``cpu`` or ``cuda``.
 
     Raises:
@@ -66,7 +67,7 @@ class TrainingSpec:
     clip_norm: float = 1.0
     ema: float = 0.995
     seed: int = 0
-    threads: int = 0
+    threads: int = 1
     device: str = "auto"
 
     def __post_init__(self) -> None:
