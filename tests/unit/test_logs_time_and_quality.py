@@ -159,7 +159,7 @@ def test_time_that_cannot_be_used(tmp_path):
         read_recording(log(tmp_path, [0.0], [1.0]))
     with pytest.raises(DataError, match="must be positive"):
         read_recording(path, SignalMap(sample_time_s=0.0))
-    with pytest.raises(DataError, match="rate_hz is 0.0; it must be a positive"):
+    with pytest.raises(DataError, match=r"rate_hz is 0\.0; it must be a positive"):
         read_recording(path, SignalMap(rate_hz=0.0))
 
 

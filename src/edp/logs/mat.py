@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from functools import partial
 from pathlib import Path
@@ -15,9 +14,10 @@ from edp.errors import DataError, closest
 from edp.logs.mat_layouts import INFO, LAYOUTS
 from edp.logs.mat_objects import Found, collect
 from edp.logs.matlab import matio
+from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, time_factor
 from edp.recording import Recording
-from edp.signals import Kind, SignalMap
+from edp.signals import SignalMap
 
 _MAGIC = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 _VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
@@ -39,7 +39,7 @@ class MatFormat:
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read all variables, or the one that the map names."""
         variables = _load(path)
-        info = _info(variables.pop(INFO, None), path)
+        own = _own(variables.pop(INFO, None), path)
         if signal_map.variable is not None:
             if signal_map.variable not in variables:
                 raise DataError(
@@ -53,7 +53,7 @@ class MatFormat:
                 f"'{path}' holds no signals (variables: {', '.join(list(variables)[:12]) or 'none'}); expected "
                 "numeric vectors, structs of them, timeseries, a Dataset or a timetable"
             )
-        return _raw_log(path, found, info, signal_map)
+        return _raw_log(path, found, own, signal_map)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write one variable ``log`` in the wanted layout, and ``edp_info``, a JSON text with units and facts."""
@@ -72,7 +72,7 @@ class MatFormat:
             try:
                 matio.save_to_mat(
                     str(path),
-                    {"log": layout.build(recording), INFO: _info_text(recording)},
+                    {"log": layout.build(recording), INFO: facts_text(recording)},
                     version=_VERSIONS[options.mat_version],
                     saveobj_classes=list(layout.saveobj_classes) or None,
                 )
@@ -125,37 +125,17 @@ def _load(path: Path) -> dict[str, Any]:
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
-def _info(value: Any, path: Path) -> dict[str, Any]:
+def _own(value: Any, path: Path) -> OwnFacts:
     if value is None:
-        return {}
-    try:
-        facts = json.loads(str(np.asarray(value).ravel()[0]))
-    except (ValueError, IndexError) as error:
-        raise DataError(f"'{path}': its variable '{INFO}' is not valid JSON ({error})") from error
-    if not isinstance(facts, dict) or "rate_hz" not in facts:
-        raise DataError(f"'{path}': its variable '{INFO}' states no rate_hz")
-    return facts
+        return OwnFacts()
+    array = np.asarray(value)
+    return own_facts(str(array.ravel()[0]) if array.size else "", f"'{path}', variable '{INFO}'")
 
 
-def _info_text(recording: Recording) -> str:
-    channels = [
-        {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in recording.channels
-    ]
-    facts = {
-        "name": recording.name,
-        "rate_hz": recording.rate_hz,
-        "source": recording.source,
-        "meta": dict(recording.meta),
-        "channels": channels,
-    }
-    return json.dumps(facts)
-
-
-def _raw_log(path: Path, found: Found, info: dict[str, Any], signal_map: SignalMap) -> RawLog:
-    known = {entry["name"]: entry for entry in info.get("channels", [])}
+def _raw_log(path: Path, found: Found, own: OwnFacts, signal_map: SignalMap) -> RawLog:
     names = [part.name for part in found.signals]
     timeless = [part.name for part in found.signals if part.time is None]
-    time_name = None if info else find_time(timeless, signal_map, path)
+    time_name = None if own.rate_hz else find_time(timeless, signal_map, path)
     time: Column | None = None
     if time_name is not None:
         part = found.signals[names.index(time_name)]
@@ -164,7 +144,7 @@ def _raw_log(path: Path, found: Found, info: dict[str, Any], signal_map: SignalM
     for part in found.signals:
         if part.name == time_name:
             continue
-        entry = known.get(part.name, {})
+        channel = own.channels.get(part.name)
         own_time = part.time if signal_map.sample_time_s is None else None
         if own_time is None and time is not None and len(time) == len(part.values):
             own_time = time
@@ -173,11 +153,10 @@ def _raw_log(path: Path, found: Found, info: dict[str, Any], signal_map: SignalM
             partial(np.asarray, part.values, dtype=np.float64),
             len(part.values),
             own_time,
-            unit=part.unit or entry.get("unit"),
-            kind=Kind(entry["kind"]) if entry else None,
-            description=entry.get("description", ""),
+            unit=part.unit or (channel.unit if channel else None),
+            kind=channel.kind if channel else None,
+            description=channel.description if channel else "",
         )
-    if info:
-        signals = {name: signals[name] for name in known if name in signals}
-    rate = info.get("rate_hz")
-    return RawLog(path, signals, found.scalars, rate, info.get("name"), info.get("source", ""), info.get("meta", {}))
+    if own.channels:
+        signals = {name: signals[name] for name in own.channels if name in signals}
+    return RawLog(path, signals, found.scalars, own.rate_hz, own.name, own.source, own.meta)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from edp.errors import DataError
+from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, time_factor
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
@@ -45,30 +44,17 @@ class ParquetFormat:
             schema, rows = parquet.schema_arrow, parquet.metadata.num_rows
         except (pa.ArrowException, OSError, ValueError) as error:
             raise DataError(f"'{path}' is a damaged Parquet file: {error}") from error
-        own = _own_facts(schema.metadata or {}, path)
+        own = _own(schema.metadata or {}, path)
         fields = [field for field in schema if _is_number(field.type)]
         time = None
-        time_name = None if own else find_time([field.name for field in schema], signal_map, path)
+        time_name = None if own.rate_hz else find_time([field.name for field in schema], signal_map, path)
         if time_name is not None:
             time = _stamps(parquet, schema.field(time_name), path, signal_map)
         signals = {field.name: _signal(parquet, field, path, rows, time) for field in fields if field.name != time_name}
-        return RawLog(
-            path,
-            signals,
-            rate_hz=own.get("rate_hz"),
-            name=own.get("name"),
-            source=own.get("source", ""),
-            meta=own.get("meta", {}),
-        )
+        return RawLog(path, signals, rate_hz=own.rate_hz, name=own.name, source=own.source, meta=own.meta)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write float32 columns in groups of rows; there is no time column: row k is at k / rate_hz."""
-        facts = {
-            "name": recording.name,
-            "rate_hz": recording.rate_hz,
-            "source": recording.source,
-            "meta": dict(recording.meta),
-        }
         fields = [
             pa.field(
                 channel.name,
@@ -77,7 +63,7 @@ class ParquetFormat:
             )
             for channel in recording.channels
         ]
-        schema = pa.schema(fields, metadata={_KEY: json.dumps(facts).encode()})
+        schema = pa.schema(fields, metadata={_KEY: facts_text(recording).encode()})
         with (
             path.open("wb") as stream,
             pq.ParquetWriter(
@@ -93,16 +79,8 @@ class ParquetFormat:
 FORMATS.register("parquet")(ParquetFormat())
 
 
-def _own_facts(metadata: dict[bytes, bytes], path: Path) -> dict[str, Any]:
-    if _KEY not in metadata:
-        return {}
-    try:
-        facts = json.loads(metadata[_KEY])
-    except ValueError as error:
-        raise DataError(f"'{path}': its recording metadata is not valid JSON ({error})") from error
-    if not isinstance(facts, dict) or not isinstance(facts.get("rate_hz"), int | float):
-        raise DataError(f"'{path}': its recording metadata states no rate_hz")
-    return facts
+def _own(metadata: dict[bytes, bytes], path: Path) -> OwnFacts:
+    return own_facts(metadata[_KEY].decode(errors="replace"), f"'{path}'") if _KEY in metadata else OwnFacts()
 
 
 def _is_number(kind: pa.DataType) -> bool:

@@ -1,0 +1,64 @@
+"""The facts that EDP writes into its own Parquet and MAT files, as JSON: rate, name, source, meta and channels."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from edp.errors import DataError
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+
+
+@dataclass(frozen=True)
+class OwnFacts:
+    """What a file that EDP wrote says about itself; without `rate_hz` the file is someone else's."""
+
+    rate_hz: float | None = None
+    name: str | None = None
+    source: str = ""
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    channels: Mapping[str, Channel] = field(default_factory=dict)
+
+
+def facts_text(recording: Recording) -> str:
+    """A recording's facts as JSON."""
+    channels = [
+        {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in recording.channels
+    ]
+    return json.dumps(
+        {
+            "name": recording.name,
+            "rate_hz": recording.rate_hz,
+            "source": recording.source,
+            "meta": dict(recording.meta),
+            "channels": channels,
+        }
+    )
+
+
+def own_facts(text: str, where: str) -> OwnFacts:
+    """Read `facts_text` back.
+
+    Raises:
+        DataError: the text is damaged.
+    """
+    try:
+        facts = json.loads(text)
+        rate = float(facts["rate_hz"])
+        if not (math.isfinite(rate) and rate > 0):
+            raise ValueError(f"rate_hz is {rate}")
+        channels = [
+            Channel(str(entry["name"]), Kind(entry["kind"]), str(entry["description"])) for entry in facts["channels"]
+        ]
+        return OwnFacts(
+            rate, str(facts["name"]), str(facts["source"]), dict(facts["meta"]), {c.name: c for c in channels}
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{where}: the facts that EDP wrote into it are damaged ({type(error).__name__}: {error}); "
+            "copy or export it again"
+        ) from error
