@@ -40,7 +40,7 @@ class ParquetFormat:
         if tail != _MAGIC:
             raise DataError(f"'{path}' is a Parquet file whose end is missing (truncated); copy or export it again")
         try:
-            parquet = pq.ParquetFile(path)
+            parquet = pq.ParquetFile(path, page_checksum_verification=True)
             schema, rows = parquet.schema_arrow, parquet.metadata.num_rows
         except (pa.ArrowException, OSError, ValueError) as error:
             raise DataError(f"'{path}' is a damaged Parquet file: {error}") from error
@@ -67,7 +67,12 @@ class ParquetFormat:
         with (
             path.open("wb") as stream,
             pq.ParquetWriter(
-                stream, schema, compression="zstd", use_dictionary=False, use_byte_stream_split=True
+                stream,
+                schema,
+                compression="zstd",
+                use_dictionary=False,
+                use_byte_stream_split=True,
+                write_page_checksum=True,
             ) as writer,
         ):
             for start in range(0, recording.samples, _GROUP_ROWS):
