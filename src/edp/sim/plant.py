@@ -52,9 +52,13 @@ def near_end(row: Array, axes: Array) -> bool:
 
 @compiled
 def run_samples(
-    state: Array, valves: Array, demands: Array, first: int, delays: Array, clocks: Array, setup: tuple, log: Array
+    state: Array, valves: Array, demands: Array, delays: Array, clocks: Array, setup: tuple, log: Array
 ) -> int:
-    """Run one sample per row of `log`; returns the number of clamped pressures."""
+    """Run one sample per row of `log`; returns the number of clamped pressures.
+
+    `demands` holds past demands first: its last rows belong to `log`. `delays` is in samples.
+    """
+    first = demands.shape[0] - log.shape[0]
     axes, plant, work = setup
     held = np.empty(at.SPOOLS)
     clamps = 0
@@ -135,7 +139,7 @@ class Plant:
         demands = np.concatenate((self._demands, fresh))
         log = np.empty((len(levers), LOG_COLUMNS))
         setup = (self.axes, self.plant, self.work)
-        self.clamps += run_samples(self.state, self.valves, demands, self._past, self._delays, self._clocks, setup, log)
+        self.clamps += run_samples(self.state, self.valves, demands, self._delays, self._clocks, setup, log)
         self._demands = demands[-self._past :].copy()
         return log
 

@@ -1,0 +1,239 @@
+"""The split ROS2 integrator against SciPy's Radau on a plain NumPy model, written from the machine file alone."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from edp.sim import layout as at
+from edp.sim import load_machine
+from edp.sim.plant import LOG_VELOCITY, Plant
+
+ATM = 1.013e5
+LEVERS = ((0.6, -0.45, 0.5), (-0.35, 0.7, -0.3), (0.0, 0.0, 0.0))
+PIECE_S = 0.4
+
+
+def smooth(machine):
+    """Without dead time and play, which no ordinary differential equation has."""
+    valves = dataclasses.replace(machine.valves, dead_time=(0.0,) * 3, conflux_extra_dead_time=0.0, hysteresis=0.0)
+    return dataclasses.replace(machine, valves=valves)
+
+
+class Reference:
+    """Right-hand side of plant, pilots and spools; state as in section 3 of the model, pilots and spools last."""
+
+    def __init__(self, machine, levers):
+        self.m = machine
+        m, v = machine, machine.valves
+        zone, start = v.lever_dead_zone, v.conflux_start
+        size = np.maximum(np.abs(levers) - zone, 0) / (1 - zone)
+        second = np.clip((size - start) / (1 - start), 0, 1)
+        share = np.where(np.array(levers) > 0, v.conflux_extend, v.conflux_retract)
+        self.demand = np.concatenate((np.sign(levers) * size, np.sign(levers) * second * share))
+        bore, rod, n = (np.array(x) for x in (m.cylinders.bore, m.cylinders.rod, m.cylinders.count))
+        self.head_area, self.rod_area = n * math.pi * bore**2 / 4, n * math.pi * (bore**2 - rod**2) / 4
+        self.stroke = np.array(m.cylinders.stroke)
+        self.thin = math.exp(0.035 * (m.oil.temperature - 40))
+
+    @staticmethod
+    def k(rating):
+        return rating[0] / 6e4 / math.sqrt(rating[1] * 1e5)
+
+    @staticmethod
+    def orifice(dp):
+        return dp * (dp * dp + 1e10) ** -0.25
+
+    def check(self, dp):
+        return self.orifice(dp) * (1.0 if dp >= 0 else self.m.valves.check_leakage)
+
+    def length(self, i, psi):
+        if i < 2:
+            c = (self.m.boom_cylinder, self.m.arm_cylinder)[i]
+            phi = math.radians(c.offset_deg) + (psi if i == 0 else -psi)
+            return abs(c.base_radius - c.rod_radius * np.exp(1j * phi))
+        b = self.m.bucket_linkage
+        pin = self.m.bodies.length[1]
+        pivot = complex(pin - b.pivot_to_pin, b.pivot_offset)
+        lug = pin + b.lug * np.exp(1j * (psi + b.lug_angle))
+        d = abs(lug - pivot)
+        corner = math.acos((b.rocker**2 + d**2 - b.link**2) / (2 * b.rocker * d))
+        end = pivot + b.rocker * (lug - pivot) / d * np.exp(1j * corner)
+        return abs(end - complex(*b.cylinder_pin))
+
+    def bodies(self, psi, rate):
+        """Mass matrix and bias from point Jacobians of the centres of mass, in the complex plane."""
+        b = self.m.bodies
+        angle = np.cumsum(psi)
+        spin = np.cumsum(rate)
+        unit = np.exp(1j * angle)
+        mass, bias = np.zeros((3, 3)), np.zeros(3)
+        for i in range(3):
+            arms = [b.length[j] * unit[j] for j in range(i)] + [complex(b.com_x[i], b.com_y[i]) * unit[i]]
+            jac = np.zeros(3, complex)
+            for j in range(i + 1):
+                jac[j] = 1j * sum(arms[j:])
+            turn = (np.arange(3) <= i).astype(float)
+            accel = -sum(a * spin[j] ** 2 for j, a in enumerate(arms)) + 1j * self.m.gravity
+            mass += b.mass[i] * np.real(np.outer(jac, jac.conj())) + b.inertia[i] * np.outer(turn, turn)
+            bias += b.mass[i] * np.real(jac.conj() * accel)
+        return mass, bias
+
+    def openings(self, i, spool, conflux, stroke):
+        v = self.m.valves
+
+        def area(s, band):
+            r = min(max((abs(s) - band) / (1 - band), 0), 1)
+            return r * (0.25 + 0.75 * r)
+
+        a, a2 = area(spool, v.dead_band[i]), area(conflux, v.conflux_dead_band[i])
+        out = spool > 0
+        r = min(max(((self.stroke[i] - stroke) if out else stroke) / self.m.cylinders.cushion_length[i], 0), 1)
+        least = self.m.cylinders.cushion_area[i]
+        left = least + (1 - least) * r * r * (3 - 2 * r)
+        main = self.k((v.meter_in_extend if out else v.meter_in_retract)[i]) * a
+        second = self.k((v.conflux_in_extend if conflux > 0 else v.conflux_in_retract)[i]) * a2
+        drain = self.k((v.meter_out_extend if out else v.meter_out_retract)[i]) * a * left
+        regen = self.k((v.regeneration_extend if out else v.regeneration_retract)[i]) * a * left
+        return main, second, drain, regen
+
+    def flows(self, i, p, spools, stroke):
+        """Head and rod inflow and the flow drawn from each pump; p = head, rod, pump 1, pump 2."""
+        m, v = self.m, self.m.valves
+        spool, conflux = spools[i], spools[i + 3]
+        main, second, drain, regen = self.openings(i, spool, conflux, stroke)
+        q, drawn = np.zeros(2), np.zeros(2)
+        for k, s, pump in ((main, spool, v.primary_pump[i] - 1), (second, conflux, v.conflux_pump[i] - 1)):
+            side = 0 if s > 0 else 1
+            flow = k * self.check(p[2 + pump] - p[side])
+            q[side] += flow
+            drawn[pump] += flow
+        side = 1 if spool > 0 else 0
+        q[side] -= drain * self.orifice(p[side] - m.oil.tank_pressure)
+        across = regen * self.check(p[side] - p[1 - side])
+        q[side] -= across
+        q[1 - side] += across
+        leak = m.cylinders.piston_leakage[i] * self.thin * (p[0] - p[1])
+        q += np.array([-leak, leak])
+        for side, relief in enumerate((v.port_relief_head[i], v.port_relief_rod[i])):
+            q[side] -= m.cylinders.spool_leakage[i] * self.thin * (p[side] - m.oil.tank_pressure)
+            q[side] -= v.port_relief_slope * max(p[side] - relief, 0)
+            q[side] += self.k(v.anti_cavitation) * self.orifice(max(m.oil.tank_pressure - p[side], 0))
+        return q, drawn
+
+    def bulk(self, p):
+        a = self.m.oil.air_fraction * ATM / (p + ATM)
+        beta = self.m.oil.bulk_modulus * (1 - 0.004 * (self.m.oil.temperature - 45))
+        return (1 + a) / (1 / beta + a / (p + ATM))
+
+    def friction(self, i, v, z):
+        f = self.m.friction
+        scale = self.head_area[i] * 343e5
+        fade = math.exp(-((v / f.stribeck_velocity) ** 2))
+        g = scale * (f.coulomb_fraction + (f.static_fraction - f.coulomb_fraction) * fade)
+        z_rate = v - f.bristle_stiffness[i] * abs(v) * z / g
+        viscous = f.viscous[i] * math.exp(-0.0175 * (self.m.oil.temperature - 40))
+        return f.bristle_stiffness[i] * z + f.bristle_damping[i] * fade * z_rate + viscous * v, z_rate
+
+    def pumps(self, y, pilots, spools, drawn):
+        m, v = self.m, self.m.valves
+        asked, bypass = np.full(2, m.pumps.min_displacement), np.ones(2)
+        for j in range(6):
+            pump = (v.primary_pump if j < 3 else v.conflux_pump)[j % 3] - 1
+            gain = (v.pump_demand_extend if pilots[j] >= 0 else v.pump_demand_retract)[j % 3]
+            asked[pump] = max(asked[pump], min(gain * max(abs(pilots[j]) - 0.1, 0) / 0.75, 1))
+            bypass[pump] *= max(1 - abs(spools[j]) / m.pumps.bypass_closed_at, 0) ** 2
+        p, d = y[12:14], y[17:19]
+        limit = min(1.0, m.pumps.power_limit / max(m.pumps.max_flow * float(asked @ np.maximum(p, 0)), 1.0))
+        lost = np.array([self.orifice(x - m.oil.tank_pressure) for x in p]) * bypass * self.k(m.pumps.bypass)
+        lost += m.pumps.relief_slope * np.maximum(p - m.pumps.relief, 0)
+        supply = m.pumps.volumetric_efficiency * m.pumps.max_flow * d
+        p_rate = np.array([self.bulk(x) for x in p]) / m.pumps.line_volume * (supply - lost - drawn)
+        return p_rate, (asked * limit - d) / m.pumps.time_constant
+
+    def __call__(self, t, y):
+        m = self.m
+        out = np.zeros_like(y)
+        psi, rate = y[:3], y[3:6]
+        pilots, spools = y[19:31].reshape(2, 6), y[31:43].reshape(2, 6)
+        mass, bias = self.bodies(psi, rate)
+        torque, drawn = -bias, np.zeros(2)
+        for i in range(3):
+            d = 1e-5
+            lever = (self.length(i, psi[i] + d) - self.length(i, psi[i] - d)) / (2 * d)
+            closed = (m.boom_cylinder, m.arm_cylinder, m.bucket_linkage)[i].closed_length
+            stroke, v = self.length(i, psi[i]) - closed, lever * rate[i]
+            p = np.array([y[6 + i], y[9 + i], y[12], y[13]])
+            q, taken = self.flows(i, p, spools[0], stroke)
+            drawn += taken
+            ends = np.array([self.head_area[i], self.rod_area[i]])
+            volume = m.cylinders.dead_length * ends + m.cylinders.hose_volume[i]
+            volume += ends * np.array([stroke, self.stroke[i] - stroke])
+            out[6 + i] = self.bulk(p[0]) / volume[0] * (q[0] - ends[0] * v)
+            out[9 + i] = self.bulk(p[1]) / volume[1] * (q[1] + ends[1] * v)
+            drag, out[14 + i] = self.friction(i, v, y[14 + i])
+            torque[i] += lever * (ends[0] * p[0] - ends[1] * p[1] - drag)
+        out[:3], out[3:6] = rate, np.linalg.solve(mass, torque)
+        out[12:14], out[17:19] = self.pumps(y, pilots[0], spools[0], drawn)
+        valves = m.valves
+        w = 2 * math.pi * np.array(valves.pilot_frequency * 2)
+        out[19:25], out[25:31] = pilots[1], w**2 * (self.demand - pilots[0]) - 2 * 0.9 * w * pilots[1]
+        w = 2 * math.pi * np.array(valves.spool_frequency + valves.conflux_spool_frequency)
+        out[31:37], out[37:43] = spools[1], w**2 * (pilots[0] - spools[0]) - 2 * w * spools[1]
+        return out
+
+
+def run_plant(step_s):
+    plant = Plant(smooth(load_machine("M22")), np.array([0.45, 0.5, 0.5]), step_s=step_s)
+    start = plant.state.copy()
+    levers = np.repeat(np.array(LEVERS), round(PIECE_S * 100), axis=0)
+    return start, plant.run(np.concatenate((levers, levers[-1:])))
+
+
+@pytest.fixture(scope="module")
+def reference():
+    start, _ = run_plant(1e-3)
+    y = np.concatenate((start, np.zeros(24)))
+    machine, rows = smooth(load_machine("M22")), [y[None]]
+    for levers in LEVERS:
+        times = np.arange(1, round(PIECE_S * 100) + 1) / 100
+        model = Reference(machine, levers)
+        found = solve_ivp(model, (0, PIECE_S), y, "Radau", t_eval=times, rtol=1e-6, atol=scales(1e-6), first_step=1e-5)
+        rows.append(found.y.T)
+        y = found.y[:, -1]
+    return np.concatenate(rows)
+
+
+def scales(tolerance):
+    """Absolute tolerances by the size of each state."""
+    sizes = np.concatenate((np.full(6, 0.1), np.full(8, 1e6), np.full(3, 1e-3), np.full(26, 0.1)))
+    return tolerance * sizes
+
+
+def velocities(rows):
+    """Cylinder velocities from angles and rates, m/s, with the reference's own lever arms."""
+    model = Reference(load_machine("M22"), (0.0, 0.0, 0.0))
+    arms = [[(model.length(i, r[i] + 1e-5) - model.length(i, r[i] - 1e-5)) / 2e-5 for i in range(3)] for r in rows]
+    return np.array(arms) * rows[:, 3:6]
+
+
+def test_one_millisecond_matches_radau(reference):
+    _, log = run_plant(1e-3)
+    speed = log[:, LOG_VELOCITY : LOG_VELOCITY + 3]
+    assert speed.std(axis=0).min() > 0.03
+    error = speed - velocities(reference)
+    assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.05e-3
+    pressure = log[:, at.HEAD : at.BRISTLE] - reference[:, at.HEAD : at.BRISTLE]
+    assert np.sqrt(np.mean(pressure**2, axis=0)).max() < 0.1e5
+
+
+def test_convergence_is_second_order():
+    coarse, middle, fine = (run_plant(h)[1][:, LOG_VELOCITY : LOG_VELOCITY + 3] for h in (1e-3, 5e-4, 2.5e-4))
+
+    def rms(error):
+        return float(np.sqrt(np.mean(error**2)))
+
+    order = math.log2(rms(coarse - middle) / rms(middle - fine))
+    assert 1.8 < order < 2.2
