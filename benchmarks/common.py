@@ -1,0 +1,90 @@
+"""What every benchmark shares: arguments, a table for people, results kept, and a last line of JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from edp.runs import command_line, environment
+from edp.storage import write_json
+
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One question answered: ours against a rival measured in the same run.
+
+    Attributes:
+        name: the question.
+        ours: our figure.
+        rival: the rival's figure.
+        ratio: ours over rival.
+        goal: the bound on the ratio, such as ``<= 0.6`` or ``>= 15``.
+        met: whether the ratio keeps the bound.
+        unit: unit of ours and rival.
+        quick: whether this was the short form.
+    """
+
+    name: str
+    ours: float
+    rival: float
+    ratio: float
+    goal: str
+    met: bool
+    unit: str
+    quick: bool
+
+
+def verdict(name: str, ours: float, rival: float, goal: str, unit: str, quick: bool) -> Verdict:
+    """Judge ``ours / rival`` against `goal`, for example ``<= 0.6``."""
+    sign, bound = goal.split()
+    ratio = ours / rival if rival else float("inf")
+    met = ratio <= float(bound) if sign == "<=" else ratio >= float(bound)
+    return Verdict(name, ours, rival, ratio, goal, met, unit, quick)
+
+
+def parser(description: str) -> argparse.ArgumentParser:
+    """Arguments that every benchmark takes."""
+    made = argparse.ArgumentParser(description=description)
+    made.add_argument("--quick", action="store_true", help="under a minute; figures are only indicative")
+    made.add_argument("--seed", type=int, default=0)
+    made.add_argument("--data", type=Path, default=None, help="folder for simulated data, kept between runs")
+    return made
+
+
+def table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Print aligned columns; numbers with four digits."""
+    text = [[_cell(value) for value in row] for row in rows]
+    widths = [max(len(row[i]) for row in [list(headings), *text]) for i in range(len(headings))]
+    for row in [list(headings), *text]:
+        print("  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths))))
+
+
+def finish(script: str, verdicts: Sequence[Verdict], seed: int, details: object = None) -> None:
+    """Print the verdicts, keep the results of the full form, end with one line of JSON."""
+    print()
+    rows = [[v.name, v.ours, v.rival, v.ratio, v.goal, "met" if v.met else "NOT MET", v.unit] for v in verdicts]
+    table(["question", "ours", "rival", "ratio", "goal", "verdict", "unit"], rows)
+    plain = [asdict(v) for v in verdicts]
+    if not any(v.quick for v in verdicts):
+        kept = {
+            "command": command_line(),
+            "date": time.strftime("%Y-%m-%d"),
+            "seed": seed,
+            "environment": environment(0),
+            "verdicts": plain,
+            "details": details,
+        }
+        write_json(RESULTS / f"{script}.json", kept)
+    print(json.dumps(plain if len(plain) != 1 else plain[0]), flush=True)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
