@@ -154,6 +154,7 @@ def load_experiment(
         where = f"'{path}'"
     for text in overrides:
         table = merged(table, _override(text))
+    where += " with --set" if overrides else ""
     return build(Experiment, table, where)
 
 

@@ -85,13 +85,14 @@ class DataSource:
             DataError: nothing to read, or a log that cannot be used as it is.
         """
         if self.path.suffix == ".toml":
-            return _read_listed(self.path, self.signal_map)
+            return _read_listed(self.path, self.signal_map, self.repair)
         return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
 
 
-def _read_listed(path: Path, signal_map: SignalMap | None) -> list[Recording]:
-    """The recordings of a data-set file; paths in it are relative to it."""
+def _read_listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Recording]:
+    """The recordings of a data-set file; paths in it are relative to it, a map or repair given here goes first."""
     settings = load_data_set(path)
+    allowed = repair or settings.repair
 
     def resolved(entry: str | SignalMap | None) -> SignalMap | None:
         return load_signal_map(path.parent / entry) if isinstance(entry, str) else entry
@@ -101,7 +102,7 @@ def _read_listed(path: Path, signal_map: SignalMap | None) -> list[Recording]:
     for entry in settings.recordings:
         chosen = resolved(entry.map) or shared
         log = Path(entry.path) if Path(entry.path).is_absolute() else path.parent / entry.path
-        recordings.append(read_recording(log, chosen, name=entry.name, rows=entry.rows, repair=settings.repair))
+        recordings.append(read_recording(log, chosen, name=entry.name, rows=entry.rows, repair=allowed))
     names = [recording.name for recording in recordings]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

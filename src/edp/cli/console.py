@@ -82,7 +82,7 @@ def duration(seconds: float) -> str:
 def run_app(app: typer.Typer) -> int:
     """Run the command line; a user's mistake ends in one message and exit code 1, Ctrl-C in 130."""
     try:
-        app(standalone_mode=False)
+        code = app(standalone_mode=False)  # the code of a command that raised typer.Exit, else what it returned
     except EdpError as error:
         err.print(f"[bold red]error:[/] {_escaped(str(error))}")
         return 1
@@ -97,7 +97,7 @@ def run_app(app: typer.Typer) -> int:
             raise
         show()
         return int(getattr(error, "exit_code", 2))
-    return 0
+    return code if isinstance(code, int) else 0
 
 
 def _escaped(text: str) -> str:

@@ -39,7 +39,8 @@ def inspect(
         verdict = f"{errors} error(s) that training would refuse" if errors else "no errors"
         out.print(f"{len(plain)} recording(s), {verdict}")
         if not errors:
-            out.print(f"next: edp train {data} --out runs/first")
+            mapped = "" if signal_map is None else f" --map {signal_map}"
+            out.print(f"next: edp train {data}{mapped} --out runs/first")
 
     emit(as_json, {"errors": errors, "recordings": plain}, show)
     if errors:
