@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -122,7 +123,10 @@ class ByTime:
 @SPLITS.register("blocks")
 @dataclass(frozen=True, kw_only=True)
 class ByBlocks:
-    """Blocks of equal duration in turn: every `every`-th block tests, the last share of each other block validates.
+    """Blocks of equal duration in turn: every `every`-th block tests, a share of the others validates.
+
+    Where neighbouring blocks have different parts, the gap is cut from the one that does not test. A rest shorter
+    than half a block joins the block before it.
 
     Attributes:
         block_s: duration of a block in seconds.
@@ -139,19 +143,34 @@ class ByBlocks:
         if self.every < 2 or self.block_s <= 0:
             raise ConfigError("split: every >= 2 and block_s > 0 must hold")
         parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
-        step = max(2, round(1 / self.validation_share)) if self.validation_share > 0 else 0
-        other = 0
+        turn = itertools.count(1)
         for i, recording in enumerate(recordings):
             size = round(self.block_s * recording.rate_hz)
-            for number, start in enumerate(range(0, recording.samples, size)):
-                stop = min(start + size, recording.samples)
-                if number % self.every == self.every - 1:
-                    parts["test"].append(Stretch(i, start, stop))
-                    continue
-                other += 1
-                part = "validation" if step and other % step == 0 else "train"
-                parts[part].append(Stretch(i, start, stop - min(gap, size // 4)))
+            if size <= 2 * gap:
+                raise ConfigError(
+                    f"split: block_s = {self.block_s:g} gives blocks of {size} samples, no more than a gap of {gap} "
+                    "(window plus horizon) at each end; use longer blocks"
+                )
+            starts = list(range(0, max(1, recording.samples - size // 2), size))
+            edges = [*starts, recording.samples]
+            owners = [self._owner(number, turn) for number in range(len(starts))]
+            for number, (part, start, stop) in enumerate(zip(owners, edges[:-1], edges[1:], strict=True)):
+                after = owners[number + 1 : number + 2]
+                if number and part != "test" and owners[number - 1] == "test":
+                    start += gap
+                if after and part != "test" and part != after[0]:
+                    stop -= gap
+                parts[part].append(Stretch(i, start, stop))
         return _checked(parts, recordings)
+
+    def _owner(self, number: int, turn: Iterator[int]) -> str:
+        """Part of block `number`; `turn` counts the blocks that do not test, over all recordings."""
+        if number % self.every == self.every - 1:
+            return "test"
+        other = next(turn)
+        if self.validation_share <= 0:
+            return "train"
+        return "validation" if other % max(2, round(1 / self.validation_share)) == 0 else "train"
 
 
 def _take(names: list[str], share: float, total: int) -> tuple[list[str], list[str]]:

@@ -1,0 +1,139 @@
+"""The parts that exist: what is registered, what fits where, and that the contract tests reach all of it."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+import edp.blocks
+from edp.blocks import BLOCKS
+from edp.blocks.base import BlockSpec, Slot
+from edp.data.features import DERIVATIONS
+from edp.data.splits import SPLITS
+from edp.errors import ConfigError, EdpError
+from edp.losses import LOSSES
+from edp.models.activations import ACTIVATIONS
+from edp.models.backbones import BACKBONES, LstmSpec, TcnSpec
+from edp.models.plain import tagged, untagged
+from edp.models.predictor import ModelSpec
+from edp.registry import Registry
+from edp.training.optimizers import OPTIMIZERS
+from edp.training.schedules import SCHEDULES
+
+SPECS = [BACKBONES, BLOCKS, ACTIVATIONS, LOSSES, OPTIMIZERS, SCHEDULES, SPLITS]
+ENTRIES = [pytest.param(registry, name, id=f"{registry.what}-{name}") for registry in SPECS for name in registry]
+
+
+def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(parts):
+    structures, forms = parts
+    tested = {
+        (BACKBONES.name_of(b), BLOCKS.name_of(blocks[0])) for b, blocks in structures.values() if len(blocks) == 1
+    }
+    fitting = {
+        (backbone, block)
+        for backbone in BACKBONES
+        for block in BLOCKS
+        if BLOCKS[block].slot in {*BACKBONES[backbone]().slots(), Slot.GATE, Slot.BYPASS}
+    }
+    assert tested == fitting
+    # Three backbones and four blocks: 3 + 3 + 4 pairs. A new part must move these numbers.
+    assert (len(BACKBONES), len(BLOCKS), len(fitting)) == (3, 4, 10)
+    assert {block for _, block in fitting} == set(BLOCKS)
+    assert {backbone for backbone, _ in fitting} == set(BACKBONES)
+    assert len(forms) == len(ACTIVATIONS) * 2 * 2
+    # Plain ones, pairs, further options of a part, and one with a block in each slot for each backbone.
+    assert len(structures) == 4 + 10 + 2 * 3 + 3
+
+
+def test_every_file_in_blocks_registers_a_block():
+    files = {path.stem for path in Path(edp.blocks.__path__[0]).glob("*.py")} - {"__init__", "base"}
+    assert files == {BLOCKS[name].__module__.rpartition(".")[2] for name in BLOCKS}
+
+
+@pytest.mark.parametrize("name", list(BLOCKS))
+def test_a_block_names_its_slot_and_a_search_space_of_its_options(name):
+    part = BLOCKS[name]
+    assert isinstance(part(), BlockSpec)
+    assert part.slot in Slot
+    options = {field.name for field in dataclasses.fields(part)}
+    for option, values in part.space.items():
+        assert option in options
+        for value in values:
+            part(**{option: value})
+
+
+@pytest.mark.parametrize(("registry", "name"), ENTRIES)
+def test_a_spec_is_frozen_has_defaults_and_survives_json(registry, name):
+    spec = registry[name]()
+    assert dataclasses.is_dataclass(spec)
+    assert untagged(tagged(spec, registry), registry) == spec
+    assert registry.name_of(spec) == name
+    for field in dataclasses.fields(spec):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(spec, field.name, None)
+
+
+@pytest.mark.parametrize("registry", [*SPECS, DERIVATIONS], ids=lambda registry: registry.what)
+def test_a_misspelt_name_is_answered_with_the_closest(registry: Registry):
+    name = next(iter(registry))
+    with pytest.raises(ConfigError, match=f"unknown {registry.what} '{name}x'.*{name}"):
+        registry[f"{name}x"]
+    with pytest.raises(ConfigError, match="registered twice"):
+        registry.register(name)(object())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("backbone", list(BACKBONES))
+@pytest.mark.parametrize("block", list(BLOCKS))
+def test_a_block_without_its_slot_is_refused(backbone, block):
+    spec = BACKBONES[backbone]()
+    if BLOCKS[block].slot in {*spec.slots(), Slot.GATE, Slot.BYPASS}:
+        ModelSpec(backbone=spec, blocks=(BLOCKS[block](),))
+    else:
+        with pytest.raises(ConfigError, match=f"block '{block}' needs the slot '{BLOCKS[block].slot}'"):
+            ModelSpec(backbone=spec, blocks=(BLOCKS[block](),))
+
+
+@pytest.mark.parametrize("slot", [Slot.GATE, Slot.BYPASS])
+def test_two_blocks_in_a_single_slot_are_refused(slot):
+    block = next(BLOCKS[name]() for name in BLOCKS if BLOCKS[name].slot is slot)
+    with pytest.raises(ConfigError, match=f"share the slot '{slot}'"):
+        ModelSpec(backbone=LstmSpec(), blocks=(block, block))
+
+
+@pytest.mark.parametrize(
+    ("channels", "kernel", "window", "advice"),
+    [
+        ((8, 8), 3, 14, "see 13 samples, the window is 14.*give 3 channels entries"),
+        ((8,), 1, 2, "use a kernel of at least 2"),
+    ],
+)
+def test_a_tcn_must_see_the_whole_window(channels, kernel, window, advice):
+    with pytest.raises(ConfigError, match=advice):
+        TcnSpec(channels=channels, kernel=kernel).build(5, window, ())
+    TcnSpec(channels=(8, 8), kernel=3).build(5, 13, ())
+
+
+BAD = [
+    lambda: BACKBONES["lstm"](units=0),
+    lambda: BACKBONES["lstm"](dropout=1.0),
+    lambda: BACKBONES["tcn"](channels=()),
+    lambda: BACKBONES["hybrid"](channels=(4, 0)),
+    lambda: BACKBONES["hybrid"](kernel=0),
+    lambda: BLOCKS["cylinder_gate"](form="diagnoal"),
+    lambda: BLOCKS["multi_scale_tcn"](first_dilations=(1,)),
+    lambda: BLOCKS["multi_scale_tcn"](first_dilations=(0, 1)),
+    lambda: BLOCKS["linear_bypass"](taps=0),
+    lambda: BLOCKS["linear_bypass"](start="rigde"),
+    lambda: BLOCKS["linear_bypass"](start="zero", trained=False),
+    lambda: ACTIVATIONS["stanh"](start=6.0),
+    lambda: LOSSES["huber"](delta=0.0),
+    lambda: OPTIMIZERS["adamw"](learning_rate=0.0),
+    lambda: SCHEDULES["cosine"](floor=1.5),
+    lambda: ModelSpec(window=0),
+]
+
+
+@pytest.mark.parametrize("make", BAD)
+def test_options_out_of_range_are_refused(make):
+    with pytest.raises(EdpError, match=r"must hold|unknown|at least|change one"):
+        make()

@@ -1,0 +1,96 @@
+"""The thesis's parameter and multiply-accumulate counts (Tables B.1, 4.8, 4.9), and the counter itself."""
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from edp.blocks import CylinderGate, MultiScaleTcn, TemporalDifference
+from edp.data.features import FG2
+from edp.data.scaling import Scaler
+from edp.data.task import TargetMode, Task
+from edp.models.activations import Identity, ScaledTanh
+from edp.models.backbones import HybridSpec
+from edp.models.heads import HeadSpec
+from edp.models.predictor import ModelSpec, build_model
+
+W = 50
+
+
+def network(channels, kernel, head, blocks, activation=None):
+    """A hybrid network whose LSTM is as wide as its first level, in double precision."""
+    spec = ModelSpec(
+        backbone=HybridSpec(channels=channels, kernel=kernel, units=channels[0]),
+        head=head,
+        activation=activation or Identity(),
+        blocks=blocks,
+        window=W,
+    )
+    task = Task(FG2, ("CylVels_1", "CylVels_2", "CylVels_3"), (10,), TargetMode.DELTA, 100.0)
+    scaler = Scaler(np.zeros(30), np.ones(30), np.zeros((1, 3)), np.ones((1, 3)))
+    return build_model(task, spec, scaler, seed=0).double().eval()
+
+
+DIFFERENCE, SCALES = (TemporalDifference(),), (MultiScaleTcn(),)
+# Network; parameters, those left after folding, MACs per window in M and per tick in k, to the digits known.
+GOLDEN = {
+    "Table B.1": (
+        ((256, 128, 64, 32), 3, HeadSpec(hidden=64, layers=2), (*SCALES, CylinderGate()), ScaledTanh()),
+        (1_376_775, 1_374_852, "62.88", "1379"),
+    ),
+    "teacher": (((256,), 5, HeadSpec(hidden=128), DIFFERENCE, ScaledTanh()), (1_197_319, 1_196_804, "45.198", "1206")),
+    "A_u64": (((64,), 5, HeadSpec(hidden=32), DIFFERENCE), (84_292, 84_164, "3.257", "86.6")),
+    "A_u32": (((32,), 5, HeadSpec(hidden=16), DIFFERENCE), (24_228, 24_164, "0.958", "25.4")),
+    "teacher P4": (((128, 64, 32), 7, HeadSpec(hidden=64), SCALES), (677_572, 676_676, "31.281", "680.5")),
+    "P4 A_u64": (((64, 32), 7, HeadSpec(hidden=32), SCALES), (181_956, 181_572, "8.409", "183.6")),
+    "P4 A_u32": (((32, 16), 7, HeadSpec(hidden=16), SCALES), (53_604, 53_412, "2.486", "54.4")),
+}
+
+
+def digits(value, printed):
+    """`value` with as many decimals as `printed` has."""
+    return f"{value:.{len(printed.partition('.')[2])}f}"
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_counts_are_those_of_the_thesis(name):
+    made, (parameters, folded, window, tick) = GOLDEN[name]
+    rows = network(*made).costs()
+    assert sum(row.parameters for row in rows) == parameters
+    assert parameters - sum(row.foldable for row in rows) == folded
+    per_window = sum(W * row.per_column + row.per_prediction for row in rows)
+    per_tick = sum(row.per_column + row.per_prediction + row.pooling for row in rows)
+    assert digits(per_window / 1e6, window) == window
+    assert digits(per_tick / 1e3, tick) == tick
+
+
+def counted(predictor, x):
+    """MACs of matrix products and convolutions by module, as PyTorch's dispatcher sees them; half its flops.
+
+    Double precision keeps the LSTM off the fused kernels, which the dispatcher cannot look into. Element-wise work
+    (gates, activations, softmax, scaling, biases) has no matrix product and is counted by neither side.
+    """
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        predictor(x, predictor.initial_state(len(x), x))
+    return {name: sum(flops.values()) // 2 for name, flops in counter.get_flop_counts().items()}
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_the_counter_agrees_with_the_operations_that_run(name):
+    predictor = network(*GOLDEN[name][0])
+    rows = predictor.costs()
+    x = torch.zeros(1, 1, 24, dtype=torch.float64)
+    tick = counted(predictor, x)["Global"]
+    assert tick == sum(row.per_column + row.per_prediction + row.pooling for row in rows)
+    window = counted(predictor, torch.zeros(1, W, 24, dtype=torch.float64))
+    # The thesis's windowed figure runs the heads once and leaves pooling out; a stream runs both at every tick.
+    backbone = window["Predictor.backbone"] - window["Predictor.backbone.pooling"]
+    heads = window["Predictor.heads"] // W
+    assert backbone + heads == sum(W * row.per_column + row.per_prediction for row in rows)
+
+
+def test_the_counter_agrees_for_every_structure(structure, predictor_of):
+    predictor = predictor_of(structure)
+    x = torch.zeros(1, 1, predictor.front.inputs, dtype=torch.float64)
+    rows = predictor.costs()
+    assert counted(predictor, x)["Global"] == sum(row.per_column + row.per_prediction + row.pooling for row in rows)

@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edp.data.features import FeatureSet
+from edp.data.prepared import prepare
+from edp.data.splits import SPLITS, ByBlocks, ByRecording, ByTime
+from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError, DataError
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+
+CHANNELS = (Channel("a", Kind.VELOCITY, "boom speed"), Channel("b", Kind.PRESSURE))
+
+
+def recordings(*samples):
+    return [
+        Recording(f"r{i}", CHANNELS, np.random.default_rng(i).normal(size=(n, 2)).astype(np.float32), 10.0)
+        for i, n in enumerate(samples)
+    ]
+
+
+def parts_of(split):
+    return {"train": split.train, "validation": split.validation, "test": split.test}
+
+
+def check(split, given_recordings, gap):
+    """Every stretch is inside its recording; no row has two parts; different parts are `gap` rows apart."""
+    flat = [(s, part) for part, stretches in parts_of(split).items() for s in stretches]
+    assert all(parts_of(split).values())
+    for stretch, _ in flat:
+        assert 0 <= stretch.start < stretch.stop <= given_recordings[stretch.recording].samples
+    for i, (one, part) in enumerate(flat):
+        for other, other_part in flat[i + 1 :]:
+            if one.recording == other.recording:
+                between = max(one.start, other.start) - min(one.stop, other.stop)
+                assert between >= (gap if part != other_part else 0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    samples=st.lists(st.integers(300, 1500), min_size=1, max_size=6),
+    gap=st.integers(1, 20),
+    kind=st.sampled_from(list(SPLITS)),
+    seed=st.integers(0, 5),
+)
+def test_parts_are_disjoint_with_a_gap(samples, gap, kind, seed):
+    logged = recordings(*samples)
+    options = {"recordings": {"seed": seed}, "blocks": {"block_s": 8.0, "validation_share": 0.5}}.get(kind, {})
+    spec = SPLITS[kind](**options)
+    try:
+        split = spec.split(logged, gap)
+    except DataError:
+        # One whole recording cannot be shared out among three parts.
+        assert kind == "recordings"
+        assert len(samples) < 2
+        return
+    check(split, logged, gap)
+    assert spec.split(logged, gap) == split
+
+
+def test_time_splits_in_order():
+    split = ByTime(validation_share=0.2, test_share=0.2).split(recordings(1000), 30)
+    assert [(s.start, s.stop) for part in parts_of(split).values() for s in part] == [(0, 570), (600, 770), (800, 1000)]
+
+
+def test_recordings_keep_whole_recordings_and_honour_names():
+    logged = recordings(*[100] * 10)
+    split = ByRecording(seed=3).split(logged, 10)
+    assert [len(part) for part in parts_of(split).values()] == [6, 2, 2]
+    assert all((s.start, s.stop) == (0, 100) for part in parts_of(split).values() for s in part)
+    named = ByRecording(validation=("r1",), test=("r0", "r9")).split(logged, 10)
+    assert [s.recording for s in named.validation] == [1]
+    assert {s.recording for s in named.test} == {0, 9}
+    assert len(named.train) == 7
+
+
+def test_two_recordings_validate_on_the_tail_of_the_one_that_trains():
+    split = ByRecording(tail_share=0.2).split(recordings(1000, 1000), 50)
+    assert split.train[0].recording == split.validation[0].recording != split.test[0].recording
+    assert (split.train[0].stop, split.validation[0].start) == (750, 800)
+
+
+def test_blocks_test_every_third_and_are_apart():
+    logged = recordings(2000)
+    split = ByBlocks(block_s=20.0, every=3, validation_share=0.25).split(logged, 10)
+    check(split, logged, 10)
+    assert [(s.start, s.stop) for s in split.test] == [(400, 600), (1000, 1200), (1600, 1800)]
+    # Blocks 0 and 1 both train: no gap between them is needed.
+    assert [(s.start, s.stop) for s in split.train][:3] == [(0, 200), (200, 390), (610, 790)]
+    assert [(s.start, s.stop) for s in split.validation] == [(800, 990)]
+
+
+def test_a_short_rest_joins_the_last_block():
+    split = ByBlocks(block_s=20.0, every=3, validation_share=0.5).split(recordings(699), 10)
+    assert [(s.start, s.stop) for part in parts_of(split).values() for s in part] == [(0, 190), (200, 390), (400, 699)]
+
+
+@pytest.mark.parametrize(
+    ("spec", "samples", "message"),
+    [
+        (ByRecording(validation=("r7",)), (100, 100), "no recording 'r7'"),
+        (ByRecording(validation=("r0",), test=("r0",)), (100, 100, 100), "both in validation and in test"),
+        (ByRecording(), (100,), "no recording is left for train"),
+        (ByTime(), (40,), "too short"),
+        (ByBlocks(every=3), (150,), "no recording is left for"),
+    ],
+)
+def test_data_that_cannot_be_divided_is_refused(spec, samples, message):
+    with pytest.raises(DataError, match=message):
+        spec.split(recordings(*samples), 30)
+
+
+@pytest.mark.parametrize(
+    "spec", [ByTime(validation_share=0.6, test_share=0.4), ByBlocks(every=1), ByBlocks(block_s=2.0)]
+)
+def test_options_that_leave_nothing_are_refused(spec):
+    with pytest.raises(ConfigError, match="split"):
+        spec.split(recordings(1000), 10)
+
+
+def test_prepared_data_keep_window_and_horizon_between_parts_and_know_their_channels():
+    task = Task(FeatureSet("f", ("a", "b")), ("a",), (5,), TargetMode.DELTA, 10.0)
+    logged = recordings(1000, 800)
+    data = prepare(logged, task, ByTime(), window=20)
+    assert [part.samples for part in data.train] == [1000 - 350 - 25, 800 - 280 - 25]
+    np.testing.assert_array_equal(data.test[1].inputs, logged[1].values[640:])
+    assert data.test[1].name == "r1[640:800]"
+    assert data.descriptions == ("boom speed",)
+    assert data.target_kinds == (Kind.VELOCITY,)
+    assert prepare(logged, task, ByTime(), window=20).digest == data.digest
+    assert prepare(logged, task, ByTime(), window=21).digest != data.digest
+    assert prepare(recordings(1000, 801), task, ByTime(), window=20).digest != data.digest
