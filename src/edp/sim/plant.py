@@ -41,11 +41,13 @@ def write_log(state: Array, demand: Array, axes: Array, plant: Array, row: Array
 
 @compiled
 def near_end(row: Array, axes: Array) -> bool:
-    """Whether any cylinder of a logged sample moves within, or will soon reach, a cushion or stop."""
+    """Whether any cylinder of a logged sample runs into a cushion, or moves at a stop."""
     for i in range(at.AXES):
         v, stroke = row[LOG_VELOCITY + i], row[LOG_STROKE + i]
-        margin = axes[i, at.CUSHION_LENGTH] + 0.02 * abs(v)
-        if min(stroke, axes[i, at.STROKE] - stroke) < margin and abs(v) > 1e-3:
+        ahead = axes[i, at.STROKE] - stroke if v > 0.0 else stroke
+        braking = abs(v) > 1e-2 and ahead < axes[i, at.CUSHION_LENGTH] + 0.02 * abs(v)
+        touching = abs(v) > 1e-3 and min(stroke, axes[i, at.STROKE] - stroke) < 1e-3
+        if braking or touching:
             return True
     return False
 
@@ -134,8 +136,7 @@ class Plant:
         The log has shape (samples, LOG_COLUMNS); row k is the state at the instant at which lever k is applied.
         """
         fresh = np.zeros((len(levers), at.SPOOLS))
-        for k, lever in enumerate(levers):
-            valve.shape_demand(lever, self.axes, self.plant, fresh[k])
+        valve.shape_demands(np.ascontiguousarray(levers, dtype=float), self.axes, self.plant, fresh)
         demands = np.concatenate((self._demands, fresh))
         log = np.empty((len(levers), LOG_COLUMNS))
         setup = (self.axes, self.plant, self.work)

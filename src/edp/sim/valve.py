@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from edp.sim import layout as at
 from edp.sim.jit import compiled
@@ -19,7 +18,7 @@ SPOOL_DAMPING = 1.0
 
 @compiled
 def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
-    """Lever positions in [-1, 1], shape (3,), to signed spool demands, shape (6,): primary, then conflux spools."""
+    """One row of `shape_demands`."""
     zone, start = plant[at.LEVER_DEAD_ZONE], plant[at.CONFLUX_START]
     for i in range(at.AXES):
         size = min(max((abs(lever[i]) - zone) / (1.0 - zone), 0.0), 1.0)
@@ -30,10 +29,22 @@ def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
         out[i + 3] = sign * second * share
 
 
-def _oscillator(frequency_hz: float, damping: float, step_s: float) -> Array:
-    """Exact transition of (error, rate) of a second-order low-pass over one step, row by row, shape (4,)."""
+@compiled
+def shape_demands(levers: Array, axes: Array, plant: Array, out: Array) -> None:
+    """Lever positions in [-1, 1], shape (time, 3), to signed spool demands (time, 6): primary, then conflux spools."""
+    for k in range(levers.shape[0]):
+        shape_demand(levers[k], axes, plant, out[k])
+
+
+def _oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:
+    """Exact transition of (error, rate) of a low-pass of damping <= 1 over one step, row by row, 4 values."""
     omega = 2.0 * math.pi * frequency_hz
-    return expm(np.array([[0.0, 1.0], [-omega * omega, -2.0 * damping * omega]]) * step_s).ravel()
+    ringing = omega * math.sqrt(1.0 - damping * damping)
+    decay, fall = damping * omega, math.exp(-damping * omega * step_s)
+    cosine = math.cos(ringing * step_s)
+    sine = math.sin(ringing * step_s) / ringing if ringing > 0.0 else step_s
+    own, cross = fall * (cosine + decay * sine), fall * sine
+    return [own, cross, -omega * omega * cross, fall * (cosine - decay * sine)]
 
 
 def spool_filters(machine: Machine, step_s: float) -> Array:
