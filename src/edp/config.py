@@ -115,7 +115,7 @@ class RecordingEntry:
     """One recording of a data-set file.
 
     Attributes:
-        path: the log, relative to the data-set file.
+        path: the log, relative to the data-set file; ``${NAME}`` is replaced by that environment variable.
         name: unique name; the file's stem by default.
         rows: ``[start, stop]`` to use a part of the log.
         map: signal map for this log: a table, or the path of a map file; the data set's map by default.

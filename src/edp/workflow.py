@@ -23,7 +23,7 @@ from edp.config import (
     plain_tree,
 )
 from edp.data.prepared import Prepared, prepare
-from edp.errors import DataError, StorageError
+from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
 from edp.logs import find_recordings, read_data_set, read_recording, write_recording
@@ -90,7 +90,7 @@ class DataSource:
 
 
 def _read_listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Recording]:
-    """The recordings of a data-set file; paths in it are relative to it, a map or repair given here goes first."""
+    """The recordings of a data-set file; paths in it are relative to it; a map given here replaces the shared one."""
     settings = load_data_set(path)
     allowed = repair or settings.repair
 
@@ -101,7 +101,7 @@ def _read_listed(path: Path, signal_map: SignalMap | None, repair: Repair | None
     recordings = []
     for entry in settings.recordings:
         chosen = resolved(entry.map) or shared
-        log = Path(entry.path) if Path(entry.path).is_absolute() else path.parent / entry.path
+        log = path.parent / _expanded(entry.path, path)  # an absolute path stands for itself
         recordings.append(read_recording(log, chosen, name=entry.name, rows=entry.rows, repair=allowed))
     names = [recording.name for recording in recordings]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -112,6 +112,17 @@ def _read_listed(path: Path, signal_map: SignalMap | None, repair: Repair | None
         shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
         raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
     return recordings
+
+
+def _expanded(entry: str, path: Path) -> str:
+    """`entry` with environment variables put in, so that a data-set file can name logs on another disk."""
+    full = os.path.expandvars(entry)
+    if "$" in full:
+        raise ConfigError(
+            f"'{path}': path = '{entry}' names an environment variable that is not set; set it to the folder of the "
+            "logs, or write the path out"
+        )
+    return full
 
 
 def simulate_data_set(
