@@ -1,0 +1,170 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from edp.data.chunks import ChunkSpec
+from edp.data.series import Series
+from edp.errors import ConfigError, DataError
+from edp.losses import MeanSquared
+from edp.models.predictor import build_model
+from edp.models.running import stream_predictions
+from edp.training.fit import TrainingError, TrainingSpec, fit, thread_count, validation_scores
+from edp.training.optimizers import OPTIMIZERS, AdamW
+from edp.training.schedules import SCHEDULES, Constant
+
+
+def weights(fitted):
+    return {name: parameter.detach().clone() for name, parameter in fitted.predictor.named_parameters()}
+
+
+def same(one, other):
+    return all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.fixture(scope="module")
+def fitted(tiny, tiny_model, tiny_training):
+    events = []
+    made = fit(tiny, tiny_model, tiny_training, on_event=events.append)
+    return made, events
+
+
+def test_the_loss_falls_and_every_epoch_has_a_row(fitted, tiny_training):
+    made, events = fitted
+    losses = [row["train_loss"] for row in made.history]
+    scores = [row["validation_score"] for row in made.history]
+    assert len(losses) == tiny_training.epochs
+    assert losses[-1] < 0.6 * losses[0]
+    assert scores[-1] < scores[0]
+    assert [row["epoch"] for row in made.history] == [1, 2, 3, 4, 5]
+    assert [event.row for event in events if event.row] == made.history
+    assert made.resumed_at == 0
+    assert not made.predictor.training
+
+
+def test_the_weights_kept_are_those_of_the_best_epoch(fitted, tiny, tiny_training):
+    made, _ = fitted
+    score, report, loss = validation_scores(made.predictor, tiny.validation, tiny_training, tiny)
+    best = min(made.history, key=lambda row: row["validation_score"])
+    assert best["best"]
+    assert score == pytest.approx(best["validation_score"], rel=1e-6)
+    assert report == pytest.approx(best["validation_mae"], rel=1e-6)
+    assert loss == pytest.approx(best["validation_loss"], rel=1e-6)
+
+
+def test_validation_scores_are_means_over_ticks_after_the_burn_in(fitted, tiny, tiny_training):
+    predictor, part = fitted[0].predictor, tiny.validation[0]
+    predicted = stream_predictions(predictor, [part])[0]
+    errors = []
+    for row, k in enumerate((1, 3)):
+        future = part.targets[20 + k : part.samples - 3 + k]
+        errors.append(np.abs(predicted[20 : part.samples - 3, row] - future).mean(axis=0, dtype=np.float64))
+    score, report, _ = validation_scores(predictor, [part], tiny_training, tiny)
+    assert report == pytest.approx(1000 * np.mean(errors), rel=1e-5)  # mm/s
+    assert score == pytest.approx(np.mean(errors / predictor.code.width.numpy()), rel=1e-5)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_others(fitted, tiny, tiny_model, tiny_training):
+    first = weights(fitted[0])
+    assert same(first, weights(fit(tiny, tiny_model, tiny_training)))
+    assert not same(first, weights(fit(tiny, tiny_model, dataclasses.replace(tiny_training, seed=4))))
+
+
+def test_training_leaves_the_global_random_state_of_model_building_alone(tiny, tiny_model):
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    build_model(tiny.task, tiny_model, tiny.scaler(), seed=9)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_test_part_is_not_touched(fitted, tiny, tiny_model, tiny_training):
+    other = dataclasses.replace(tiny, test=[])
+    assert same(weights(fitted[0]), weights(fit(other, tiny_model, tiny_training)))
+
+
+@pytest.mark.parametrize("schedule", list(SCHEDULES))
+@pytest.mark.parametrize("optimizer", list(OPTIMIZERS))
+def test_every_optimizer_and_schedule_trains_with_either_regime(schedule, optimizer, tiny, tiny_bypass):
+    for regime, length in (("chunk", 32), ("window", 10)):
+        spec = TrainingSpec(
+            chunks=ChunkSpec(regime=regime, length=length, batch=8, burn_in=20),
+            loss=MeanSquared(),
+            weight_power=1.0,
+            optimizer=OPTIMIZERS[optimizer](),
+            schedule=SCHEDULES[schedule](),
+            epochs=2,
+            updates=12,
+            ema=0.0,
+            device="cpu",
+        )
+        made = fit(tiny, tiny_bypass, spec)
+        assert made.history[-1]["updates"] == 24
+        assert np.isfinite(made.history[-1]["validation_score"])
+
+
+def test_a_by_pass_starts_better_than_a_network_alone(fitted, tiny, tiny_bypass, tiny_training):
+    made = fit(tiny, tiny_bypass, dataclasses.replace(tiny_training, epochs=1))
+    assert made.history[0]["validation_score"] < fitted[0].history[0]["validation_score"]
+
+
+def test_a_by_pass_that_is_not_trained_stays(tiny, tiny_bypass, tiny_training):
+    fixed = dataclasses.replace(tiny_bypass.blocks[1], trained=False)
+    model = dataclasses.replace(tiny_bypass, blocks=(fixed,))
+    short = fit(tiny, model, dataclasses.replace(tiny_training, epochs=1)).predictor.bypass
+    longer = fit(tiny, model, dataclasses.replace(tiny_training, epochs=2)).predictor.bypass
+    assert short.weight.abs().sum() > 0
+    assert torch.equal(short.weight, longer.weight)
+
+
+def test_patience_stops_a_training_that_does_not_get_better(tiny, tiny_model, tiny_training):
+    # At this rate no weight moves, so the first epoch stays the best but for rounding.
+    still = AdamW(learning_rate=1e-30, weight_decay=0.0)
+    spec = dataclasses.replace(tiny_training, optimizer=still, patience=2, epochs=9, ema=0.0)
+    assert [row["best"] for row in fit(tiny, tiny_model, spec).history] == [True, False, False]
+
+
+def test_a_loss_that_is_not_finite_is_a_training_error(tiny, tiny_model, tiny_training):
+    wild = dataclasses.replace(tiny_training, optimizer=AdamW(learning_rate=1e38), schedule=Constant())
+    with pytest.raises(TrainingError, match=r"loss is (nan|inf) at update \d+: .* lower the learning rate"):
+        fit(tiny, tiny_model, wild)
+
+
+def test_recordings_shorter_than_the_burn_in_are_refused(tiny, tiny_model, tiny_training):
+    def cut(part, samples):
+        return Series(part.name, part.inputs[:samples], part.targets[:samples])
+
+    short = dataclasses.replace(tiny, train=[*tiny.train, cut(tiny.train[0], 23)])
+    with pytest.raises(DataError, match="'linear 1' has 23 samples, shorter than the burn-in of 20"):
+        fit(short, tiny_model, tiny_training)
+    short = dataclasses.replace(tiny, validation=[cut(tiny.validation[0], 23)])
+    with pytest.raises(DataError, match="validation recording 'linear 3' has 23 samples"):
+        fit(short, tiny_model, tiny_training)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"epochs": 0},
+        {"updates": -1},
+        {"patience": -1},
+        {"clip_norm": 0.0},
+        {"ema": 1.0},
+        {"threads": -1},
+        {"device": "tpu"},
+    ],
+)
+def test_settings_out_of_range_are_refused(options):
+    with pytest.raises(ConfigError, match="must hold"):
+        TrainingSpec(**options)
+
+
+def test_zero_threads_means_all_cores():
+    assert thread_count(TrainingSpec(threads=0)) >= 1
+    assert thread_count(TrainingSpec(threads=3)) == 3
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="asks for a device that is there")
+def test_a_missing_device_is_named(tiny, tiny_model, tiny_training):
+    with pytest.raises(ConfigError, match="no CUDA device is present"):
+        fit(tiny, tiny_model, dataclasses.replace(tiny_training, device="cuda"))

@@ -1,0 +1,158 @@
+import dataclasses
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from edp.errors import StorageError
+from edp.runs import RunFolder, run_key
+from edp.training.checkpoint import FILE
+from edp.training.fit import fit
+from edp.training.schedules import Plateau
+
+KEY = "k" * 32
+
+
+class Stop(Exception):
+    """Raised in place of Ctrl-C."""
+
+
+def stop_after(epochs):
+    def on_event(event):
+        if event.row and event.epoch == epochs:
+            raise Stop
+
+    return on_event
+
+
+def assert_same(one, other):
+    for (name, mine), theirs in zip(one.predictor.named_parameters(), other.predictor.parameters(), strict=True):
+        assert torch.equal(mine, theirs), name
+
+    def facts(fitted):
+        return [{key: value for key, value in row.items() if key != "seconds"} for row in fitted.history]
+
+    assert facts(one) == facts(other)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tiny, tiny_model, tiny_training):
+    return fit(tiny, tiny_model, tiny_training)
+
+
+@pytest.mark.parametrize("stops", [(2,), (1, 3, 4)])
+def test_a_stopped_training_goes_on_to_the_same_bits(stops, tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
+    for epoch in stops:
+        with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+            fit(tiny, tiny_model, tiny_training, (folder, KEY), stop_after(epoch))
+    with RunFolder(tmp_path) as folder:
+        resumed = fit(tiny, tiny_model, tiny_training, (folder, KEY))
+    assert resumed.resumed_at == stops[-1]
+    assert_same(resumed, uninterrupted)
+    assert len((tmp_path / "history.jsonl").read_text().splitlines()) == tiny_training.epochs
+
+
+def test_schedules_with_memory_and_fixed_by_passes_go_on_too(tmp_path, tiny, tiny_bypass, tiny_training):
+    fixed = dataclasses.replace(tiny_bypass.blocks[1], trained=False)
+    model = dataclasses.replace(tiny_bypass, blocks=(tiny_bypass.blocks[0], fixed))
+    spec = dataclasses.replace(tiny_training, schedule=Plateau(patience=0, threshold=0.5), epochs=4)
+    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+        fit(tiny, model, spec, (folder, KEY), stop_after(2))
+    with RunFolder(tmp_path) as folder:
+        assert_same(fit(tiny, model, spec, (folder, KEY)), fit(tiny, model, spec))
+
+
+def test_a_finished_training_is_not_done_again(tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
+    for _ in range(2):
+        with RunFolder(tmp_path) as folder:
+            again = fit(tiny, tiny_model, tiny_training, (folder, KEY))
+    assert again.resumed_at == tiny_training.epochs
+    assert_same(again, uninterrupted)
+
+
+KILLED = """
+import os, runpy, signal, sys
+tiny = runpy.run_path(sys.argv[1])
+from edp.runs import RunFolder
+from edp.training.fit import fit
+fsync, writes = os.fsync, []
+def die(handle):
+    writes.append(handle)
+    # Two files an epoch: the fifth is the third checkpoint, of which half is on the disk.
+    if len(writes) == 5:
+        os.ftruncate(handle, os.fstat(handle).st_size // 2)
+        os.kill(os.getpid(), signal.SIGKILL)
+    fsync(handle)
+os.fsync = die
+fit(tiny["prepared"](), tiny["MODEL"], tiny["TRAINING"], (RunFolder(sys.argv[2]), "k" * 32))
+"""
+
+
+def test_a_process_killed_while_it_writes_a_checkpoint_goes_on_to_the_same_bits(
+    tmp_path, tiny, tiny_model, tiny_training, uninterrupted
+):
+    helper = Path(__file__).with_name("conftest.py")
+    done = subprocess.run([sys.executable, "-c", KILLED, helper, tmp_path], check=False, capture_output=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
+    with RunFolder(tmp_path) as folder:
+        resumed = fit(tiny, tiny_model, tiny_training, (folder, KEY))
+    assert resumed.resumed_at == 2
+    assert_same(resumed, uninterrupted)
+
+
+@pytest.fixture
+def half_done(tmp_path, tiny, tiny_model, tiny_training):
+    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+        fit(tiny, tiny_model, tiny_training, (folder, KEY), stop_after(1))
+    return tmp_path
+
+
+@pytest.mark.parametrize("kept", [0, 4, 0.3, 0.99])
+def test_a_truncated_checkpoint_is_refused(kept, half_done, tiny, tiny_model, tiny_training):
+    file = half_done / FILE
+    data = file.read_bytes()
+    file.write_bytes(data[: kept if isinstance(kept, int) else int(kept * len(data))])
+    with RunFolder(half_done) as folder, pytest.raises(StorageError, match=r"is damaged .* remove it to train"):
+        fit(tiny, tiny_model, tiny_training, (folder, KEY))
+
+
+def test_a_checkpoint_of_another_run_is_refused(half_done, tiny, tiny_model, tiny_training):
+    with RunFolder(half_done) as folder, pytest.raises(StorageError, match="belongs to another run"):
+        fit(tiny, tiny_model, tiny_training, (folder, "other"))
+
+
+def test_a_locked_run_folder_names_its_holder(tmp_path):
+    with RunFolder(tmp_path), pytest.raises(StorageError, match=r"in use by process \d+"):
+        RunFolder(tmp_path)
+    with RunFolder(tmp_path):
+        """The lock is free again."""
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot create folder"):
+        RunFolder(tmp_path / "file" / "run")
+
+
+def test_a_lock_that_cannot_be_opened_is_a_storage_error(tmp_path):
+    (tmp_path / ".lock").mkdir()
+    with pytest.raises(StorageError, match=r"cannot write .*lock"):
+        RunFolder(tmp_path)
+
+
+def test_a_folder_is_bound_to_one_run(tmp_path):
+    with RunFolder(tmp_path) as folder:
+        assert not folder.claim("a", "text = 1\n")
+        assert folder.claim("a", "text = 1\n")
+        with pytest.raises(StorageError, match="holds another run"):
+            folder.claim("b", "text = 2\n")
+    assert (tmp_path / "config.toml").read_text() == "text = 1\n"
+
+
+def test_run_keys_depend_on_settings_and_data_and_not_on_their_order():
+    key = run_key({"a": 1, "b": [2]}, "d")
+    assert key == run_key({"b": [2], "a": 1}, "d")
+    assert len({key, run_key({"a": 1, "b": [3]}, "d"), run_key({"a": 1, "b": [2]}, "e")}) == 3
