@@ -106,14 +106,14 @@ def bang_bang(seconds, seed=0):
 def test_bang_bang_into_the_stops_stays_bounded():
     low, high = bang_bang(120)
     assert low >= 0.1e5 - 1
-    assert high < 440e5
+    assert high < 425e5
 
 
 @pytest.mark.slow
 def test_an_hour_of_bang_bang_stays_bounded():
     low, high = bang_bang(3600)
     assert low >= 0.1e5 - 1
-    assert high < 440e5
+    assert high < 425e5
 
 
 @pytest.fixture(scope="module")
