@@ -13,6 +13,8 @@ from edp.blocks.base import BLOCKS, Slot
 from edp.errors import ConfigError, closest
 from edp.streaming import Cost, State, Streaming, parameters_of
 
+STARTS = ("ridge", "crossed", "zero")
+
 
 @BLOCKS.register("linear_bypass")
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +23,9 @@ class LinearBypass:
 
     Attributes:
         taps: samples of history, the present one included.
-        start: ``ridge`` starts from the ridge regression on the training data, ``zero`` from nothing.
+        start: ``ridge`` starts from the ridge regression on the training data, with penalty and history chosen on
+            the validation data; ``crossed`` from the one on both, chosen by cross-validation (for little data);
+            ``zero`` from nothing.
         trained: False keeps the start values, so that the network learns what the linear map leaves.
 
     Raises:
@@ -29,7 +33,7 @@ class LinearBypass:
     """
 
     slot: ClassVar[Slot] = Slot.BYPASS
-    space: ClassVar[dict[str, Any]] = {"taps": (5, 50), "start": ("ridge", "zero")}
+    space: ClassVar[dict[str, Any]] = {"taps": (5, 50), "start": STARTS}
     taps: int = 25
     start: str = "ridge"
     trained: bool = True
@@ -37,8 +41,8 @@ class LinearBypass:
     def __post_init__(self) -> None:
         if self.taps < 1:
             raise ConfigError(f"linear_bypass: taps = {self.taps}; at least 1 must hold")
-        if self.start not in ("ridge", "zero"):
-            raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, ('ridge', 'zero'))}")
+        if self.start not in STARTS:
+            raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, STARTS)}")
         if self.start == "zero" and not self.trained:
             raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ PENALTIES = tuple(10.0**power for power in range(-6, 2))
 
 HISTORIES = (5, 20)
 """Histories tried beside the task's own."""
+
+CROSSED_HISTORIES = (3, 5, 10, 20)
+"""Histories tried by cross-validation beside the task's own."""
 
 BLOCK_ROWS = 16_384
 
@@ -96,6 +99,69 @@ def ridge_solution(
             weights[:, better] = 0.0
             weights[: samples * inputs, better] = candidate[:, better]
     return _physical(weights, fitted, standard, task, (penalty, history))
+
+
+def crossed_solution(
+    parts: Sequence[Series],
+    task: LagTask,
+    folds: int = 5,
+    penalties: Sequence[float] = PENALTIES,
+    histories: Sequence[int] = CROSSED_HISTORIES,
+) -> RidgeSolution:
+    """Ridge regression on all of `parts`; penalty and history by cross-validation over contiguous folds.
+
+    For little data, where one held-out stretch is too short to choose by and too dear to leave out of the fit.
+
+    Args:
+        parts: all stretches that may be learned from.
+        task: what to predict from what; history and horizon are not carried from one fold to the next.
+        folds: pieces of nearly equal duration.
+        penalties: as for `ridge_solution`.
+        histories: histories to choose from, in samples; cut to the task's.
+
+    Raises:
+        ConfigError: a penalty too small for inputs that are copies of each other.
+    """
+    standard = standard_of(parts, target_means(parts))
+    whole = moments_of(parts, task, standard)
+    folded = [moments_of(fold, task, standard) for fold in _folds(parts, folds)]
+    folded = [found for found in folded if found.rows]
+    pairs = [(_sum([other for other in folded if other is not fold]), fold) for fold in folded if len(folded) > 1]
+    inputs, outputs = len(standard.centre), task.outputs
+    best = np.full(outputs, np.inf)
+    weights = np.zeros((task.history * inputs, outputs))
+    penalty, history = np.zeros(outputs), np.zeros(outputs, dtype=np.int64)
+    for samples in sorted({min(entry, task.history) for entry in (*histories, task.history)}, reverse=True):
+        for relative in sorted(penalties):
+            size = samples * inputs
+            loss = np.zeros(outputs)
+            for rest, fold in pairs:
+                loss += fold.rows * _squared_error(fold, rest, _solve(rest, size, relative))
+            better = loss < best
+            if better.any():
+                solved = _solve(whole, size, relative)
+                best[better], penalty[better], history[better] = loss[better], relative, samples
+                weights[:, better] = 0.0
+                weights[:size, better] = solved[:, better]
+    return _physical(weights, whole, standard, task, (penalty, history))
+
+
+def _folds(parts: Sequence[Series], folds: int) -> list[list[Series]]:
+    """Contiguous pieces of nearly equal duration over all stretches, in order."""
+    edges = np.linspace(0, sum(part.samples for part in parts), folds + 1).round().astype(int)
+    pieces: list[list[Series]] = [[] for _ in range(folds)]
+    begin = 0
+    for part in parts:
+        for piece, low, high in zip(pieces, edges[:-1] - begin, edges[1:] - begin, strict=True):
+            rows = slice(max(0, low), max(0, min(high, part.samples)))
+            if rows.stop > rows.start:
+                piece.append(Series(part.name, part.inputs[rows], part.targets[rows]))
+        begin += part.samples
+    return pieces
+
+
+def _sum(parts: Sequence[Moments]) -> Moments:
+    return Moments(*(sum(getattr(part, entry.name) for part in parts) for entry in fields(Moments)))
 
 
 def _solve(fitted: Moments, size: int, relative: float) -> DoubleArray:

@@ -158,7 +158,7 @@ class _Loop:
                 )
         scaler = data.scaler()
         self.net = build_model(data.task, model, scaler, spec.seed)
-        start_bypass(self.net, data.train, data.validation)
+        started = start_bypass(self.net, data.train, data.validation)
         self.net.to(self.device)
         named = [(name, parameter) for name, parameter in self.net.named_parameters() if parameter.requires_grad]
         self.optimizer = spec.optimizer.build(named)
@@ -169,6 +169,8 @@ class _Loop:
         sigma = torch.tensor(scaler.target_scale, dtype=torch.float32, device=self.device)
         self.weights = output_weights(sigma, spec.weight_power)
         self.updates = spec.updates or max(1, self.sampler.updates())
+        if started:  # The regression is a candidate itself: training must improve on it to be kept.
+            self.progress.best_score = self._validate()[0]
 
     def fit(self, on_event: Callable[[Event], None]) -> Fitted:
         self._resume()

@@ -9,45 +9,53 @@ import torch
 
 from edp.blocks.linear_bypass import Bypass
 from edp.data.lags import LagTask, origins
-from edp.data.ridge import ridge_solution
+from edp.data.ridge import crossed_solution, ridge_solution
+from edp.data.scaling import feature_matrix
 from edp.data.series import Series
+from edp.data.task import Task
 from edp.errors import DataError
 from edp.models.predictor import Predictor
 
 
-def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequence[Series]) -> None:
-    """Set the by-pass to the ridge regression on the logged channels, so that training starts from that baseline.
+def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequence[Series]) -> bool:
+    """Set the by-pass to the ridge regression and silence the heads, so that training starts as that baseline.
 
-    Does nothing where the predictor has no by-pass, it starts from zero, or no logged channel is a feature.
+    The regression reads the logged channels, and those derived ones that say what no logged channel says: targets, and
+    those whose source is not itself a feature. Does nothing where the predictor has no by-pass or it starts from zero.
 
     Args:
         predictor: with its fitted scaler.
         train: the map is fitted here.
-        validation: chooses penalty and history for each horizon and target.
+        validation: chooses penalty and history for each horizon and target; a crossed start is fitted on it too.
+
+    Returns:
+        Whether anything was set.
 
     Raises:
         DataError: no training stretch is as long as the taps plus the largest horizon.
     """
     bypass, task = predictor.bypass, predictor.task
-    channels = len(task.features.channels)
-    if not isinstance(bypass, Bypass) or bypass.spec.start != "ridge" or channels == 0:
-        return
-    # A derived feature is no input: the regression then finds that target's level from the channels themselves.
-    present = tuple(column if column is not None and column < channels else None for column in task.present)
+    if not isinstance(bypass, Bypass) or bypass.spec.start == "zero":
+        return False
+    read = _columns(task)
+    # A target that is no feature has no level to start from: the regression then finds it from the features.
+    present = tuple(None if column is None else read.index(column) for column in task.present)
     lags = LagTask(task.horizons, present, bypass.spec.taps)
-    logged = [
-        [Series(part.name, part.inputs[:, :channels], part.targets) for part in parts] for parts in (train, validation)
+    known = [
+        [Series(part.name, feature_matrix(task, part)[:, read], part.targets) for part in parts]
+        for parts in (train, validation)
     ]
-    if not any(len(origins(part, lags)) for part in logged[0]):
+    if not any(len(origins(part, lags)) for part in known[0]):
         raise DataError(
             f"linear_bypass: the longest training stretch has {max(part.samples for part in train)} samples, fewer "
             f"than its {bypass.spec.taps} taps plus the horizon of {task.reach}; give longer recordings or fewer taps"
         )
-    solution = ridge_solution(logged[0], lags, logged[1])
+    crossed = bypass.spec.start == "crossed"
+    solution = crossed_solution(known[0] + known[1], lags) if crossed else ridge_solution(known[0], lags, known[1])
     # SI to network units: scaled = (x - offset) / width on both sides.
     offset, width = (tensor.double().cpu().numpy() for tensor in (predictor.front.offset, predictor.front.width))
     maps = np.zeros((bypass.spec.taps, len(offset), *solution.intercept.shape))
-    maps[:, :channels] = solution.weights
+    maps[:, read] = solution.weights
     if predictor.code.delta:
         for target, column in enumerate(predictor.code.present):
             maps[0, column, :, target] -= 1.0
@@ -58,3 +66,14 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
         # The by-pass filters forward in time: its last tap is lag 0.
         bypass.weight.copy_(torch.from_numpy(weight[::-1].transpose(2, 1, 0).copy()))
         bypass.bias.copy_(torch.from_numpy((level / unit).ravel()))
+        for parameter in (predictor.heads.weights[-1], predictor.heads.biases[-1]):
+            parameter.zero_()
+    return True
+
+
+def _columns(task: Task) -> list[int]:
+    """Features that the regression reads, in order."""
+    features = task.features
+    new = {entry.name for entry in features.derived if entry.source in features.hidden}
+    wanted = {*features.channels, *new, *task.targets}
+    return [column for column, name in enumerate(features.features) if name in wanted]
