@@ -152,8 +152,8 @@ def simulate_data_set(
     """
     from edp.sim import plan_data_set, simulate_many
 
-    folder = make_folder(out)
     plan = plan_data_set(machine, minutes, recordings, seed)
+    folder = make_folder(out)
     identity = {"schema": 1, "edp": __version__, "machine": machine, "plan": [asdict(entry) for entry in plan]}
     manifest = folder / MANIFEST
     if manifest.exists() and read_json(manifest) != identity:

@@ -82,7 +82,9 @@ def duration(seconds: float) -> str:
 def run_app(app: typer.Typer) -> int:
     """Run the command line; a user's mistake ends in one message and exit code 1, Ctrl-C in 130."""
     try:
-        code = app(standalone_mode=False)  # the code of a command that raised typer.Exit, else what it returned
+        code = app(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
     except EdpError as error:
         err.print(f"[bold red]error:[/] {_escaped(str(error))}")
         return 1

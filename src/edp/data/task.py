@@ -58,7 +58,7 @@ class Task:
         if self.mode is TargetMode.DELTA and blind:
             raise ConfigError(
                 f"task: mode = 'delta' predicts the change from the present value, but {', '.join(blind)} is not a "
-                "feature; add it to the features or set mode = 'absolute'"
+                f"feature{closest(blind[0], self.features.features)}; add it to the features or set mode = 'absolute'"
             )
         seen = [name for name in self.targets if name in self.features.features]
         if 0 in self.horizons and seen:

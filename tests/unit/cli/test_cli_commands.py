@@ -1,0 +1,129 @@
+"""Each command: its help, its JSON, its exit code, and what it leaves on disk."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from edp import __version__
+from edp.cli import app, demo
+from edp.cli import train as train_command
+from edp.cli.console import duration
+
+COMMANDS = [command.name for command in app.registered_commands]
+EXPECTED = ["demo", "simulate", "inspect", "train", "evaluate", "footprint", "report"]
+
+
+def test_all_commands_are_known_here():
+    assert sorted(COMMANDS) == sorted(EXPECTED)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example_and_the_json_option(edp, command):
+    ended = edp(command, "--help")
+    assert ended.code == 0
+    words = " ".join(ended.out.split())
+    assert "Example: " in words
+    assert f"edp {command}" in words
+    assert "--json" in words
+
+
+def test_version_and_an_unknown_command(edp):
+    assert edp("--version").out.strip() == __version__
+    ended = edp("tran")
+    assert ended.code == 2
+    assert "train" in ended.err
+
+
+def test_help_needs_no_heavy_packages():
+    code = "import sys; from edp.cli import app; print([n for n in ('torch', 'plotly', 'pyarrow') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_whole_path_from_the_simulator_to_the_page(edp, tmp_path, small):
+    data, run = tmp_path / "data", tmp_path / "run"
+    made = edp("simulate", data, "--minutes", 0.8, "--recordings", 4, "--seed", 3, "--workers", 1, "--json").json
+    assert made["recordings"] == 4
+    assert len(list(data.glob("*.parquet"))) == 4
+
+    seen = edp("inspect", data, "--json")
+    assert (seen.code, seen.json["errors"], len(seen.json["recordings"])) == (0, 0, 4)
+
+    trained = edp("train", data, "--out", run, *small, "--json").json
+    assert trained["run"] == str(run)
+    assert trained["validation_mae"] > 0
+
+    scores = edp("evaluate", run, "--baselines", "persistence,ridge_arx", "--json").json
+    assert sorted(scores["models"]) == ["network", "persistence", "ridge_arx"]
+
+    page = edp("report", run, "--json").json
+    assert (run / "report.html").read_text(encoding="utf-8").lower().startswith("<!doctype html>")
+    assert "ahead" in page["headline"]
+
+    counts = edp("footprint", run / "bundle", "--json").json
+    assert counts["parameters"] == trained["parameters"]
+
+    kept = edp("simulate", data, "--minutes", 0.8, "--recordings", 4, "--seed", 3)
+    assert kept.code == 0
+    other = edp("simulate", data, "--minutes", 0.8, "--recordings", 4, "--seed", 4)
+    assert other.code == 1
+    assert "another simulated data set" in other.err
+
+
+def test_output_for_people_names_the_next_command(edp, logs, trained, tmp_path, small):
+    assert f"edp train {logs}" in edp("inspect", logs, "--no-channels").out
+    assert "edp evaluate" in edp("train", logs, "--out", tmp_path / "run", *small).out
+    judged = edp("evaluate", trained, "--baselines", "persistence").out
+    assert "100 ms ahead (k = 10)" in judged
+    assert f"edp report {trained}" in judged
+    assert "report.html" in edp("report", trained).out
+    assert "MACs per tick" in edp("footprint", trained).out
+
+
+def test_json_of_a_process_is_all_of_standard_output(trained):
+    command = [sys.executable, "-m", "edp", "report", str(trained), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["report"] == str(trained / "report.html")
+    assert done.stderr == ""
+
+
+def test_demo_runs_its_four_steps(edp, tmp_path, monkeypatch, small):
+    monkeypatch.setattr(demo, "MINUTES", 0.8)
+    monkeypatch.setattr(demo, "RECORDINGS", 4)
+    whole, fewer = train_command.run, 'judge.baselines=["persistence", "ridge_arx"]'
+
+    def shorter(data, run, *, preset, changes, quiet):
+        return whole(data, run, preset=preset, changes=[*changes, *small[3::2], fewer], quiet=quiet)
+
+    monkeypatch.setattr(train_command, "run", shorter)
+    shown = edp("demo", "--out", tmp_path / "demo", "--json").json
+    assert {"network", "persistence", "ridge_arx"} <= set(shown["scores"]["models"])
+    assert (tmp_path / "demo" / "run_0" / "report.html").is_file()
+    again = edp("demo", "--out", tmp_path / "demo")
+    assert again.code == 0
+    for step in ("1/4", "2/4", "3/4", "4/4", "open the report"):
+        assert step in again.out
+
+
+def test_inspection_of_a_faulty_log_ends_with_code_3(edp, tmp_path):
+    log = tmp_path / "drive.csv"
+    log.write_text("time,CylVels_1\n0,1\n0.01,\n0.02,2\n0.03,2\n")
+    ended = edp("inspect", log, "--json")
+    assert ended.code == 3
+    assert ended.json["errors"] == 1
+    assert "--repair" in ended.err
+
+
+def test_other_recordings_can_be_judged(edp, logs, trained):
+    found = edp("evaluate", trained, "--data", logs / "drive_1.parquet", "--baselines", "persistence", "--json").json
+    assert found["folder"] == str(trained / "on_drive_1")
+    assert (trained / "on_drive_1" / "scores.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.2, "0 s"), (59.6, "1 min 00 s"), (200, "3 min 20 s"), (3900, "1 h 05 min")]
+)
+def test_durations_read_well(seconds, text):
+    assert duration(seconds) == text
