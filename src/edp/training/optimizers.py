@@ -56,3 +56,45 @@ class AdamW:
             (matrices if parameter.ndim > 1 and "bias" not in name else vectors).append(parameter)
         groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
         return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
+
+
+@OPTIMIZERS.register("soap")
+@dataclass(frozen=True, kw_only=True)
+class Soap:
+    """Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al. 2024, arXiv 2409.11321).
+
+    On networks of this size a step costs little more than AdamW's and the error falls several times faster per
+    processor second; see docs/findings.md.
+
+    Attributes:
+        learning_rate: base rate.
+        weight_decay: lambda, decoupled.
+        beta1: decay of the mean of gradients.
+        beta2: decay of the second moments.
+        refresh: updates between refreshes of the eigenbasis.
+    """
+
+    learning_rate: float = 6e-3
+    weight_decay: float = 1e-4
+    beta1: float = 0.95
+    beta2: float = 0.95
+    refresh: int = 10
+
+    def __post_init__(self) -> None:
+        if not self.learning_rate > 0 or self.weight_decay < 0 or self.refresh < 1:
+            raise ConfigError(
+                f"soap: learning_rate = {self.learning_rate}, weight_decay = {self.weight_decay}, refresh = "
+                f"{self.refresh}; learning_rate > 0, weight_decay >= 0 and refresh >= 1 must hold"
+            )
+
+    def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
+        """The optimiser on all parameters."""
+        from pytorch_optimizer import SOAP  # deferred: only this optimiser needs the library
+
+        return SOAP(
+            [parameter for _, parameter in named],
+            lr=self.learning_rate,
+            betas=(self.beta1, self.beta2),
+            weight_decay=self.weight_decay,
+            precondition_frequency=self.refresh,
+        )
