@@ -14,7 +14,7 @@ from common import Verdict, finish, parser, table, verdict
 from edp.cli.demo import MINUTES, RECORDINGS
 from edp.config import load_experiment
 from edp.storage import read_json
-from edp.workflow import DataSource, evaluate, simulate_data_set, train
+from edp.workflow import DataSource, SimulationOrder, evaluate, simulate_data_set, train
 
 BASELINES = ("persistence", "ridge_arx", "boosted_trees", "small_mlp")
 
@@ -39,7 +39,8 @@ def main() -> None:
         folder = Path(temporary)
         data = arguments.data or folder / "data"
         began = time.perf_counter()
-        simulate_data_set(data, "M22", 8.0 if quick else MINUTES, 8 if quick else RECORDINGS, seed)
+        minutes, recordings = (8.0, 8) if quick else (MINUTES, RECORDINGS)
+        simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=recordings, seed=seed))
         print(f"simulated in {time.perf_counter() - began:.1f} s")
         verdicts: list[Verdict] = []
         details = {}

@@ -21,7 +21,7 @@ from edp.data.prepared import Prepared
 from edp.training import Event, fit
 from edp.training.optimizers import AdamW, Soap
 from edp.training.schedules import Constant
-from edp.workflow import DataSource, prepare_data, simulate_data_set
+from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
 
 
 class ReachedError(Exception):
@@ -55,7 +55,8 @@ def main() -> None:
     budget = 8.0 if quick else 240.0
     with tempfile.TemporaryDirectory() as temporary:
         source = arguments.data or Path(temporary) / "data"
-        simulate_data_set(source, "M22", 8.0 if quick else 40.0, 8 if quick else 20, seed)
+        minutes, recordings = (8.0, 8) if quick else (40.0, 20)
+        simulate_data_set(source, SimulationOrder(minutes=minutes, recordings=recordings, seed=seed))
         experiment = load_experiment(None, "quick", [f"training.seed={seed}"])
         data = prepare_data(DataSource.of(source), experiment)
         base = replace(experiment.training, epochs=10_000, patience=0, threads=1)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors.numpy import save
 
 from edp import __version__
@@ -125,30 +126,42 @@ def _expanded(entry: str, path: Path) -> str:
     return full
 
 
-def simulate_data_set(
-    out: str | Path,
-    machine: str = "M22",
-    minutes: float = 60.0,
-    recordings: int = 30,
-    seed: int = 0,
-    suffix: str = ".parquet",
-    workers: int = 0,
-    on_done: Callable[[Recording, bool], None] | None = None,
-) -> list[Path]:
-    """Simulate a data set into a folder, a log each; logs already there from the same plan are kept.
+@dataclass(frozen=True, kw_only=True)
+class SimulationOrder:
+    """A simulated data set: the same order gives the same bits, whatever the number of workers.
 
-    Args:
-        out: folder; it may hold nothing but an earlier part of the same data set.
+    Attributes:
         machine: machine parameter set.
         minutes: length of all recordings together.
         recordings: how many recordings.
-        seed: the same seed gives the same bits, whatever `workers`.
+        seed: root of every random choice.
         suffix: ending of the logs, which settles their format.
+    """
+
+    machine: str = "M22"
+    minutes: float = 60.0
+    recordings: int = 30
+    seed: int = 0
+    suffix: str = ".parquet"
+
+
+def simulate_data_set(
+    out: str | Path,
+    order: SimulationOrder | None = None,
+    workers: int = 0,
+    on_done: Callable[[Recording, bool], None] | None = None,
+) -> list[Path]:
+    """Simulate a data set into a folder, a log each; logs already there from the same order are kept.
+
+    Args:
+        out: folder; it may hold nothing but an earlier part of the same data set.
+        order: what to simulate; an hour of machine M22 by default.
         workers: processes; 0 for one a core.
         on_done: called with each recording and whether it was there already.
 
     Raises:
         StorageError: the folder holds another data set or cannot be written.
+        ConfigError: an ending without a format, or a number out of range.
     """
     from edp.sim import plan_data_set, simulate_many
 
@@ -261,6 +274,7 @@ def evaluate(
         raise StorageError(f"'{folder}' is not a run folder: it has no provenance.json; give the folder of edp train")
     provenance = read_json(folder / "provenance.json")
     experiment = load_experiment(folder / "config.toml")
+    torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
     data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment)
     if data.digest != provenance["data"]["digest"]:
         raise DataError(
@@ -318,6 +332,7 @@ def _untrained(model: ModelSpec, task: Any) -> Predictor:
 
 __all__ = [
     "DataSource",
+    "SimulationOrder",
     "build_report",
     "evaluate",
     "footprint_of",

@@ -27,11 +27,13 @@ def demo(
     Example: `edp demo --out demo`
     """
     from edp.report import build_report, headline, read_facts
+    from edp.workflow import SimulationOrder
 
     began = time.monotonic()
     data, run = folder / f"data_{seed}", folder / f"run_{seed}"
     _say(as_json, f"1/4 simulate {MINUTES:g} min of machine M22 in free air")
-    simulate_command.run(data, minutes=MINUTES, recordings=RECORDINGS, seed=seed, quiet=as_json)
+    order = SimulationOrder(minutes=MINUTES, recordings=RECORDINGS, seed=seed)
+    simulate_command.run(data, order, quiet=as_json)
     _say(as_json, "2/4 train the hybrid TCN-LSTM for 100 ms ahead (k = 10)")
     train_command.run(data, run, preset="quick", changes=[f"training.seed={seed}", f"split.seed={seed}"], quiet=as_json)
     _say(as_json, "3/4 judge it on held-out recordings beside baselines")

@@ -12,6 +12,7 @@ from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
 
 if TYPE_CHECKING:
     from edp.recording import Recording
+    from edp.workflow import SimulationOrder
 
 
 def simulate(
@@ -28,7 +29,11 @@ def simulate(
 
     Example: `edp simulate data/m22 --minutes 90 --recordings 30 --seed 1`
     """
-    paths = run(folder, machine, minutes, recordings, seed, form, workers, as_json)
+    from edp.workflow import SimulationOrder
+
+    suffix = f".{form.lstrip('.')}"
+    order = SimulationOrder(machine=machine, minutes=minutes, recordings=recordings, seed=seed, suffix=suffix)
+    paths = run(folder, order, workers, as_json)
     facts = {"folder": str(folder), "recordings": len(paths), "minutes": minutes, "machine": machine, "seed": seed}
 
     def show() -> None:
@@ -38,36 +43,22 @@ def simulate(
     emit(as_json, facts, show)
 
 
-def run(
-    folder: Path,
-    machine: str = "M22",
-    minutes: float = 60.0,
-    recordings: int = 30,
-    seed: int = 0,
-    form: str = "parquet",
-    workers: int = 0,
-    quiet: bool = False,
-) -> list[Path]:
+def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = False) -> list[Path]:
     """Simulate with a progress display."""
-    from edp.errors import ConfigError, closest
-    from edp.logs import known_suffixes
     from edp.workflow import simulate_data_set
 
-    suffix = f".{form.lstrip('.')}"
-    if suffix not in known_suffixes():
-        raise ConfigError(f"there is no log format '{form}'{closest(form, [s.lstrip('.') for s in known_suffixes()])}")
     began, steps, made = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
     with progress(quiet) as shown:
-        bar = shown.add_task("simulate", total=recordings, note="")
+        bar = shown.add_task("simulate", total=order.recordings, note="")
 
         def on_done(recording: Recording, kept: bool) -> None:
             made["kept" if kept else "new"] += 1
             made["seconds"] += 0.0 if kept else recording.duration_s
             elapsed = time.monotonic() - began
             done = made["kept"] + made["new"]
-            left = elapsed / max(1, made["new"]) * (recordings - done)
+            left = elapsed / max(1, made["new"]) * (order.recordings - done)
             note = f"{made['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
             shown.update(bar, advance=1, note=note)
-            steps.say(f"simulate: {done:g} of {recordings} recordings, {note}, {duration(left)} left")
+            steps.say(f"simulate: {done:g} of {order.recordings} recordings, {note}, {duration(left)} left")
 
-        return simulate_data_set(folder, machine, minutes, recordings, seed, suffix, workers, on_done)
+        return simulate_data_set(folder, order, workers, on_done)
