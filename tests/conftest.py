@@ -25,7 +25,7 @@ WINDOW = 9
 SMALL = {
     "lstm": [LstmSpec(units=6), LstmSpec(units=5, layers=2, dropout=0.2)],
     "tcn": [TcnSpec(channels=(6, 4), kernel=3, dropout=0.2)],
-    "hybrid": [HybridSpec(channels=(6,), kernel=3, units=5, dropout=0.2)],
+    "hybrid": [HybridSpec(channels=(6,), kernel=3, units=5, dropout=0.2), HybridSpec(channels=(4,), kernel=1, units=4)],
     "cylinder_gate": [BLOCKS["cylinder_gate"](), BLOCKS["cylinder_gate"](form="linear")],
     "linear_bypass": [BLOCKS["linear_bypass"](taps=4), BLOCKS["linear_bypass"](taps=1, trained=False)],
 }

@@ -42,7 +42,7 @@ def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(p
     assert {backbone for backbone, _ in fitting} == set(BACKBONES)
     assert len(forms) == len(ACTIVATIONS) * 2 * 2
     # Plain ones, pairs, further options of a part, and one with a block in each slot for each backbone.
-    assert len(structures) == 4 + 10 + 2 * 3 + 3
+    assert len(structures) == 5 + 10 + 2 * 3 + 3
 
 
 def test_every_file_in_blocks_registers_a_block():
