@@ -307,7 +307,7 @@ def _value(name: str, hint: Any, value: Any, path: str, problems: list[str]) -> 
         return _tagged(name, value, path, problems)
     choices = typing.get_args(hint) if typing.get_origin(hint) is not tuple else ()
     table_type = hint if is_dataclass(hint) else next((c for c in choices if is_dataclass(c)), None)
-    if table_type is not None and isinstance(value, Mapping):
+    if table_type is not None and (isinstance(value, Mapping) or table_type is hint):
         return _build(typing.cast(type, table_type), value, path, problems)
     item_type = next(iter(typing.get_args(hint)), None) if typing.get_origin(hint) is tuple else None
     if is_dataclass(item_type) and isinstance(value, list):

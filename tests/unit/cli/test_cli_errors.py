@@ -127,7 +127,7 @@ def test_unknown_preset_machine_format_and_paths(edp, logs, tmp_path):
     run = tmp_path / "run"
     refused(edp("train", logs, "--out", run, "--preset", "quik"), "did you mean 'quick'?")
     refused(edp("simulate", run, "--machine", "M23"), "M22")
-    refused(edp("simulate", run, "--format", "parket"), "did you mean 'parquet'?")
+    refused(edp("simulate", run, "--format", "parket"), "did you mean", "parquet'?")
     refused(edp("train", tmp_path / "none", "--out", run), "none", "does not exist")
     refused(edp("evaluate", tmp_path), "not a bundle", "edp train")
     refused(edp("report", tmp_path), str(tmp_path))

@@ -1,0 +1,135 @@
+"""What the README and the examples show is run as it stands there."""
+
+import dataclasses
+import re
+import runpy
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edp.cli import app
+from edp.cli.console import run_app
+from edp.config import TAGGED, RecordingEntry, TaskSettings, load_data_set, load_experiment, load_signal_map
+from edp.data.chunks import ChunkSpec
+from edp.evaluation.judge import JudgeSpec
+from edp.logs import write_recording
+from edp.models.heads import HeadSpec
+from edp.models.predictor import ModelSpec
+from edp.recording import Recording
+from edp.signals import TABLE_A1
+from edp.training import TrainingSpec
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+SETTINGS = sorted(EXAMPLES.rglob("*.toml"))
+SMALL = (
+    "training.epochs=1",
+    "training.updates=3",
+    'training.chunks={regime="chunk",length=32,batch=4,burn_in=10}',
+    'model.backbone={kind="hybrid",channels=[4],kernel=3,units=4}',
+    "model.window=12",
+    "judge.history=5",
+)
+
+
+def loader_of(path: Path) -> Callable[[Path], object]:
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    return load_data_set if "recordings" in table else load_signal_map if "channels" in table else load_experiment
+
+
+def test_there_are_examples():
+    assert len(SETTINGS) >= 10
+    assert {loader_of(path) for path in SETTINGS} == {load_signal_map, load_data_set, load_experiment}
+
+
+@pytest.mark.parametrize("path", SETTINGS, ids=lambda path: str(path.relative_to(EXAMPLES)))
+def test_settings_load(path):
+    assert loader_of(path)(path) is not None
+
+
+def test_readme_shows_the_map_and_the_settings_of_the_examples():
+    shown = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert shown
+    for name in ("map.toml", "rig.toml"):
+        text = (EXAMPLES / name).read_text(encoding="utf-8")
+        assert text in shown, f"README.md and examples/{name} differ"
+
+
+def test_readme_quotes_the_quickstart():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(shown.strip().splitlines()) <= 15
+    whole = (EXAMPLES / "quickstart.py").read_text(encoding="utf-8")
+    body = [line.strip() for line in whole.splitlines()]
+    for line in shown.strip().splitlines():
+        assert line.partition("  #")[0].strip() in [part.partition("  #")[0].strip() for part in body], line
+
+
+def test_links_of_the_documents_lead_somewhere():
+    pages = [ROOT / "README.md", *ROOT.glob("docs/**/*.md")]
+    for page in pages:
+        for target in re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8")):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_settings_page_names_every_part_and_key():
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    sections = dict(part.partition("\n")[::2] for part in re.split(r"^#+ ", page, flags=re.MULTILINE))
+    classes = {f'{name}: `kind = "{kind}"`': TAGGED[name][kind] for name in TAGGED for kind in TAGGED[name]}
+    classes |= {"`[task]`": TaskSettings, "`[model]`": ModelSpec, "`[training]`": TrainingSpec, "`[judge]`": JudgeSpec}
+    classes |= {"`[model.head]`": HeadSpec, "`[training.chunks]`": ChunkSpec, "`[[recordings]]`": RecordingEntry}
+    assert {title for title in sections if "kind =" in title} == {title for title in classes if "kind =" in title}
+    for title, cls in classes.items():
+        keys = re.findall(r"^\| `(\w+)` \|", sections[title], re.MULTILINE)
+        assert keys == [entry.name for entry in dataclasses.fields(cls)], title
+
+
+def test_quickstart(tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    scale = np.array([0.2 if channel.unit == "m/s" else 1e6 for channel in TABLE_A1.values()])
+    for i in range(4):
+        walk = np.cumsum(rng.normal(size=(400, 24)), axis=0) * 0.02 * scale
+        recording = Recording(f"drive_{i}", tuple(TABLE_A1.values()), walk.astype(np.float32), 100.0, source="test")
+        write_recording(recording, tmp_path / "data" / f"drive_{i}.parquet")
+    script = runpy.run_path(str(EXAMPLES / "quickstart.py"))
+    script["main"](str(tmp_path / "data"), str(tmp_path / "run"), *SMALL)
+    printed = capsys.readouterr().out
+    assert "report.html" in printed
+    assert "CylVels_3" in printed
+
+
+def rig_log(path: Path, seconds: float = 12.0) -> None:
+    """A log of the README's test rig: milliseconds, mm/s, bar, percent; one value is missing."""
+    rng = np.random.default_rng(1)
+    time_s = np.arange(0.0, seconds, 0.01)
+    command = 60 * np.sin(1.3 * time_s) + 20 * np.sin(3.1 * time_s)
+    speed = 2.5 * command + rng.normal(0, 1, len(time_s))
+    lines = ["Zeit;v_cyl;pA;pB;u_valve;remark"]
+    for t, v, u in zip(time_s, speed, command, strict=True):
+        lines.append(f"{1e3 * t:.0f};{v:.3f};{80 + 0.3 * u:.2f};{60 - 0.2 * u:.2f};{u:.2f};ok")
+    lines[500] = lines[500].replace(lines[500].split(";")[1], "", 1)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_own_logs_as_the_readme_tells(tmp_path, monkeypatch, capsys):
+    def edp(*args: object) -> int:
+        monkeypatch.setattr(sys, "argv", ["edp", *map(str, args)])
+        return run_app(app)
+
+    log, run = tmp_path / "drive.csv", tmp_path / "run"
+    rig_log(log)
+    mapped = ("--map", EXAMPLES / "map.toml")
+    assert edp("inspect", log, *mapped) == 3  # a missing value
+    options = [word for change in SMALL for word in ("--set", change)]
+    train = ("train", log, *mapped, "--config", EXAMPLES / "rig.toml", "--preset", "quick", *options, "--out", run)
+    assert edp(*train) == 1
+    assert "--repair" in capsys.readouterr().err
+    assert edp(*train, "--repair", "nan=hold") == 0
+    assert edp("evaluate", run, "--baselines", "persistence,ridge_arx") == 0
+    assert edp("report", run) == 0
+    assert "velocity" in (run / "report.html").read_text(encoding="utf-8")

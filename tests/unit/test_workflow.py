@@ -1,0 +1,189 @@
+"""The main jobs as functions: data-set files, provenance, evaluation and footprints."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from edp.config import load_experiment
+from edp.data.prepared import Prepared
+from edp.errors import DataError, EdpError, StorageError
+from edp.logs import write_recording
+from edp.logs.repair import Repair
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+from edp.training import load_bundle
+from edp.workflow import (
+    DataSource,
+    SimulationOrder,
+    evaluate,
+    footprint_of,
+    judge_bundle,
+    prepare_data,
+    simulate_data_set,
+    train,
+)
+
+CHANNELS = (Channel("v", Kind.VELOCITY), Channel("u", Kind.RATIO))
+SMALL = (
+    'task.features={name="rig", channels=["v", "u"]}',
+    'task.targets=["v"]',
+    "task.horizons=[2]",
+    "training.epochs=1",
+    "training.updates=3",
+    'training.chunks={regime="chunk",length=16,batch=2,burn_in=5}',
+    'model.backbone={kind="lstm",units=4}',
+    "model.blocks=[]",
+    "model.window=8",
+    "judge.history=4",
+    'judge.baselines=["persistence"]',
+)
+
+
+def drive(name, seed, samples=200, rate_hz=100.0):
+    rng = np.random.default_rng([seed, samples])
+    u = np.sin(np.arange(samples) / 15 + rng.uniform(0, 6)) + 0.01 * rng.normal(size=samples)
+    values = np.stack([np.convolve(u, np.ones(5) / 5)[:samples], u], axis=1)
+    return Recording(name, CHANNELS, values.astype(np.float32), rate_hz, source="test")
+
+
+@pytest.fixture
+def logs(tmp_path):
+    """Four drives, and the map that names their columns."""
+    for i in range(4):
+        write_recording(drive(f"drive_{i}", i), tmp_path / "logs" / f"drive_{i}.csv")
+    lines = ['[channels.v]\nkind = "velocity"\nunit = "m/s"', '[channels.u]\nkind = "ratio"\nunit = "1"']
+    (tmp_path / "map.toml").write_text("\n".join(lines) + "\n")
+    return tmp_path / "logs"
+
+
+def experiment():
+    return load_experiment(preset="quick", overrides=SMALL)
+
+
+def source_of(logs):
+    return DataSource.of(logs, logs.parent / "map.toml")
+
+
+def listed(logs, *entries, head='map = "map.toml"\n'):
+    path = logs.parent / "set.toml"
+    path.write_text(head + "".join(f"[[recordings]]\n{entry}\n" for entry in entries))
+    return path
+
+
+def test_a_run_holds_all_that_repeats_it(logs, tmp_path):
+    bundle = train(source_of(logs), experiment(), tmp_path / "run")
+    facts = json.loads((tmp_path / "run" / "provenance.json").read_text())
+    parts = [facts["data"][part]["names"] for part in ("train", "validation", "test")]
+    assert sorted(name for names in parts for name in names) == ["drive_0", "drive_1", "drive_2", "drive_3"]
+    assert facts["environment"]["torch"] == str(torch.__version__)
+    again = DataSource.from_plain(facts["data"]["reader"])
+    kept = load_experiment(tmp_path / "run" / "config.toml", "standard")
+    assert prepare_data(again, kept).digest == facts["data"]["digest"]
+    held = load_bundle(tmp_path / "run")
+    assert [channel.name for channel in held.inputs] == ["v", "u"]
+    assert all(torch.equal(a, b) for a, b in zip(bundle.predictor.parameters(), held.predictor.parameters()))
+
+
+def test_the_same_settings_and_data_give_the_same_bits(logs, tmp_path):
+    first = train(source_of(logs), experiment(), tmp_path / "a").predictor
+    second = train(source_of(logs), experiment(), tmp_path / "b").predictor
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters()))
+
+
+def test_evaluation_writes_scores_here_and_into_the_bundle(logs, tmp_path):
+    train(source_of(logs), experiment(), tmp_path / "run")
+    assert load_bundle(tmp_path / "run").scores == {}
+    steps = []
+    assert evaluate(tmp_path / "run", on_step=steps.append) == tmp_path / "run"
+    scores = json.loads((tmp_path / "run" / "scores.json").read_text())
+    assert steps == ["network", "persistence"]
+    assert set(scores["models"]) == {"network", "persistence"}
+    assert load_bundle(tmp_path / "run").scores == scores["models"]["network"]["overall"]
+
+
+def test_evaluation_on_other_recordings_leaves_the_run_as_it_was(logs, tmp_path):
+    train(source_of(logs), experiment(), tmp_path / "run")
+    header = (tmp_path / "run" / "bundle" / "bundle.json").read_bytes()
+    other = tmp_path / "other.csv"
+    write_recording(drive("other", 9), other)
+    folder = evaluate(tmp_path / "run", DataSource.of(other, tmp_path / "map.toml"))
+    assert folder == tmp_path / "run" / "on_other"
+    assert (folder / "predictions.safetensors").is_file()
+    assert not (tmp_path / "run" / "scores.json").exists()
+    assert (tmp_path / "run" / "bundle" / "bundle.json").read_bytes() == header
+
+
+def test_a_bundle_alone_is_not_a_run(logs, tmp_path):
+    train(source_of(logs), experiment(), tmp_path / "run")
+    with pytest.raises(StorageError, match="not a run folder"):
+        evaluate(tmp_path / "run" / "bundle")
+
+
+def test_a_bundle_is_judged_without_a_run_folder(logs, tmp_path):
+    bundle = train(source_of(logs), experiment(), tmp_path / "run")
+    data = prepare_data(source_of(logs), experiment())
+    assert isinstance(data, Prepared)
+    found = judge_bundle(bundle, data, experiment().judge)
+    assert found.scores["models"]["network"]["overall"]["2"]["mean"]["mae"] > 0
+
+
+def test_data_set_files_give_parts_names_and_maps(logs):
+    own = 'path = "logs/drive_1.csv"\nname = "second"\n[recordings.map.channels.u]\nkind = "ratio"\nunit = "%"'
+    path = listed(logs, 'path = "logs/drive_0.csv"\nrows = [20, 70]', own)
+    first, second = DataSource.of(path).read()
+    assert (first.name, first.samples, first.channel_names) == ("drive_0", 50, ("v", "u"))
+    assert (second.name, second.channel_names) == ("second", ("u",))
+    np.testing.assert_allclose(100 * second.column("u"), drive("", 1).column("u"), rtol=1e-6)
+
+
+def test_names_and_rates_of_data_set_files_must_agree(logs):
+    path = listed(logs, 'path = "logs/drive_0.csv"', 'path = "logs/drive_0.csv"')
+    with pytest.raises(DataError, match="drive_0 occur twice"):
+        DataSource.of(path).read()
+    write_recording(drive("slow", 5, rate_hz=50.0), logs / "slow.csv")
+    path = listed(logs, 'path = "logs/drive_0.csv"', 'path = "logs/slow.csv"')
+    with pytest.raises(DataError, match=r"mixed rates.*100 Hz.*50 Hz.*rate_hz"):
+        DataSource.of(path).read()
+
+
+def test_repairs_of_the_call_replace_those_of_the_file(logs):
+    log = logs / "drive_0.csv"
+    lines = log.read_text().splitlines()
+    lines[30] = lines[30].rpartition(",")[0] + ","
+    log.write_text("\n".join(lines) + "\n")
+    path = listed(logs, 'path = "logs/drive_0.csv"')
+    with pytest.raises(DataError, match="missing or infinite"):
+        DataSource.of(path).read()
+    (mended,) = DataSource.of(path, repair=Repair(nan="hold")).read()
+    assert np.isfinite(mended.values).all()
+    held = listed(logs, 'path = "logs/drive_0.csv"', head='map = "map.toml"\nrepair = { nan = "hold" }\n')
+    assert DataSource.of(held).read()[0].digest == mended.digest
+
+
+def test_simulated_data_sets_go_on_and_refuse_another_plan(tmp_path):
+    seen = []
+
+    def on_done(recording, kept):
+        seen.append((recording.name, kept))
+
+    order = SimulationOrder(minutes=0.3, recordings=2, seed=1)
+    paths = simulate_data_set(tmp_path, order, 1, on_done)
+    held = [path.read_bytes() for path in paths]
+    paths[0].unlink()
+    assert simulate_data_set(tmp_path, order, 1, on_done) == paths
+    assert [path.read_bytes() for path in paths] == held
+    assert [kept for _, kept in seen] == [False, False, True, False]
+    with pytest.raises(StorageError, match="another simulated data set"):
+        simulate_data_set(tmp_path, replace(order, seed=2))
+
+
+def test_footprints_of_settings_runs_and_bundles_agree(logs, tmp_path):
+    train(source_of(logs), experiment(), tmp_path / "run")
+    counts, _ = footprint_of(tmp_path / "run" / "config.toml")
+    assert footprint_of(tmp_path / "run")[0] == counts
+    assert footprint_of(tmp_path / "run" / "bundle")[0] == counts
+    with pytest.raises(EdpError, match="not a bundle"):
+        footprint_of(logs)
