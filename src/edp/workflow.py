@@ -24,10 +24,10 @@ from edp.config import (
     plain_tree,
 )
 from edp.data.prepared import Prepared, prepare
-from edp.errors import ConfigError, DataError, StorageError
+from edp.errors import ConfigError, DataError, StorageError, closest
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
-from edp.logs import find_recordings, read_data_set, read_recording, write_recording
+from edp.logs import find_recordings, known_suffixes, read_data_set, read_recording, write_recording
 from edp.logs.repair import Repair
 from edp.models.predictor import ModelSpec, Predictor, build_model, describe
 from edp.recording import Recording
@@ -165,9 +165,14 @@ def simulate_data_set(
     """
     from edp.sim import plan_data_set, simulate_many
 
-    plan = plan_data_set(machine, minutes, recordings, seed)
+    order = order or SimulationOrder()
+    suffix = order.suffix
+    if suffix not in known_suffixes():
+        hint = closest(suffix, known_suffixes())
+        raise ConfigError(f"there is no log format for the ending '{suffix}'{hint}")
+    plan = plan_data_set(order.machine, order.minutes, order.recordings, order.seed)
     folder = make_folder(out)
-    identity = {"schema": 1, "edp": __version__, "machine": machine, "plan": [asdict(entry) for entry in plan]}
+    identity = {"schema": 1, "edp": __version__, "plan": [asdict(entry) for entry in plan]}
     manifest = folder / MANIFEST
     if manifest.exists() and read_json(manifest) != identity:
         raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
