@@ -11,6 +11,7 @@ from edp.errors import StorageError
 from edp.runs import RunFolder, run_key
 from edp.training.checkpoint import FILE
 from edp.training.fit import fit
+from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import Plateau
 
 KEY = "k" * 32
@@ -55,10 +56,15 @@ def test_a_stopped_training_goes_on_to_the_same_bits(stops, tmp_path, tiny, tiny
     assert len((tmp_path / "history.jsonl").read_text().splitlines()) == tiny_training.epochs
 
 
-def test_schedules_with_memory_and_fixed_by_passes_go_on_too(tmp_path, tiny, tiny_bypass, tiny_training):
+@pytest.mark.parametrize("optimizer", list(OPTIMIZERS))
+def test_optimizers_schedules_with_memory_and_fixed_by_passes_go_on_too(
+    optimizer, tmp_path, tiny, tiny_bypass, tiny_training
+):
     fixed = dataclasses.replace(tiny_bypass.blocks[1], trained=False)
     model = dataclasses.replace(tiny_bypass, blocks=(tiny_bypass.blocks[0], fixed))
-    spec = dataclasses.replace(tiny_training, schedule=Plateau(patience=0, threshold=0.5), epochs=4)
+    spec = dataclasses.replace(
+        tiny_training, optimizer=OPTIMIZERS[optimizer](), schedule=Plateau(patience=0, threshold=0.5), epochs=4
+    )
     with RunFolder(tmp_path) as folder, pytest.raises(Stop):
         fit(tiny, model, spec, (folder, KEY), stop_after(2))
     with RunFolder(tmp_path) as folder:
