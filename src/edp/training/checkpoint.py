@@ -91,7 +91,8 @@ def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
     """Plain JSON of a tree; its tensors go to `tensors` and leave a reference."""
     if isinstance(value, Tensor):
         tensors[path] = value.detach().cpu().contiguous()
-        return {"tensor": path}
+        # The order in memory decides how a matrix product rounds; without it a resumed run drifts by a last bit.
+        return {"tensor": path, "stride": torch.empty_like(value, memory_format=torch.preserve_format).stride()}
     if isinstance(value, dict):
         return {str(key): _strip(item, f"{path}/{key}", tensors) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -101,8 +102,9 @@ def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
 
 def _restore(value: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(value, dict):
-        if set(value) == {"tensor"}:
-            return tensors[value["tensor"]]
+        if set(value) == {"tensor", "stride"}:
+            held = tensors[value["tensor"]]
+            return torch.empty_strided(held.shape, value["stride"], dtype=held.dtype).copy_(held)
         return {key: _restore(item, tensors) for key, item in value.items()}
     if isinstance(value, list):
         return [_restore(item, tensors) for item in value]
