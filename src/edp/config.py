@@ -42,7 +42,7 @@ TAGGED: Mapping[str, Registry[type]] = {
 }
 """Fields whose tables say with ``kind = "..."`` which registered part they set."""
 
-PRESETS = ("quick", "standard", "thesis")
+PRESETS = ("quick", "small", "standard", "thesis")
 Table = dict[str, Any]
 
 

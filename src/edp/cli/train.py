@@ -13,8 +13,8 @@ from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from edp.sources import DataSource
     from edp.training import Bundle, Event
-    from edp.workflow import DataSource
 
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
@@ -26,7 +26,7 @@ def train(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run in it goes on.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset.")] = None,
-    preset: Annotated[str, typer.Option(help="quick, standard or thesis.")] = "standard",
+    preset: Annotated[str, typer.Option(help="quick, small, standard or thesis.")] = "standard",
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example training.epochs=10.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -64,7 +64,7 @@ def run(
 ) -> tuple[Bundle, float | None]:
     """Train with a progress display; returns the bundle and the best validation error."""
     from edp.config import load_experiment
-    from edp.workflow import DataSource
+    from edp.sources import DataSource
     from edp.workflow import train as run_training
 
     experiment = load_experiment(config, preset, changes)
@@ -79,7 +79,7 @@ def source_of(data: Path, signal_map: Path | None, repair: list[str]) -> DataSou
     from edp.config import build
     from edp.errors import ConfigError
     from edp.logs.repair import Repair
-    from edp.workflow import DataSource
+    from edp.sources import DataSource
 
     table: dict[str, str] = {}
     for text in repair:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.prepared import Prepared
+from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, BaselineTask
@@ -92,12 +93,13 @@ def judge(
     predictions = {"network": stream_predictions(predictor, data.test)}
     names, times = {"network": label}, {"network": seconds}
     task = baseline_task(data, spec)
+    known = {part: _with_derived_targets(data, getattr(data, part)) for part in ("train", "validation", "test")}
     for name in spec.baselines:
         say(name)
         began = time.perf_counter()
         baseline = BASELINES[name](task)
-        baseline.fit(data.train, data.validation)
-        predictions[name] = [baseline.predict(series) for series in data.test]
+        baseline.fit(known["train"], known["validation"])
+        predictions[name] = [baseline.predict(series) for series in known["test"]]
         names[name], times[name] = LABELS.get(name, name), time.perf_counter() - began
     skip = predictor.spec.window if spec.skip is None else spec.skip
     ruler = _Ruler(data, skip)
@@ -109,12 +111,29 @@ def judge(
 
 
 def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
-    """The baselines' task: present values only where a logged input measures them."""
-    inputs = data.task.features.inputs
+    """The baselines' task: present values only where an input measures them, or a feature derived from one."""
+    inputs = (*data.task.features.inputs, *_derived_targets(data))
     present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
     longest = min(series.samples for series in [*data.train, *data.test]) - data.task.reach - 1
     history = max(1, min(spec.history, longest // 2))
     return BaselineTask(horizons=data.task.horizons, present=present, history=history, seed=spec.seed)
+
+
+def _derived_targets(data: Prepared) -> list[str]:
+    features = data.task.features
+    return [entry.name for entry in features.derived if entry.name in data.task.targets]
+
+
+def _with_derived_targets(data: Prepared, parts: Sequence[Series]) -> list[Series]:
+    """Inputs as the baselines read them: where the network knows a target's present value, so must they."""
+    names = _derived_targets(data)
+    if not names:
+        return list(parts)
+    columns = [data.task.features.features.index(name) for name in names]
+    return [
+        replace(part, inputs=np.concatenate([part.inputs, feature_matrix(data.task, part)[:, columns]], axis=1))
+        for part in parts
+    ]
 
 
 class _Ruler:

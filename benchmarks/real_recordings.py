@@ -1,0 +1,165 @@
+"""Our default on public measured recordings, beside persistence, linear floors and published free-run scores.
+
+Each set is a data-set file and a settings file in ``examples/real``; no code knows any of them. The same commands, with
+the same preset, work on anyone's recordings:
+
+    edp train examples/real/faster.toml --preset small --config examples/real/faster_settings.toml --out runs/faster
+    edp evaluate runs/faster
+
+The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from common import Verdict, finish, parser, table, verdict
+from edp.config import load_experiment, read_toml
+from edp.storage import read_json
+from edp.workflow import DataSource, evaluate, train
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples" / "real"
+VARIABLE = "EDP_SHARED_DATA"
+PRESET = "small"
+BASELINES = ("persistence", "ridge_arx")
+QUICK_SETS = ("sjoberg.toml", "tanks.toml")
+QUICK = ("training.epochs=2",)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Root-mean-square errors of one target at one horizon, in the units of the floors.
+
+    Attributes:
+        ours: of the network.
+        ridge: of the ridge regression on the network's own training part.
+        persistence: of persistence, in this run.
+        floor_persistence: as stated with the data.
+        floor_linear: as stated with the data.
+    """
+
+    title: str
+    target: str
+    horizon: int
+    ours: float
+    ridge: float
+    persistence: float
+    floor_persistence: float
+    floor_linear: float
+
+
+def scores_of(data: str, settings: str, out: Path, changes: Sequence[str]) -> tuple[dict[str, Any], float]:
+    """Train and judge by a data-set file and a settings file; the content of scores.json, and seconds."""
+    began = time.perf_counter()
+    experiment = load_experiment(EXAMPLES / settings, PRESET, changes)
+    train(DataSource.of(EXAMPLES / data), experiment, out)
+    folder = evaluate(out, baselines=BASELINES)
+    return read_json(folder / "scores.json"), time.perf_counter() - began
+
+
+def rmse(scores: dict[str, Any], model: str, target: str, horizon: int) -> float:
+    """Root-mean-square error of a model in report units."""
+    return float(scores["models"][model]["overall"][str(horizon)][target]["rmse"])
+
+
+def floor_rows(entry: dict[str, Any], scores: dict[str, Any]) -> Iterator[Row]:
+    """A row for each stated floor of a set."""
+    for target, horizon, persistence, linear in entry["rows"]:
+        ours, ridge, held = (rmse(scores, model, target, horizon) for model in ("network", "ridge_arx", "persistence"))
+        yield Row(entry["title"], target, horizon, ours, ridge, held, persistence, linear)
+
+
+def verdicts_of(rows: Sequence[Row], quick: bool) -> list[Verdict]:
+    """Ours against the linear floor, row by row."""
+    return [
+        verdict(f"{r.title}: {r.target}, k = {r.horizon}", r.ours, r.floor_linear, "<= 1", "RMSE", quick) for r in rows
+    ]
+
+
+def show_floors(rows: Sequence[Row], quick: bool) -> None:
+    """Print the k-step table."""
+    print(f"\nRMSE k steps ahead, preset '{PRESET}'" + (" (quick: hardly trained)" if quick else ""))
+    headings = ["set", "target", "k", "ours", "linear floor", "ridge here", "persistence", "stated", "ours/floor"]
+    lines = []
+    for r in rows:
+        held = (r.floor_linear, r.ridge, r.persistence, r.floor_persistence, r.ours / r.floor_linear)
+        lines.append([r.title, r.target, r.horizon, r.ours, *held])
+    table(headings, lines)
+
+
+def free_run(entry: dict[str, Any], scores: dict[str, Any]) -> dict[str, float]:
+    """Our free-run errors by name, in the unit of the published ones."""
+    found = {}
+    for model, name in (("network", "OURS"), ("ridge_arx", "ridge on past inputs, here")):
+        if entry.get("integrated"):
+            value = float(scores["models"][model]["integrated"][entry["target"]]["rmse"])
+        else:
+            value = rmse(scores, model, entry["target"], 0)
+        found[name] = value * entry.get("factor", 1.0)
+    return found
+
+
+def show_league(entry: dict[str, Any], ours: dict[str, float], scores: dict[str, Any], quick: bool) -> None:
+    """Print the published league with our errors in their place."""
+    skip, rate = scores["task"]["skip"], scores["task"]["rate_hz"]
+    print(f"\nFree run: {entry['title']}" + (" (quick: hardly trained)" if quick else ""))
+    both = [*entry["published"].items(), *ours.items()]
+    both.sort(key=lambda pair: pair[1] if math.isfinite(pair[1]) else math.inf)
+    table(["method", "test RMSE"], both)
+    print(f"Source: {entry['source']}; {entry['note']}.")
+    print(f"Ours knows no initial state: {skip} first ticks ({skip / rate:g} s) warm up and are not scored.")
+
+
+def run(quick: bool, seed: int) -> tuple[list[Row], dict[str, Any]]:
+    """Train and judge every set; rows of the k-step table and what else is kept."""
+    listed = read_toml(EXAMPLES / "leagues.toml")
+    changes = [f"training.seed={seed}", *(QUICK if quick else ())]
+    rows: list[Row] = []
+    kept: dict[str, Any] = {"seconds": {}, "free_run": {}}
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in ("floors", "leagues"):
+            for entry in listed[kind]:
+                if quick and entry["data"] not in QUICK_SETS:
+                    continue
+                print(f"{entry['settings']} ...", file=sys.stderr, flush=True)
+                out = Path(folder) / Path(entry["settings"]).stem
+                scores, seconds = scores_of(entry["data"], entry["settings"], out, changes)
+                kept["seconds"][entry["settings"]] = round(seconds, 1)
+                if kind == "floors":
+                    rows += floor_rows(entry, scores)
+                else:
+                    ours = free_run(entry, scores)
+                    show_league(entry, ours, scores, quick)
+                    kept["free_run"][entry["title"]] = {**ours, "skip": scores["task"]["skip"]}
+    return rows, kept
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    options = parser(__doc__ or "")
+    options.add_argument("--shared", type=Path, default=None, help=f"folder of the recordings (else ${VARIABLE})")
+    given = options.parse_args(arguments)
+    shared = given.shared or Path(os.environ.get(VARIABLE) or ROOT.parent / "shared" / "data")
+    if not shared.is_dir():
+        print(f"skipped: there is no folder of real recordings '{shared}'; give --shared or set {VARIABLE}")
+        print(json.dumps({"skipped": True, "why": "no real recordings"}))
+        return
+    os.environ[VARIABLE] = str(shared.resolve())
+    rows, kept = run(given.quick, given.seed)
+    show_floors(rows, given.quick)
+    kept["rows"] = [vars(row) for row in rows]
+    finish("real_recordings", verdicts_of(rows, given.quick), given.seed, kept)
+
+
+if __name__ == "__main__":
+    main()
