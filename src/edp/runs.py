@@ -69,6 +69,8 @@ class RunFolder:
         self._lock.truncate(0)
         self._lock.write(str(os.getpid()))
         self._lock.flush()
+        for rest in self.path.glob(".*.tmp"):  # of a process that was killed while it wrote
+            rest.unlink(missing_ok=True)
 
     def __enter__(self) -> RunFolder:
         """The folder itself; leaving the block frees the lock."""

@@ -16,24 +16,20 @@ from safetensors.numpy import save
 from edp import __version__
 from edp.config import (
     Experiment,
-    build,
     experiment_toml,
-    load_data_set,
     load_experiment,
-    load_signal_map,
     plain_tree,
 )
 from edp.data.prepared import Prepared, prepare
 from edp.errors import ConfigError, DataError, StorageError, closest
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
-from edp.logs import find_recordings, known_suffixes, read_data_set, read_recording, write_recording
-from edp.logs.repair import Repair
+from edp.logs import known_suffixes, read_recording, write_recording
 from edp.models.predictor import ModelSpec, Predictor, build_model, describe
 from edp.recording import Recording
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
-from edp.signals import SignalMap
+from edp.sources import DataSource
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.training import Bundle, Event, fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler
@@ -42,88 +38,6 @@ from edp.training.fit import thread_count
 SHOWN_RECORDINGS = 6
 SHOWN_TICKS = 60_000
 MANIFEST = "data_set.json"
-
-
-@dataclass(frozen=True)
-class DataSource:
-    """Where recordings come from.
-
-    Attributes:
-        path: a log, a folder of logs, or a data-set file (``.toml``).
-        signal_map: columns to channels; None takes the vocabulary's names.
-        repair: what may be mended.
-    """
-
-    path: Path
-    signal_map: SignalMap | None = None
-    repair: Repair | None = None
-
-    @staticmethod
-    def of(path: str | Path, map_file: str | Path | None = None, repair: Repair | None = None) -> DataSource:
-        """A source from paths."""
-        return DataSource(Path(path), None if map_file is None else load_signal_map(map_file), repair)
-
-    def to_plain(self) -> dict[str, Any]:
-        """What provenance keeps, to read the same data again."""
-        kept: dict[str, Any] = {"path": str(self.path.resolve())}
-        if self.signal_map is not None:
-            kept["map"] = plain_tree(self.signal_map)
-        if self.repair is not None:
-            kept["repair"] = plain_tree(self.repair)
-        return kept
-
-    @staticmethod
-    def from_plain(plain: dict[str, Any]) -> DataSource:
-        """The source that `to_plain` described."""
-        signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
-        repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
-        return DataSource(Path(plain["path"]), signal_map, repair)
-
-    def read(self) -> list[Recording]:
-        """All recordings, at one rate.
-
-        Raises:
-            DataError: nothing to read, or a log that cannot be used as it is.
-        """
-        if self.path.suffix == ".toml":
-            return _read_listed(self.path, self.signal_map, self.repair)
-        return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
-
-
-def _read_listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Recording]:
-    """The recordings of a data-set file; paths in it are relative to it; a map given here replaces the shared one."""
-    settings = load_data_set(path)
-    allowed = repair or settings.repair
-
-    def resolved(entry: str | SignalMap | None) -> SignalMap | None:
-        return load_signal_map(path.parent / entry) if isinstance(entry, str) else entry
-
-    shared = signal_map or resolved(settings.map)
-    recordings = []
-    for entry in settings.recordings:
-        chosen = resolved(entry.map) or shared
-        log = path.parent / _expanded(entry.path, path)  # an absolute path stands for itself
-        recordings.append(read_recording(log, chosen, name=entry.name, rows=entry.rows, repair=allowed))
-    names = [recording.name for recording in recordings]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise DataError(f"'{path}': recording name(s) {', '.join(twice)} occur twice; set name = \"...\" for each")
-    rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
-    if max(rates) > 1.001 * min(rates):
-        shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
-        raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
-    return recordings
-
-
-def _expanded(entry: str, path: Path) -> str:
-    """`entry` with environment variables put in, so that a data-set file can name logs on another disk."""
-    full = os.path.expandvars(entry)
-    if "$" in full:
-        raise ConfigError(
-            f"'{path}': path = '{entry}' names an environment variable that is not set; set it to the folder of the "
-            "logs, or write the path out"
-        )
-    return full
 
 
 @dataclass(frozen=True, kw_only=True)

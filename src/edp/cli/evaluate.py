@@ -12,7 +12,7 @@ from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, tabl
 from edp.cli.train import MapOption, RepairOption, source_of
 
 if TYPE_CHECKING:
-    from edp.workflow import DataSource
+    from edp.sources import DataSource
 
 
 def evaluate(

@@ -14,7 +14,7 @@ FAULTY = 3
 
 
 def inspect(
-    data: Annotated[Path, typer.Argument(help="A log or a folder of logs.")],
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     signal_map: MapOption = None,
     channels: Annotated[bool, typer.Option(help="Show a row for each channel.")] = True,
     as_json: JsonFlag = False,
@@ -25,12 +25,9 @@ def inspect(
 
     Example: `edp inspect logs/ --map mine.toml`
     """
-    from edp.config import load_signal_map
-    from edp.logs import find_recordings, inspect_log
+    from edp.sources import DataSource
 
-    chosen = None if signal_map is None else load_signal_map(signal_map)
-    reports = [inspect_log(path, chosen) for path in find_recordings(data)]
-    plain = [report.to_json() for report in reports]
+    plain = [report.to_json() for report in DataSource.of(data, signal_map).inspect()]
     errors = sum(finding["severity"] == "error" for report in plain for finding in report["findings"])
 
     def show() -> None:

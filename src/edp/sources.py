@@ -1,0 +1,125 @@
+"""Where recordings come from: a log, a folder of logs, or a data-set file that lists them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edp.config import build, load_data_set, load_signal_map, plain_tree
+from edp.errors import ConfigError, DataError
+from edp.logs import QualityReport, find_recordings, inspect_log, read_data_set, read_recording
+from edp.logs.repair import Repair
+from edp.recording import Recording
+from edp.signals import SignalMap
+
+
+@dataclass(frozen=True)
+class DataSource:
+    """Where recordings come from.
+
+    Attributes:
+        path: a log, a folder of logs, or a data-set file (``.toml``).
+        signal_map: columns to channels; None takes the vocabulary's names.
+        repair: what may be mended.
+    """
+
+    path: Path
+    signal_map: SignalMap | None = None
+    repair: Repair | None = None
+
+    @staticmethod
+    def of(path: str | Path, map_file: str | Path | None = None, repair: Repair | None = None) -> DataSource:
+        """A source from paths."""
+        return DataSource(Path(path), None if map_file is None else load_signal_map(map_file), repair)
+
+    def to_plain(self) -> dict[str, Any]:
+        """What provenance keeps, to read the same data again."""
+        kept: dict[str, Any] = {"path": str(self.path.resolve())}
+        if self.signal_map is not None:
+            kept["map"] = plain_tree(self.signal_map)
+        if self.repair is not None:
+            kept["repair"] = plain_tree(self.repair)
+        return kept
+
+    @staticmethod
+    def from_plain(plain: dict[str, Any]) -> DataSource:
+        """The source that `to_plain` described."""
+        signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
+        repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
+        return DataSource(Path(plain["path"]), signal_map, repair)
+
+    def logs(self) -> list[Log]:
+        """The logs of the source, unread, each with the map that belongs to it."""
+        if self.path.suffix == ".toml":
+            return _listed(self.path, self.signal_map, self.repair)
+        return [Log(path, self.signal_map, self.repair) for path in find_recordings(self.path)]
+
+    def read(self) -> list[Recording]:
+        """All recordings, at one rate.
+
+        Raises:
+            DataError: nothing to read, or a log that cannot be used as it is.
+        """
+        if self.path.suffix != ".toml":
+            return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
+        recordings = [log.read() for log in self.logs()]
+        _check_listed(recordings, self.path)
+        return recordings
+
+    def inspect(self) -> list[QualityReport]:
+        """What is in each log and what is wrong with it; nothing is mended or refused."""
+        return [inspect_log(log.path, log.signal_map) for log in self.logs()]
+
+
+@dataclass(frozen=True)
+class Log:
+    """One log of a source, with what is needed to read it; see `edp.config.RecordingEntry`."""
+
+    path: Path
+    signal_map: SignalMap | None = None
+    repair: Repair | None = None
+    name: str | None = None
+    rows: tuple[int, int] | None = None
+
+    def read(self) -> Recording:
+        """The recording."""
+        return read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
+
+
+def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
+    """The logs of a data-set file; paths in it are relative to it; a map given here replaces the shared one."""
+    settings = load_data_set(path)
+
+    def resolved(entry: str | SignalMap | None) -> SignalMap | None:
+        return load_signal_map(path.parent / entry) if isinstance(entry, str) else entry
+
+    shared, allowed = signal_map or resolved(settings.map), repair or settings.repair
+    return [
+        # An absolute path stands for itself.
+        Log(path.parent / _expanded(entry.path, path), resolved(entry.map) or shared, allowed, entry.name, entry.rows)
+        for entry in settings.recordings
+    ]
+
+
+def _check_listed(recordings: list[Recording], path: Path) -> None:
+    names = [recording.name for recording in recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DataError(f"'{path}': recording name(s) {', '.join(twice)} occur twice; set name = \"...\" for each")
+    rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
+    if max(rates) > 1.001 * min(rates):
+        shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
+        raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
+
+
+def _expanded(entry: str, path: Path) -> str:
+    """`entry` with environment variables put in, so that a data-set file can name logs on another disk."""
+    full = os.path.expandvars(entry)
+    if "$" in full:
+        raise ConfigError(
+            f"'{path}': path = '{entry}' names an environment variable that is not set; set it to the folder of the "
+            "logs, or write the path out"
+        )
+    return full
