@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from edp.data.lags import DoubleArray, LagTask, target_means
+from edp.data.lags import DoubleArray, LagTask, origins, target_means
 from edp.data.ridge_moments import Moments, Standard, moments_of, standard_of
 from edp.data.series import Series
 from edp.errors import ConfigError
@@ -114,8 +114,8 @@ def crossed_solution(
 
     Args:
         parts: all stretches that may be learned from.
-        task: what to predict from what; history and horizon are not carried from one fold to the next.
-        folds: pieces of nearly equal duration.
+        task: what to predict from what.
+        folds: pieces of nearly equal duration; neighbouring ones share the history and future of their ticks.
         penalties: as for `ridge_solution`.
         histories: histories to choose from, in samples; cut to the task's.
 
@@ -123,40 +123,47 @@ def crossed_solution(
         ConfigError: a penalty too small for inputs that are copies of each other.
     """
     standard = standard_of(parts, target_means(parts))
-    whole = moments_of(parts, task, standard)
-    folded = [moments_of(fold, task, standard) for fold in _folds(parts, folds)]
-    folded = [found for found in folded if found.rows]
-    pairs = [(_sum([other for other in folded if other is not fold]), fold) for fold in folded if len(folded) > 1]
     inputs, outputs = len(standard.centre), task.outputs
     best = np.full(outputs, np.inf)
     weights = np.zeros((task.history * inputs, outputs))
     penalty, history = np.zeros(outputs), np.zeros(outputs, dtype=np.int64)
     for samples in sorted({min(entry, task.history) for entry in (*histories, task.history)}, reverse=True):
+        # Rows are counted anew for each history: a short one can use more of them.
+        tried = replace(task, history=samples)
+        folded = [moments_of(fold, tried, standard) for fold in _folds(parts, tried, folds)]
+        whole = _sum(folded)
+        pairs = [(_sum([other for other in folded if other is not fold]), fold) for fold in folded if fold.rows]
         for relative in sorted(penalties):
-            size = samples * inputs
             loss = np.zeros(outputs)
             for rest, fold in pairs:
-                loss += fold.rows * _squared_error(fold, rest, _solve(rest, size, relative))
+                if rest.rows:
+                    loss += (
+                        fold.rows / whole.rows * _squared_error(fold, rest, _solve(rest, samples * inputs, relative))
+                    )
             better = loss < best
             if better.any():
-                solved = _solve(whole, size, relative)
+                solved = _solve(whole, samples * inputs, relative)
                 best[better], penalty[better], history[better] = loss[better], relative, samples
                 weights[:, better] = 0.0
-                weights[:size, better] = solved[:, better]
-    return _physical(weights, whole, standard, task, (penalty, history))
+                weights[: samples * inputs, better] = solved[:, better]
+    # Intercepts come from the rows that all histories share.
+    longest = _sum([moments_of(fold, task, standard) for fold in _folds(parts, task, folds)])
+    return _physical(weights, longest, standard, task, (penalty, history))
 
 
-def _folds(parts: Sequence[Series], folds: int) -> list[list[Series]]:
-    """Contiguous pieces of nearly equal duration over all stretches, in order."""
-    edges = np.linspace(0, sum(part.samples for part in parts), folds + 1).round().astype(int)
+def _folds(parts: Sequence[Series], task: LagTask, folds: int) -> list[list[Series]]:
+    """Contiguous pieces with nearly equal shares of the ticks, in order; each tick is the origin of one piece."""
+    ticks = [origins(part, task) for part in parts]
+    edges = np.linspace(0, sum(len(own) for own in ticks), folds + 1).round().astype(int)
     pieces: list[list[Series]] = [[] for _ in range(folds)]
     begin = 0
-    for part in parts:
+    for part, own in zip(parts, ticks, strict=True):
         for piece, low, high in zip(pieces, edges[:-1] - begin, edges[1:] - begin, strict=True):
-            rows = slice(max(0, low), max(0, min(high, part.samples)))
-            if rows.stop > rows.start:
+            chosen = own[max(0, low) : max(0, high)]
+            if chosen:
+                rows = slice(chosen.start - task.history + 1, chosen.stop + max(task.horizons))
                 piece.append(Series(part.name, part.inputs[rows], part.targets[rows]))
-        begin += part.samples
+        begin += len(own)
     return pieces
 
 

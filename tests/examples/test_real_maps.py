@@ -1,0 +1,114 @@
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edp.config import load_data_set, load_experiment, read_toml
+from edp.errors import ConfigError
+from edp.workflow import DataSource
+
+ROOT = Path(__file__).parents[2]
+REAL = ROOT / "examples" / "real"
+LISTED = read_toml(REAL / "leagues.toml")
+ENTRIES = [*LISTED["floors"], *LISTED["leagues"]]
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """The benchmark script as a module."""
+    folder = str(ROOT / "benchmarks")
+    sys.path.insert(0, folder)
+    try:
+        spec = importlib.util.spec_from_file_location("bench_real_recordings", ROOT / "benchmarks/real_recordings.py")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+        yield module
+    finally:
+        sys.path.remove(folder)
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=[entry["settings"] for entry in ENTRIES])
+def test_maps_and_settings_agree(entry):
+    data = load_data_set(REAL / entry["data"])
+    maps = [recording.map or data.map for recording in data.recordings]
+    experiment = load_experiment(REAL / entry["settings"], "small")
+    task = experiment.task.resolve(10.0)
+    for signal_map in maps:
+        assert set(task.features.inputs) <= {channel.name for channel in signal_map.channels}
+    if "rows" in entry:
+        assert {row[0] for row in entry["rows"]} <= set(task.targets)
+        assert {row[1] for row in entry["rows"]} <= set(task.horizons)
+        assert all(linear > 0 and persistence > 0 for _, _, persistence, linear in entry["rows"])
+    else:
+        assert task.horizons == (0,)
+        assert not set(task.targets) & set(task.features.features)
+        assert entry["target"] in task.targets
+
+
+def test_every_file_is_listed():
+    named = {entry["settings"] for entry in ENTRIES} | {entry["data"] for entry in ENTRIES} | {"leagues.toml"}
+    assert {path.name for path in REAL.iterdir()} == named
+
+
+def test_sets_share_one_preset():
+    for path in REAL.glob("*_settings.toml"):
+        assert set(read_toml(path)) <= {"task", "split"}, f"{path.name} changes more than the task and the split"
+
+
+def test_an_unset_variable_is_named(monkeypatch):
+    monkeypatch.delenv("EDP_SHARED_DATA", raising=False)
+    with pytest.raises(ConfigError, match=r"EDP_SHARED_DATA.*is not set"):
+        DataSource.of(REAL / "faster.toml").read()
+
+
+def test_without_recordings_it_says_so_and_succeeds(bench, tmp_path, capsys):
+    bench.main(["--shared", str(tmp_path / "nowhere")])
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert lines[0].startswith("skipped:")
+    assert json.loads(lines[-1])["skipped"] is True
+
+
+def test_rows_verdicts_and_league(bench, capsys):
+    def model(error: float) -> dict:
+        return {"overall": {"1": {"y": {"rmse": error}}, "0": {"y": {"rmse": error}}}}
+
+    scores = {
+        "task": {"skip": 4, "rate_hz": 2.0},
+        "models": {"network": model(0.5), "ridge_arx": model(0.8), "persistence": model(2.0)},
+    }
+    entry = {"title": "made up", "rows": [["y", 1, 2.1, 0.4]]}
+    rows = list(bench.floor_rows(entry, scores))
+    assert (rows[0].ours, rows[0].ridge, rows[0].persistence, rows[0].floor_linear) == (0.5, 0.8, 2.0, 0.4)
+    (found,) = bench.verdicts_of(rows, quick=True)
+    assert not found.met
+    assert found.ratio == pytest.approx(1.25)
+    bench.show_floors(rows, quick=True)
+    league = {"title": "made up", "target": "y", "published": {"A": 0.1, "B": 900.0}, "factor": 1e3, "source": "s"}
+    ours = bench.free_run(league, scores)
+    assert ours == {"OURS": 500.0, "ridge on past inputs, here": 800.0}
+    bench.show_league({**league, "note": "n"}, ours, scores, quick=True)
+    printed = capsys.readouterr().out
+    assert printed.index("A  ") < printed.index("OURS") < printed.index("B  ")
+    assert "4 first ticks (2 s)" in printed
+
+
+def test_real_recordings_train_through_their_maps(bench, tmp_path, monkeypatch):
+    """The whole path on a set of the same shape, so that it runs where the recordings are not."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=(160, 2)), 8, axis=0)[:1024]
+    y = np.zeros_like(u)
+    for t in range(1, len(u)):
+        y[t] = 0.9 * y[t - 1] + 0.1 * np.tanh(u[t - 1]) + 0.01 * rng.normal(size=2)
+    (tmp_path / "cascaded_tanks").mkdir()
+    table = np.column_stack([u, y])
+    text = "uEst,uVal,yEst,yVal\n" + "\n".join(",".join(f"{v:.6g}" for v in row) for row in table)
+    (tmp_path / "cascaded_tanks/dataBenchmark.csv").write_text(text)
+    monkeypatch.setenv("EDP_SHARED_DATA", str(tmp_path))
+    changes = ["training.epochs=1", "training.updates=2"]
+    scores, _ = bench.scores_of("tanks.toml", "tanks_settings.toml", tmp_path / "run", changes)
+    for horizon in (1, 5, 10):
+        assert bench.rmse(scores, "network", "y", horizon) < bench.rmse(scores, "persistence", "y", horizon)
