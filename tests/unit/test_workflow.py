@@ -33,6 +33,7 @@ SMALL = (
     "task.horizons=[2]",
     "training.epochs=1",
     "training.updates=3",
+    'training.optimizer={kind="adamw"}',
     'training.chunks={regime="chunk",length=16,batch=2,burn_in=5}',
     'model.backbone={kind="lstm",units=4}',
     "model.blocks=[]",

@@ -22,6 +22,7 @@ from edp.signals import TABLE_A1
 SMALL = (
     "training.epochs=2",
     "training.updates=5",
+    'training.optimizer={kind="adamw"}',
     'training.chunks={regime="chunk",length=32,batch=4,burn_in=10}',
     'model.backbone={kind="hybrid",channels=[6],kernel=3,units=6}',
     "model.head.hidden=6",

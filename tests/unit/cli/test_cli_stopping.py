@@ -48,7 +48,7 @@ def test_a_second_call_finds_the_run_finished(edp, logs, tmp_path, small):
 
 
 def test_stopped_and_killed_training_ends_with_the_same_bits(edp, logs, tmp_path, small):
-    run, options = tmp_path / "run", [*small, "--set", "training.epochs=40", "--set", "training.updates=8"]
+    run, options = tmp_path / "run", [*small, "--set", "training.epochs=30", "--set", "training.updates=8"]
     command = ("train", logs, "--out", run, *options)
     checkpoint = run / "checkpoint.safetensors"
 
@@ -67,7 +67,8 @@ def test_stopped_and_killed_training_ends_with_the_same_bits(edp, logs, tmp_path
     assert edp("train", logs, "--out", tmp_path / "whole", *options).code == 0
     stopped, whole = weights_of(run), weights_of(tmp_path / "whole")
     assert all((stopped[name] == whole[name]).all() for name in whole)
-    assert len((run / "history.jsonl").read_text().splitlines()) == 40
+    assert len((run / "history.jsonl").read_text().splitlines()) == 30
+    assert not list(run.rglob("*.tmp"))
 
 
 def test_stopped_simulation_keeps_whole_logs_and_goes_on(edp, tmp_path):
