@@ -13,8 +13,8 @@ from edp.cli import simulate as simulate_command
 from edp.cli import train as train_command
 from edp.cli.console import JsonFlag, duration, emit, out
 
-MINUTES = 75.0
-RECORDINGS = 25
+MINUTES = 180.0
+RECORDINGS = 60
 
 
 def demo(
