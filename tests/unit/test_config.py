@@ -31,9 +31,8 @@ def saved(tmp_path, text, name="settings.toml"):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_load_and_survive_a_round_trip(preset, tmp_path):
     experiment = load_experiment(preset=preset)
-    for other in PRESETS:  # the file holds every setting, so the preset below it does not matter
-        again = load_experiment(saved(tmp_path, experiment_toml(experiment)), preset=other)
-        assert plain_tree(again) == plain_tree(experiment)
+    again = load_experiment(saved(tmp_path, experiment_toml(experiment)))  # as a run folder is read
+    assert plain_tree(again) == plain_tree(experiment)
 
 
 def test_every_registered_part_survives_a_round_trip(tmp_path):
