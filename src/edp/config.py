@@ -137,18 +137,21 @@ class DataSetSettings:
 
 
 def load_experiment(
-    path: str | Path | None = None, preset: str = "standard", overrides: Sequence[str] = ()
+    path: str | Path | None = None, preset: str | None = "standard", overrides: Sequence[str] = ()
 ) -> Experiment:
     """Settings from a preset, changed by a TOML file, changed by ``key.path=value`` overrides.
+
+    Without a preset the file is taken as it stands, over the defaults of the specs: what a run folder keeps is whole.
 
     Raises:
         ConfigError: names every unknown key, wrong type and impossible value at once.
     """
-    if preset not in PRESETS:
-        raise ConfigError(f"there is no preset '{preset}'{closest(preset, PRESETS)}")
-    text = resources.files("edp").joinpath(f"presets/{preset}.toml").read_text(encoding="utf-8")
-    table = tomllib.loads(text)
+    table: Table = {}
     where = f"preset '{preset}'"
+    if preset is not None:
+        if preset not in PRESETS:
+            raise ConfigError(f"there is no preset '{preset}'{closest(preset, PRESETS)}")
+        table = tomllib.loads(resources.files("edp").joinpath(f"presets/{preset}.toml").read_text(encoding="utf-8"))
     if path is not None:
         table = merged(table, read_toml(path))
         where = f"'{path}'"

@@ -130,7 +130,8 @@ def train(
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
     """
     data = prepare_data(source, experiment)
-    key = run_key(plain_tree(experiment), data.digest)
+    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    key = run_key(settings, data.digest)
     with RunFolder(out) as run:
         run.claim(key, experiment_toml(experiment))
         fitted = fit(data, experiment.model, experiment.training, (run, key), on_event)
@@ -192,7 +193,7 @@ def evaluate(
     if not (folder / "provenance.json").is_file():
         raise StorageError(f"'{folder}' is not a run folder: it has no provenance.json; give the folder of edp train")
     provenance = read_json(folder / "provenance.json")
-    experiment = load_experiment(folder / "config.toml")
+    experiment = load_experiment(folder / "config.toml", preset=None)
     torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
     data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment)
     if data.digest != provenance["data"]["digest"]:

@@ -21,13 +21,6 @@ from edp.models.running import stream_predictions
 from edp.signals import KINDS
 
 Predictions = list[NDArray[np.float32]]
-ALL_BASELINES = ("persistence", "ridge_arx", "boosted_trees", "small_mlp")
-LABELS = {
-    "persistence": "Persistence",
-    "ridge_arx": "Ridge ARX",
-    "boosted_trees": "Boosted trees",
-    "small_mlp": "Small MLP",
-}
 SPEED_BINS = 6
 
 
@@ -42,7 +35,7 @@ class JudgeSpec:
         seed: of the baselines' row sampling and initial weights.
     """
 
-    baselines: tuple[str, ...] = ALL_BASELINES
+    baselines: tuple[str, ...] = tuple(BASELINES)
     history: int = 50
     skip: int | None = None
     seed: int = 0
@@ -100,7 +93,7 @@ def judge(
         baseline = BASELINES[name](task)
         baseline.fit(known["train"], known["validation"])
         predictions[name] = [baseline.predict(series) for series in known["test"]]
-        names[name], times[name] = LABELS.get(name, name), time.perf_counter() - began
+        names[name], times[name] = baseline.label, time.perf_counter() - began
     skip = predictor.spec.window if spec.skip is None else spec.skip
     ruler = _Ruler(data, skip)
     models = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -13,7 +12,7 @@ from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import ConfigError
 from edp.models.activations import ActivationSpec, Identity
-from edp.models.backbones import BackboneSpec, HybridSpec, in_slot
+from edp.models.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.models.frontend import FrontEnd, TargetCode
 from edp.models.heads import HeadSpec
 from edp.streaming import Cost, State, Streaming, parameters_of
@@ -136,9 +135,6 @@ def trainable(module: nn.Module) -> list[nn.Parameter]:
     return [parameter for parameter in module.parameters() if parameter.requires_grad]
 
 
-def describe(spec: ModelSpec, names: Sequence[str] = ()) -> str:
+def describe(spec: ModelSpec) -> str:
     """A short label for tables, for example ``hybrid + temporal_difference``."""
-    from edp.models.backbones import BACKBONES
-
-    labels = [BACKBONES.name_of(spec.backbone), *(BLOCKS.name_of(block) for block in spec.blocks), *names]
-    return " + ".join(labels)
+    return " + ".join([BACKBONES.name_of(spec.backbone), *(BLOCKS.name_of(block) for block in spec.blocks)])

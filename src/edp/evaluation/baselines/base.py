@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,6 +32,9 @@ class Baseline(ABC):
 
     Every baseline leaves the same ticks NaN (those before a full history), so that all are scored on equal ticks.
     """
+
+    label: ClassVar[str]
+    """How tables and pictures call it."""
 
     def __init__(self, task: BaselineTask) -> None:
         self.task = task

@@ -29,6 +29,8 @@ class BoostedTrees(Baseline):
         trees: largest number of trees per ensemble.
     """
 
+    label = "Boosted trees"
+
     def __init__(self, task: BaselineTask, row_cap: int = 60_000, trees: int = 150) -> None:
         super().__init__(task)
         self._row_cap = row_cap

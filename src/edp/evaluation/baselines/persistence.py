@@ -16,6 +16,8 @@ from edp.recording import FloatArray
 class Persistence(Baseline):
     """Holds the present value over all horizons; a target that no input measures gets its training mean."""
 
+    label = "Persistence"
+
     def _fit(self, train: Sequence[Series], validation: Sequence[Series]) -> None:
         self._means = target_means(train)
 

@@ -31,6 +31,8 @@ class SmallMlp(Baseline):
         patience: epochs without a better validation error after which training stops.
     """
 
+    label = "Small MLP"
+
     def __init__(self, task: BaselineTask, row_cap: int = 60_000, epochs: int = 30, patience: int = 5) -> None:
         super().__init__(task)
         self._row_cap = row_cap
