@@ -32,7 +32,7 @@ from edp.runs import RunFolder, command_line, environment, run_key
 from edp.sources import DataSource
 from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.training import Bundle, Event, fit, load_bundle, make_bundle, save_bundle
-from edp.training.bundle import blank_scaler
+from edp.training.bundle import blank_scaler, weights_digest
 from edp.training.fit import thread_count
 
 SHOWN_RECORDINGS = 6
@@ -179,6 +179,8 @@ def evaluate(
 ) -> Path:
     """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
 
+    Scores of the same weights, recordings and settings are kept, not computed again.
+
     Args:
         run: run folder.
         source: other recordings; all of them are judged.
@@ -201,18 +203,32 @@ def evaluate(
             f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "
             "split would not be the same: train again, or judge other recordings with --data"
         )
-    target = folder
+    target, judged = folder, [data.digest]
     if source is not None:
-        data = replace(data, test=[bundle.task.series(recording) for recording in source.read()])
+        recordings = source.read()
+        data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
+        judged += [part for recording in recordings for part in (recording.name, recording.digest)]
         target = make_folder(folder / f"on_{source.path.stem}")
     chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
-    found = judge(bundle.predictor, data, chosen, describe(bundle.predictor.spec), provenance["seconds"], on_step)
-    write_json(target / "scores.json", found.scores)
-    write_bytes(target / "predictions.safetensors", save(_shown(found)))
+    settings = plain_tree(replace(experiment, judge=chosen))["judge"]
+    key = run_key({"judge": settings, "weights": weights_digest(bundle.predictor)}, " ".join(judged))
+    scores = _kept(target, key)
+    if scores is None:
+        found = judge(bundle.predictor, data, chosen, describe(bundle.predictor.spec), provenance["seconds"], on_step)
+        scores = found.scores | {"key": key}
+        write_bytes(target / "predictions.safetensors", save(_shown(found)))
+        write_json(target / "scores.json", scores)
     if source is None:
-        own = found.scores["models"]["network"]["overall"]
-        save_bundle(replace(bundle, scores=own), folder / "bundle")
+        save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
     return target
+
+
+def _kept(folder: Path, key: str) -> dict[str, Any] | None:
+    """Scores of an earlier judgement of the same things."""
+    if not (folder / "scores.json").is_file() or not (folder / "predictions.safetensors").is_file():
+        return None
+    scores = read_json(folder / "scores.json")
+    return scores if scores.get("key") == key else None
 
 
 def _shown(found: Evaluation) -> dict[str, np.ndarray]:

@@ -105,6 +105,20 @@ def test_evaluation_writes_scores_here_and_into_the_bundle(logs, tmp_path):
     assert load_bundle(tmp_path / "run").scores == scores["models"]["network"]["overall"]
 
 
+def test_the_same_judgement_is_not_made_twice(logs, tmp_path):
+    train(source_of(logs), experiment(), tmp_path / "run")
+    steps = []
+    evaluate(tmp_path / "run", on_step=steps.append)
+    scores = (tmp_path / "run" / "scores.json").read_bytes()
+    train(source_of(logs), experiment(), tmp_path / "run")
+    evaluate(tmp_path / "run", on_step=steps.append)
+    assert steps == ["network", "persistence"]
+    assert (tmp_path / "run" / "scores.json").read_bytes() == scores
+    assert load_bundle(tmp_path / "run").scores == json.loads(scores)["models"]["network"]["overall"]
+    evaluate(tmp_path / "run", baselines=["ridge_arx"], on_step=steps.append)
+    assert steps[2:] == ["network", "ridge_arx"]
+
+
 def test_evaluation_on_other_recordings_leaves_the_run_as_it_was(logs, tmp_path):
     train(source_of(logs), experiment(), tmp_path / "run")
     header = (tmp_path / "run" / "bundle" / "bundle.json").read_bytes()

@@ -59,6 +59,15 @@ def make_bundle(
     return Bundle(predictor, data.inputs, data.target_kinds, data.descriptions, provenance, scores or {})
 
 
+def weights_digest(predictor: Predictor) -> str:
+    """Content address of the weights of a predictor."""
+    return hashlib.blake2b(_weights_bytes(predictor), digest_size=16).hexdigest()
+
+
+def _weights_bytes(predictor: Predictor) -> bytes:
+    return save({name: tensor.detach().cpu().contiguous() for name, tensor in predictor.state_dict().items()})
+
+
 def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     """Write a bundle; the header is renamed into place last, so a reader sees the old bundle or the new one.
 
@@ -66,8 +75,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         StorageError: the folder cannot be written.
     """
     path = make_folder(folder)
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in bundle.predictor.state_dict().items()}
-    data = save(tensors)
+    data = _weights_bytes(bundle.predictor)
     digest = hashlib.blake2b(data, digest_size=16).hexdigest()
     weights = f"weights-{digest[:12]}.safetensors"
     write_bytes(path / weights, data)
