@@ -146,11 +146,45 @@ class Valves:
 
 @dataclass(frozen=True)
 class Sensors:
-    """White noise (rms, SI) and the bandwidth of the differentiated velocity in Hz."""
+    """What sensors and bus do to the truth; SI units, degrees where the name says so; a size of zero turns it off.
+
+    Attributes:
+        velocity: white noise of each cylinder velocity, rms.
+        pressure: white noise of each cylinder pressure, rms.
+        acceleration_bandwidth: of the differentiated velocity, Hz.
+        joint_rate_deg: white error of each joint rate, deg/s rms; times the lever arm in the velocity.
+        joint_bias_walk_deg: random walk of its bias, deg/s per root of a minute.
+        angle_quantum_deg: quantum of the joint angles, from which the lever arms follow.
+        pin_backlash: play of the pins between cylinder and joint, m.
+        pressure_range: full scale of a pressure transmitter, from 0.
+        pressure_offset: smallest and largest offset of an instance, either sign, as a share of full scale.
+        pressure_bits: resolution of full scale.
+        pressure_lag: time constant, s.
+        pressure_drift: share of full scale per K of oil temperature away from 40 degC.
+        can_period: time between frames of an ECU, s; 0 for no bus.
+        can_latency: shortest and longest latency, s.
+        can_jitter: rms of the latency, s.
+        can_loss: share of frames lost.
+        instance_seed: with the machine's name, the seed of the instance: offsets, clock phases, latencies.
+    """
 
     velocity: float
     pressure: float
     acceleration_bandwidth: float
+    joint_rate_deg: float
+    joint_bias_walk_deg: float
+    angle_quantum_deg: float
+    pin_backlash: Triple
+    pressure_range: float
+    pressure_offset: tuple[float, float]
+    pressure_bits: int
+    pressure_lag: float
+    pressure_drift: float
+    can_period: float
+    can_latency: tuple[float, float]
+    can_jitter: float
+    can_loss: float
+    instance_seed: int
 
 
 @dataclass(frozen=True)
