@@ -64,8 +64,9 @@ def test_mat_layouts_read_without_our_own_facts(tmp_path, layout):
     recording = make()
     write_recording(recording, tmp_path / "a.mat", WriteOptions(layout))
     variables = matio.load_from_mat(str(tmp_path / "a.mat"))
-    assert set(variables) - {"__header__", "__version__"} == {"log", "edp_info"}
-    raw = open_log(tmp_path / "a.mat", SignalMap(variable="log"))
+    main = LAYOUTS[layout].variable
+    assert set(variables) - {"__header__", "__version__", "tout"} == {main, "edp_info"}
+    raw = open_log(tmp_path / "a.mat", SignalMap(variable=main))
     np.testing.assert_allclose(raw.signals["BmUp"].time_s, np.arange(400) / 100, atol=1e-9)
 
 

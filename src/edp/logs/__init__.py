@@ -5,14 +5,15 @@ from edp.logs.detect import format_for, known_suffixes, open_log
 from edp.logs.inspection import inspect_log
 from edp.logs.mat_layouts import LAYOUTS
 from edp.logs.quality import ChannelFacts, Finding, QualityReport, inspect
-from edp.logs.raw import FORMATS, LogFormat, RawLog, RawSignal, WriteOptions
+from edp.logs.raw import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
 from edp.logs.read import find_recordings, read_data_set, read_recording
 from edp.logs.repair import Repair, split_at_gaps
-from edp.logs.write import write_recording
+from edp.logs.write import truth_path, write_recording
 
 __all__ = [
     "FORMATS",
     "LAYOUTS",
+    "TRUTH_PLACES",
     "ChannelFacts",
     "Finding",
     "LogFormat",
@@ -33,5 +34,6 @@ __all__ = [
     "read_data_set",
     "read_recording",
     "split_at_gaps",
+    "truth_path",
     "write_recording",
 ]

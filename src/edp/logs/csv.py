@@ -45,6 +45,7 @@ class CsvFormat:
     name = "csv"
     suffixes: tuple[str, ...] = (".csv", ".tsv")
     content = "CSV text"
+    parts = False
 
     def claims(self, head: bytes) -> bool:
         """Text without NUL bytes, or UTF-16 with its mark."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from edp.logs.mat_layouts import INFO, LAYOUTS
 from edp.logs.mat_objects import Found, collect
 from edp.logs.matlab import matio
 from edp.logs.own import OwnFacts, facts_text, own_facts
-from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, time_factor
+from edp.logs.raw import FORMATS, TRUTH, Column, RawLog, RawSignal, WriteOptions, find_time, parted, time_factor
 from edp.recording import Recording
 from edp.signals import SignalMap
 
@@ -29,6 +30,7 @@ class MatFormat:
     name = "mat"
     suffixes: tuple[str, ...] = (".mat",)
     content = "a MAT file"
+    parts = True
 
     def claims(self, head: bytes) -> bool:
         """The text header of v5 and v7.3 (also when cut off), or the numbers of a v4 header."""
@@ -47,6 +49,8 @@ class MatFormat:
                     "set 'variable' in the signal map to an existing one"
                 )
             variables = {signal_map.variable: variables[signal_map.variable]}
+            if signal_map.variable == TRUTH and own.truth:
+                own = replace(own, channels=own.truth)
         found = collect(variables)
         if not found.signals:
             raise DataError(
@@ -56,7 +60,7 @@ class MatFormat:
         return _raw_log(path, found, own, signal_map)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
-        """Write one variable ``log`` in the wanted layout, and ``edp_info``, a JSON text with units and facts."""
+        """Write the variables of the wanted layout, and ``edp_info``, a JSON text with units and facts."""
         if options.mat_version not in _VERSIONS:
             known = closest(options.mat_version, _VERSIONS)
             raise DataError(f"MAT version '{options.mat_version}' cannot be written{known}")
@@ -67,12 +71,17 @@ class MatFormat:
                 "rename them in the signal map"
             )
         layout = LAYOUTS[options.mat_layout]
+        measured, truth = parted(recording) if options.truth == "apart" else (recording, None)
+        variables = layout.variables(measured or recording)
+        if truth is not None:
+            variables[TRUTH] = layout.build(truth)
+        variables[INFO] = facts_text(measured or recording, truth)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
                 matio.save_to_mat(
                     str(path),
-                    {"log": layout.build(recording), INFO: facts_text(recording)},
+                    variables,
                     version=_VERSIONS[options.mat_version],
                     saveobj_classes=list(layout.saveobj_classes) or None,
                 )

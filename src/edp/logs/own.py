@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,22 +22,23 @@ class OwnFacts:
     source: str = ""
     meta: Mapping[str, Any] = field(default_factory=dict)
     channels: Mapping[str, Channel] = field(default_factory=dict)
+    truth: Mapping[str, Channel] = field(default_factory=dict)
 
 
-def facts_text(recording: Recording) -> str:
-    """A recording's facts as JSON."""
-    channels = [
-        {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in recording.channels
-    ]
-    return json.dumps(
-        {
-            "name": recording.name,
-            "rate_hz": recording.rate_hz,
-            "source": recording.source,
-            "meta": dict(recording.meta),
-            "channels": channels,
-        }
-    )
+def facts_text(recording: Recording, truth: Recording | None = None) -> str:
+    """A recording's facts as JSON, with those of the channels that the file holds apart."""
+    facts = {
+        "name": recording.name,
+        "rate_hz": recording.rate_hz,
+        "source": recording.source,
+        "meta": dict(recording.meta),
+        "channels": _listed(recording.channels),
+    }
+    return json.dumps(facts if truth is None else facts | {"truth": _listed(truth.channels)})
+
+
+def _listed(channels: Sequence[Channel]) -> list[dict[str, str]]:
+    return [{"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in channels]
 
 
 def own_facts(text: str, where: str) -> OwnFacts:
@@ -51,12 +52,11 @@ def own_facts(text: str, where: str) -> OwnFacts:
         rate = float(facts["rate_hz"])
         if not (math.isfinite(rate) and rate > 0):
             raise ValueError(f"rate_hz is {rate}")
-        channels = [
-            Channel(str(entry["name"]), Kind(entry["kind"]), str(entry["description"])) for entry in facts["channels"]
-        ]
-        return OwnFacts(
-            rate, str(facts["name"]), str(facts["source"]), dict(facts["meta"]), {c.name: c for c in channels}
+        channels, truth = (
+            {str(e["name"]): Channel(str(e["name"]), Kind(e["kind"]), str(e["description"])) for e in entries}
+            for entries in (facts["channels"], facts.get("truth", []))
         )
+        return OwnFacts(rate, str(facts["name"]), str(facts["source"]), dict(facts["meta"]), channels, truth)
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{where}: the facts that EDP wrote into it are damaged ({type(error).__name__}: {error}); "

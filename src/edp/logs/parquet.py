@@ -26,6 +26,7 @@ class ParquetFormat:
     name = "parquet"
     suffixes: tuple[str, ...] = (".parquet", ".pq")
     content = "Parquet"
+    parts = False
 
     def claims(self, head: bytes) -> bool:
         """Begins with Parquet's magic number."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError, closest
 from edp.recording import Recording
 from edp.registry import Registry
-from edp.signals import TIME_UNITS, Kind, SignalMap
+from edp.signals import EXTRA_CHANNELS, TIME_UNITS, Kind, SignalMap
 
 Column = NDArray[np.float64]
 
@@ -82,25 +82,53 @@ class RawLog:
         return self.signals[name]
 
 
+TRUTH_PLACES = ("with", "apart", "without")
+TRUTH = "truth"
+"""Variable of a MAT file, and middle part of a file's name, that hold the truth."""
+
+
 @dataclass(frozen=True)
 class WriteOptions:
-    """How a MAT file is laid out; other formats have one layout.
+    """How a MAT file is laid out, and where truth goes (the channels of `EXTRA_CHANNELS`).
 
     Attributes:
-        mat_layout: a name in `edp.logs.mat_layouts.LAYOUTS`.
+        mat_layout: a name in `edp.logs.mat_layouts.LAYOUTS`; other formats have one layout.
         mat_version: ``v5`` or ``v7.3``.
+        truth: ``with`` the other channels; ``apart``, in a variable ``truth`` of the MAT file or a file
+            ``NAME.truth.SUFFIX`` beside the log; or ``without`` it.
+
+    Raises:
+        DataError: no such way to keep the truth.
     """
 
     mat_layout: str = "struct"
     mat_version: str = "v5"
+    truth: str = "with"
+
+    def __post_init__(self) -> None:
+        if self.truth not in TRUTH_PLACES:
+            raise DataError(f"truth = '{self.truth}' cannot be written{closest(self.truth, TRUTH_PLACES)}")
+
+
+def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
+    """The measured channels and the truth of a recording; None for a part without channels."""
+    of_truth = [channel.name in EXTRA_CHANNELS for channel in recording.channels]
+
+    def part(wanted: bool) -> Recording | None:
+        places = [i for i, found in enumerate(of_truth) if found == wanted]
+        channels = tuple(recording.channels[i] for i in places)
+        return replace(recording, channels=channels, values=recording.values[:, places]) if places else None
+
+    return part(False), part(True)
 
 
 class LogFormat(Protocol):
-    """One file format; instances are entered in `FORMATS`."""
+    """One file format; instances are entered in `FORMATS`. `parts`: whether one file can hold truth apart."""
 
     name: str
     suffixes: tuple[str, ...]
     content: str
+    parts: bool
 
     def claims(self, head: bytes) -> bool:
         """Whether a file that begins with `head` (up to 4 KiB) holds this format."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.logs.detect import known_suffixes, open_log
-from edp.logs.raw import RawLog, RawSignal
+from edp.logs.raw import TRUTH, RawLog, RawSignal
 from edp.logs.repair import Repair, mend_gaps, mend_stamps, mend_values
 from edp.logs.resolve import Wanted, resolve
 from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
@@ -188,6 +188,8 @@ def _rows(rows: tuple[int, int | None] | None, count: int, where: str) -> slice:
 def find_recordings(path: str | Path) -> tuple[Path, ...]:
     """The log files at a path: the file itself, or all files with a known ending in a folder and below, sorted.
 
+    In a folder, files that hold the truth of the log beside them (``NAME.truth.SUFFIX``) are passed over.
+
     Raises:
         DataError: the path does not exist, or holds no log file.
     """
@@ -200,11 +202,17 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
     found = [
         entry
         for entry in sorted(source.rglob("*"))
-        if entry.suffix.lower() in known and not entry.name.startswith(".") and entry.is_file()
+        if entry.suffix.lower() in known and not entry.name.startswith(".") and entry.is_file() and not _is_truth(entry)
     ]
     if not found:
         raise DataError(f"'{source}' holds no log files; known endings: {', '.join(known)}")
     return tuple(found)
+
+
+def _is_truth(path: Path) -> bool:
+    """Whether a file holds the truth of a log that lies beside it."""
+    log = path.with_name(f"{path.stem.removesuffix(f'.{TRUTH}')}{path.suffix}")
+    return log != path and log.is_file()
 
 
 def read_data_set(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.detect import format_for
-from edp.logs.raw import WriteOptions
+from edp.logs.raw import TRUTH, LogFormat, WriteOptions, parted
 from edp.recording import Recording
 from edp.storage import replacing
 
@@ -17,7 +18,7 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
     Args:
         recording: what to write.
         path: ``.csv``, ``.parquet`` or ``.mat``; an existing file is replaced only by a complete new one.
-        options: the layout of a MAT file.
+        options: the layout of a MAT file; where truth goes.
 
     Raises:
         DataError: unknown ending, nothing to write, or names the format cannot hold.
@@ -27,6 +28,31 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
     chosen = format_for(target)
     if recording.samples == 0 or not recording.channels:
         raise DataError(f"recording '{recording.name}' is empty; nothing is written to '{target}'")
+    options = options or WriteOptions()
+    if options.truth == "with":
+        return _write(chosen, recording, target, options)
+    measured, truth = parted(recording)
+    if measured is None:
+        raise DataError(
+            f"recording '{recording.name}' holds no channel but truth; nothing would be left for '{target}': "
+            "write it with the truth"
+        )
+    if truth is None or options.truth == "without":
+        return _write(chosen, measured, target, replace(options, truth="without"))
+    if chosen.parts:
+        return _write(chosen, recording, target, options)
+    # The log last: where it lies, its truth lies beside it.
+    _write(chosen, truth, truth_path(target), options)
+    return _write(chosen, measured, target, options)
+
+
+def _write(chosen: LogFormat, recording: Recording, target: Path, options: WriteOptions) -> Path:
     with replacing(target) as temporary:
-        chosen.write(recording, temporary, options or WriteOptions())
+        chosen.write(recording, temporary, options)
     return target
+
+
+def truth_path(path: str | Path) -> Path:
+    """The file that holds the truth of a log, where the format has no place for it in the log itself."""
+    log = Path(path)
+    return log.with_name(f"{log.stem}.{TRUTH}{log.suffix}")

@@ -74,10 +74,10 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
     # A few frames before the start, so that the first sample has one to show.
     before = int(np.ceil(bus.latency[1] / bus.period)) + 2
     count = before + int(np.ceil(samples / rate_hz / bus.period)) + 1
-    taken: Array = (np.arange(count) - before + phase) * bus.period
+    taken = np.asarray((np.arange(count) - before + phase) * bus.period, dtype=np.float64)
     latency = np.clip(latency_s + rng.normal(0.0, bus.jitter, count), *bus.latency)
     # Frames of one ECU keep their order: a late one holds up those behind it.
-    arrivals: Array = np.maximum.accumulate(taken + latency) * rate_hz
+    arrivals = np.maximum.accumulate(taken + latency) * rate_hz
     lost = rng.random(count) < bus.loss
     lost[0] = False
     kept = np.flatnonzero(~lost)
