@@ -182,13 +182,39 @@ def _truth() -> dict[str, Channel]:
             Channel(f"JointAngle_{i}", Kind.ANGLE, f"{joint} relative joint angle"),
             Channel(f"JointVel_{i}", Kind.ANGULAR_VELOCITY, f"{joint} relative joint velocity"),
         ]
+    channels += [
+        Channel("TipX", Kind.POSITION, "bucket tip, forward of the boom foot"),
+        Channel("TipY", Kind.POSITION, "bucket tip, above the boom foot"),
+        Channel("TipAngle", Kind.ANGLE, "direction from bucket pin to tip, from the horizontal"),
+        Channel("TipForceX", Kind.FORCE, "force of the ground on the bucket, forward"),
+        Channel("TipForceY", Kind.FORCE, "force of the ground on the bucket, upward"),
+        Channel("Payload", Kind.MASS, "soil in the bucket"),
+        Channel("OilTemperature", Kind.TEMPERATURE, "oil temperature in the tank"),
+        Channel("Event_Relief", Kind.RATIO, "1 while a relief valve is open"),
+        Channel("Event_Cavitation", Kind.RATIO, "1 while a chamber is below atmospheric pressure"),
+        Channel("Event_Regeneration", Kind.RATIO, "1 while oil passes a regeneration check"),
+        Channel("Event_PowerLimit", Kind.RATIO, "1 while the power limit reduces the pumps"),
+        Channel("Event_SoilContact", Kind.RATIO, "1 where the bucket touched soil since the last sample"),
+    ]
+    channels += [Channel(f"PumpDisplacement_{m}", Kind.RATIO, f"Pump {m} displacement, share of full") for m in (1, 2)]
+    channels += [
+        Channel(f"SpoolPos_{j + 1}", Kind.RATIO, f"{joint} {which}spool position, extension positive")
+        for j, (which, joint) in enumerate((w, c) for w in ("", "conflux ") for c in _JOINTS)
+    ]
     return {channel.name: channel for channel in channels}
 
 
 EXTRA_CHANNELS: Mapping[str, Channel] = _truth()
 """Further names that the simulator logs; never model inputs by default."""
 
-VOCABULARY: Mapping[str, Channel] = {**TABLE_A1, **EXTRA_CHANNELS}
+GROUND_POINTS = 32
+GROUND_CHANNELS: Mapping[str, Channel] = {
+    name: Channel(name, Kind.POSITION, "ground height above the boom foot, from the nearest point to the farthest")
+    for name in (f"Ground_{k:02d}" for k in range(GROUND_POINTS))
+}
+"""Logged beside `EXTRA_CHANNELS` where a recording was made in soil."""
+
+VOCABULARY: Mapping[str, Channel] = {**TABLE_A1, **EXTRA_CHANNELS, **GROUND_CHANNELS}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ import pytest
 
 from edp.sim import Scenario, dynamics, friction, linkage, load_machine, plan_data_set, simulate
 from edp.sim import layout as at
-from edp.sim.plant import LOG_STROKE, LOG_VELOCITY, Plant
+from edp.sim.layout import LOG_STROKE, LOG_VELOCITY
+from edp.sim.plant import Plant
 
 CYLINDERS = range(3)
 

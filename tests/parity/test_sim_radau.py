@@ -9,7 +9,8 @@ from scipy.integrate import solve_ivp
 
 from edp.sim import layout as at
 from edp.sim import load_machine
-from edp.sim.plant import LOG_VELOCITY, Plant
+from edp.sim.layout import LOG_VELOCITY
+from edp.sim.plant import Plant
 
 ATM = 1.013e5
 LEVERS = ((0.6, -0.45, 0.5), (-0.35, 0.7, -0.3), (0.0, 0.0, 0.0))
@@ -88,8 +89,9 @@ class Reference:
             r = min(max((abs(s) - band) / (1 - band), 0), 1)
             return r * (0.25 + 0.75 * r)
 
-        a, a2 = area(spool, v.dead_band[i]), area(conflux, v.conflux_dead_band[i])
         out = spool > 0
+        a = area(spool, (v.dead_band_extend if out else v.dead_band_retract)[i])
+        a2 = area(conflux, (v.conflux_dead_band_extend if conflux > 0 else v.conflux_dead_band_retract)[i])
         r = min(max(((self.stroke[i] - stroke) if out else stroke) / self.m.cylinders.cushion_length[i], 0), 1)
         least = self.m.cylinders.cushion_area[i]
         left = least + (1 - least) * r * r * (3 - 2 * r)

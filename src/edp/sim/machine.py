@@ -118,8 +118,10 @@ class Valves:
     conflux_spool_frequency: Triple
     dead_time: Triple
     conflux_extra_dead_time: float
-    dead_band: Triple
-    conflux_dead_band: Triple
+    dead_band_extend: Triple
+    dead_band_retract: Triple
+    conflux_dead_band_extend: Triple
+    conflux_dead_band_retract: Triple
     hysteresis: float
     lever_dead_zone: float
     conflux_start: float
@@ -142,6 +144,48 @@ class Valves:
     port_relief_rod: Triple
     port_relief_slope: float
     anti_cavitation: Rating
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """What the bucket is to the soil; SI units.
+
+    Attributes:
+        width: cutting width.
+        capacity: struck volume, m^3.
+        floor_angle_deg: from the line tip-pin to the floor plate, towards the shell.
+        floor_length: from the cutting edge to the heel.
+        edge_area: frontal area of lip and teeth, m^2.
+        load_x: centre of a full load along the line pin-tip.
+        load_y: the same across it, towards the shell.
+    """
+
+    width: float
+    capacity: float
+    floor_angle_deg: float
+    floor_length: float
+    edge_area: float
+    load_x: float
+    load_y: float
+
+
+@dataclass(frozen=True)
+class Chassis:
+    """How the undercarriage gives way; SI units.
+
+    Attributes:
+        boom_foot_height: above level ground.
+        pitch_inertia: about the tipping line, kg m^2.
+        pitch_frequency: of rocking on the tracks, Hz.
+        pitch_damping: share of critical.
+        lift_moment: pitching moment at which the front of the tracks leaves the ground, N m.
+    """
+
+    boom_foot_height: float
+    pitch_inertia: float
+    pitch_frequency: float
+    pitch_damping: float
+    lift_moment: float
 
 
 @dataclass(frozen=True)
@@ -203,6 +247,8 @@ class Machine:
     oil: Oil
     pumps: Pumps
     valves: Valves
+    bucket: Bucket
+    chassis: Chassis
     sensors: Sensors
 
 
@@ -216,6 +262,8 @@ _SECTIONS: dict[str, type] = {
     "oil": Oil,
     "pumps": Pumps,
     "valves": Valves,
+    "bucket": Bucket,
+    "chassis": Chassis,
     "sensors": Sensors,
 }
 Section = TypeVar("Section")

@@ -90,8 +90,10 @@ def _pack_valves(machine: Machine, axes: Array) -> None:
     }
     for column, triple in ratings.items():
         axes[:, column] = [conductance(rating) for rating in triple]
-    axes[:, at.DEAD_BAND] = valves.dead_band
-    axes[:, at.CONFLUX_DEAD_BAND] = valves.conflux_dead_band
+    axes[:, at.DEAD_BAND_EXTEND] = valves.dead_band_extend
+    axes[:, at.DEAD_BAND_RETRACT] = valves.dead_band_retract
+    axes[:, at.CONFLUX_DEAD_BAND_EXTEND] = valves.conflux_dead_band_extend
+    axes[:, at.CONFLUX_DEAD_BAND_RETRACT] = valves.conflux_dead_band_retract
     axes[:, at.PRIMARY_PUMP] = np.array(valves.primary_pump) - 1
     axes[:, at.CONFLUX_PUMP] = np.array(valves.conflux_pump) - 1
     axes[:, at.DEMAND_EXTEND] = valves.pump_demand_extend
@@ -117,6 +119,7 @@ def _pack_linkage(machine: Machine, plant: Array) -> None:
 def _pack_supply(machine: Machine, plant: Array) -> None:
     oil, pumps, valves = machine.oil, machine.pumps, machine.valves
     plant[at.BULK_MODULUS] = oil.bulk_modulus * (1.0 - 0.004 * (oil.temperature - 45.0))
+    plant[at.OIL_TEMPERATURE] = oil.temperature
     plant[at.AIR] = oil.air_fraction
     plant[at.TANK] = oil.tank_pressure
     plant[at.CHECK] = valves.check_leakage

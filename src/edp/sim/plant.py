@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
-from edp.sim import dynamics, integrator, linkage, valve
+from edp.sim import dynamics, integrator, linkage, logbook, soil, valve
 from edp.sim import layout as at
 from edp.sim.jit import compiled
 from edp.sim.machine import Machine
@@ -14,11 +16,6 @@ from edp.sim.parameters import pack
 
 Array = NDArray[np.float64]
 
-# columns of one logged sample
-LOG_DEMAND = at.STATES
-LOG_STROKE = LOG_DEMAND + at.SPOOLS
-LOG_VELOCITY = LOG_STROKE + 3
-LOG_COLUMNS = LOG_VELOCITY + 3
 FINE = 4
 """A step is cut in this many near the ends of the stroke, where cushions and stops are stiff."""
 RESTING_PRESSURE = 10e5
@@ -27,23 +24,10 @@ LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
 
 
 @compiled
-def write_log(state: Array, demand: Array, axes: Array, plant: Array, row: Array) -> None:
-    """One sample: plant state, spool demands, cylinder strokes (m from closed) and velocities (m/s)."""
-    for n in range(at.STATES):
-        row[n] = state[n]
-    for j in range(at.SPOOLS):
-        row[LOG_DEMAND + j] = demand[j]
-    for i in range(at.AXES):
-        length, lever = linkage.cylinder(i, state[at.PSI + i], plant)
-        row[LOG_STROKE + i] = length - axes[i, at.CLOSED]
-        row[LOG_VELOCITY + i] = lever * state[at.RATE + i]
-
-
-@compiled
 def near_end(row: Array, axes: Array) -> bool:
     """Whether any cylinder of a logged sample runs into a cushion, or moves at a stop."""
     for i in range(at.AXES):
-        v, stroke = row[LOG_VELOCITY + i], row[LOG_STROKE + i]
+        v, stroke = row[at.LOG_VELOCITY + i], row[at.LOG_STROKE + i]
         ahead = axes[i, at.STROKE] - stroke if v > 0.0 else stroke
         braking = abs(v) > 1e-2 and ahead < axes[i, at.CUSHION_LENGTH] + 0.02 * abs(v)
         touching = abs(v) > 1e-3 and min(stroke, axes[i, at.STROKE] - stroke) < 1e-3
@@ -61,11 +45,11 @@ def run_samples(
     `demands` holds past demands first: its last rows belong to `log`. `delays` is in samples.
     """
     first = demands.shape[0] - log.shape[0]
-    axes, plant, work = setup
+    axes, plant, work, ground = setup
     held = np.empty(at.SPOOLS)
     clamps = 0
     for k in range(log.shape[0]):
-        write_log(state, demands[first + k], axes, plant, log[k])
+        logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k])
         fine = 1 if near_end(log[k], axes) else 0
         steps = int(clocks[fine, 0])
         for n in range(steps):
@@ -97,12 +81,20 @@ class Plant:
         strokes: initial strokes as a share of each cylinder's stroke, shape (3,).
         rate_hz: logging and command rate.
         step_s: integration step; a whole number of them must fill a sample.
+        ground: what the bucket digs in; None in free air.
 
     Raises:
         ConfigError: the step does not divide the sample time.
     """
 
-    def __init__(self, machine: Machine, strokes: Array, rate_hz: float = 100.0, step_s: float = 1e-3) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        strokes: Array,
+        rate_hz: float = 100.0,
+        step_s: float = 1e-3,
+        ground: soil.Ground | None = None,
+    ) -> None:
         steps = round(1.0 / (rate_hz * step_s))
         if steps < 1 or abs(steps * step_s * rate_hz - 1.0) > 1e-9:
             raise ConfigError(
@@ -116,7 +108,9 @@ class Plant:
         self.valves = np.zeros((at.SPOOLS, 5))
         self.hand = np.zeros((at.AXES, 2))
         self.work = integrator.new_work()
-        self.clamps = 0
+        self._counts = np.zeros(1, dtype=np.int64)
+        self.ground = ground
+        self._ground = soil.no_ground() if ground is None else ground.arrays()
         self._delays = valve.dead_times(machine) * rate_hz
         self._past = int(np.ceil(self._delays.max())) + 1
         self._demands = np.zeros((self._past, at.SPOOLS))
@@ -130,18 +124,35 @@ class Plant:
         lengths = [linkage.cylinder(i, self.state[at.PSI + i], self.plant)[0] for i in range(at.AXES)]
         return (np.array(lengths) - self.axes[:, at.CLOSED]) / self.axes[:, at.STROKE]
 
+    @property
+    def payload_kg(self) -> float:
+        """Soil in the bucket; 0 in free air."""
+        return 0.0 if self.ground is None else self.ground.payload_kg
+
+    @property
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """Every array that changes as time goes on, live: what to copy, and to write back to, for an exact restart."""
+        changing = (self.state, self.valves, self.hand, self._demands, self.axes, self.plant, self._counts)
+        return (*changing, *self._ground[3:])
+
+    @property
+    def clamps(self) -> int:
+        """Pressures lifted to the floor so far."""
+        return int(self._counts[0])
+
     def run(self, levers: Array) -> Array:
         """Run one sample per row of lever positions, shape (samples, 3), in [-1, 1]; returns the log.
 
-        The log has shape (samples, LOG_COLUMNS); row k is the state at the instant at which lever k is applied.
+        The log has shape (samples, columns of `edp.sim.layout`); row k is the state at the instant at which lever k is
+        applied.
         """
         fresh = np.zeros((len(levers), at.SPOOLS))
         valve.shape_demands(np.ascontiguousarray(levers, dtype=float), self.axes, self.plant, fresh)
         demands = np.concatenate((self._demands, fresh))
-        log = np.empty((len(levers), LOG_COLUMNS))
-        setup = (self.axes, self.plant, self.work)
-        self.clamps += run_samples(self.state, self.valves, demands, self._delays, self._clocks, setup, log)
-        self._demands = demands[-self._past :].copy()
+        log = np.empty((len(levers), at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
+        setup = (self.axes, self.plant, self.work, self._ground)
+        self._counts[0] += run_samples(self.state, self.valves, demands, self._delays, self._clocks, setup, log)
+        self._demands[:] = demands[-self._past :]
         return log
 
     def follow(self, targets: Array) -> Array:

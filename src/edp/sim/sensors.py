@@ -11,7 +11,6 @@ from scipy import signal
 
 from edp.sim import can, linkage, transducers
 from edp.sim import layout as at
-from edp.sim import plant as plant_module
 from edp.sim.jit import compiled
 from edp.sim.machine import Machine
 from edp.sim.parameters import pack
@@ -89,9 +88,9 @@ def measured_signals(
         rng: source of noise, bias, jitter and losses of this recording.
         oil_temperature: in K, shape (time,), for the drift of the pressures; default: the machine's constant.
     """
-    velocity = log[:, plant_module.LOG_VELOCITY : plant_module.LOG_VELOCITY + 3]
+    velocity = log[:, at.LOG_VELOCITY : at.LOG_VELOCITY + 3]
     pressures = log[:, at.HEAD : at.HEAD + 6]
-    demands = log[:, plant_module.LOG_DEMAND : plant_module.LOG_DEMAND + at.SPOOLS]
+    demands = log[:, at.LOG_DEMAND : at.LOG_DEMAND + at.SPOOLS]
     pilots = pilot_demands(demands, machine.valves.pilot_pressure)
     if rng is not None:
         if oil_temperature is None:
@@ -122,7 +121,7 @@ def _velocity(log: Array, machine: Machine, rate_hz: float, frames: can.Frames, 
     # Within the friction of the seals the sign of the force through the pins is undecided.
     seated = transducers.seats(force, axes[:, at.COULOMB])
     play = transducers.slack(seated, np.array(own.pin_backlash), CROSSING_TIME, step_s)
-    velocity = frames.take(log[:, plant_module.LOG_VELOCITY : plant_module.LOG_VELOCITY + 3] + play)
+    velocity = frames.take(log[:, at.LOG_VELOCITY : at.LOG_VELOCITY + 3] + play)
     angles, rates = frames.take(log[:, at.PSI : at.PSI + 3]), frames.take(log[:, at.RATE : at.RATE + 3])
     frame_s = own.can_period or step_s
     drift, noise = rng.spawn(2)
@@ -161,12 +160,22 @@ def lever_arms(angles: Array, plant: Array) -> Array:
 
 
 def truth_signals(log: Array) -> dict[str, Array]:
-    """Noise-free further signals by the names of `EXTRA_CHANNELS`."""
+    """Noise-free further signals by the names of `EXTRA_CHANNELS` and, in soil, of `GROUND_CHANNELS`."""
     columns: dict[str, Array] = {}
     for m in range(2):
         columns[f"PumpPressure_{m + 1}"] = log[:, at.PUMP + m]
+        columns[f"PumpDisplacement_{m + 1}"] = log[:, at.DISPLACEMENT + m]
     for i in range(at.AXES):
-        columns[f"CylStroke_{i + 1}"] = log[:, plant_module.LOG_STROKE + i]
+        columns[f"CylStroke_{i + 1}"] = log[:, at.LOG_STROKE + i]
         columns[f"JointAngle_{i + 1}"] = log[:, at.PSI + i]
         columns[f"JointVel_{i + 1}"] = log[:, at.RATE + i]
+    for j in range(at.SPOOLS):
+        columns[f"SpoolPos_{j + 1}"] = log[:, at.LOG_SPOOL + j]
+    one_each = ("TipX", "TipY", "TipAngle", "TipForceX", "TipForceY", "Payload", "OilTemperature")
+    events = ("Relief", "Cavitation", "Regeneration", "PowerLimit", "SoilContact")
+    for n, name in enumerate((*one_each, *(f"Event_{event}" for event in events))):
+        columns[name] = log[:, at.LOG_TIP + n]
+    columns["OilTemperature"] = columns["OilTemperature"] + 273.15
+    for k in range(log.shape[1] - at.LOG_GROUND):
+        columns[f"Ground_{k:02d}"] = log[:, at.LOG_GROUND + k]
     return columns

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from edp.errors import ConfigError, EdpError
 from edp.recording import Recording
-from edp.signals import EXTRA_CHANNELS, TABLE_A1
+from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.sim import layout as at
 from edp.sim import sensors
 from edp.sim.machine import Machine, load_machine
 from edp.sim.operator import EXCITATIONS
@@ -113,14 +114,14 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
 def _recording(
     scenario: Scenario, machine: Machine, log: Array, clamps: int, noise: np.random.Generator | None
 ) -> Recording:
-    measured = sensors.measured_signals(log, machine, scenario.rate_hz, noise)
+    measured = sensors.measured_signals(log, machine, scenario.rate_hz, noise, log[:, at.LOG_OIL] + 273.15)
     truth = sensors.truth_signals(log)
-    extra = [truth[name] for name in EXTRA_CHANNELS]
+    extra = {name: channel for name, channel in {**EXTRA_CHANNELS, **GROUND_CHANNELS}.items() if name in truth}
     facts = {key: value for key, value in asdict(scenario).items() if key != "name"}
     return Recording(
         name=scenario.label,
-        channels=(*TABLE_A1.values(), *EXTRA_CHANNELS.values()),
-        values=np.column_stack([measured, *extra]).astype(np.float32),
+        channels=(*TABLE_A1.values(), *extra.values()),
+        values=np.column_stack([measured, *(truth[name] for name in extra)]).astype(np.float32),
         rate_hz=scenario.rate_hz,
         source=f"sim:{machine.name}",
         meta={**facts, "clamps": clamps},

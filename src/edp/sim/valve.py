@@ -109,7 +109,9 @@ def open_spools(valves: Array, stroke: Array, axes: Array, out: Array) -> None:
     for i in range(at.AXES):
         a = axes[i]
         spool, second = valves[i, at.SPOOL], valves[i + 3, at.SPOOL]
-        area, second_area = opening(spool, a[at.DEAD_BAND]), opening(second, a[at.CONFLUX_DEAD_BAND])
+        band = a[at.DEAD_BAND_EXTEND] if spool > 0.0 else a[at.DEAD_BAND_RETRACT]
+        second_band = a[at.CONFLUX_DEAD_BAND_EXTEND] if second > 0.0 else a[at.CONFLUX_DEAD_BAND_RETRACT]
+        area, second_area = opening(spool, band), opening(second, second_band)
         pump, second_pump = int(a[at.PRIMARY_PUMP]), int(a[at.CONFLUX_PUMP])
         if second > 0.0:
             out[i, at.HEAD_IN_1 + second_pump] = a[at.CONFLUX_EXTEND] * second_area
