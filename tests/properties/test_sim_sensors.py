@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from edp.sim import can, load_machine, sensors, transducers
 from edp.sim import layout as at
-from edp.sim.plant import LOG_COLUMNS, LOG_VELOCITY, Plant
+from edp.sim.layout import LOG_COLUMNS, LOG_VELOCITY
+from edp.sim.plant import Plant
 
 BUS = can.Bus(period=0.010, latency=(0.002, 0.012), jitter=1.5e-3, loss=0.02)
 FULL = {
