@@ -24,7 +24,7 @@ from edp.data.prepared import Prepared, prepare
 from edp.errors import ConfigError, DataError, StorageError, closest
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
-from edp.logs import known_suffixes, read_recording, write_recording
+from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
 from edp.models.predictor import ModelSpec, Predictor, build_model, describe
 from edp.recording import Recording
 from edp.report import build_report
@@ -50,6 +50,9 @@ class SimulationOrder:
         recordings: how many recordings.
         seed: root of every random choice.
         suffix: ending of the logs, which settles their format.
+        layout: layout of MAT files, a name in `edp.logs.LAYOUTS`; empty for the plain one.
+        truth: where the channels go that only a simulation knows, see `edp.logs.WriteOptions`; empty for ``apart``
+            in a layout that was asked for, else ``with`` the others.
     """
 
     machine: str = "M22"
@@ -57,6 +60,24 @@ class SimulationOrder:
     recordings: int = 30
     seed: int = 0
     suffix: str = ".parquet"
+    layout: str = ""
+    truth: str = ""
+
+    def files(self) -> WriteOptions:
+        """How the logs are written.
+
+        Raises:
+            EdpError: an ending without a format, an unknown layout, or one of another format.
+        """
+        if self.suffix not in known_suffixes():
+            hint = closest(self.suffix, known_suffixes())
+            raise ConfigError(f"there is no log format for the ending '{self.suffix}'{hint}")
+        if self.layout:
+            LAYOUTS[self.layout]
+            if self.suffix != ".mat":
+                raise ConfigError(f"layout '{self.layout}' is one of MAT files, not of '{self.suffix}'; ask for mat")
+        truth = self.truth or ("apart" if self.layout else "with")
+        return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
 
 
 def simulate_data_set(
@@ -80,13 +101,12 @@ def simulate_data_set(
     from edp.sim import plan_data_set, simulate_many
 
     order = order or SimulationOrder()
-    suffix = order.suffix
-    if suffix not in known_suffixes():
-        hint = closest(suffix, known_suffixes())
-        raise ConfigError(f"there is no log format for the ending '{suffix}'{hint}")
+    suffix, files = order.suffix, order.files()
     plan = plan_data_set(order.machine, order.minutes, order.recordings, order.seed)
     folder = make_folder(out)
     identity = {"schema": 1, "edp": __version__, "plan": [asdict(entry) for entry in plan]}
+    if files != WriteOptions():
+        identity["files"] = asdict(files)
     manifest = folder / MANIFEST
     if manifest.exists() and read_json(manifest) != identity:
         raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
@@ -98,7 +118,7 @@ def simulate_data_set(
             on_done(read_recording(path), True)
     count = workers or os.cpu_count() or 1
     for recording in simulate_many(missing, min(count, max(1, len(missing)))):
-        write_recording(recording, folder / f"{recording.name}{suffix}")
+        write_recording(recording, folder / f"{recording.name}{suffix}", files)
         if on_done is not None:
             on_done(recording, False)
     return paths

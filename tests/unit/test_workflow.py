@@ -10,10 +10,10 @@ import torch
 from edp.config import load_experiment
 from edp.data.prepared import Prepared
 from edp.errors import DataError, EdpError, StorageError
-from edp.logs import write_recording
+from edp.logs import open_log, read_recording, write_recording
 from edp.logs.repair import Repair
 from edp.recording import Recording
-from edp.signals import Channel, Kind
+from edp.signals import EXTRA_CHANNELS, TABLE_A1, Channel, Kind, SignalMap
 from edp.training import load_bundle
 from edp.workflow import (
     DataSource,
@@ -176,6 +176,34 @@ def test_repairs_of_the_call_replace_those_of_the_file(logs):
     assert np.isfinite(mended.values).all()
     held = listed(logs, 'path = "logs/drive_0.csv"', head='map = "map.toml"\nrepair = { nan = "hold" }\n')
     assert DataSource.of(held).read()[0].digest == mended.digest
+
+
+@pytest.mark.parametrize(("layout", "variable"), [("simulink", "logsout"), ("speedgoat", "data")])
+def test_simulated_data_sets_in_layouts_of_others_read_back_without_truth(tmp_path, layout, variable):
+    order = SimulationOrder(minutes=0.1, recordings=1, seed=1, suffix=".mat", layout=layout)
+    (path,) = simulate_data_set(tmp_path, order, 1)
+    assert {"CylVels_1", "BmUp"} <= set(open_log(path, SignalMap(variable=variable)).signals)
+    (read,) = DataSource.of(tmp_path).read()
+    assert (read.channel_names, read.rate_hz) == (tuple(TABLE_A1), 100.0)
+    with pytest.raises(StorageError, match="another simulated data set"):
+        simulate_data_set(tmp_path, replace(order, layout="struct"), 1)
+    truth = read_recording(path, SignalMap(variable="truth"))
+    assert set(truth.channel_names) == set(EXTRA_CHANNELS)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": "simulnk", "suffix": ".mat"}, "did you mean 'simulink'"),
+        ({"layout": "simulink"}, "is one of MAT files"),
+        ({"truth": "beside"}, "truth = 'beside'"),
+        ({"suffix": ".mta"}, "no log format"),
+    ],
+)
+def test_orders_for_files_that_cannot_be_are_refused_before_anything_is_written(tmp_path, change, message):
+    with pytest.raises(EdpError, match=message):
+        simulate_data_set(tmp_path / "data", SimulationOrder(**change), 1)
+    assert not (tmp_path / "data").exists()
 
 
 def test_simulated_data_sets_go_on_and_refuse_another_plan(tmp_path):

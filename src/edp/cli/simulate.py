@@ -22,6 +22,8 @@ def simulate(
     recordings: Annotated[int, typer.Option(help="How many recordings.")] = 30,
     seed: Annotated[int, typer.Option(help="The same seed gives the same bits.")] = 0,
     form: Annotated[str, typer.Option("--format", help="Ending of the logs: parquet, csv or mat.")] = "parquet",
+    layout: Annotated[str, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, dataset, ...")] = "",
+    truth: Annotated[str, typer.Option(help="What only a simulation knows: with the rest, apart or without.")] = "",
     workers: Annotated[int, typer.Option(help="Processes; 0 for one a core.")] = 0,
     as_json: JsonFlag = False,
 ) -> None:
@@ -32,7 +34,8 @@ def simulate(
     from edp.workflow import SimulationOrder
 
     suffix = f".{form.lstrip('.')}"
-    order = SimulationOrder(machine=machine, minutes=minutes, recordings=recordings, seed=seed, suffix=suffix)
+    files = {"suffix": suffix, "layout": layout, "truth": truth}
+    order = SimulationOrder(machine=machine, minutes=minutes, recordings=recordings, seed=seed, **files)
     paths = run(folder, order, workers, as_json)
     facts = {"folder": str(folder), "recordings": len(paths), "minutes": minutes, "machine": machine, "seed": seed}
 
