@@ -187,18 +187,23 @@ class Reference:
         return out
 
 
-def run_plant(step_s):
-    plant = Plant(smooth(load_machine("M22")), np.array([0.45, 0.5, 0.5]), step_s=step_s)
+def run_plant(name, step_s):
+    plant = Plant(smooth(load_machine(name)), np.array([0.45, 0.5, 0.5]), step_s=step_s)
     start = plant.state.copy()
     levers = np.repeat(np.array(LEVERS), round(PIECE_S * 100), axis=0)
     return start, plant.run(np.concatenate((levers, levers[-1:])))
 
 
+@pytest.fixture(scope="module", params=["M22", "C14"])
+def name(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def reference():
-    start, _ = run_plant(1e-3)
+def reference(name):
+    start, _ = run_plant(name, 1e-3)
     y = np.concatenate((start, np.zeros(24)))
-    machine, rows = smooth(load_machine("M22")), [y[None]]
+    machine, rows = smooth(load_machine(name)), [y[None]]
     for levers in LEVERS:
         times = np.arange(1, round(PIECE_S * 100) + 1) / 100
         model = Reference(machine, levers)
@@ -214,25 +219,25 @@ def scales(tolerance):
     return tolerance * sizes
 
 
-def velocities(rows):
+def velocities(name, rows):
     """Cylinder velocities from angles and rates, m/s, with the reference's own lever arms."""
-    model = Reference(load_machine("M22"), (0.0, 0.0, 0.0))
+    model = Reference(load_machine(name), (0.0, 0.0, 0.0))
     arms = [[(model.length(i, r[i] + 1e-5) - model.length(i, r[i] - 1e-5)) / 2e-5 for i in range(3)] for r in rows]
     return np.array(arms) * rows[:, 3:6]
 
 
-def test_one_millisecond_matches_radau(reference):
-    _, log = run_plant(1e-3)
+def test_one_millisecond_matches_radau(name, reference):
+    _, log = run_plant(name, 1e-3)
     speed = log[:, LOG_VELOCITY : LOG_VELOCITY + 3]
     assert speed.std(axis=0).min() > 0.03
-    error = speed - velocities(reference)
+    error = speed - velocities(name, reference)
     assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.05e-3
     pressure = log[:, at.HEAD : at.BRISTLE] - reference[:, at.HEAD : at.BRISTLE]
     assert np.sqrt(np.mean(pressure**2, axis=0)).max() < 0.1e5
 
 
 def test_convergence_is_second_order():
-    coarse, middle, fine = (run_plant(h)[1][:, LOG_VELOCITY : LOG_VELOCITY + 3] for h in (1e-3, 5e-4, 2.5e-4))
+    coarse, middle, fine = (run_plant("M22", h)[1][:, LOG_VELOCITY : LOG_VELOCITY + 3] for h in (1e-3, 5e-4, 2.5e-4))
 
     def rms(error):
         return float(np.sqrt(np.mean(error**2)))

@@ -19,7 +19,7 @@ from edp.sim import (
     simulate,
     simulate_many,
 )
-from edp.sim.machine import parse_machine
+from edp.sim.machine_files import parse_machine
 from edp.sim.sensors import filtered_derivative
 
 SHORT = 4.0

@@ -1,6 +1,7 @@
 """Simulator of an electro-hydraulic excavator front: scenarios in, recordings out."""
 
-from edp.sim.machine import Machine, load_machine, machine_names
+from edp.sim.machine import Machine
+from edp.sim.machine_files import load_machine, machine_names
 from edp.sim.operator import EXCITATIONS
 from edp.sim.plan import DEFAULT_MIX, plan_data_set, simulate_many
 from edp.sim.simulate import Scenario, SimulationError, simulate

@@ -55,15 +55,53 @@ def cylinder(axis: int, psi: float, plant: Array) -> tuple[float, float]:
     return bucket_linkage(psi, plant)
 
 
+def bucket_closes(psi: Array, plant: Array) -> NDArray[np.bool_]:
+    """Whether rocker and link meet at these bucket angles (rad)."""
+    angle = psi + plant[at.LUG_ANGLE]
+    across = plant[at.PIN_X] + plant[at.LUG] * np.cos(angle) - plant[at.PIVOT_X]
+    apart = np.hypot(across, plant[at.LUG] * np.sin(angle) - plant[at.PIVOT_Y])
+    folded, straight = abs(plant[at.ROCKER] - plant[at.LINK]), plant[at.ROCKER] + plant[at.LINK]
+    return np.asarray((apart > folded + 1e-6) & (apart < straight - 1e-6))
+
+
+def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Array]:
+    """Angles (rad, rising) and lengths (m, falling) of the stretch on which the bucket cylinder works.
+
+    Of all stretches of angles on which the linkage closes and the cylinder shortens as the angle grows, the one that
+    covers most of the lengths from `closed` to `full`; empty when there is none.
+    """
+    psi = np.linspace(-1.3 * np.pi, 0.7 * np.pi, 1801)
+    pairs = [bucket_linkage(p, plant) if ok else (np.nan, np.nan) for p, ok in zip(psi, bucket_closes(psi, plant))]
+    length, lever = np.array(pairs).T
+    falling = np.concatenate(([False], lever < 0.0, [False]))
+    edges = np.flatnonzero(np.diff(falling.astype(int))).reshape(-1, 2)
+
+    def covered(edge: NDArray[np.int_]) -> float:
+        part = length[edge[0] : edge[1]]
+        return float(min(part.max(), full) - max(part.min(), closed))
+
+    if not len(edges):
+        return psi[:0], length[:0]
+    first, last = max(edges, key=covered)
+    return psi[first:last], length[first:last]
+
+
 def angle_at_stroke(axis: int, stroke: float, axes: Array, plant: Array) -> float:
-    """Joint angle (rad) at a stroke (m from closed), by bisection over the joint's working range."""
-    low, high = ((-1.0, 1.25), (-2.75, -0.35), (-2.55, 0.65))[axis]
+    """Joint angle (rad) at a stroke (m from closed): the cosine law, or bisection for the bucket."""
     target = stroke + axes[axis, at.CLOSED]
-    rising = cylinder(axis, high, plant)[0] > cylinder(axis, low, plant)[0]
+    if axis < 2:
+        base, rod, offset = ((at.BOOM_BASE, at.BOOM_ROD, at.BOOM_OFFSET), (at.ARM_BASE, at.ARM_ROD, at.ARM_OFFSET))[
+            axis
+        ]
+        cosine = (plant[base] ** 2 + plant[rod] ** 2 - target**2) / (2.0 * plant[base] * plant[rod])
+        phi = math.acos(min(max(cosine, -1.0), 1.0))
+        return float(phi - plant[offset] if axis == 0 else plant[offset] - phi)
+    psi, _ = bucket_branch(axes[axis, at.CLOSED], axes[axis, at.CLOSED] + axes[axis, at.STROKE], plant)
+    low, high = psi[0], psi[-1]
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if (cylinder(axis, middle, plant)[0] < target) == rising:
+        if bucket_linkage(middle, plant)[0] > target:
             low = middle
         else:
             high = middle
-    return 0.5 * (low + high)
+    return float(0.5 * (low + high))

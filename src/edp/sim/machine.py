@@ -1,14 +1,8 @@
-"""A machine: the numbers of one excavator front, read from `machines/<name>.toml`."""
+"""A machine: the numbers of one excavator front. Files of them are read and checked in `machine_files`."""
 
 from __future__ import annotations
 
-import tomllib
-from dataclasses import dataclass, fields
-from functools import cache
-from importlib import resources
-from typing import Any, TypeVar
-
-from edp.errors import ConfigError, closest
+from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 Rating = tuple[float, float]
@@ -252,7 +246,7 @@ class Machine:
     sensors: Sensors
 
 
-_SECTIONS: dict[str, type] = {
+SECTIONS: dict[str, type] = {
     "bodies": Bodies,
     "boom_cylinder": PinTriangle,
     "arm_cylinder": PinTriangle,
@@ -266,60 +260,4 @@ _SECTIONS: dict[str, type] = {
     "chassis": Chassis,
     "sensors": Sensors,
 }
-Section = TypeVar("Section")
-
-
-def machine_names() -> tuple[str, ...]:
-    """Names of the machines that come with the package."""
-    files = resources.files("edp.sim").joinpath("machines").iterdir()
-    return tuple(sorted(f.name.removesuffix(".toml").upper() for f in files if f.name.endswith(".toml")))
-
-
-@cache
-def load_machine(name: str) -> Machine:
-    """The machine of this name (upper or lower case).
-
-    Raises:
-        ConfigError: no such machine (the closest name is offered), or its file lacks or misnames a key.
-    """
-    known = machine_names()
-    if name.upper() not in known:
-        raise ConfigError(f"unknown machine '{name}'{closest(name, known)}")
-    source = resources.files("edp.sim").joinpath("machines").joinpath(f"{name.lower()}.toml")
-    return parse_machine(source.read_text(encoding="utf-8"), f"{name.lower()}.toml")
-
-
-def parse_machine(text: str, where: str) -> Machine:
-    """Read a machine from TOML text; `where` names the file in messages.
-
-    Raises:
-        ConfigError: not TOML, or a key is missing, unknown, or a list has the wrong length.
-    """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"machine file {where} is not valid TOML: {error}") from error
-    parts: dict[str, Any] = {
-        key: _section(_SECTIONS[key], value, f"{where} [{key}]") if key in _SECTIONS else value
-        for key, value in table.items()
-    }
-    return _section(Machine, parts, where)
-
-
-def _section(kind: type[Section], table: dict[str, Any], where: str) -> Section:
-    known = {field.name: str(field.type) for field in fields(kind)}  # type: ignore[arg-type]
-    missing = sorted(set(known) - set(table))
-    if missing:
-        raise ConfigError(f"machine file {where}: missing {', '.join(missing)}")
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        if key not in known:
-            raise ConfigError(f"machine file {where}: unknown key '{key}'{closest(key, known)}")
-        if known[key] in ("Triple", "Ratings") and (not isinstance(value, list) or len(value) != 3):
-            raise ConfigError(f"machine file {where}: {key} = {value!r} must list boom, arm, bucket")
-        values[key] = _frozen(value)
-    return kind(**values)
-
-
-def _frozen(value: Any) -> Any:
-    return tuple(_frozen(part) for part in value) if isinstance(value, list) else value
+"""Tables of a machine file."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from edp.errors import ConfigError
 from edp.recording import Recording
+from edp.sim.machine_files import load_machine
 from edp.sim.operator import EXCITATIONS
 from edp.sim.simulate import Scenario, SimulationError, simulate
 
@@ -47,13 +48,14 @@ def plan_data_set(
     order_seed, *seeds = root.spawn(recordings + 1)
     names = _apportion(shares, recordings)
     order = np.random.default_rng(order_seed).permutation(recordings)
+    label = load_machine(machine).name.lower()
     return tuple(
         Scenario(
             machine=machine,
             excitation=names[order[i]],
             duration_s=round(minutes * 60.0 / recordings, 2),
             seed=int(seeds[i].generate_state(1)[0]),
-            name=f"{machine.lower()}_{i:03d}_{names[order[i]]}",
+            name=f"{label}_{i:03d}_{names[order[i]]}",
         )
         for i in range(recordings)
     )

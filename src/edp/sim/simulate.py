@@ -14,7 +14,8 @@ from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim import layout as at
 from edp.sim import sensors
-from edp.sim.machine import Machine, load_machine
+from edp.sim.machine import Machine
+from edp.sim.machine_files import load_machine
 from edp.sim.operator import EXCITATIONS
 from edp.sim.plant import Plant
 
@@ -31,7 +32,7 @@ class Scenario:
     """One recording to simulate.
 
     Attributes:
-        machine: name of a machine file.
+        machine: name of a machine, or path of a machine file (`.toml`).
         excitation: name in `EXCITATIONS`.
         duration_s: length of the recording.
         rate_hz: samples per second, also the rate of commands.
@@ -75,7 +76,7 @@ class Scenario:
     @property
     def label(self) -> str:
         """Name of the recording."""
-        return self.name or f"{self.machine.lower()}_{self.excitation}_{self.seed}"
+        return self.name or f"{load_machine(self.machine).name.lower()}_{self.excitation}_{self.seed}"
 
 
 def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Recording:

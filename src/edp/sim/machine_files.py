@@ -1,0 +1,106 @@
+"""Machines by name or from a TOML file: reading, and refusing what cannot be simulated before the first step."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import fields
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+from edp.errors import ConfigError, closest
+from edp.sim.machine import SECTIONS, Machine
+from edp.sim.machine_checks import check_machine
+
+Section = TypeVar("Section")
+LISTS = {"Triple": 3, "Ratings": 3, "Rating": 2, "tuple[float, float]": 2}
+"""Length of a list by the type of its key."""
+
+
+def machine_names() -> tuple[str, ...]:
+    """Names of the machines that come with the package."""
+    files = resources.files("edp.sim").joinpath("machines").iterdir()
+    return tuple(sorted(f.name.removesuffix(".toml").upper() for f in files if f.name.endswith(".toml")))
+
+
+def load_machine(name: str) -> Machine:
+    """The machine of this name (upper or lower case), or of the TOML file at this path.
+
+    Raises:
+        ConfigError: no such machine (the closest name is offered) or file; or the file lacks or misnames a key, or
+            a value is out of its bounds, or the linkage is impossible: file, key, value and bound are named.
+    """
+    if name.lower().endswith(".toml"):
+        path = Path(name)
+        try:
+            changed = path.stat().st_mtime_ns
+        except OSError as error:
+            raise ConfigError(
+                f"machine file {name} cannot be read: {error.strerror}; give the path of a TOML file, "
+                f"or one of the names {', '.join(machine_names())}"
+            ) from error
+        return _from_file(path.resolve(), changed)
+    return _built_in(name.upper())
+
+
+@cache
+def _from_file(path: Path, changed: int) -> Machine:
+    """`changed` is the file's time stamp, so that an edited file is read anew."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"machine file {path} cannot be read: {error}") from error
+    return parse_machine(text, path.name)
+
+
+@cache
+def _built_in(name: str) -> Machine:
+    known = machine_names()
+    if name not in known:
+        raise ConfigError(f"unknown machine '{name}'{closest(name, known)}; or give the path of a .toml file")
+    source = resources.files("edp.sim").joinpath("machines").joinpath(f"{name.lower()}.toml")
+    return parse_machine(source.read_text(encoding="utf-8"), source.name)
+
+
+def parse_machine(text: str, where: str) -> Machine:
+    """Read and check a machine from TOML text; `where` names the file in messages.
+
+    Raises:
+        ConfigError: not TOML, a key is missing or unknown, or a value cannot be (see `machine_checks`).
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"machine file {where} is not valid TOML: {error}") from error
+    parts: dict[str, Any] = {
+        key: _section(SECTIONS[key], value, f"{where} [{key}]") if key in SECTIONS else value
+        for key, value in table.items()
+    }
+    machine = _section(Machine, parts, where)
+    check_machine(machine, where)
+    return machine
+
+
+def _section(kind: type[Section], table: Any, where: str) -> Section:
+    if not isinstance(table, dict):
+        raise ConfigError(f"machine file {where}: is {table!r}, expected a table of keys")
+    known = {field.name: str(field.type) for field in fields(kind)}  # type: ignore[arg-type]
+    for key in table:
+        if key not in known:
+            raise ConfigError(f"machine file {where}: unknown key '{key}'{closest(key, known)}")
+    missing = sorted(set(known) - set(table))
+    if missing:
+        raise ConfigError(f"machine file {where}: missing {', '.join(missing)}")
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        size = LISTS.get(known[key])
+        if size is not None and (not isinstance(value, list) or len(value) != size):
+            wanted = "boom, arm, bucket" if size == 3 else "two values"
+            raise ConfigError(f"machine file {where}: {key} = {value!r} must list {wanted}")
+        values[key] = _frozen(value)
+    return kind(**values)
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(part) for part in value) if isinstance(value, list) else value
