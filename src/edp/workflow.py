@@ -49,6 +49,7 @@ class SimulationOrder:
         minutes: length of all recordings together.
         recordings: how many recordings.
         seed: root of every random choice.
+        family: how many machines of 10 to 50 t take turns in place of `machine`; 0 for none.
         suffix: ending of the logs, which settles their format.
         layout: layout of MAT files, a name in `edp.logs.LAYOUTS`; empty for the plain one.
         truth: where the channels go that only a simulation knows, see `edp.logs.WriteOptions`; empty for ``apart``
@@ -59,6 +60,7 @@ class SimulationOrder:
     minutes: float = 60.0
     recordings: int = 30
     seed: int = 0
+    family: int = 0
     suffix: str = ".parquet"
     layout: str = ""
     truth: str = ""
@@ -98,11 +100,13 @@ def simulate_data_set(
         StorageError: the folder holds another data set or cannot be written.
         ConfigError: an ending without a format, or a number out of range.
     """
-    from edp.sim import plan_data_set, simulate_many
+    from edp.sim import over_family, plan_data_set, simulate_many
 
     order = order or SimulationOrder()
     suffix, files = order.suffix, order.files()
     plan = plan_data_set(order.machine, order.minutes, order.recordings, order.seed)
+    if order.family:
+        plan = over_family(plan, order.family, order.seed)
     folder = make_folder(out)
     identity = {"schema": 1, "edp": __version__, "plan": [asdict(entry) for entry in plan]}
     if files != WriteOptions():

@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 
 def simulate(
     folder: Annotated[Path, typer.Argument(help="Folder for the logs; an unfinished data set goes on.")],
-    machine: Annotated[str, typer.Option(help="Machine parameter set.")] = "M22",
+    machine: Annotated[str, typer.Option(help="M22, C14, or the path of a machine file (.toml).")] = "M22",
     minutes: Annotated[float, typer.Option(help="Length of all recordings together.")] = 60.0,
     recordings: Annotated[int, typer.Option(help="How many recordings.")] = 30,
     seed: Annotated[int, typer.Option(help="The same seed gives the same bits.")] = 0,
+    family: Annotated[int, typer.Option(help="So many random machines of 10 to 50 t in place of one.")] = 0,
     form: Annotated[str, typer.Option("--format", help="Ending of the logs: parquet, csv or mat.")] = "parquet",
     layout: Annotated[str, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, dataset, ...")] = "",
     truth: Annotated[str, typer.Option(help="What only a simulation knows: with the rest, apart or without.")] = "",
@@ -35,12 +36,13 @@ def simulate(
 
     suffix = f".{form.lstrip('.')}"
     files = {"suffix": suffix, "layout": layout, "truth": truth}
-    order = SimulationOrder(machine=machine, minutes=minutes, recordings=recordings, seed=seed, **files)
+    order = SimulationOrder(machine=machine, minutes=minutes, recordings=recordings, seed=seed, family=family, **files)
     paths = run(folder, order, workers, as_json)
-    facts = {"folder": str(folder), "recordings": len(paths), "minutes": minutes, "machine": machine, "seed": seed}
+    made = f"{family} machines" if family else machine
+    facts = {"folder": str(folder), "recordings": len(paths), "minutes": minutes, "machine": made, "seed": seed}
 
     def show() -> None:
-        out.print(f"{len(paths)} recordings of {machine}, {minutes:g} min, in {folder}")
+        out.print(f"{len(paths)} recordings of {made}, {minutes:g} min, in {folder}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
 
     emit(as_json, facts, show)

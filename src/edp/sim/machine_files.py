@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import fields
 from functools import cache
@@ -9,11 +10,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from edp.errors import ConfigError, closest
+from edp.sim.family import member_mass, scaled_machine
 from edp.sim.machine import SECTIONS, Machine
 from edp.sim.machine_checks import check_machine
 
 Section = TypeVar("Section")
+FAMILY = re.compile(r"FAMILY-(\d{1,9})-(\d{1,6})")
+"""A machine of a family, `family-<seed>-<index>`: it needs no file."""
 LISTS = {"Triple": 3, "Ratings": 3, "Rating": 2, "tuple[float, float]": 2}
 """Length of a list by the type of its key."""
 
@@ -25,7 +31,7 @@ def machine_names() -> tuple[str, ...]:
 
 
 def load_machine(name: str) -> Machine:
-    """The machine of this name (upper or lower case), or of the TOML file at this path.
+    """The machine of this name (upper or lower case; also `family-<seed>-<index>`), or of the TOML file at this path.
 
     Raises:
         ConfigError: no such machine (the closest name is offered) or file; or the file lacks or misnames a key, or
@@ -56,11 +62,34 @@ def _from_file(path: Path, changed: int) -> Machine:
 
 @cache
 def _built_in(name: str) -> Machine:
+    member = FAMILY.fullmatch(name)
+    if member is not None:
+        return family_member(int(member[1]), int(member[2]))
     known = machine_names()
     if name not in known:
         raise ConfigError(f"unknown machine '{name}'{closest(name, known)}; or give the path of a .toml file")
     source = resources.files("edp.sim").joinpath("machines").joinpath(f"{name.lower()}.toml")
     return parse_machine(source.read_text(encoding="utf-8"), source.name)
+
+
+def family_member(seed: int, index: int, low_t: float = 10.0, high_t: float = 50.0) -> Machine:
+    """Machine `index` of the family of `seed`: M22 scaled to a mass from `low_t` to `high_t`, with scatter.
+
+    With the default range it is also `load_machine("family-<seed>-<index>")`.
+
+    Raises:
+        ConfigError: the range of masses is empty or out of bounds.
+    """
+    rng = np.random.default_rng([seed, 1 + index])
+    name = f"family-{seed}-{index}"
+    machine = scaled_machine(_built_in("M22"), member_mass(seed, index, low_t, high_t), rng, name)
+    check_machine(machine, name)
+    return machine
+
+
+def machine_family(count: int, seed: int, low_t: float = 10.0, high_t: float = 50.0) -> tuple[Machine, ...]:
+    """`count` machines from `low_t` to `high_t`, each with its own scatter; the same seed gives the same machines."""
+    return tuple(family_member(seed, index, low_t, high_t) for index in range(count))
 
 
 def parse_machine(text: str, where: str) -> Machine:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,6 +59,20 @@ def plan_data_set(
             name=f"{label}_{i:03d}_{names[order[i]]}",
         )
         for i in range(recordings)
+    )
+
+
+def over_family(scenarios: Sequence[Scenario], count: int, seed: int) -> tuple[Scenario, ...]:
+    """The same scenarios on `count` machines of other sizes in turn, see `machine_family`.
+
+    Raises:
+        ConfigError: the count is not positive.
+    """
+    if count < 1:
+        raise ConfigError(f"family = {count} machines; at least one is needed")
+    return tuple(
+        replace(s, machine=f"family-{seed}-{i % count}", name=f"family-{seed}-{i % count}_{i:03d}_{s.excitation}")
+        for i, s in enumerate(scenarios)
     )
 
 

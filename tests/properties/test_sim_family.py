@@ -1,0 +1,79 @@
+"""Families of machines: valid by construction, scaled by the stated laws, runnable."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edp.errors import ConfigError
+from edp.sim import load_machine, machine_family, over_family, plan_data_set, simulate
+from edp.sim.family import scaled_machine
+from edp.sim.machine_checks import check_machine
+from edp.sim.plant import Plant
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.floats(10.0, 50.0))
+def test_every_member_passes_the_checks(seed, mass_t):
+    machine = scaled_machine(load_machine("M22"), mass_t, np.random.default_rng(seed))
+    check_machine(machine, "member")
+    check_machine(scaled_machine(load_machine("C14"), mass_t, np.random.default_rng(seed), "x", 14.7), "member")
+
+
+class Middle:
+    """Stands in for a generator: every draw is the value that leaves the law alone."""
+
+    def uniform(self, low, high, size=None):
+        value = 1.0 if low < 1.0 < high else 0.0 if low < 0.0 < high else low
+        return value if size is None else np.full(size, value)
+
+
+def test_the_laws_of_scaling():
+    base = load_machine("M22")
+    twice = scaled_machine(base, 8 * 21.7, Middle())
+    assert twice.bodies.length == pytest.approx(2 * np.array(base.bodies.length))
+    assert twice.bodies.mass == pytest.approx(8 * np.array(base.bodies.mass))
+    assert twice.bodies.inertia == pytest.approx(32 * np.array(base.bodies.inertia))
+    assert twice.cylinders.bore == pytest.approx(2 * np.array(base.cylinders.bore))
+    assert twice.pumps.max_flow == pytest.approx(4 * base.pumps.max_flow)
+    assert twice.valves.meter_in_extend[1] == pytest.approx((4 * 165.0, 14.0))
+    assert twice.valves.spool_frequency == pytest.approx(np.array(base.valves.spool_frequency) / np.sqrt(2))
+
+
+def test_a_family_spreads_over_its_range_and_repeats():
+    family = machine_family(12, seed=3)
+    length = [m.bodies.length[0] for m in family]
+    assert max(length) > 1.4 * min(length)
+    assert family == machine_family(12, seed=3)
+    assert family[5] == load_machine("family-3-5")
+    assert len({m.valves.dead_band_extend for m in family}) == 12
+    assert len({m.name for m in family}) == 12
+
+
+def test_a_range_of_masses_must_make_sense():
+    for low, high in ((50.0, 10.0), (0.1, 10.0), (10.0, 1e4), (float("nan"), 20.0)):
+        with pytest.raises(ConfigError, match="family of machines"):
+            machine_family(2, 0, low, high)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_members_move_and_stay_bounded(index):
+    machine = load_machine(f"family-1-{index}")
+    plant = Plant(machine, np.array([0.5, 0.5, 0.5]))
+    rng = np.random.default_rng(index)
+    before = plant.strokes
+    log = plant.run(np.repeat(rng.choice([-1.0, 1.0], (10, 3)), 150, axis=0))
+    assert np.isfinite(log).all()
+    assert np.abs(plant.strokes - before).max() > 0.05
+
+
+def test_a_data_set_of_a_family_takes_turns():
+    plan = over_family(plan_data_set("M22", 1.0, 6, seed=2), 3, seed=2)
+    assert {s.machine for s in plan} == {f"family-2-{i}" for i in range(3)}
+    assert len({s.name for s in plan}) == 6
+    recording = simulate(dataclasses.replace(plan[0], duration_s=2.0))
+    assert recording.source.startswith("sim:family-2-")
+    with pytest.raises(ConfigError, match="family = -1"):
+        over_family(plan, -1, seed=2)
