@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from edp.sim import friction, hydraulics, linkage, load_machine, pump, valve
 from edp.sim import layout as at
-from edp.sim.operator import extend_probability
+from edp.sim.excitation.base import extend_probability
 from edp.sim.parameters import conductance, pack
 
 AXES, PLANT = pack(load_machine("M22"))

@@ -13,8 +13,8 @@ import numpy as np
 
 from edp.errors import ConfigError
 from edp.recording import Recording
+from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine_files import load_machine
-from edp.sim.operator import EXCITATIONS
 from edp.sim.simulate import Scenario, SimulationError, simulate
 
 DEFAULT_MIX: Mapping[str, float] = {"isolated": 0.40, "combined": 0.48, "reversals": 0.05, "end_stops": 0.07}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,18 @@ from edp.errors import ConfigError, EdpError
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim import layout as at
-from edp.sim import sensors
+from edp.sim import pose, sensors, soil, terramechanics
+from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine import Machine
 from edp.sim.machine_files import load_machine
-from edp.sim.operator import EXCITATIONS
+from edp.sim.parameters import pack
 from edp.sim.plant import Plant
+from edp.sim.snapshot import Snapshot, capture, restored
+from edp.sim.view import view_of
 
 Array = NDArray[np.float64]
 START_STROKES = (0.3, 0.7)
+START_CLEARANCE_M, START_TRIES = 0.3, 100
 
 
 class SimulationError(EdpError):
@@ -38,6 +43,7 @@ class Scenario:
         rate_hz: samples per second, also the rate of commands.
         step_s: integration step; cut in four near the ends of the stroke.
         sensor_noise: False logs the truth.
+        material: soil that the bucket works in, see `soil.material_names`; empty for free air.
         seed: the same seed gives the same bits on the same machine.
         name: name of the recording; empty builds one from machine, excitation and seed.
 
@@ -53,10 +59,13 @@ class Scenario:
     sensor_noise: bool = True
     seed: int = 0
     name: str = ""
+    material: str = ""
 
     def __post_init__(self) -> None:
         load_machine(self.machine)
         EXCITATIONS[self.excitation]
+        if self.material:
+            soil.load_material(self.material)
         for key in ("duration_s", "rate_hz", "step_s"):
             value = getattr(self, key)
             if not (math.isfinite(value) and value > 0):
@@ -79,6 +88,152 @@ class Scenario:
         return self.name or f"{load_machine(self.machine).name.lower()}_{self.excitation}_{self.seed}"
 
 
+class Simulation:
+    """A scenario under way: run it for a while, keep a moment of it, go back there, or branch off.
+
+    Args:
+        scenario: what to simulate.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        machine = load_machine(scenario.machine)
+        start, hand = (np.random.default_rng(s) for s in _seeds(scenario)[:2])
+        self.machine = machine
+        ground = None
+        if scenario.material:
+            material = soil.load_material(scenario.material)
+            ground = soil.Ground(material, machine, np.random.default_rng(_seeds(scenario)[3]))
+        strokes = _start_strokes(machine, ground, start)
+        self.plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground)
+        self.operator = EXCITATIONS[scenario.excitation](hand, scenario.rate_hz, machine)
+        self.samples = 0
+        self._hand = hand
+        self._waiting = np.zeros((0, at.AXES))
+        self._logs: list[Array] = []
+        self._targets: list[Array] = []
+
+    @property
+    def log(self) -> Array:
+        """What was logged so far, shape (samples, LOG_COLUMNS)."""
+        return np.concatenate(self._logs) if self._logs else np.zeros((0, at.LOG_COLUMNS))
+
+    @property
+    def targets(self) -> Array:
+        """Lever targets since this object was made or restored, shape (time, 3)."""
+        return np.concatenate(self._targets) if self._targets else np.zeros((0, at.AXES))
+
+    def run(self, samples: int, progress: Callable[[float], None] | None = None) -> Array:
+        """Run for `samples`; the rows that were logged in them, shape (samples, LOG_COLUMNS).
+
+        Running in pieces gives the same bits as running at once.
+
+        Raises:
+            SimulationError: the state became non-finite.
+        """
+        first, end = len(self._logs), self.samples + samples
+        while self.samples < end:
+            if len(self._waiting) == 0:
+                self._waiting = self.operator.block(view_of(self.plant))
+            now, self._waiting = self._waiting[: end - self.samples], self._waiting[end - self.samples :]
+            self.follow(now)
+            if progress is not None:
+                progress(self.samples / self.scenario.samples)
+        return np.concatenate(self._logs[first:])
+
+    def follow(self, targets: Array) -> Array:
+        """Run with lever targets given from outside, shape (samples, 3), as the operator's were; returns the log.
+
+        Raises:
+            SimulationError: the state became non-finite.
+        """
+        rows = self.plant.follow(targets) if self.operator.by_hand else self.plant.run(targets)
+        self.samples += len(rows)
+        if not math.isfinite(rows[-1].sum()):  # what is not finite stays so
+            scenario = self.scenario
+            raise SimulationError(
+                f"simulation '{scenario.label}' diverged before t = {self.samples / scenario.rate_hz:.2f} s "
+                f"(machine {scenario.machine}, seed {scenario.seed}); choose a smaller step_s than {scenario.step_s}"
+            )
+        self._logs.append(rows)
+        self._targets.append(targets)
+        return rows
+
+    def recording(self) -> Recording:
+        """What the sensors made of the log so far."""
+        noise = None
+        if self.scenario.sensor_noise:
+            noise = np.random.default_rng(_seeds(self.scenario)[2])
+        return _recording(self.scenario, self.machine, self.log, self.plant.clamps, noise)
+
+    def snapshot(self) -> Snapshot:
+        """This moment: plant, operator, random state and log; nothing that follows changes it."""
+        arrays: list[NDArray[Any]] = []
+        state = capture({key: getattr(self, key) for key in _CHANGING}, arrays)
+        return Snapshot(asdict(self.scenario), self.samples, state, tuple(arrays), tuple(self._logs))
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go to a moment of the same scenario, exactly: what follows gives the same bits as it gave then.
+
+        Raises:
+            SimulationError: the snapshot belongs to another scenario.
+        """
+        if snapshot.scenario != asdict(self.scenario):
+            raise SimulationError(
+                f"the snapshot belongs to scenario {snapshot.scenario}, not to {asdict(self.scenario)}; "
+                "make the simulation from it with Simulation.of(snapshot)"
+            )
+        present = {key: getattr(self, key) for key in _CHANGING}
+        for key, value in restored(present, snapshot.state, snapshot.arrays).items():
+            setattr(self, key, value)
+        self.samples = snapshot.samples
+        self._logs, self._targets = list(snapshot.log), []
+
+    @staticmethod
+    def of(snapshot: Snapshot) -> Simulation:
+        """The simulation that a snapshot was taken of, at that moment."""
+        simulation = Simulation(Scenario(**snapshot.scenario))
+        simulation.restore(snapshot)
+        return simulation
+
+    def branch(self, seed: np.random.SeedSequence) -> None:
+        """Give operator and soil fresh randomness from here on; what the operator does now goes on, see `redraw`."""
+        hand, course = seed.spawn(2)
+        self._hand.bit_generator.state = np.random.default_rng(hand).bit_generator.state
+        self.operator.redraw(len(self._waiting))
+        self._waiting = self._waiting[:0]
+        self.branch_soil(course)
+
+    def branch_soil(self, seed: np.random.SeedSequence) -> None:
+        """Give the soil that is still to be met a fresh course of its resistance; commands stay as they are."""
+        ground = self.plant.ground
+        if ground is not None:
+            ground.course[...] = terramechanics.draw_course(ground.material, np.random.default_rng(seed))
+
+
+_CHANGING = ("plant", "operator", "_hand", "_waiting")
+
+
+def _seeds(scenario: Scenario) -> list[np.random.SeedSequence]:
+    """Seeds of start, operator, sensors and soil, in this order."""
+    return np.random.SeedSequence(scenario.seed).spawn(4)
+
+
+def _start_strokes(machine: Machine, ground: soil.Ground | None, rng: np.random.Generator) -> Array:
+    """Strokes (shares of full) to start from, near the middle, and with the bucket clear of any ground."""
+    strokes = rng.uniform(*START_STROKES, 3)
+    if ground is None:
+        return strokes
+    kinematics = pose.Kinematics(*pack(machine))
+    for _ in range(START_TRIES):
+        x, y, _ = kinematics.pose_at(strokes)
+        if y > ground.height(x) + START_CLEARANCE_M:
+            break
+        strokes = rng.uniform(*START_STROKES, 3)
+        strokes[0] = rng.uniform(START_STROKES[1], 0.9)
+    return strokes
+
+
 def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Recording:
     """Simulate one scenario.
 
@@ -92,24 +247,9 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     Raises:
         SimulationError: the state became non-finite.
     """
-    machine = load_machine(scenario.machine)
-    start, hand, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(scenario.seed).spawn(3))
-    plant = Plant(machine, start.uniform(*START_STROKES, 3), scenario.rate_hz, scenario.step_s)
-    operator = EXCITATIONS[scenario.excitation](hand, scenario.rate_hz)
-    logs: list[Array] = []
-    done = 0
-    while done < scenario.samples:
-        targets = operator.block(plant.strokes)[: scenario.samples - done]
-        logs.append(plant.follow(targets))
-        done += len(targets)
-        if not np.isfinite(logs[-1]).all():
-            raise SimulationError(
-                f"simulation '{scenario.label}' diverged before t = {done / scenario.rate_hz:.2f} s "
-                f"(machine {scenario.machine}, seed {scenario.seed}); choose a smaller step_s than {scenario.step_s}"
-            )
-        if progress is not None:
-            progress(done / scenario.samples)
-    return _recording(scenario, machine, np.concatenate(logs), plant.clamps, noise if scenario.sensor_noise else None)
+    simulation = Simulation(scenario)
+    simulation.run(scenario.samples, progress)
+    return simulation.recording()
 
 
 def _recording(

@@ -1,0 +1,126 @@
+"""What every way of moving the levers shares: the registry, the lean towards mid stroke, and holds of random length."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.registry import Registry
+from edp.sim.machine import Machine
+from edp.sim.view import View
+
+Array = NDArray[np.float64]
+AXES = 3
+
+
+class Excitation:
+    """Someone at the levers; subclasses give `block` and register in `EXCITATIONS`.
+
+    What a subclass keeps between blocks must be numbers, arrays, lists of them, random generators, or objects of
+    these made in its constructor, so that a snapshot can hold it.
+
+    Attributes:
+        by_hand: whether targets pass through an operator's hand; False for test signals and automatic control.
+        works_ground: whether the family is meant for soil; the others always move in free air.
+    """
+
+    by_hand: bool = True
+    works_ground: bool = False
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
+        self._rng, self._rate, self._machine = rng, rate_hz, machine
+
+    def block(self, view: View) -> Array:
+        """The next lever targets in [-1, 1], shape (samples, 3), given what is seen now."""
+        raise TypeError(f"{type(self).__name__} does not say what it does next; give it a `block`")
+
+    def redraw(self, unused: int) -> None:
+        """Forget the last `unused` samples of the latest block, and how long what is being done was to last.
+
+        A branch of the future calls this: what the operator does now stays, for how much longer is drawn anew from
+        what the time held so far leaves possible.
+        """
+
+
+EXCITATIONS: Registry[Callable[[np.random.Generator, float, Machine], Excitation]] = Registry("excitation")
+"""By name: a subclass of `Excitation`, made from a random generator, the command rate in Hz and the machine."""
+
+
+def extend_probability(stroke: float, pull: float = 1.1) -> float:
+    """Chance to extend next: more when retracted, so that the mean stroke stays near the middle."""
+    return min(max(0.5 + pull * (0.5 - stroke), 0.03), 0.97)
+
+
+class Hold:
+    """Something that lasts for a uniformly drawn time.
+
+    Attributes:
+        left: samples left.
+    """
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float) -> None:
+        self._rng, self._rate = rng, rate_hz
+        self._low = self._high = 0.0
+        self._held = 0
+        self.left = 0
+
+    def start(self, low_s: float, high_s: float) -> int:
+        """Begin a new one of `low_s` to `high_s` seconds; returns its samples."""
+        self._low, self._high, self._held = low_s, high_s, 0
+        self.left = max(1, round(self._rng.uniform(low_s, high_s) * self._rate))
+        return self.left
+
+    def spend(self, samples: int) -> int:
+        """Let `samples` pass."""
+        self.left -= samples
+        self._held += samples
+        return samples
+
+    def redraw(self, unused: int) -> None:
+        """Take back `unused` samples and draw what is left, given the time held so far."""
+        self.spend(-unused)
+        if self.left > 0:
+            low = max(self._low, self._held / self._rate)
+            self.left = max(1, round(self._rng.uniform(low, max(low, self._high)) * self._rate) - self._held)
+
+
+class AxisStream:
+    """One lever: moves of random size, sign and length, with pauses between them.
+
+    Its vigour changes every few moves, from careful positioning to full-lever work, so that a data set holds both.
+
+    Args:
+        rng: source of randomness.
+        rate_hz: samples per second.
+        pause: chance that a hold is a pause.
+
+    Attributes:
+        level: lever position now.
+        hold: how long it stays.
+    """
+
+    LEVELS = (0.15, 1.0)
+    HOLD_S = (0.25, 1.6)
+    VIGOUR = (0.2, 1.0)
+    CHANGE = 0.1
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float, pause: float = 0.45) -> None:
+        self._rng, self._pause = rng, pause
+        self._vigour = rng.uniform(*self.VIGOUR)
+        self.level = 0.0
+        self.hold = Hold(rng, rate_hz)
+
+    def move(self, stroke: float) -> float:
+        """Lever position of a move."""
+        if self._rng.random() < self.CHANGE:
+            self._vigour = self._rng.uniform(*self.VIGOUR)
+        sign = 1.0 if self._rng.random() < extend_probability(stroke) else -1.0
+        low, high = self.LEVELS
+        return sign * (low + (high - low) * self._vigour * self._rng.random())
+
+    def next(self, stroke: float) -> None:
+        """Take a new lever position and its length: a pause or a move."""
+        self.level = 0.0 if self._rng.random() < self._pause else self.move(stroke)
+        self.hold.start(*self.HOLD_S)

@@ -1,0 +1,33 @@
+"""Three levers at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edp.sim.excitation.base import AXES, EXCITATIONS, Array, AxisStream, Excitation
+from edp.sim.machine import Machine
+from edp.sim.view import View
+
+
+@EXCITATIONS.register("combined")
+class Combined(Excitation):
+    """Three independent levers."""
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
+        super().__init__(rng, rate_hz, machine)
+        self._streams = [AxisStream(rng, rate_hz) for _ in range(AXES)]
+
+    def block(self, view: View) -> Array:
+        """Levers up to the next change of any of them."""
+        for i, stream in enumerate(self._streams):
+            if stream.hold.left == 0:
+                stream.next(view.strokes[i])
+        samples = min(stream.hold.left for stream in self._streams)
+        for stream in self._streams:
+            stream.hold.spend(samples)
+        return np.tile([stream.level for stream in self._streams], (samples, 1))
+
+    def redraw(self, unused: int) -> None:
+        """Each lever's hold lasts anew."""
+        for stream in self._streams:
+            stream.hold.redraw(unused)

@@ -1,0 +1,113 @@
+"""Closed loops on the bucket tip: a reference along legs, feed-forward through the inverse dead band, and PI."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edp.sim import pose, tip_control
+from edp.sim.excitation.base import AXES, Array, Excitation
+from edp.sim.excitation.levers import speed_table
+from edp.sim.machine import Machine
+from edp.sim.parameters import pack
+from edp.sim.view import View
+
+
+class Tracked(Excitation):
+    """Moves the tip along legs, one after another; subclasses choose the next leg in `next_leg`.
+
+    A leg is a straight line of the tip at a linearly changing attitude, or of the three strokes. Its reference
+    speeds up and slows down over at most `RAMP_S`, and waits while the cylinders are too far behind. Levers are the
+    inverse of the measured lever-to-speed curves, dead band included, at the reference speed `LEAD_S` ahead (the
+    machine answers that late) plus a PI correction of each stroke. The jump over the dead band at every change of
+    sign makes light axes hunt, the bucket first: that limit cycle is real, and wanted.
+
+    Args:
+        rng: source of randomness.
+        rate_hz: samples per second.
+        machine: the machine that is moved.
+    """
+
+    CONTROL_HZ = 20.0
+    RAMP_S = 0.5
+    LEAD_S = 0.2
+    PROPORTIONAL = 2.0
+    """1/s, on the stroke error."""
+    INTEGRAL = 0.8
+    """1/s^2."""
+    REST_SPEED = 0.004
+    """Wanted speeds below this (m/s) leave the lever centred."""
+    WAITS_BEHIND = 0.12
+    """Stroke error (m) at which the reference stands still."""
+
+    def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
+        super().__init__(rng, rate_hz, machine)
+        self._axes, plant = pack(machine)
+        self.kinematics = pose.Kinematics(self._axes, plant)
+        levers, speeds = speed_table(machine)
+        limits, scratch = self.kinematics.limits, np.zeros(pose.REACHED_VALUES)
+        self._setup = (speeds, levers, self._axes, plant, limits, scratch)
+        self._samples = max(1, round(rate_hz / self.CONTROL_HZ))
+        step = self._samples / rate_hz
+        self._gains = np.array(
+            [self.RAMP_S, step, self.PROPORTIONAL, self.INTEGRAL, self.REST_SPEED, self.WAITS_BEHIND]
+        )
+        self._leg, self._begun = np.zeros(tip_control.LEG_VALUES), False
+        self._memory = np.zeros(tip_control.MEMORY)
+        self._queue = np.zeros((1 + max(1, round(self.LEAD_S / step)), AXES))
+
+    def next_leg(self, view: View) -> Array:
+        """The leg to follow when the last one is done; from `cartesian_leg` or `stroke_leg`."""
+        raise TypeError(f"{type(self).__name__} plans no legs; give it a `next_leg`")
+
+    def steer(self, view: View) -> None:
+        """Change the leg under way, from what is seen; does nothing by default."""
+
+    def block(self, view: View) -> Array:
+        """Levers over one control step, from the last ones in a straight line to the new ones."""
+        memory = self._memory
+        if not self._begun:
+            self._begun = True
+            self._queue[:] = view.strokes
+            self._leg = self.next_leg(view)
+        elif memory[tip_control.TIME] >= self._leg[tip_control.LENGTH]:
+            self._leg, memory[tip_control.TIME] = self.next_leg(view), 0.0
+        self.steer(view)
+        targets = np.empty((self._samples, AXES))
+        tip_control.control(self._leg, view.strokes, self._queue, memory, self._gains, self._setup, targets)
+        return targets
+
+    @property
+    def step_s(self) -> float:
+        """Length of a control step."""
+        return float(self._gains[tip_control.STEP])
+
+    @property
+    def behind(self) -> float:
+        """Largest stroke error of the last control step, m."""
+        return float(self._memory[tip_control.BEHIND])
+
+    def end_leg(self) -> None:
+        """Let the leg under way be the past."""
+        self._memory[tip_control.TIME] = self._leg[tip_control.LENGTH]
+
+    def reference_pose(self) -> tuple[float, float, float]:
+        """Tip pose at the newest reference."""
+        return self.kinematics.pose_at(self._queue[-1])
+
+    def line_fits(self, start: tuple[float, ...], goal: tuple[float, ...], margin: float = 0.04) -> bool:
+        """Whether every pose of a Cartesian leg can be reached, `margin` (share of stroke) away from all ends."""
+        for q in np.linspace(0.0, 1.0, 7):
+            x, y, attitude = (a + q * (b - a) for a, b in zip(start, goal, strict=True))
+            strokes = self.kinematics.strokes_at(x, y, attitude)
+            if strokes is None or strokes.min() < margin or strokes.max() > 1.0 - margin:
+                return False
+        return True
+
+    def stroke_leg(self, goal: Array, speed: float) -> Array:
+        """From the present reference to strokes, the slowest cylinder at `speed` in shares of stroke per second."""
+        start = self._queue[-1]
+        return np.array([*start, *goal, float(np.abs(goal - start).max()) / speed + self.RAMP_S, 0.0])
+
+    def cartesian_leg(self, start: tuple[float, ...], goal: tuple[float, ...], length_s: float) -> Array:
+        """From a tip pose to another."""
+        return np.array([*start, *goal, length_s, 1.0])

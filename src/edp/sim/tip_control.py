@@ -1,0 +1,99 @@
+"""One control step on the bucket tip: reference along a leg, inverse dead band, PI. See `excitation.tracking`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim import layout as at
+from edp.sim import pose
+from edp.sim.jit import compiled
+
+Array = NDArray[np.float64]
+
+# leg[...]: start and goal (stroke shares, or tip x, y and attitude), length in s, whether it is Cartesian
+START, GOAL, LENGTH, CARTESIAN = 0, 3, 6, 7
+LEG_VALUES = 8
+# gains[...]: ramp and control step in s, PI gains, least speed that opens a valve, stroke error at which to wait
+RAMP, STEP, PROPORTIONAL, INTEGRAL, REST_SPEED, WAITS_BEHIND = range(6)
+GAINS = 6
+# memory[...]: time on the leg in s, largest stroke error in m, then integrals and last levers of the three axes
+TIME, BEHIND, SUM, LEVER = 0, 1, 2, 5
+MEMORY = 8
+MOST_SUM = 0.1
+
+
+@compiled
+def progress(time: float, length: float, ramp: float) -> float:
+    """Share of the way done after `time` of `length` seconds, with constant acceleration over the ramps."""
+    ramp = min(ramp, 0.5 * length)
+    time = min(max(time, 0.0), length)
+    top = 1.0 / (length - ramp)
+    if time < ramp:
+        return 0.5 * top * time * time / ramp
+    if time > length - ramp:
+        return 1.0 - 0.5 * top * (length - time) ** 2 / ramp
+    return top * (time - 0.5 * ramp)
+
+
+@compiled
+def inverse_lever(speed: float, speeds: Array, levers: Array, rest: float) -> float:
+    """Lever for a cylinder speed (m/s); `speeds` and `levers` have rows for extension and retraction."""
+    size = abs(speed)
+    if size < rest:
+        return 0.0
+    side = 0 if speed > 0.0 else 1
+    last = speeds.shape[1] - 1
+    lever = 1.0
+    if size < speeds[side, last]:
+        n = 1
+        while speeds[side, n] < size:
+            n += 1
+        share = (size - speeds[side, n - 1]) / (speeds[side, n] - speeds[side, n - 1])
+        lever = levers[side, n - 1] + share * (levers[side, n] - levers[side, n - 1])
+    return lever if speed > 0.0 else -lever
+
+
+@compiled
+def reference(leg: Array, time: float, ramp: float, setup: tuple, reached: Array) -> None:
+    """Stroke shares at a time of a leg into `reached[:3]`; `setup` is that of `control`."""
+    q = progress(time, leg[LENGTH], ramp)
+    for i in range(at.AXES):
+        reached[i] = leg[START + i] + q * (leg[GOAL + i] - leg[START + i])
+    if leg[CARTESIAN] > 0.5:
+        pose.reach(reached[0], reached[1], reached[2], setup[2], setup[3], setup[4], reached)
+
+
+@compiled
+def control(
+    leg: Array, strokes: Array, queue: Array, memory: Array, gains: Array, setup: tuple, targets: Array
+) -> None:
+    """Levers of one control step into `targets`, shape (samples, 3), in a straight line from the last ones.
+
+    `queue` holds reference strokes (shares), the oldest belonging to now; `setup` is the curves of `inverse_lever`
+    for each axis, `axes`, `plant`, `pose.joint_limits` and scratch of `pose.REACHED_VALUES`.
+    """
+    speeds, levers, axes, reached = setup[0], setup[1], setup[2], setup[5]
+    lag = 2.0 - 2.0 * memory[BEHIND] / gains[WAITS_BEHIND]
+    memory[TIME] += gains[STEP] * min(max(lag, 0.0), 1.0)
+    last = queue.shape[0] - 1
+    for n in range(last):
+        for i in range(at.AXES):
+            queue[n, i] = queue[n + 1, i]
+    reference(leg, memory[TIME], gains[RAMP], setup, reached)
+    memory[BEHIND] = 0.0
+    for i in range(at.AXES):
+        queue[last, i] = reached[i]
+        full = axes[i, at.STROKE]
+        error = (queue[0, i] - strokes[i]) * full
+        memory[BEHIND] = max(memory[BEHIND], abs(error))
+        speed = (queue[last, i] - queue[last - 1, i]) * full / gains[STEP]
+        speed += gains[PROPORTIONAL] * error + memory[SUM + i]
+        lever = inverse_lever(speed, speeds[i], levers[i], gains[REST_SPEED])
+        if abs(lever) < 1.0:
+            total = memory[SUM + i] + gains[INTEGRAL] * gains[STEP] * error
+            memory[SUM + i] = min(max(total, -MOST_SUM), MOST_SUM)
+        before, samples = memory[LEVER + i], targets.shape[0]
+        for k in range(samples):
+            targets[k, i] = before + (lever - before) * (k + 1) / samples
+        memory[LEVER + i] = lever
