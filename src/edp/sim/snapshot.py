@@ -60,7 +60,7 @@ class Snapshot:
             StorageError: the file is missing, damaged, or of another schema.
         """
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
                 facts = json.loads(bytes(stored[_FACTS]))
                 arrays = tuple(stored[f"a{i}"] for i in range(len(stored.files) - 2))
                 log = stored["log"]
