@@ -14,13 +14,20 @@ CYLINDERS = range(3)
 machines = pytest.mark.parametrize("name", ["M22", "C14"])
 
 
+def viscous(plant, i):
+    return plant.axes[i, at.VISCOUS] * plant.plant[at.VISCOUS_SHARE]
+
+
 def cylinder_forces(plant, log):
     """Hydraulic and friction forces, each (time, 3), N, from logged pressures, bristles and velocities."""
     hydraulic = log[:, at.HEAD : at.ROD] * plant.axes[:, at.HEAD_AREA]
     hydraulic -= log[:, at.ROD : at.PUMP] * plant.axes[:, at.ROD_AREA]
     speed, bristle = log[:, LOG_VELOCITY : LOG_VELOCITY + 3], log[:, at.BRISTLE : at.DISPLACEMENT]
     drag = np.array(
-        [[friction.lugre(v[i], z[i], plant.axes[i])[0] for i in CYLINDERS] for v, z in zip(speed, bristle, strict=True)]
+        [
+            [friction.lugre(v[i], z[i], plant.axes, i, viscous(plant, i))[0] for i in CYLINDERS]
+            for v, z in zip(speed, bristle, strict=True)
+        ]
     )
     return hydraulic, drag
 

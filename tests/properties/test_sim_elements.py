@@ -11,6 +11,12 @@ from edp.sim.excitation.base import extend_probability
 from edp.sim.parameters import conductance, pack
 
 AXES, PLANT = pack(load_machine("M22"))
+
+
+def viscous(i):
+    return AXES[i, at.VISCOUS] * PLANT[at.VISCOUS_SHARE]
+
+
 few = settings(max_examples=40, deadline=None)
 pressure = st.floats(-0.9e5, 400e5)
 
@@ -48,13 +54,16 @@ def test_oil_softens_with_free_air(p):
 @few
 @given(st.integers(0, 2), st.floats(-1.0, 1.0), st.floats(-2e-3, 2e-3))
 def test_friction_slopes_match_differences(i, v, z):
-    force, _, force_by_z, force_by_v, rate_by_z, rate_by_v = friction.lugre(v, z, AXES[i])
+    force, _, force_by_z, force_by_v, rate_by_z, rate_by_v = friction.lugre(v, z, AXES, i, viscous(i))
     if abs(v) > 1e-5:
-        above, below = friction.lugre(v + 1e-7, z, AXES[i]), friction.lugre(v - 1e-7, z, AXES[i])
+        above, below = (
+            friction.lugre(v + 1e-7, z, AXES, i, viscous(i)),
+            friction.lugre(v - 1e-7, z, AXES, i, viscous(i)),
+        )
         scale = 1e-4 * (abs(force) + AXES[i, at.SIGMA0] * 1e-4)
         assert force_by_v == pytest.approx((above[0] - below[0]) / 2e-7, rel=1e-3, abs=scale)
         assert rate_by_v == pytest.approx((above[1] - below[1]) / 2e-7, rel=1e-3, abs=1e-2)
-    above, below = friction.lugre(v, z + 1e-8, AXES[i]), friction.lugre(v, z - 1e-8, AXES[i])
+    above, below = friction.lugre(v, z + 1e-8, AXES, i, viscous(i)), friction.lugre(v, z - 1e-8, AXES, i, viscous(i))
     assert force_by_z == pytest.approx((above[0] - below[0]) / 2e-8, rel=1e-3, abs=1e3)
     assert rate_by_z == pytest.approx((above[1] - below[1]) / 2e-8, rel=1e-3, abs=1e-3)
 
@@ -65,19 +74,19 @@ def test_steady_friction_is_stribeck(i, v):
     level = AXES[i, at.COULOMB] + (AXES[i, at.STATIC] - AXES[i, at.COULOMB]) * np.exp(
         -((v / AXES[i, at.STRIBECK]) ** 2)
     )
-    force, rate, *_ = friction.lugre(v, level / AXES[i, at.SIGMA0], AXES[i])
+    force, rate, *_ = friction.lugre(v, level / AXES[i, at.SIGMA0], AXES, i, viscous(i))
     assert rate == pytest.approx(0.0, abs=1e-9)
-    assert force == pytest.approx(level + AXES[i, at.VISCOUS] * v)
+    assert force == pytest.approx(level + viscous(i) * v)
 
 
 @few
 @given(st.integers(0, 2), st.floats(-0.03, 0.03), st.floats(-1.0, 1.0))
 def test_stops_push_and_never_pull(i, beyond, v):
     top = AXES[i, at.STROKE]
-    assert friction.end_stop(-abs(beyond), v, AXES[i])[0] >= 0
-    assert friction.end_stop(top + abs(beyond), v, AXES[i])[0] <= 0
-    assert friction.end_stop(0.5 * top, v, AXES[i]) == (0.0, 0.0)
-    assert friction.end_stop(-abs(beyond), v, AXES[i])[1] <= 0
+    assert friction.end_stop(-abs(beyond), v, AXES, i)[0] >= 0
+    assert friction.end_stop(top + abs(beyond), v, AXES, i)[0] <= 0
+    assert friction.end_stop(0.5 * top, v, AXES, i) == (0.0, 0.0)
+    assert friction.end_stop(-abs(beyond), v, AXES, i)[1] <= 0
 
 
 @few

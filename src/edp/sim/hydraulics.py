@@ -8,39 +8,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim import layout as at
-from edp.sim.jit import compiled
+from edp.sim.jit import inlined
 
 Array = NDArray[np.float64]
 SMOOTH2 = 1e5**2
 """Square of the pressure (Pa) below which an orifice turns laminar."""
 
 
-@compiled
+@inlined
 def orifice(dp: float) -> tuple[float, float]:
     """Dp / (dp^2 + delta^2)^(1/4), which is sqrt(dp) smoothed over 1 bar, and its derivative."""
-    q = math.sqrt(dp * dp + SMOOTH2)
-    root = math.sqrt(q)
-    return dp / root, (0.5 * dp * dp + SMOOTH2) / (q * q * root)
+    q2 = dp * dp + SMOOTH2
+    root = math.sqrt(math.sqrt(q2))
+    inverse = 1.0 / (q2 * root)
+    return dp * q2 * inverse, (q2 - 0.5 * dp * dp) * inverse
 
 
-@compiled
+@inlined
 def check_orifice(dp: float, leak: float) -> tuple[float, float]:
     """An orifice behind a check valve: passes `leak` of the flow backwards."""
     flow, slope = orifice(dp)
-    if dp < 0.0:
-        return leak * flow, leak * slope
-    return flow, slope
+    passed = leak if dp < 0.0 else 1.0
+    return passed * flow, passed * slope
 
 
-@compiled
+@inlined
 def stiffness(pressure: float, plant: Array) -> float:
     """Effective bulk modulus (Pa) of oil with free air at a gauge pressure (Pa), isothermal."""
     absolute = max(pressure + at.ATMOSPHERE, 1e4)
-    air = plant[at.AIR] * at.ATMOSPHERE / absolute
-    return (1.0 + air) / (1.0 / plant[at.BULK_MODULUS] + air / absolute)
+    air = plant[at.AIR] * at.ATMOSPHERE
+    # (1 + a) / (1 / beta + a / p) with a = air / p, in one division
+    return plant[at.BULK_MODULUS] * absolute * (absolute + air) / (absolute * absolute + plant[at.BULK_MODULUS] * air)
 
 
-@compiled
+@inlined
 def port_flows(pressure: float, relief: float, leak: float, plant: Array) -> tuple[float, float]:
     """Inflow (m^3/s) of one chamber through relief, make-up check and spool leakage, and its slope (<= 0)."""
     flow, slope = -leak * (pressure - plant[at.TANK]), -leak
@@ -54,74 +55,75 @@ def port_flows(pressure: float, relief: float, leak: float, plant: Array) -> tup
     return flow, slope
 
 
-@compiled
-def meter_in(i: int, state: Array, opened: Array, plant: Array, f: Array) -> None:
-    """Add flows from both pumps through load checks to head and rod chamber of cylinder `i` into its row `f`."""
-    for m in range(2):
-        supply = state[at.PUMP + m]
-        if opened[at.HEAD_IN_1 + m] > 0.0:
-            q, d = check_orifice(supply - state[at.HEAD + i], plant[at.CHECK])
-            q, d = q * opened[at.HEAD_IN_1 + m], d * opened[at.HEAD_IN_1 + m]
-            f[at.Q_HEAD] += q
-            f[at.HEAD_BY_HEAD] -= d
-            f[at.HEAD_BY_1 + m] += d
-            f[at.DRAWN_1 + m] += q
-        if opened[at.ROD_IN_1 + m] > 0.0:
-            q, d = check_orifice(supply - state[at.ROD + i], plant[at.CHECK])
-            q, d = q * opened[at.ROD_IN_1 + m], d * opened[at.ROD_IN_1 + m]
-            f[at.Q_ROD] += q
-            f[at.ROD_BY_ROD] -= d
-            f[at.ROD_BY_1 + m] += d
-            f[at.DRAWN_1 + m] += q
+@inlined
+def section(area: float, supply: float, load: float, highest: float, leak: float) -> tuple[float, float, float]:
+    """Flow from a pump line through a load check into a chamber, and its slopes by pump pressure and by load.
+
+    `highest` is the pressure that a pressure-compensated section shows its pump instead of its own lower load.
+    """
+    if area <= 0.0:
+        return 0.0, 0.0, 0.0
+    q, d = check_orifice(supply - max(load, highest), leak)
+    return area * q, area * d, (area * d if load >= highest else 0.0)
 
 
-@compiled
-def meter_out(head: float, rod: float, opened: Array, plant: Array, f: Array) -> None:
-    """Add flows to tank and through the regeneration checks into the row `f`."""
-    if opened[at.HEAD_OUT] > 0.0:
-        q, d = orifice(head - plant[at.TANK])
-        f[at.Q_HEAD] -= q * opened[at.HEAD_OUT]
-        f[at.HEAD_BY_HEAD] -= d * opened[at.HEAD_OUT]
-    if opened[at.ROD_OUT] > 0.0:
-        q, d = orifice(rod - plant[at.TANK])
-        f[at.Q_ROD] -= q * opened[at.ROD_OUT]
-        f[at.ROD_BY_ROD] -= d * opened[at.ROD_OUT]
-    through = d_through = 0.0
-    if opened[at.HEAD_TO_ROD] > 0.0:
-        q, d = check_orifice(head - rod, plant[at.CHECK])
-        through, d_through = q * opened[at.HEAD_TO_ROD], d * opened[at.HEAD_TO_ROD]
-    if opened[at.ROD_TO_HEAD] > 0.0:
-        q, d = check_orifice(rod - head, plant[at.CHECK])
-        through, d_through = through - q * opened[at.ROD_TO_HEAD], d_through + d * opened[at.ROD_TO_HEAD]
-    f[at.Q_HEAD] -= through
-    f[at.Q_ROD] += through
-    f[at.HEAD_BY_HEAD] -= d_through
-    f[at.HEAD_BY_ROD] += d_through
-    f[at.ROD_BY_HEAD] += d_through
-    f[at.ROD_BY_ROD] -= d_through
+@inlined
+def drain(area: float, dp: float, leak: float) -> tuple[float, float]:
+    """Flow through an opening to tank or, behind a check, to the other chamber, and its slope."""
+    if area <= 0.0:
+        return 0.0, 0.0
+    q, d = check_orifice(dp, leak)
+    return area * q, area * d
 
 
-@compiled
-def cylinder_flows(i: int, state: Array, opened: Array, axes: Array, plant: Array, flow: Array) -> None:
-    """All flows of cylinder `i` and their derivatives into `flow[i]`, shape (FLOWS,)."""
-    f, a = flow[i], axes[i]
-    head, rod = state[at.HEAD + i], state[at.ROD + i]
-    for n in range(at.FLOWS):
-        f[n] = 0.0
-    f[at.Q_HEAD], f[at.HEAD_BY_HEAD] = port_flows(head, a[at.RELIEF_HEAD], a[at.SPOOL_LEAK], plant)
-    f[at.Q_ROD], f[at.ROD_BY_ROD] = port_flows(rod, a[at.RELIEF_ROD], a[at.SPOOL_LEAK], plant)
-    leak = a[at.PISTON_LEAK]
-    f[at.Q_HEAD] -= leak * (head - rod)
-    f[at.Q_ROD] += leak * (head - rod)
-    f[at.HEAD_BY_HEAD] -= leak
-    f[at.ROD_BY_ROD] -= leak
-    f[at.HEAD_BY_ROD] += leak
-    f[at.ROD_BY_HEAD] += leak
-    meter_in(i, state, opened[i], plant, f)
-    meter_out(head, rod, opened[i], plant, f)
+@inlined
+def cylinder_flows(
+    i: int,
+    pressures: tuple[float, float, float, float],
+    highest: tuple[float, float],
+    opened: Array,
+    axes: Array,
+    plant: Array,
+) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float, float, float, float]]:
+    """All flows of cylinder `i` at head, rod and both pump pressures (Pa).
+
+    Returns:
+        Net inflow of head and rod chamber and what is drawn from either pump, m^3/s; then the slopes: head by head,
+        rod by rod, either by the other, head by pump 1 and 2, rod by pump 1 and 2.
+    """
+    head, rod, pump_1, pump_2 = pressures
+    check, tank = plant[at.CHECK], plant[at.TANK]
+    spool_leak = axes[i, at.SPOOL_LEAK] * plant[at.THINNING]
+    leak = axes[i, at.PISTON_LEAK] * plant[at.THINNING]
+    h, h_h = port_flows(head, axes[i, at.RELIEF_HEAD], spool_leak, plant)
+    r, r_r = port_flows(rod, axes[i, at.RELIEF_ROD], spool_leak, plant)
+    head_1, h_1, h_load_1 = section(opened[i, at.HEAD_IN_1], pump_1, head, highest[0], check)
+    head_2, h_2, h_load_2 = section(opened[i, at.HEAD_IN_2], pump_2, head, highest[1], check)
+    rod_1, r_1, r_load_1 = section(opened[i, at.ROD_IN_1], pump_1, rod, highest[0], check)
+    rod_2, r_2, r_load_2 = section(opened[i, at.ROD_IN_2], pump_2, rod, highest[1], check)
+    head_out, h_out = drain(opened[i, at.HEAD_OUT], head - tank, 1.0)
+    rod_out, r_out = drain(opened[i, at.ROD_OUT], rod - tank, 1.0)
+    down, by_down = drain(opened[i, at.HEAD_TO_ROD], head - rod, check)
+    up, by_up = drain(opened[i, at.ROD_TO_HEAD], rod - head, check)
+    through, across = leak * (head - rod) + down - up, leak + by_down + by_up
+    flows = (h + head_1 + head_2 - head_out - through, r + rod_1 + rod_2 - rod_out + through)
+    slopes = (h_h - h_load_1 - h_load_2 - h_out - across, r_r - r_load_1 - r_load_2 - r_out - across, across)
+    return (*flows, head_1 + rod_1, head_2 + rod_2), (*slopes, h_1, h_2, r_1, r_2)
 
 
-@compiled
+@inlined
+def highest_load(m: int, state: Array, opened: Array) -> float:
+    """Largest pressure (Pa) among the chambers that pump `m` is open to; far below any where there is none."""
+    most = -1e9
+    for i in range(at.AXES):
+        if opened[i, at.HEAD_IN_1 + m] > 0.0:
+            most = max(most, state[at.HEAD + i])
+        if opened[i, at.ROD_IN_1 + m] > 0.0:
+            most = max(most, state[at.ROD + i])
+    return most
+
+
+@inlined
 def pump_outflow(pressure: float, bypass: float, plant: Array) -> tuple[float, float]:
     """Flow (m^3/s) from a pump line through open centre and main relief, and its slope."""
     q, d = orifice(pressure - plant[at.TANK])

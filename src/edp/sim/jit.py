@@ -40,15 +40,24 @@ def cache_folder() -> Path | None:
 
 def compiled(function: Function) -> Function:
     """Compile with Numba; cache the machine code on disk, or do without where no folder is writable."""
+    return _compile(function, OPTIONS)
+
+
+def inlined(function: Function) -> Function:
+    """Like `compiled`, and part of every caller's own code, so that results which a caller drops cost nothing."""
+    return _compile(function, {**OPTIONS, "forceinline": True})
+
+
+def _compile(function: Function, options: dict[str, Any]) -> Function:
     folder = cache_folder()
     if folder is None:
-        plain: Any = numba.njit(**OPTIONS)(function)
+        plain: Any = numba.njit(**options)(function)
         return plain  # type: ignore[no-any-return]
     config: Any = numba.config
     before = config.CACHE_DIR
     config.CACHE_DIR = str(folder)
     try:
-        fast: Any = numba.njit(cache=True, **OPTIONS)(function)
+        fast: Any = numba.njit(cache=True, **options)(function)
     finally:
         config.CACHE_DIR = before
     return fast  # type: ignore[no-any-return]

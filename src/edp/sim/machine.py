@@ -77,13 +77,16 @@ class Friction:
 
 @dataclass(frozen=True)
 class Oil:
-    """Oil and tank; SI units, temperature in degC."""
+    """Oil and tank; SI units, temperatures in degC: at the start and around; heat capacity J/K, cooling W/K."""
 
     bulk_modulus: float
     air_fraction: float
     viscosity: float
     temperature: float
     tank_pressure: float
+    heat_capacity: float
+    cooling: float
+    ambient: float
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,7 @@ class Valves:
     port_relief_rod: Triple
     port_relief_slope: float
     anti_cavitation: Rating
+    flow_sharing: str
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.errors import ConfigError
 from edp.sim import layout as at
+from edp.sim import thermal
 from edp.sim.machine import Machine, Rating
 
 Array = NDArray[np.float64]
 REFERENCE_PRESSURE = 343e5
 """Main relief, Pa: friction is given as a share of head area times this."""
+
+
+FLOW_SHARING = ("parallel", "compensated")
 
 
 def conductance(rating: Rating) -> float:
@@ -38,13 +43,13 @@ def _pack_bodies(machine: Machine, axes: Array) -> None:
     bodies = machine.bodies
     axes[:, at.LENGTH] = bodies.length
     axes[:, at.MASS] = bodies.mass
-    axes[:, at.COM_RADIUS] = np.hypot(bodies.com_x, bodies.com_y)
-    axes[:, at.COM_ANGLE] = np.arctan2(bodies.com_y, bodies.com_x)
+    axes[:, at.COM_X] = bodies.com_x
+    axes[:, at.COM_Y] = bodies.com_y
     axes[:, at.INERTIA] = bodies.inertia
 
 
 def _pack_cylinders(machine: Machine, axes: Array) -> None:
-    cylinders, valves, oil = machine.cylinders, machine.valves, machine.oil
+    cylinders, valves = machine.cylinders, machine.valves
     count, bore, rod = (np.array(v) for v in (cylinders.count, cylinders.bore, cylinders.rod))
     axes[:, at.HEAD_AREA] = count * np.pi / 4 * bore**2
     axes[:, at.ROD_AREA] = count * np.pi / 4 * (bore**2 - rod**2)
@@ -57,9 +62,8 @@ def _pack_cylinders(machine: Machine, axes: Array) -> None:
     axes[:, at.CUSHION_AREA] = cylinders.cushion_area
     axes[:, at.STOP_STIFFNESS] = cylinders.stop_stiffness
     axes[:, at.STOP_DAMPING] = cylinders.stop_damping
-    thinning = math.exp(0.035 * (oil.temperature - 40.0))  # leakage goes with 1/viscosity
-    axes[:, at.PISTON_LEAK] = np.array(cylinders.piston_leakage) * thinning
-    axes[:, at.SPOOL_LEAK] = np.array(cylinders.spool_leakage) * thinning
+    axes[:, at.PISTON_LEAK] = cylinders.piston_leakage
+    axes[:, at.SPOOL_LEAK] = cylinders.spool_leakage
     axes[:, at.RELIEF_HEAD] = valves.port_relief_head
     axes[:, at.RELIEF_ROD] = valves.port_relief_rod
 
@@ -70,8 +74,7 @@ def _pack_friction(machine: Machine, axes: Array) -> None:
     axes[:, at.COULOMB] = friction.coulomb_fraction * reference
     axes[:, at.STATIC] = friction.static_fraction * reference
     axes[:, at.STRIBECK] = friction.stribeck_velocity
-    # viscous friction goes with the square root of viscosity
-    axes[:, at.VISCOUS] = np.array(friction.viscous) * math.exp(-0.0175 * (machine.oil.temperature - 40.0))
+    axes[:, at.VISCOUS] = friction.viscous
     axes[:, at.SIGMA0] = friction.bristle_stiffness
     axes[:, at.SIGMA1] = friction.bristle_damping
 
@@ -107,19 +110,25 @@ def _pack_linkage(machine: Machine, plant: Array) -> None:
     plant[at.GRAVITY] = machine.gravity
     plant[at.BOOM_BASE], plant[at.BOOM_ROD] = boom.base_radius, boom.rod_radius
     plant[at.ARM_BASE], plant[at.ARM_ROD] = arm.base_radius, arm.rod_radius
-    plant[at.BOOM_OFFSET], plant[at.ARM_OFFSET] = math.radians(boom.offset_deg), math.radians(arm.offset_deg)
+    for offset_deg, cosine, sine in (
+        (boom.offset_deg, at.BOOM_COS, at.BOOM_SIN),
+        (arm.offset_deg, at.ARM_COS, at.ARM_SIN),
+    ):
+        plant[cosine], plant[sine] = math.cos(math.radians(offset_deg)), math.sin(math.radians(offset_deg))
     pin_x = machine.bodies.length[1]
     plant[at.PIN_X] = pin_x
     plant[at.PIVOT_X], plant[at.PIVOT_Y] = pin_x - bucket.pivot_to_pin, bucket.pivot_offset
-    plant[at.ROCKER], plant[at.LINK], plant[at.LUG] = bucket.rocker, bucket.link, bucket.lug
-    plant[at.LUG_ANGLE] = bucket.lug_angle
+    plant[at.ROCKER], plant[at.LINK] = bucket.rocker, bucket.link
+    plant[at.LUG_X] = bucket.lug * math.cos(bucket.lug_angle)
+    plant[at.LUG_Y] = bucket.lug * math.sin(bucket.lug_angle)
     plant[at.CYLINDER_X], plant[at.CYLINDER_Y] = bucket.cylinder_pin
 
 
 def _pack_supply(machine: Machine, plant: Array) -> None:
     oil, pumps, valves = machine.oil, machine.pumps, machine.valves
-    plant[at.BULK_MODULUS] = oil.bulk_modulus * (1.0 - 0.004 * (oil.temperature - 45.0))
-    plant[at.OIL_TEMPERATURE] = oil.temperature
+    plant[at.BULK_AT_45] = oil.bulk_modulus
+    plant[at.HEAT_CAPACITY], plant[at.COOLING], plant[at.AMBIENT] = oil.heat_capacity, oil.cooling, oil.ambient
+    thermal.set_temperature(oil.temperature, plant)
     plant[at.AIR] = oil.air_fraction
     plant[at.TANK] = oil.tank_pressure
     plant[at.CHECK] = valves.check_leakage
@@ -138,3 +147,9 @@ def _pack_supply(machine: Machine, plant: Array) -> None:
     plant[at.HYSTERESIS] = valves.hysteresis
     plant[at.LEVER_DEAD_ZONE] = valves.lever_dead_zone
     plant[at.CONFLUX_START] = valves.conflux_start
+    if valves.flow_sharing not in FLOW_SHARING:
+        raise ConfigError(
+            f"machine {machine.name} [valves]: flow_sharing = {valves.flow_sharing!r} must be one of "
+            f"{', '.join(FLOW_SHARING)}"
+        )
+    plant[at.COMPENSATED] = FLOW_SHARING.index(valves.flow_sharing)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
-from edp.sim import dynamics, integrator, linkage, logbook, soil, valve
+from edp.sim import dynamics, earth, integrator, linkage, logbook, soil, terramechanics, thermal, valve
 from edp.sim import layout as at
 from edp.sim.jit import compiled
 from edp.sim.machine import Machine
@@ -38,26 +38,39 @@ def near_end(row: Array, axes: Array) -> bool:
 
 @compiled
 def run_samples(
-    state: Array, valves: Array, demands: Array, delays: Array, clocks: Array, setup: tuple, log: Array
+    state: Array,
+    valves: Array,
+    demands: Array,
+    delays: Array,
+    clocks: tuple[tuple[int, float, float, Array], tuple[int, float, float, Array]],
+    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
+    log: Array,
 ) -> int:
     """Run one sample per row of `log`; returns the number of clamped pressures.
 
-    `demands` holds past demands first: its last rows belong to `log`. `delays` is in samples.
+    `demands` holds past demands first: its last rows belong to `log`. `delays` is in samples. `clocks` holds the
+    number of steps in a sample and the clock of one step, for coarse and for fine steps.
     """
     first = demands.shape[0] - log.shape[0]
-    axes, plant, work, ground = setup
+    axes, plant, _, ground = setup
     held = np.empty(at.SPOOLS)
+    time_s = clocks[0][0] * clocks[0][1]
+    in_soil = ground[0][terramechanics.ACTIVE] > 0.0
     clamps = 0
     for k in range(log.shape[0]):
         logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k])
-        fine = 1 if near_end(log[k], axes) else 0
-        steps = int(clocks[fine, 0])
+        thermal.warm(log[k], axes, plant, time_s)
+        near, fine = False, near_end(log[k], axes)
+        if in_soil:
+            near, touching = earth.look(log[k], time_s, axes, ground)
+            fine = fine or touching
+        steps, step_s, share, filters = clocks[1] if fine else clocks[0]
         for n in range(steps):
             for j in range(at.SPOOLS):
                 # whole samples of delay, plus the part of a sample that is left, at mid-step
                 when = first + k + (n + 0.5) / steps - delays[j]
                 held[j] = demands[max(int(np.floor(when)), 0), j]
-            clamps += integrator.step(state, valves, held, clocks[fine, 1:], axes, plant, work)
+            clamps += integrator.step(state, valves, held, (step_s, share, filters), setup, near)
     return clamps
 
 
@@ -114,9 +127,8 @@ class Plant:
         self._delays = valve.dead_times(machine) * rate_hz
         self._past = int(np.ceil(self._delays.max())) + 1
         self._demands = np.zeros((self._past, at.SPOOLS))
-        self._clocks = np.array(
-            [np.concatenate(([n * steps], integrator.clock_row(machine, step_s / n))) for n in (1, FINE)]
-        )
+        coarse, fine = ((n * steps, *integrator.clock_of(machine, step_s / n)) for n in (1, FINE))
+        self._clocks = coarse, fine
 
     @property
     def strokes(self) -> Array:

@@ -8,20 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim import layout as at
-from edp.sim.jit import compiled
+from edp.sim.jit import compiled, inlined
 
 Array = NDArray[np.float64]
 
 
-@compiled
+@inlined
 def demand(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
     """Displacement asked for by the pilots, as a share of full, for both pumps."""
     first = second = plant[at.MIN_DISPLACEMENT]
     for j in range(at.SPOOLS):
-        i = j % 3
+        i = j if j < 3 else j - 3
         pilot = valves[j, at.PILOT]
         gain = axes[i, at.DEMAND_EXTEND] if pilot >= 0.0 else axes[i, at.DEMAND_RETRACT]
-        asked = min(gain * max(abs(pilot) - 0.1, 0.0) / 0.75, 1.0)
+        asked = min(gain * max(abs(pilot) - 0.1, 0.0) * (1.0 / 0.75), 1.0)
         pump = axes[i, at.PRIMARY_PUMP] if j < 3 else axes[i, at.CONFLUX_PUMP]
         if pump == 0.0:
             first = max(first, asked)
@@ -41,16 +41,18 @@ def displacement_step(state: Array, valves: Array, axes: Array, plant: Array, sh
     state[d + 1] = second * limit + (state[d + 1] - second * limit) * share
 
 
-@compiled
-def bypass_conductance(pump: int, valves: Array, axes: Array, plant: Array) -> float:
-    """Open centre of one pump: closes as any of its spools moves, product of (1 - |s| / s_closed)^2."""
-    share = 1.0
+@inlined
+def bypass_conductances(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
+    """Open centre of both pumps: closes as any spool of a pump moves, product of (1 - |s| / s_closed)^2."""
+    first = second = plant[at.BYPASS]
+    per_closed = 1.0 / plant[at.BYPASS_CLOSED]
     for j in range(at.SPOOLS):
-        fed_by = axes[j % 3, at.PRIMARY_PUMP] if j < 3 else axes[j % 3, at.CONFLUX_PUMP]
-        if fed_by == pump:
-            left = max(1.0 - abs(valves[j, at.SPOOL]) / plant[at.BYPASS_CLOSED], 0.0)
-            share *= left * left
-    return plant[at.BYPASS] * share
+        left = max(1.0 - abs(valves[j, at.SPOOL]) * per_closed, 0.0)
+        if (axes[j, at.PRIMARY_PUMP] if j < 3 else axes[j - 3, at.CONFLUX_PUMP]) == 0.0:
+            first *= left * left
+        else:
+            second *= left * left
+    return first, second
 
 
 def displacement_share(time_constant_s: float, step_s: float) -> float:

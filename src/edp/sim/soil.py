@@ -182,4 +182,4 @@ class Ground:
 
 def no_ground() -> tuple[Array, ...]:
     """Stand-in of `Ground.arrays` in free air."""
-    return np.zeros(terramechanics.NUMBERS), np.zeros((2, 4)), np.zeros((2, 4)), np.zeros(2), np.zeros(at.MEMORY)
+    return np.zeros(terramechanics.NUMBERS), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(2), np.zeros(at.MEMORY)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim import layout as at
-from edp.sim.jit import compiled
+from edp.sim.jit import compiled, inlined
 from edp.sim.machine import Machine
 
 Array = NDArray[np.float64]
@@ -66,36 +66,35 @@ def dead_times(machine: Machine) -> Array:
     return np.concatenate((first, first + machine.valves.conflux_extra_dead_time))
 
 
-@compiled
+@inlined
 def pilot_half_step(demand: Array, filters: Array, hysteresis: float, valves: Array) -> None:
     """Advance the pilots by half a step, then move the play operator's output."""
     for j in range(at.SPOOLS):
-        f = filters[j, 0]
         error, rate = valves[j, at.PILOT] - demand[j], valves[j, at.PILOT_RATE]
-        valves[j, at.PILOT] = demand[j] + f[0] * error + f[1] * rate
-        valves[j, at.PILOT_RATE] = f[2] * error + f[3] * rate
-        pilot = valves[j, at.PILOT]
+        pilot = demand[j] + filters[j, 0, 0] * error + filters[j, 0, 1] * rate
+        valves[j, at.PILOT] = pilot
+        valves[j, at.PILOT_RATE] = filters[j, 0, 2] * error + filters[j, 0, 3] * rate
         valves[j, at.PLAY] = max(pilot - hysteresis, min(pilot + hysteresis, valves[j, at.PLAY]))
 
 
-@compiled
+@inlined
 def spool_half_step(filters: Array, valves: Array) -> None:
     """Advance the spools by half a step towards the play operator's output."""
     for j in range(at.SPOOLS):
-        f = filters[j, 1]
-        error, rate = valves[j, at.SPOOL] - valves[j, at.PLAY], valves[j, at.SPOOL_RATE]
-        valves[j, at.SPOOL] = valves[j, at.PLAY] + f[0] * error + f[1] * rate
-        valves[j, at.SPOOL_RATE] = f[2] * error + f[3] * rate
+        play = valves[j, at.PLAY]
+        error, rate = valves[j, at.SPOOL] - play, valves[j, at.SPOOL_RATE]
+        valves[j, at.SPOOL] = play + filters[j, 1, 0] * error + filters[j, 1, 1] * rate
+        valves[j, at.SPOOL_RATE] = filters[j, 1, 2] * error + filters[j, 1, 3] * rate
 
 
-@compiled
+@inlined
 def opening(spool: float, dead_band: float) -> float:
     """Share of the full area behind the dead band: r (0.25 + 0.75 r), fine control near closed."""
     r = min(max((abs(spool) - dead_band) / (1.0 - dead_band), 0.0), 1.0)
     return r * (0.25 + 0.75 * r)
 
 
-@compiled
+@inlined
 def cushion(distance: float, length: float, least: float) -> float:
     """Share of the outflow area left at a distance (m) from the stop: a smoothstep down to `least`."""
     r = min(max(distance / length, 0.0), 1.0)
@@ -105,25 +104,27 @@ def cushion(distance: float, length: float, least: float) -> float:
 @compiled
 def open_spools(valves: Array, stroke: Array, axes: Array, out: Array) -> None:
     """Conductances of this step from spool positions and cushions, `out` shape (3, OPENINGS)."""
-    out[:] = 0.0
     for i in range(at.AXES):
-        a = axes[i]
+        for n in range(at.OPENINGS):
+            out[i, n] = 0.0
         spool, second = valves[i, at.SPOOL], valves[i + 3, at.SPOOL]
-        band = a[at.DEAD_BAND_EXTEND] if spool > 0.0 else a[at.DEAD_BAND_RETRACT]
-        second_band = a[at.CONFLUX_DEAD_BAND_EXTEND] if second > 0.0 else a[at.CONFLUX_DEAD_BAND_RETRACT]
-        area, second_area = opening(spool, band), opening(second, second_band)
-        pump, second_pump = int(a[at.PRIMARY_PUMP]), int(a[at.CONFLUX_PUMP])
+        pump, second_pump = int(axes[i, at.PRIMARY_PUMP]), int(axes[i, at.CONFLUX_PUMP])
         if second > 0.0:
-            out[i, at.HEAD_IN_1 + second_pump] = a[at.CONFLUX_EXTEND] * second_area
+            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_EXTEND])
+            out[i, at.HEAD_IN_1 + second_pump] = axes[i, at.CONFLUX_EXTEND] * area
         else:
-            out[i, at.ROD_IN_1 + second_pump] = a[at.CONFLUX_RETRACT] * second_area
+            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_RETRACT])
+            out[i, at.ROD_IN_1 + second_pump] = axes[i, at.CONFLUX_RETRACT] * area
+        length, least = axes[i, at.CUSHION_LENGTH], axes[i, at.CUSHION_AREA]
         if spool > 0.0:
-            left = cushion(a[at.STROKE] - stroke[i], a[at.CUSHION_LENGTH], a[at.CUSHION_AREA])
-            out[i, at.HEAD_IN_1 + pump] = a[at.IN_EXTEND] * area
-            out[i, at.ROD_OUT] = a[at.OUT_EXTEND] * area * left
-            out[i, at.ROD_TO_HEAD] = a[at.REGEN_EXTEND] * area * left
+            area = opening(spool, axes[i, at.DEAD_BAND_EXTEND])
+            left = area * cushion(axes[i, at.STROKE] - stroke[i], length, least)
+            out[i, at.HEAD_IN_1 + pump] = axes[i, at.IN_EXTEND] * area
+            out[i, at.ROD_OUT] = axes[i, at.OUT_EXTEND] * left
+            out[i, at.ROD_TO_HEAD] = axes[i, at.REGEN_EXTEND] * left
         else:
-            left = cushion(stroke[i], a[at.CUSHION_LENGTH], a[at.CUSHION_AREA])
-            out[i, at.ROD_IN_1 + pump] = a[at.IN_RETRACT] * area
-            out[i, at.HEAD_OUT] = a[at.OUT_RETRACT] * area * left
-            out[i, at.HEAD_TO_ROD] = a[at.REGEN_RETRACT] * area * left
+            area = opening(spool, axes[i, at.DEAD_BAND_RETRACT])
+            left = area * cushion(stroke[i], length, least)
+            out[i, at.ROD_IN_1 + pump] = axes[i, at.IN_RETRACT] * area
+            out[i, at.HEAD_OUT] = axes[i, at.OUT_RETRACT] * left
+            out[i, at.HEAD_TO_ROD] = axes[i, at.REGEN_RETRACT] * left
