@@ -4,9 +4,9 @@ With s the cube root of the ratio of masses (geometric similarity at equal press
 
 =======================  ======================================================================
 lengths, bores, strokes  s
-masses, volumes          s^3
+masses, volumes          s^3; so does heat capacity
 moments of inertia       s^5
-flows, ratings, power    s^2, as areas, since pressures and cylinder speeds stay
+flows, ratings, power    s^2, as areas, since pressures and cylinder speeds stay; so does cooling
 viscous friction         s^2; its Coulomb part is a share of area times pressure
 leakage                  s, a gap of equal width around a larger diameter
 stop stiffness           s
@@ -81,7 +81,12 @@ def scaled_machine(
         bucket_linkage=_bucket_linkage(base.bucket_linkage, linkage[2], base.bodies.length[1], bodies.length[1]),
         cylinders=_cylinders(base.cylinders, s, linkage, rng),
         friction=_friction(base, s, rng),
-        oil=replace(base.oil, air_fraction=base.oil.air_fraction * rng.uniform(0.8, 2.0)),
+        oil=replace(
+            base.oil,
+            air_fraction=base.oil.air_fraction * rng.uniform(0.8, 2.0),
+            heat_capacity=base.oil.heat_capacity * s**3,
+            cooling=base.oil.cooling * s**2,
+        ),
         pumps=_pumps(base, s, rng),
         valves=_valves(base.valves, s, rng),
         bucket=replace(

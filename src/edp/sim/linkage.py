@@ -82,7 +82,7 @@ def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Arra
     covers most of the lengths from `closed` to `full`; empty when there is none.
     """
     psi = np.linspace(-1.3 * np.pi, 0.7 * np.pi, 1801)
-    pairs = [bucket_linkage(p, plant) if ok else (np.nan, np.nan) for p, ok in zip(psi, bucket_closes(psi, plant))]
+    pairs = [cylinder(2, p, plant) if ok else (np.nan, np.nan) for p, ok in zip(psi, bucket_closes(psi, plant))]
     length, lever = np.array(pairs).T
     falling = np.concatenate(([False], lever < 0.0, [False]))
     edges = np.flatnonzero(np.diff(falling.astype(int))).reshape(-1, 2)
@@ -111,7 +111,7 @@ def angle_at_stroke(axis: int, stroke: float, axes: Array, plant: Array) -> floa
     low, high = psi[0], psi[-1]
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if bucket_linkage(middle, plant)[0] > target:
+        if cylinder(2, middle, plant)[0] > target:
             low = middle
         else:
             high = middle

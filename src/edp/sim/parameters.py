@@ -110,15 +110,17 @@ def _pack_linkage(machine: Machine, plant: Array) -> None:
     plant[at.GRAVITY] = machine.gravity
     plant[at.BOOM_BASE], plant[at.BOOM_ROD] = boom.base_radius, boom.rod_radius
     plant[at.ARM_BASE], plant[at.ARM_ROD] = arm.base_radius, arm.rod_radius
-    for offset_deg, cosine, sine in (
-        (boom.offset_deg, at.BOOM_COS, at.BOOM_SIN),
-        (arm.offset_deg, at.ARM_COS, at.ARM_SIN),
+    for offset_deg, angle, cosine, sine in (
+        (boom.offset_deg, at.BOOM_OFFSET, at.BOOM_COS, at.BOOM_SIN),
+        (arm.offset_deg, at.ARM_OFFSET, at.ARM_COS, at.ARM_SIN),
     ):
-        plant[cosine], plant[sine] = math.cos(math.radians(offset_deg)), math.sin(math.radians(offset_deg))
+        plant[angle] = math.radians(offset_deg)
+        plant[cosine], plant[sine] = math.cos(plant[angle]), math.sin(plant[angle])
     pin_x = machine.bodies.length[1]
     plant[at.PIN_X] = pin_x
     plant[at.PIVOT_X], plant[at.PIVOT_Y] = pin_x - bucket.pivot_to_pin, bucket.pivot_offset
     plant[at.ROCKER], plant[at.LINK] = bucket.rocker, bucket.link
+    plant[at.LUG], plant[at.LUG_ANGLE] = bucket.lug, bucket.lug_angle
     plant[at.LUG_X] = bucket.lug * math.cos(bucket.lug_angle)
     plant[at.LUG_Y] = bucket.lug * math.sin(bucket.lug_angle)
     plant[at.CYLINDER_X], plant[at.CYLINDER_Y] = bucket.cylinder_pin
