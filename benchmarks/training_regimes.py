@@ -29,7 +29,7 @@ class ReachedError(Exception):
 
 
 def measure(
-    data: Prepared, model: Any, training: Any, budget_s: float, wanted: float | None
+    name: str, data: Prepared, model: Any, training: Any, budget_s: float, wanted: float | None = None
 ) -> tuple[float, list[tuple[float, float]]]:
     """Targets per second, and (processor seconds, validation MAE) after each epoch.
 
@@ -44,6 +44,7 @@ def measure(
             return
         curve.append((time.process_time() - began, event.row["validation_mae"]))
         rates.append(event.targets_per_s)
+        print(f"{name}: {curve[-1][0]:.0f} processor s, validation MAE {curve[-1][1]:.3f} mm/s", flush=True)
         if curve[-1][0] >= budget_s or (wanted is not None and curve[-1][1] <= wanted):
             raise ReachedError
 
@@ -55,7 +56,7 @@ def measure(
 def main() -> None:
     arguments = parser(__doc__ or "").parse_args()
     quick, seed = arguments.quick, arguments.seed
-    budget = 8.0 if quick else 1500.0
+    budget = 8.0 if quick else 900.0
     with tempfile.TemporaryDirectory() as temporary:
         source = arguments.data or Path(temporary) / "data"
         minutes, recordings = (8.0, 8) if quick else (40.0, 20)
@@ -76,11 +77,13 @@ def main() -> None:
         rates, curves = {}, {}
         for name, spec in rivals.items():
             rates[name], curves[name] = measure(
-                data, experiment.model, replace(spec, updates=updates, patience=patience), budget, None
+                name, data, experiment.model, replace(spec, updates=updates, patience=patience), budget
             )
         best, at_best, name = min((mae, seconds, name) for name in rivals for seconds, mae in curves[name])
         chunk = replace(base, updates=40 if quick else 80)
-        rates["chunk, preset"], curves["chunk, preset"] = measure(data, experiment.model, chunk, budget, best)
+        rates["chunk, preset"], curves["chunk, preset"] = measure(
+            "chunk, preset", data, experiment.model, chunk, budget, best
+        )
         rate_chunk, rate_window = rates["chunk, preset"], max(rates[name] for name in rivals)
         needed = next((seconds for seconds, mae in curves["chunk, preset"] if mae <= best), float("inf"))
         print(f"best of the window runs: {name}, validation MAE {best:.4g} mm/s after {at_best:.0f} processor s")
