@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError, closest
 from edp.recording import Recording
 from edp.registry import Registry
-from edp.signals import EXTRA_CHANNELS, TIME_UNITS, Kind, SignalMap
+from edp.signals import TABLE_A1, TIME_UNITS, VOCABULARY, Kind, SignalMap
 
 Column = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ TRUTH = "truth"
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """How a MAT file is laid out, and where truth goes (the channels of `EXTRA_CHANNELS`).
+    """How a MAT file is laid out, and where truth goes (the vocabulary beyond Table A.1).
 
     Attributes:
         mat_layout: a name in `edp.logs.mat_layouts.LAYOUTS`; other formats have one layout.
@@ -112,7 +112,7 @@ class WriteOptions:
 
 def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
     """The measured channels and the truth of a recording; None for a part without channels."""
-    of_truth = [channel.name in EXTRA_CHANNELS for channel in recording.channels]
+    of_truth = [name in VOCABULARY and name not in TABLE_A1 for name in recording.channel_names]
 
     def part(wanted: bool) -> Recording | None:
         places = [i for i, found in enumerate(of_truth) if found == wanted]

@@ -1,0 +1,320 @@
+"""What a data set covers: spectrum of its inputs, poses, joint histograms, events, and how far tests lie from training.
+
+It works on any recordings: roles come from names or kinds (`edp.data.roles`), and what a recording lacks is named in
+`Coverage.absent`, never guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data import events, spectrum
+from edp.data.distance import Distance, split_distance
+from edp.data.roles import Axis, Roles, roles_of, signed
+from edp.data.splits import Split
+from edp.errors import DataError
+from edp.recording import Recording
+from edp.signals import KINDS
+
+Array = NDArray[np.float64]
+CELLS = 6
+"""Cells of each stroke in the occupancy."""
+BINS = 24
+"""Bins of each side of a joint histogram."""
+TAIL = 5e-4
+"""Share of the samples at either end that lies outside a joint histogram."""
+QUANTILES = 32
+"""Bins of equal content for the mutual information."""
+MEASURED, INTEGRATED = "strokes", "integrated velocity"
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Inputs in the frequency domain; see `edp.data.spectrum`."""
+
+    names: tuple[str, ...]
+    frequency_hz: Array
+    density: Array
+    flat_to_hz: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Occupancy:
+    """Time in each cell of up to three strokes.
+
+    Attributes:
+        source: ``strokes``, or ``integrated velocity`` where no stroke is measured.
+        names: channels, an axis of `samples` each.
+        span: lowest and highest value of each, m.
+        full_stroke: whether the span is the cylinder's; else it is what was seen.
+        samples: count of samples, shape ``(CELLS,) * axes``.
+    """
+
+    source: str
+    names: tuple[str, ...]
+    span: tuple[tuple[float, float], ...]
+    full_stroke: bool
+    samples: NDArray[np.int64]
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that were visited."""
+        return float((self.samples > 0).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Joint histogram of two signals in report units: `counts` has shape ``(x bin, y bin)``.
+
+    Attributes:
+        filled: share of the bins with a sample.
+        correlation: Pearson's, over all samples.
+        information: mutual information in nat between quantile bins at the same instant, bias of chance removed.
+    """
+
+    group: str
+    x: str
+    y: str
+    x_unit: str
+    y_unit: str
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    counts: NDArray[np.int64]
+    filled: float
+    correlation: float
+    information: float
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """What a data set covers.
+
+    Attributes:
+        recordings, hours, rate_hz: its size.
+        inputs: channels that command.
+        singular: smallest singular value of the input Hankel matrix by lags; inputs of deviation 1.
+        constant: inputs that never change, left out of `singular`.
+        absent: what could not be looked at, and why.
+    """
+
+    recordings: int
+    hours: float
+    rate_hz: float
+    inputs: tuple[str, ...]
+    singular: dict[int, float]
+    constant: tuple[str, ...]
+    spectrum: Spectrum | None
+    occupancy: Occupancy | None
+    joints: tuple[Joint, ...]
+    activity: tuple[events.Activity, ...]
+    together: dict[str, float]
+    events: tuple[events.Event, ...]
+    distance: Distance | None
+    absent: tuple[str, ...] = field(default=())
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; arrays as lists, share of cells with them."""
+        plain: dict[str, Any] = _plain(asdict(self))
+        plain["singular"] = {str(lags): value for lags, value in self.singular.items()}
+        if self.occupancy is not None:
+            plain["occupancy"]["share"] = self.occupancy.share
+        return plain
+
+
+def cover(
+    recordings: Sequence[Recording], inputs: Sequence[str] = (), split: Split | None = None, dead_band: float = 0.14
+) -> Coverage:
+    """Look at what a data set covers.
+
+    Args:
+        recordings: at one rate, with equal channels.
+        inputs: channels that command, where neither name nor kind tells.
+        split: also say how far its tests lie from its training.
+        dead_band: share of the largest command that moves nothing.
+
+    Raises:
+        DataError: no recordings, mixed rates, an unknown input, or neither a command nor a velocity.
+    """
+    if not recordings:
+        raise DataError("there are no recordings to look at; give a log or a folder of logs")
+    first = recordings[0]
+    if any(abs(r.rate_hz - first.rate_hz) > 1e-3 * first.rate_hz for r in recordings):
+        raise DataError("coverage needs recordings of one rate; set rate_hz in the signal map")
+    roles = roles_of(first, inputs)
+    if not roles.axes:
+        raise DataError(
+            f"recording '{first.name}' has neither a velocity nor a command (pilot pressure, current, voltage, ratio); "
+            "map channels with their kinds, or name the inputs"
+        )
+    absent: list[str] = []
+    moving, constant = _inputs(recordings, roles)
+    occupancy = _occupancy(recordings, roles.axes, absent)
+    if not roles.inputs:
+        absent.append("excitation: no channel is known to command; name the inputs")
+    return Coverage(
+        len(recordings),
+        sum(r.samples for r in recordings) / first.rate_hz / 3600.0,
+        first.rate_hz,
+        roles.inputs,
+        spectrum.smallest_singular_values([r.select(moving).astype(np.float64) for r in recordings]) if moving else {},
+        constant,
+        _spectrum(recordings, roles),
+        occupancy,
+        tuple(_joints(recordings, roles.axes, absent)),
+        events.activity_of(recordings, roles.axes, dead_band),
+        events.together(recordings, roles.axes, dead_band),
+        events.events_of(recordings, None if occupancy is None or not occupancy.full_stroke else _ends(occupancy)),
+        None if split is None else split_distance(recordings, roles.axes, split),
+        tuple(absent),
+    )
+
+
+def _inputs(recordings: Sequence[Recording], roles: Roles) -> tuple[list[str], tuple[str, ...]]:
+    """Inputs that change, and those that do not."""
+
+    def changes(name: str) -> bool:
+        values = [r.column(name) for r in recordings]
+        return float(max(v.max() for v in values) - min(v.min() for v in values)) > 0.0
+
+    moving = [name for name in roles.inputs if changes(name)]
+    return moving, tuple(name for name in roles.inputs if name not in moving)
+
+
+def _spectrum(recordings: Sequence[Recording], roles: Roles) -> Spectrum | None:
+    sources = dict.fromkeys(axis.command for axis in roles.axes if axis.command)
+    if not sources:
+        return None
+    stretches = [np.stack([signed(r, command) for command in sources], axis=1) for r in recordings]
+    frequency, power = spectrum.density(stretches, recordings[0].rate_hz)
+    flat = tuple(spectrum.flat_to(frequency, power[:, i]) for i in range(len(sources)))
+    # a tenth of an octave is enough for a picture
+    wanted = np.geomspace(frequency[0], frequency[-1], 90) if len(frequency) else np.zeros(0)
+    kept = np.unique(np.minimum(np.searchsorted(frequency, wanted), max(len(frequency) - 1, 0)))
+    names = tuple(" - ".join(command) for command in sources)
+    return Spectrum(names, frequency[kept], power[kept], flat)
+
+
+def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> Occupancy | None:
+    """Occupancy of the strokes of up to three axes, from what is there."""
+    stroked = [axis for axis in axes if axis.stroke][:3]
+    if stroked:
+        names, source = tuple(axis.stroke for axis in stroked), MEASURED
+        places = np.concatenate([r.select(names) for r in recordings])
+    else:
+        names = tuple(axis.velocity for axis in axes if axis.velocity)[:3]
+        source = INTEGRATED
+        if not names:
+            absent.append("occupancy: neither strokes nor velocities")
+            return None
+        absent.append(
+            "strokes are not recorded: the occupancy integrates velocities, each recording about its own mean, so that "
+            "offsets between recordings and drift are in it"
+        )
+        places = np.concatenate([_integrated(r, names) for r in recordings])
+    full: Any = recordings[0].meta.get("full_strokes_m") if source == MEASURED else None
+    known = isinstance(full, list | tuple) and len(full) == len(names)
+    if known:
+        span = tuple((0.0, float(length)) for length in full)
+    else:
+        span = tuple((float(low), float(high)) for low, high in zip(places.min(axis=0), places.max(axis=0)))
+    cells = [_cell(places[:, i], *span[i], CELLS) for i in range(len(names))]
+    samples = np.zeros((CELLS,) * len(names), dtype=np.int64)
+    np.add.at(samples, tuple(cells), 1)
+    return Occupancy(source, names, span, known, samples)
+
+
+def _ends(occupancy: Occupancy) -> dict[str, tuple[float, float]]:
+    return dict(zip(occupancy.names, occupancy.span, strict=True))
+
+
+def _integrated(recording: Recording, names: Sequence[str]) -> Array:
+    way = np.cumsum(recording.select(names).astype(np.float64), axis=0) / recording.rate_hz
+    return np.asarray(way - way.mean(axis=0))
+
+
+def _cell(values: NDArray[Any], low: float, high: float, count: int) -> NDArray[np.intp]:
+    share = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
+    return np.clip(np.floor(share * count), 0, count - 1).astype(np.intp)
+
+
+def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> list[Joint]:
+    """Histograms of command, pressures and velocity of each axis, and of velocities with each other."""
+    made = [_joint(recordings, "command", a.command, (a.velocity,)) for a in axes if a.command and a.velocity]
+    for side, title in enumerate(("head pressure", "rod pressure")):
+        chosen = [axis for axis in axes if len(axis.pressures) > side and axis.velocity]
+        made += [_joint(recordings, title, (axis.pressures[side],), (axis.velocity,)) for axis in chosen]
+    speeds = [axis.velocity for axis in axes if axis.velocity]
+    pairs = [(a, b) for i, a in enumerate(speeds) for b in speeds[i + 1 :]]
+    made += [_joint(recordings, "velocities", (a,), (b,)) for a, b in pairs]
+    for title in ("command", "head pressure", "velocities"):
+        if not any(joint.group == title for joint in made):
+            absent.append(f"joint histograms of {title}: no such channels")
+    return made
+
+
+def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: tuple[str, ...]) -> Joint:
+    (x_values, x_unit), (y_values, y_unit) = _values(recordings, x), _values(recordings, y)
+    (x_low, x_high), (y_low, y_high) = _range(x_values), _range(y_values)
+    counts = np.histogram2d(x_values, y_values, BINS, ((x_low, x_high), (y_low, y_high)))[0].astype(np.int64)
+    with np.errstate(invalid="ignore"):
+        alike = x_values.std() > 0 and y_values.std() > 0
+        correlation = float(np.corrcoef(x_values, y_values)[0, 1]) if alike else 0.0
+    return Joint(
+        group,
+        " - ".join(x),
+        " - ".join(y),
+        x_unit,
+        y_unit,
+        (x_low, x_high),
+        (y_low, y_high),
+        counts,
+        float((counts > 0).mean()),
+        correlation,
+        mutual_information(x_values, y_values),
+    )
+
+
+def _values(recordings: Sequence[Recording], names: tuple[str, ...]) -> tuple[Array, str]:
+    kind = recordings[0].channels[recordings[0].index(names[0])].kind
+    factor = KINDS[kind].report_factor
+    return np.concatenate([signed(r, names) for r in recordings]) * factor, KINDS[kind].report_unit
+
+
+def _range(values: Array) -> tuple[float, float]:
+    low, high = (float(v) for v in np.quantile(values, [TAIL, 1.0 - TAIL]))
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
+    """Mutual information in nat of two signals in bins of equal content, less its expected value for independent ones.
+
+    A value held for long (a command at rest) takes a bin of its own, however many samples it has.
+    """
+
+    def ranked(values: Array) -> NDArray[np.intp]:
+        edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, bins + 1)[1:-1]))
+        return np.searchsorted(edges, values, side="right")
+
+    a, b = ranked(x), ranked(y)
+    table = np.zeros((a.max() + 1, b.max() + 1))
+    np.add.at(table, (a, b), 1.0)
+    share = table / len(x)
+    outer = share.sum(axis=1, keepdims=True) * share.sum(axis=0, keepdims=True)
+    seen = share > 0
+    chance = (np.count_nonzero(table.sum(axis=1)) - 1) * (np.count_nonzero(table.sum(axis=0)) - 1) / (2.0 * len(x))
+    return float(max((share[seen] * np.log(share[seen] / outer[seen])).sum() - chance, 0.0))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value

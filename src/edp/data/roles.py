@@ -1,0 +1,130 @@
+"""Which channels of a recording command an axis and which show what it does: by Table A.1, else by kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, closest
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+
+Array = NDArray[np.float64]
+COMMANDS = (Kind.PILOT_PRESSURE, Kind.CURRENT, Kind.VOLTAGE, Kind.RATIO)
+"""Kinds that stand for a command, in the order in which they are looked for."""
+_TABLE_A1 = (
+    ("boom", ("BmUp", "BmDwn"), ("BmUpConf", "BmDwnConf")),
+    ("arm", ("AmIn", "AmOut"), ("AmInConf", "AmOutConf")),
+    ("bucket", ("BktIn", "BktOut"), ("BktInConf", "BktOutConf")),
+)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of motion and its channels; what a recording lacks is empty.
+
+    Attributes:
+        name: for readers.
+        command: channels that command it: extend and retract, one signed channel, or none.
+        velocity: its velocity, extension positive.
+        pressures: head and rod pressure, or as many as there are.
+        stroke: its position.
+        conflux: channels that give it the second pump.
+    """
+
+    name: str
+    command: tuple[str, ...] = ()
+    velocity: str = ""
+    pressures: tuple[str, ...] = ()
+    stroke: str = ""
+    conflux: tuple[str, ...] = ()
+
+    def signed_command(self, recording: Recording) -> Array:
+        """Command, extension positive, shape ``(time,)``."""
+        return signed(recording, self.command)
+
+
+def signed(recording: Recording, names: Sequence[str]) -> Array:
+    """The first channel less the second, if there is one, shape ``(time,)``."""
+    values = recording.column(names[0]).astype(np.float64)
+    return values - recording.column(names[1]) if len(names) > 1 else values
+
+
+@dataclass(frozen=True)
+class Roles:
+    """The axes of a recording, and all channels that command."""
+
+    axes: tuple[Axis, ...]
+    inputs: tuple[str, ...]
+
+
+def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
+    """The axes of Table A.1 where a recording has its names, else one a velocity channel.
+
+    Args:
+        recording: whose channels are looked at.
+        inputs: names of the channels that command, where neither name nor kind tells.
+
+    Raises:
+        DataError: no such input channel.
+    """
+    names = recording.channel_names
+    for name in inputs:
+        if name not in names:
+            raise DataError(f"input '{name}' is not a channel of '{recording.name}'{closest(name, names)}")
+    known = [] if inputs else [axis for i in range(3) if (axis := _of_table(i, names)) is not None]
+    if known:
+        return Roles(tuple(known), tuple(name for axis in known for name in axis.command))
+    return _by_kind(recording.channels, tuple(inputs))
+
+
+def _of_table(i: int, names: Sequence[str]) -> Axis | None:
+    title, command, conflux = _TABLE_A1[i]
+
+    def there(*wanted: str) -> tuple[str, ...]:
+        return tuple(name for name in wanted if name in names)
+
+    axis = Axis(
+        title,
+        there(*command) if set(command) <= set(names) else (),
+        "".join(there(f"CylVels_{i + 1}")),
+        there(f"CylPressures_{i + 1}", f"CylPressures_{i + 5}"),
+        "".join(there(f"CylStroke_{i + 1}")),
+        there(*conflux) if set(conflux) <= set(names) else (),
+    )
+    return axis if axis.command or axis.velocity else None
+
+
+def _by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
+    """An axis for each velocity; commands, pressures and positions go to them in order where their numbers fit."""
+    kinds = {channel.name: channel.kind for channel in channels}
+
+    def of(*wanted: Kind) -> list[str]:
+        return [name for name, kind in kinds.items() if kind in wanted and name not in inputs]
+
+    commands = list(inputs) or next((found for kind in COMMANDS if (found := of(kind))), [])
+    speeds = of(Kind.VELOCITY) or of(Kind.ANGULAR_VELOCITY)
+    places, pressures = of(Kind.POSITION) or of(Kind.ANGLE), of(Kind.PRESSURE)
+    count = max(len(speeds), min(len(commands), 1))
+    one_sided = len(commands) == 2 * count and all(kinds[name] == Kind.PILOT_PRESSURE for name in commands)
+
+    def command(i: int) -> tuple[str, ...]:
+        if one_sided:
+            return tuple(commands[2 * i : 2 * i + 2])
+        return tuple(commands[i : i + 1] if len(commands) == count else commands[:1])
+
+    each = min(len(pressures) // count, 2) if count and len(pressures) % count == 0 else 0
+    axes = tuple(
+        Axis(
+            speeds[i] if speeds else commands[0],
+            command(i),
+            speeds[i] if speeds else "",
+            tuple(pressures[i * each : (i + 1) * each]),
+            places[i] if len(places) == count else "",
+        )
+        for i in range(count)
+    )
+    return Roles(axes, tuple(commands))

@@ -1,0 +1,100 @@
+"""How rich inputs are: persistent excitation by the input Hankel matrix, and the power spectral density."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+Array = NDArray[np.float64]
+LAGS = 50
+LAG_STEPS = (1, 2, 3, 5, 8, 12, 16, 20, 25, 30, 35, 40, 45, 50)
+FLAT_DB = 10.0
+SEGMENT_S = 10.24
+
+
+def hankel_gram(inputs: Sequence[Array], lags: int) -> tuple[Array, int]:
+    """Gram matrix of the block Hankel matrix of several stretches, and its number of columns.
+
+    Column t of the Hankel matrix holds u(t), u(t + 1), ... u(t + lags - 1). Its Gram matrix is block by block a sum of
+    products at one distance, so that each block follows from its neighbour by one product less and one more.
+
+    Args:
+        inputs: stretches, shape ``(time, input)``; those shorter than `lags` are left out.
+        lags: block rows.
+
+    Returns:
+        shape ``(lags * input, lags * input)``; columns.
+    """
+    width = inputs[0].shape[1]
+    gram = np.zeros((lags, width, lags, width))
+    columns = 0
+    for u in inputs:
+        count = len(u) - lags + 1
+        if count < 1:
+            continue
+        columns += count
+        for apart in range(lags):
+            block = u[:count].T @ u[apart : apart + count]
+            for a in range(lags - apart):
+                gram[a, :, a + apart, :] += block
+                if apart:
+                    gram[a + apart, :, a, :] += block.T
+                end = a + count
+                if end + apart < len(u):
+                    block = block - np.outer(u[a], u[a + apart]) + np.outer(u[end], u[end + apart])
+    return gram.reshape(lags * width, lags * width), columns
+
+
+def smallest_singular_values(inputs: Sequence[Array], lags: int = LAGS) -> dict[int, float]:
+    """Smallest singular value of the input Hankel matrix over the root of its columns, by number of lags.
+
+    Inputs are brought to mean 0 and deviation 1, so that white noise has the value 1. Inputs are persistently exciting
+    of an order as long as the value is above zero; a small one says which models the data cannot tell apart.
+
+    Args:
+        inputs: stretches, shape ``(time, input)``; no column is constant.
+        lags: the largest number of block rows.
+    """
+    whole = np.concatenate(inputs)
+    mean, deviation = whole.mean(axis=0), whole.std(axis=0)
+    gram, columns = hankel_gram([(u - mean) / deviation for u in inputs], lags)
+    width = whole.shape[1]
+    if columns <= lags * width:
+        return {}
+    steps = [n for n in LAG_STEPS if n < lags] + [lags]
+    return {n: float(np.sqrt(max(np.linalg.eigvalsh(gram[: n * width, : n * width] / columns)[0], 0.0))) for n in steps}
+
+
+def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
+    """Power spectral density by Welch's method, averaged over stretches by their length.
+
+    Returns:
+        frequencies in Hz without zero, shape ``(frequency,)``; density, shape ``(frequency, signal)``. Empty where no
+        stretch fills a segment.
+    """
+    size = 1 << round(np.log2(max(SEGMENT_S * rate_hz, 16)))
+    fitting = [u for u in stretches if len(u) >= size]
+    if not fitting:
+        return np.zeros(0), np.zeros((0, stretches[0].shape[1]))
+    parts = [signal.welch(u, rate_hz, nperseg=size, axis=0) for u in fitting]
+    power = np.average([p for _, p in parts], axis=0, weights=[len(u) for u in fitting])
+    return np.asarray(parts[0][0][1:]), np.asarray(power[1:])
+
+
+def flat_to(frequency: Array, power: Array, within_db: float = FLAT_DB) -> float:
+    """Highest frequency up to which a density stays within some dB of its maximum, in Hz; 0 for silence.
+
+    The density is first averaged over a third of an octave.
+    """
+    if len(power) == 0 or not power.max() > 0:
+        return 0.0
+    edges = frequency * 2.0 ** (1.0 / 6.0)
+    total = np.concatenate(([0.0], np.cumsum(power)))
+    low, high = np.searchsorted(frequency, frequency / 2.0 ** (1.0 / 6.0)), np.searchsorted(frequency, edges)
+    smooth = (total[np.maximum(high, low + 1)] - total[low]) / np.maximum(high - low, 1)
+    peak = int(np.argmax(smooth))
+    below = np.flatnonzero(smooth[peak:] < smooth[peak] * 10.0 ** (-within_db / 10.0))
+    return float(frequency[peak + below[0] - 1] if len(below) and peak + below[0] > 0 else frequency[-1])
