@@ -20,7 +20,10 @@ from edp.config import (
     load_experiment,
     plain_tree,
 )
+from edp.data.coverage import Coverage, cover
 from edp.data.prepared import Prepared, prepare
+from edp.data.spectrum import LAGS
+from edp.data.splits import SPLITS
 from edp.errors import ConfigError, DataError, StorageError, closest
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
@@ -126,6 +129,22 @@ def simulate_data_set(
         if on_done is not None:
             on_done(recording, False)
     return paths
+
+
+def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
+    """What a data set covers: see `edp.data.coverage`.
+
+    Args:
+        source: where the recordings are.
+        inputs: channels that command, where neither names nor kinds tell.
+        split: name of a split with its usual settings, to say how far tests lie from training.
+
+    Raises:
+        EdpError: the recordings cannot be read as they are, or do not command or move anything; an unknown split.
+    """
+    chosen = SPLITS[split]() if split else None
+    recordings = source.read()
+    return cover(recordings, inputs, None if chosen is None else chosen.split(recordings, LAGS))
 
 
 def prepare_data(source: DataSource, experiment: Experiment) -> Prepared:
@@ -294,6 +313,7 @@ __all__ = [
     "DataSource",
     "SimulationOrder",
     "build_report",
+    "coverage",
     "evaluate",
     "footprint_of",
     "judge_bundle",

@@ -1,14 +1,19 @@
-"""``edp inspect``: what is in a log and what is wrong with it."""
+"""``edp inspect``: what is in a log, what is wrong with it, and what a data set covers."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.cli.console import JsonFlag, emit, err, out, table
 from edp.cli.train import MapOption
+from edp.errors import EdpError
+
+if TYPE_CHECKING:
+    from edp.data.coverage import Coverage
+    from edp.sources import DataSource
 
 FAULTY = 3
 
@@ -17,32 +22,67 @@ def inspect(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     signal_map: MapOption = None,
     channels: Annotated[bool, typer.Option(help="Show a row for each channel.")] = True,
+    covered: Annotated[bool, typer.Option("--coverage/--no-coverage", help="Show what the data cover.")] = True,
+    page: Annotated[Path | None, typer.Option(help="Also write the coverage as an offline HTML page.")] = None,
+    split: Annotated[
+        str, typer.Option(help="Also say how far tests lie from training: recordings, blocks, time.")
+    ] = "",
+    inputs: Annotated[str, typer.Option(help="Channels that command, where names and kinds do not tell: a,b.")] = "",
     as_json: JsonFlag = False,
 ) -> None:
     """Report rate, gaps, missing values, constant channels and doubtful units of recordings; nothing is changed.
 
+    Then what the data cover: how rich the inputs are, poses, joint histograms, events.
     Ends with exit code 3 where a log has an error that training would refuse.
 
-    Example: `edp inspect logs/ --map mine.toml`
+    Example: `edp inspect logs/ --map mine.toml --page coverage.html`
     """
     from edp.sources import DataSource
 
-    plain = [report.to_json() for report in DataSource.of(data, signal_map).inspect()]
+    source = DataSource.of(data, signal_map)
+    plain = [report.to_json() for report in source.inspect()]
     errors = sum(finding["severity"] == "error" for report in plain for finding in report["findings"])
+    asked = page is not None or bool(split or inputs)
+    found, why = None, "" if covered or asked else "not asked for"
+    if not errors and (covered or asked):
+        found, why = _coverage(source, split, tuple(filter(None, inputs.split(","))), asked)
+    if found is not None and page is not None:
+        from edp.report import build_coverage_page
+
+        build_coverage_page(found, page, data.resolve().name)
 
     def show() -> None:
         for report in plain:
             show_report(report, channels)
+        if found is not None:
+            show_coverage(found)
+        elif why and covered:
+            out.print(f"coverage: {why}")
+        if found is not None and page is not None:
+            out.print(f"page: {page.resolve()}")
         verdict = f"{errors} error(s) that training would refuse" if errors else "no errors"
         out.print(f"{len(plain)} recording(s), {verdict}")
         if not errors:
             mapped = "" if signal_map is None else f" --map {signal_map}"
             out.print(f"next: edp train {data}{mapped} --out runs/first")
 
-    emit(as_json, {"errors": errors, "recordings": plain}, show)
+    covers = None if found is None else found.to_json()
+    emit(as_json, {"errors": errors, "recordings": plain, "coverage": covers, "coverage_absent": why}, show)
     if errors:
         err.print("see the advice beside each error, or ask for a repair with --repair when training")
         raise typer.Exit(FAULTY)
+
+
+def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bool) -> tuple[Coverage | None, str]:
+    """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
+    from edp.workflow import coverage
+
+    try:
+        return coverage(source, inputs, split), ""
+    except EdpError as error:
+        if asked:
+            raise
+        return None, str(error)
 
 
 def show_report(report: dict[str, Any], channels: bool) -> None:
@@ -64,5 +104,51 @@ def show_report(report: dict[str, Any], channels: bool) -> None:
     out.print()
 
 
+def show_coverage(found: Coverage) -> None:
+    """Print what a data set covers."""
+    rows: list[tuple[Any, ...]] = []
+    if found.singular:
+        lags = max(found.singular)
+        rows.append((f"smallest singular value, {lags} lags", f"{found.singular[lags]:.3g}", "white noise: 1"))
+    if found.spectrum is not None:
+        for name, flat, drop in zip(found.spectrum.names, found.spectrum.flat_to_hz, found.spectrum.drop_db):
+            rows.append((f"{name}: flat within 10 dB to", f"{flat:.2g} Hz", f"{drop:.0f} dB down at 4 Hz"))
+    if found.occupancy is not None:
+        spans = "full strokes" if found.occupancy.full_stroke else "range that was seen"
+        cells = found.occupancy.samples.size
+        rows.append((f"cells of {cells} visited", _share(found.occupancy.share), f"{found.occupancy.source}, {spans}"))
+    if found.distance is not None:
+        far = found.distance
+        rows.append(("test to train, median", f"{far.test[0]:.3g}", f"train to train {far.train[0]:.3g}"))
+        rows.append(("test farther than 95 % of train", _share(far.beyond), "5 % where both are alike"))
+    table(f"coverage: {found.recordings} recording(s), {found.hours:.2f} h", ["", "value", "note"], rows)
+    out.print()
+    moves = [(a.axis, *(_count(v) for v in (a.reversals, a.crossings)), _share(a.active)) for a in found.activity]
+    table("commands", ["axis", "reversals", "dead-band crossings", "time active"], moves)
+    out.print()
+    if found.together:
+        table("in use at once", ["", "time"], [(name, _share(share)) for name, share in found.together.items()])
+        out.print()
+    counted = [(e.name, _count(e.count), _share(e.share), e.note) for e in found.events]
+    table("events", ["", "count", "time", "note"], counted)
+    out.print()
+    pairs = [
+        (f"{j.group}: {j.x}", j.y, _share(j.filled), f"{j.correlation:.2f}", f"{j.information:.2f}")
+        for j in found.joints
+    ]
+    table("joint histograms", ["", "with", "bins filled", "correlation", "mutual information, nat"], pairs)
+    for note in found.absent:
+        out.print(f"  note: {note}")
+    out.print()
+
+
 def _short(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f} %"
+
+
+def _count(value: int | None) -> str:
+    return "-" if value is None else f"{value:,}"

@@ -30,17 +30,28 @@ TAIL = 5e-4
 """Share of the samples at either end that lies outside a joint histogram."""
 QUANTILES = 32
 """Bins of equal content for the mutual information."""
+INFORMED = 200_000
+"""Samples for the mutual information, evenly spread."""
 MEASURED, INTEGRATED = "strokes", "integrated velocity"
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Inputs in the frequency domain; see `edp.data.spectrum`."""
+    """Inputs in the frequency domain; see `edp.data.spectrum`.
+
+    Attributes:
+        names: commands; two one-sided ones as their difference.
+        frequency_hz: shape ``(frequency,)``.
+        density: power spectral density, shape ``(frequency, command)``.
+        flat_to_hz: how far each stays within 10 dB of its maximum.
+        drop_db: how far each lies below its maximum at `USED_HZ`.
+    """
 
     names: tuple[str, ...]
     frequency_hz: Array
     density: Array
     flat_to_hz: tuple[float, ...]
+    drop_db: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,12 +202,12 @@ def _spectrum(recordings: Sequence[Recording], roles: Roles) -> Spectrum | None:
         return None
     stretches = [np.stack([signed(r, command) for command in sources], axis=1) for r in recordings]
     frequency, power = spectrum.density(stretches, recordings[0].rate_hz)
-    flat = tuple(spectrum.flat_to(frequency, power[:, i]) for i in range(len(sources)))
+    flat, drop = zip(*(spectrum.flat_to(frequency, power[:, i]) for i in range(len(sources))))
     # a tenth of an octave is enough for a picture
     wanted = np.geomspace(frequency[0], frequency[-1], 90) if len(frequency) else np.zeros(0)
     kept = np.unique(np.minimum(np.searchsorted(frequency, wanted), max(len(frequency) - 1, 0)))
     names = tuple(" - ".join(command) for command in sources)
-    return Spectrum(names, frequency[kept], power[kept], flat)
+    return Spectrum(names, frequency[kept], power[kept], flat, drop)
 
 
 def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> Occupancy | None:
@@ -223,8 +234,7 @@ def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: li
     else:
         span = tuple((float(low), float(high)) for low, high in zip(places.min(axis=0), places.max(axis=0)))
     cells = [_cell(places[:, i], *span[i], CELLS) for i in range(len(names))]
-    samples = np.zeros((CELLS,) * len(names), dtype=np.int64)
-    np.add.at(samples, tuple(cells), 1)
+    samples = _counted(cells, (CELLS,) * len(names))
     return Occupancy(source, names, span, known, samples)
 
 
@@ -240,6 +250,12 @@ def _integrated(recording: Recording, names: Sequence[str]) -> Array:
 def _cell(values: NDArray[Any], low: float, high: float, count: int) -> NDArray[np.intp]:
     share = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
     return np.clip(np.floor(share * count), 0, count - 1).astype(np.intp)
+
+
+def _counted(cells: Sequence[NDArray[np.intp]], shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """How often each cell occurs; one array of places an axis."""
+    flat = np.ravel_multi_index(tuple(cells), shape)
+    return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape)
 
 
 def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> list[Joint]:
@@ -260,7 +276,9 @@ def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[
 def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: tuple[str, ...]) -> Joint:
     (x_values, x_unit), (y_values, y_unit) = _values(recordings, x), _values(recordings, y)
     (x_low, x_high), (y_low, y_high) = _range(x_values), _range(y_values)
-    counts = np.histogram2d(x_values, y_values, BINS, ((x_low, x_high), (y_low, y_high)))[0].astype(np.int64)
+    inside = (x_values >= x_low) & (x_values <= x_high) & (y_values >= y_low) & (y_values <= y_high)
+    cells = [_cell(x_values[inside], x_low, x_high, BINS), _cell(y_values[inside], y_low, y_high, BINS)]
+    counts = _counted(cells, (BINS, BINS))
     with np.errstate(invalid="ignore"):
         alike = x_values.std() > 0 and y_values.std() > 0
         correlation = float(np.corrcoef(x_values, y_values)[0, 1]) if alike else 0.0
@@ -300,9 +318,10 @@ def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
         edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, bins + 1)[1:-1]))
         return np.searchsorted(edges, values, side="right")
 
+    step = max(1, len(x) // INFORMED)
+    x, y = x[::step], y[::step]
     a, b = ranked(x), ranked(y)
-    table = np.zeros((a.max() + 1, b.max() + 1))
-    np.add.at(table, (a, b), 1.0)
+    table = _counted([a, b], (int(a.max()) + 1, int(b.max()) + 1))
     share = table / len(x)
     outer = share.sum(axis=1, keepdims=True) * share.sum(axis=0, keepdims=True)
     seen = share > 0

@@ -30,7 +30,7 @@ class Activity:
 
     Attributes:
         reversals: changes of the sign of a command that left the dead band.
-        crossings: rises of the command out of its dead band.
+        crossings: times the command left its dead band, in either direction.
         active: share of the time outside the dead band.
     """
 
@@ -77,7 +77,7 @@ def activity_of(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band
         if axis.command:
             commands = [axis.signed_command(r) for r in recordings]
             turned = sum(reversals(u, level) for u in commands)
-            crossed = sum(rises(np.abs(u) > level) for u in commands)
+            crossed = sum(rises(u > level) + rises(-u > level) for u in commands)
             active = sum(int(np.count_nonzero(np.abs(u) > level)) for u in commands) / sum(len(u) for u in commands)
         made.append(Activity(axis.name, turned, crossed, active))
     return tuple(made)

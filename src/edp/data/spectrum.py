@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 LAGS = 50
 LAG_STEPS = (1, 2, 3, 5, 8, 12, 16, 20, 25, 30, 35, 40, 45, 50)
 FLAT_DB = 10.0
+USED_HZ = 4.0
+"""Up to here a machine's axes answer their commands."""
 SEGMENT_S = 10.24
 
 
@@ -84,17 +86,23 @@ def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
     return np.asarray(parts[0][0][1:]), np.asarray(power[1:])
 
 
-def flat_to(frequency: Array, power: Array, within_db: float = FLAT_DB) -> float:
-    """Highest frequency up to which a density stays within some dB of its maximum, in Hz; 0 for silence.
+def flat_to(frequency: Array, power: Array, within_db: float = FLAT_DB) -> tuple[float, float]:
+    """How flat a density is, averaged over a third of an octave.
 
-    The density is first averaged over a third of an octave.
+    Returns:
+        the highest frequency up to which it stays within some dB of its maximum, Hz; how far it lies below the maximum
+        at `USED_HZ`, dB. Zeros for silence.
     """
     if len(power) == 0 or not power.max() > 0:
-        return 0.0
-    edges = frequency * 2.0 ** (1.0 / 6.0)
+        return 0.0, 0.0
+    sixth = 2.0 ** (1.0 / 6.0)
     total = np.concatenate(([0.0], np.cumsum(power)))
-    low, high = np.searchsorted(frequency, frequency / 2.0 ** (1.0 / 6.0)), np.searchsorted(frequency, edges)
-    smooth = (total[np.maximum(high, low + 1)] - total[low]) / np.maximum(high - low, 1)
+    low = np.searchsorted(frequency, frequency / sixth)
+    high = np.maximum(np.searchsorted(frequency, frequency * sixth), low + 1)
+    smooth = (total[high] - total[low]) / (high - low)
     peak = int(np.argmax(smooth))
     below = np.flatnonzero(smooth[peak:] < smooth[peak] * 10.0 ** (-within_db / 10.0))
-    return float(frequency[peak + below[0] - 1] if len(below) and peak + below[0] > 0 else frequency[-1])
+    flat = frequency[max(peak + int(below[0]) - 1, 0)] if len(below) else frequency[-1]
+    used = smooth[min(int(np.searchsorted(frequency, USED_HZ)), len(smooth) - 1)]
+    drop = 10.0 * np.log10(smooth[peak] / max(used, 1e-30 * smooth[peak]))
+    return float(flat), float(drop)

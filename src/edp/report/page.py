@@ -70,7 +70,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
         "worst": tables.worst_recordings_table(facts),
         "plots": plots,
-        "specs": _script_json([plot.spec() for plot in plots.values()]),
+        "specs": script_json([plot.spec() for plot in plots.values()]),
         "checks": tables.budget_checks(facts),
         "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
         "parts": tables.parts_table(facts),
@@ -79,17 +79,18 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "config": facts.config,
         "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
         "absent": facts.absent,
-        "style": Markup(_asset("page.css")),
-        "script": Markup(_asset("page.js")),
+        "style": Markup(asset("page.css")),
+        "script": Markup(asset("page.js")),
         "plotly": Markup(get_plotlyjs()),
     }
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """A file of the page's own, as text."""
     return resources.files("edp.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def _script_json(value: Any) -> Markup:
+def script_json(value: Any) -> Markup:
     """JSON that cannot end its script element, whatever names it holds."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))

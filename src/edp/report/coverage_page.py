@@ -1,0 +1,178 @@
+"""One offline HTML page of what a data set covers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from edp.data.coverage import INTEGRATED, Coverage
+from edp.data.spectrum import FLAT_DB, USED_HZ
+from edp.report.coverage_plots import coverage_plots
+from edp.report.page import asset, script_json
+from edp.report.tables import Table
+from edp.report.wording import MISSING, listed, number, percent, unbroken, whole
+from edp.storage import write_bytes
+
+WANTED_OCCUPANCY = 0.9
+"""Share of the cells that a data set should visit."""
+
+
+def build_coverage_page(found: Coverage, output: str | Path, title: str) -> Path:
+    """Write what a data set covers as one HTML file that opens with no network.
+
+    Args:
+        found: what it covers.
+        output: where to write.
+        title: name of the data set.
+
+    Raises:
+        StorageError: the page cannot be written.
+    """
+    target = Path(output)
+    write_bytes(target, render_coverage(found, title).encode())
+    return target
+
+
+def render_coverage(found: Coverage, title: str) -> str:
+    """The page's text."""
+    environment = Environment(
+        loader=PackageLoader("edp.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    plots = coverage_plots(found)
+    context: dict[str, Any] = {
+        "title": title,
+        "size": f"{found.recordings} recording{'s' * (found.recordings != 1)}, {number(found.hours, 2)} h at "
+        f"{found.rate_hz:g} Hz",
+        "headline": unbroken(headline(found)),
+        "verdict": verdict(found),
+        "tiles": tiles(found),
+        "plots": plots,
+        "specs": script_json([plot.spec() for plot in plots.values()]),
+        "found": found,
+        "integrated": found.occupancy is not None and found.occupancy.source == INTEGRATED,
+        "activity": activity_table(found),
+        "together": together_table(found),
+        "events": events_table(found),
+        "joints": joints_table(found),
+        "distance": distance_table(found),
+        "style": Markup(asset("page.css")),
+        "script": Markup(asset("page.js")),
+        "plotly": Markup(get_plotlyjs()),
+    }
+    return environment.get_template("coverage.html.jinja").render(**context)
+
+
+def headline(found: Coverage) -> str:
+    """What the data cover, in a sentence."""
+    parts = []
+    if found.occupancy is not None:
+        kind = "of the poses" if found.occupancy.samples.ndim > 1 else "of the stroke"
+        parts.append(f"visits {percent(found.occupancy.share)} {kind}")
+    if found.spectrum is not None and any(found.spectrum.flat_to_hz):
+        parts.append(f"excites its commands up to {number(min(found.spectrum.flat_to_hz), 1)} Hz")
+    if found.distance is not None:
+        parts.append(f"leaves {percent(found.distance.beyond)} of the tests outside what was trained")
+    size = f"{number(found.hours, 1 if found.hours >= 1 else 2)} h of data"
+    return (
+        f"{size}: {listed(parts)}." if not parts else f"{size} that {listed(parts)}.".replace(" that that ", " that ")
+    )
+
+
+def verdict(found: Coverage) -> list[str]:
+    """What is missing for learning a model of the machine from these data."""
+    lines = []
+    if found.spectrum is not None and any(found.spectrum.flat_to_hz) and min(found.spectrum.flat_to_hz) < USED_HZ:
+        drop = max(found.spectrum.drop_db)
+        lines.append(
+            f"Commands fall by {FLAT_DB:g} dB before {USED_HZ:g} Hz, where they lie up to {number(drop, 0)} dB below "
+            "their maximum: faster changes teach little here."
+        )
+    if found.occupancy is not None and found.occupancy.share < WANTED_OCCUPANCY:
+        lines.append(f"Fewer than {percent(WANTED_OCCUPANCY)} of the cells were visited; the white ones were never.")
+    if found.constant:
+        lines.append(f"{listed(found.constant)} never change{'s' * (len(found.constant) == 1)}.")
+    return lines
+
+
+def tiles(found: Coverage) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, what."""
+    made: list[tuple[str, str, str]] = []
+    if found.occupancy is not None:
+        cells = found.occupancy.samples.size
+        made.append((number(100 * found.occupancy.share, 0), "%", f"of {cells} cells of the strokes visited"))
+    if found.spectrum is not None and found.spectrum.flat_to_hz:
+        made.append(
+            (number(min(found.spectrum.flat_to_hz), 2), "Hz", f"every command within {FLAT_DB:g} dB up to here")
+        )
+    if found.singular:
+        lags = max(found.singular)
+        made.append((f"{found.singular[lags]:.2g}", "", f"smallest singular value of the inputs, {lags} lags"))
+    turns = [axis.reversals for axis in found.activity if axis.reversals is not None]
+    if turns:
+        made.append((whole(sum(turns)), "", "reversals of the commands"))
+    if found.distance is not None:
+        made.append(
+            (percent(found.distance.beyond).rstrip(" %"), "%", "of the tests farther than 95 % of the training")
+        )
+    return made
+
+
+def activity_table(found: Coverage) -> Table | None:
+    """Commands by axis."""
+    rows = tuple(
+        (axis.axis, whole(axis.reversals), whole(axis.crossings), percent(axis.active))
+        for axis in found.activity
+        if axis.reversals is not None
+    )
+    columns = (("Axis", ""), ("Reversals", ""), ("Dead band left", ""), ("Commanded", "of the time"))
+    return Table("Commands", columns, rows) if rows else None
+
+
+def together_table(found: Coverage) -> Table | None:
+    """Axes in use at once."""
+    rows = tuple((_first_up(name), percent(share)) for name, share in found.together.items())
+    return Table("In use at once", (("Commanded", ""), ("Share", "of the time")), rows) if rows else None
+
+
+def events_table(found: Coverage) -> Table:
+    """Events, recorded or not."""
+    rows = tuple(
+        (_first_up(event.name), whole(event.count), percent(event.share), event.note or "recorded")
+        for event in found.events
+    )
+    return Table("Events", (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", "")), rows)
+
+
+def joints_table(found: Coverage) -> Table | None:
+    """Joint histograms in figures."""
+    rows = tuple(
+        (f"{j.x} and {j.y}", percent(j.filled), number(j.correlation, 2), number(j.information, 2))
+        for j in found.joints
+    )
+    columns = (("Signals", ""), ("Bins filled", ""), ("Correlation", ""), ("Mutual information", "nat"))
+    return Table("Joint histograms in figures", columns, rows) if rows else None
+
+
+def distance_table(found: Coverage) -> Table | None:
+    """Distance from tests to training beside that within training."""
+    far = found.distance
+    if far is None:
+        return None
+    rows = (
+        ("From test to training", number(far.test[0], 2), number(far.test[1], 2), percent(far.beyond)),
+        ("Within training", number(far.train[0], 2), number(far.train[1], 2), percent(0.05)),
+    )
+    columns = (("Nearest neighbour", ""), ("Median", ""), ("95 % quantile", ""), ("Beyond 95 % of training", ""))
+    return Table(f"Distance in deviations of {far.signals} signals", columns, rows)
+
+
+def _first_up(text: str) -> str:
+    return text[:1].upper() + text[1:] if text else MISSING
