@@ -17,8 +17,9 @@ from edp.logs import (
 )
 from edp.logs.matlab import matio
 from edp.recording import Recording
-from edp.signals import EXTRA_CHANNELS, TABLE_A1, VOCABULARY, Channel, Kind, SignalMap
+from edp.signals import TABLE_A1, VOCABULARY, Channel, Kind, SignalMap
 
+TRUTH = {name: channel for name, channel in VOCABULARY.items() if name not in TABLE_A1}
 SUFFIXES = [part.suffixes[0] for part in FORMATS.values()]
 
 
@@ -42,8 +43,8 @@ def test_truth_apart_is_not_read_with_the_log_but_can_be_read_alone(tmp_path, su
     assert len(read_data_set(tmp_path)) == 1
     beside = truth_path(path)
     truth = read_recording(beside) if beside.exists() else read_recording(path, SignalMap(variable="truth"))
-    np.testing.assert_array_equal(columns(truth, EXTRA_CHANNELS), recording.select(list(EXTRA_CHANNELS)))
-    assert [c.kind for c in truth.channels] == [c.kind for c in EXTRA_CHANNELS.values()]
+    np.testing.assert_array_equal(columns(truth, TRUTH), recording.select(list(TRUTH)))
+    assert [c.kind for c in truth.channels] == [c.kind for c in TRUTH.values()]
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -66,7 +67,7 @@ def test_mat_layouts_keep_truth_in_a_variable_of_its_own(tmp_path, layout):
     read = read_recording(path)
     np.testing.assert_array_equal(columns(read, TABLE_A1), recording.select(list(TABLE_A1)))
     truth = read_recording(path, SignalMap(variable="truth"))
-    np.testing.assert_array_equal(columns(truth, EXTRA_CHANNELS), recording.select(list(EXTRA_CHANNELS)))
+    np.testing.assert_array_equal(columns(truth, TRUTH), recording.select(list(TRUTH)))
 
 
 @pytest.mark.parametrize("version", ["v5", "v7.3"])
@@ -110,6 +111,6 @@ def test_logs_without_truth_or_of_nothing_else(tmp_path):
     write_recording(only, tmp_path / "a.csv", WriteOptions(truth="apart"))
     assert not truth_path(tmp_path / "a.csv").exists()
     with pytest.raises(DataError, match="no channel but truth"):
-        write_recording(simulated(names=tuple(EXTRA_CHANNELS)), tmp_path / "b.csv", WriteOptions(truth="without"))
+        write_recording(simulated(names=tuple(TRUTH)), tmp_path / "b.csv", WriteOptions(truth="without"))
     with pytest.raises(DataError, match="did you mean 'apart'"):
         WriteOptions(truth="aparts")

@@ -103,7 +103,7 @@ def occupancy_plot(occupancy: Occupancy | None) -> Plot | None:
     top = max(float(part.max()) for part in share)
     low, high = occupancy.span[0]
     edges = np.linspace(low, high, samples.shape[0] + 1)
-    titles = [f"{_short_name(occupancy.names[0])} {a:.2f}–{b:.2f} m" for a, b in itertools.pairwise(edges)]
+    titles = [f"{a:.2f} to {b:.2f} m" for a, b in itertools.pairwise(np.round(edges, 2) + 0.0)]
     columns = min(len(maps), 6)
     figure = make_subplots(
         rows=1,
@@ -126,14 +126,17 @@ def occupancy_plot(occupancy: Occupancy | None) -> Plot | None:
             row=1,
             col=i + 1,
         )
-    styled(figure, 300, coloraxis=_colours(top, "% of the time"))
-    figure.update_layout(margin={"t": 34, "r": 80})
+    styled(figure, 310, coloraxis=_colours(top, "% of the time"))
+    figure.update_layout(margin={"t": 48, "r": 80})
     figure.update_annotations(font={"size": 12, "color": SOFT})
+    if len(maps) > 1:
+        figure.layout.annotations[0].text = f"{_short_name(occupancy.names[0])}<br>{titles[0]}"
     axis = _short_name(occupancy.names[-1])
     for i in range(columns):
         figure.update_xaxes(title_text=f"{axis} [m]" if i == 0 or columns == 1 else "", nticks=4, row=1, col=i + 1)
     if samples.ndim > 1:
         figure.update_yaxes(title_text=f"{_short_name(occupancy.names[-2])} [m]", row=1, col=1)
+    figure.update_yaxes(showgrid=False)
     return Plot("occupancy", figure)
 
 
@@ -171,6 +174,7 @@ def joint_plot(found: Coverage, group: str) -> Plot | None:
     styled(figure, 60 + 270 * rows, coloraxis=_colours(top, "% of the samples"))
     figure.update_layout(margin={"t": 34, "r": 80})
     figure.update_annotations(font={"size": 12, "color": SOFT})
+    figure.update_yaxes(showgrid=False)
     return Plot(name, figure)
 
 

@@ -265,5 +265,5 @@ def _recording(
         values=np.column_stack([measured, *(truth[name] for name in extra)]).astype(np.float32),
         rate_hz=scenario.rate_hz,
         source=f"sim:{machine.name}",
-        meta={**facts, "clamps": clamps},
+        meta={**facts, "clamps": clamps, "full_strokes_m": list(machine.cylinders.stroke)},
     )
