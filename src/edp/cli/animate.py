@@ -1,0 +1,69 @@
+"""``edp animate``: the side view of a recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from edp.cli.console import JsonFlag, emit, out
+from edp.cli.train import MapOption
+from edp.errors import ConfigError, DataError
+from edp.recording import Recording
+
+PAGES = (".html", ".htm")
+
+
+def animate(
+    log: Annotated[Path, typer.Argument(help="A log with joint angles or cylinder strokes.")],
+    output: Annotated[
+        Path | None, typer.Option("--out", help="The page (.html) or film (.mp4, .gif); default: beside the log.")
+    ] = None,
+    machine: Annotated[
+        str | None, typer.Option(help="Machine name or file (.toml) to draw; default: the recording's.")
+    ] = None,
+    start: Annotated[float, typer.Option(help="First second shown.")] = 0.0,
+    seconds: Annotated[float | None, typer.Option(help="How many seconds; default: up to 600.")] = None,
+    signal_map: MapOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show a recording from the side: an offline page to play, with bucket path, soil, pressures and velocities.
+
+    Example: `edp animate data/m22/m22_000_combined.parquet`
+    """
+    from edp.report.animation import scene_of, write_animation
+    from edp.report.film import FILMS, write_film
+
+    target = output or log.with_name(f"{log.stem}.html")
+    scene = scene_of(_read(log, signal_map), machine, start, seconds)
+    film = target.suffix.lower() in FILMS
+    if not film and target.suffix.lower() not in PAGES:
+        endings = ", ".join((*PAGES, *FILMS))
+        raise ConfigError(f"--out {target}: an animation ends in one of {endings}, not in '{target.suffix}'")
+    (write_film if film else write_animation)(scene, target)
+
+    def show() -> None:
+        out.print(f"animation: {target.resolve()}")
+
+    emit(as_json, {"animation": str(target)}, show)
+
+
+def _read(log: Path, signal_map: Path | None) -> Recording:
+    """One recording, with the truth that lies beside its log."""
+    from edp.logs import read_recording, truth_path
+    from edp.sources import DataSource
+
+    found = DataSource.of(log, signal_map).read()
+    if len(found) != 1:
+        raise DataError(f"'{log}' holds {len(found)} recordings; give one log to animate")
+    recording, beside = found[0], truth_path(log)
+    if not log.is_file() or not beside.is_file():
+        return recording
+    truth = read_recording(beside)
+    new = [c for c in truth.channels if c.name not in recording.channel_names]
+    rows = min(recording.samples, truth.samples)
+    values = np.concatenate((recording.values[:rows], truth.select([c.name for c in new])[:rows]), axis=1)
+    return replace(recording, channels=(*recording.channels, *new), values=values)
