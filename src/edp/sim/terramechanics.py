@@ -46,6 +46,8 @@ EDGE_DEPTH = 0.05
 """Depth (m) at which the whole edge is in the ground."""
 HEEL_CONTACT = 0.2
 """Length (m) of floor plate that bears on the ground; E."""
+DEEPEST = 1.2
+"""Depth (m) beyond which the cutting force stays: about the height of a bucket."""
 PIN_STIFFNESS = 1.2e7
 """Stiffness (N/m) of the front behind the heel; E."""
 TURNING = 0.05
@@ -60,7 +62,8 @@ def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> t
     rake, phi, delta = (math.radians(a) for a in (rake_deg, friction_deg, metal_deg))
     cot_out = 1.0 / np.tan(failure + phi)
     below = math.cos(rake + delta) + math.sin(rake + delta) * cot_out
-    weight = (1.0 / math.tan(rake) + 1.0 / np.tan(failure)) / (2.0 * np.maximum(below, 1e-3))
+    wedge = 1.0 / math.tan(rake) + 1.0 / np.tan(failure)
+    weight = np.where((below > 1e-2) & (wedge > 0.0), wedge / (2.0 * np.maximum(below, 1e-2)), np.inf)
     n = int(np.argmin(weight))
     cohesion = (1.0 + cot_out[n] / math.tan(failure[n])) / below[n]
     adhesion = (1.0 - cot_out[n] / math.tan(rake)) / below[n]
@@ -251,7 +254,7 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
     inward = min(max(0.5 - 0.5 * vx / TURNING, 0.0), 1.0)
     uncut = inward * height_at(c[POINTS] - 1.5 * SPACING, heights)
     uncut += (1.0 - inward) * height_at(c[POINTS] + 1.5 * SPACING, heights)
-    c[DEPTH] = uncut - c[POINTS + 1]
+    c[DEPTH] = min(uncut - c[POINTS + 1], DEEPEST)
     c[HEEL_DEPTH] = height_at(c[POINTS + 2], heights) - c[POINTS + 3]
     if c[DEPTH] > 0.0:
         c[ON] = 1.0
@@ -304,15 +307,18 @@ def torques(c: Array, w1: float, w2: float, w3: float) -> tuple[float, float, fl
 def damp(w1: float, w2: float, w3: float, c: Array) -> None:
     """Damping of the joints by the soil at these rates, N m s, into `c[DAMPING:]`, row by row."""
     v = velocities(c, w1, w2, w3)
-    drag = c[DRAG] / math.sqrt(v[0] * v[0] + v[1] * v[1] + CREEP * CREEP)
+    slow = 1.0 / math.sqrt(v[0] * v[0] + v[1] * v[1] + CREEP * CREEP)
+    drag, across = c[DRAG] * slow, c[ACROSS] * slow
     into = v[0] * c[EDGE_X] + v[1] * c[EDGE_Y]
-    edge = c[EDGE] / math.sqrt(into * into + CREEP * CREEP) if into > 0.0 else 0.0
+    # the edge's part also where it is about to come: too much damping in the Jacobian costs little, too little all
+    edge = c[EDGE] / math.sqrt(into * into + CREEP * CREEP) if into > -5.0 * CREEP else 0.0
     slide = c[SLIDE] / math.sqrt(v[2] * v[2] + CREEP * CREEP)
     xx, xy, yy = drag + edge * c[EDGE_X] * c[EDGE_X], edge * c[EDGE_X] * c[EDGE_Y], drag + edge * c[EDGE_Y] * c[EDGE_Y]
     for i in range(3):
         for j in range(3):
             ix, iy, jx, jy = c[TIP_JX + i], c[TIP_JY + i], c[TIP_JX + j], c[TIP_JY + j]
             value = xx * ix * jx + xy * (ix * jy + iy * jx) + yy * iy * jy
+            value += across * (ix * jy - iy * jx)
             value += slide * c[HEEL_JX + i] * c[HEEL_JX + j] + c[NORMAL_DAMPING] * c[HEEL_JY + i] * c[HEEL_JY + j]
             c[DAMPING + 3 * i + j] = value
 
