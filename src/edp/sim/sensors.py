@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from edp.sim import can, linkage, transducers
+from edp.sim import can, pins, transducers
 from edp.sim import layout as at
-from edp.sim.jit import compiled
 from edp.sim.machine import Machine
 from edp.sim.parameters import pack
 
@@ -21,8 +20,6 @@ ECUS = ("joints", "pressures", "valves")
 """Senders on the bus: rates of the joints, cylinder pressures, and pilot demands."""
 REFERENCE_TEMPERATURE = 313.15
 """Oil temperature in K at which pressure transmitters are adjusted (40 degC)."""
-CROSSING_TIME = 0.015
-"""s for a joint to cross the play of its pins; E: 1.5 mm at 5 to 10 m/s^2 take 17 to 24 ms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,20 +112,16 @@ def _velocity(log: Array, machine: Machine, rate_hz: float, frames: can.Frames, 
     """Cylinder velocities that the joints' ECU sends: v = J(measured angle) * measured rate, shape (frame, 3)."""
     own = machine.sensors
     step_s = 1.0 / rate_hz
-    pressures = log[:, at.HEAD : at.HEAD + 6]
     axes, plant = pack(machine)
-    force = axes[:, at.HEAD_AREA] * pressures[:, :3] - axes[:, at.ROD_AREA] * pressures[:, 3:]
-    # Within the friction of the seals the sign of the force through the pins is undecided.
-    seated = transducers.seats(force, axes[:, at.COULOMB])
-    play = transducers.slack(seated, np.array(own.pin_backlash), CROSSING_TIME, step_s)
+    play = pins.play_velocity(*pins.loads(log, axes, plant), np.array(own.pin_backlash), step_s)
     velocity = frames.take(log[:, at.LOG_VELOCITY : at.LOG_VELOCITY + 3] + play)
     angles, rates = frames.take(log[:, at.PSI : at.PSI + 3]), frames.take(log[:, at.RATE : at.RATE + 3])
     frame_s = own.can_period or step_s
     drift, noise = rng.spawn(2)
     error = transducers.random_walk(rates.shape, frame_s, np.deg2rad(own.joint_bias_walk_deg) / np.sqrt(60.0), drift)
     error += noise.normal(0.0, np.deg2rad(own.joint_rate_deg), rates.shape)
-    lever = lever_arms(transducers.quantised(angles, np.deg2rad(own.angle_quantum_deg)), plant)
-    velocity = velocity + (lever - lever_arms(angles, plant)) * rates + lever * error
+    lever = pins.lever_arms(transducers.quantised(angles, np.deg2rad(own.angle_quantum_deg)), plant)
+    velocity = velocity + (lever - pins.lever_arms(angles, plant)) * rates + lever * error
     return velocity + rng.normal(0.0, own.velocity, velocity.shape)
 
 
@@ -143,20 +136,6 @@ def _pressures(
     values = values + rng.normal(0.0, own.pressure, values.shape)
     quantum = own.pressure_range / 2.0**own.pressure_bits if own.pressure_bits > 0 else 0.0
     return transducers.quantised(transducers.limited(values, own.pressure_range), quantum)
-
-
-@compiled
-def _fill_levers(angles: Array, plant: Array, out: Array) -> None:
-    for k in range(angles.shape[0]):
-        for i in range(at.AXES):
-            out[k, i] = linkage.cylinder(i, angles[k, i], plant)[1]
-
-
-def lever_arms(angles: Array, plant: Array) -> Array:
-    """Lever arms J = dx/dpsi in m/rad at joint angles, shape (time, 3)."""
-    out = np.empty_like(angles)
-    _fill_levers(np.ascontiguousarray(angles), plant, out)
-    return out
 
 
 def truth_signals(log: Array) -> dict[str, Array]:

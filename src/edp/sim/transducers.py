@@ -36,27 +36,3 @@ def lagged(values: Array, time_constant_s: float, step_s: float) -> Array:
 def limited(values: Array, full_scale: float) -> Array:
     """Cut to what a transmitter can show, 0 to `full_scale`."""
     return np.clip(values, 0.0, full_scale) if full_scale > 0.0 else values
-
-
-def seats(force: Array, threshold: Array) -> Array:
-    """The side on which each pin lies in its bore, +1 pushed out or -1 pulled in, shape ``(time, cylinder)``.
-
-    It changes only once the force exceeds `threshold`, shape ``(cylinder,)``, in the other direction.
-    """
-    clear = np.where(np.abs(force) > threshold, np.sign(force), 0.0)
-    clear[0] = np.where(force[0] < 0.0, -1.0, 1.0)
-    since = np.maximum.accumulate(np.where(clear != 0.0, np.arange(len(force))[:, None], 0), axis=0)
-    return np.take_along_axis(clear, since, axis=0)
-
-
-def slack(seated: Array, width: Array, crossing_s: float, step_s: float) -> Array:
-    """Velocity of a joint against its cylinder in the play of the pins, in m/s, shape ``(time, cylinder)``.
-
-    A pin that pushes lies ahead of its bore by half of `width`, shape ``(cylinder,)``, in m; it crosses the play with a
-    first-order lag. The mean velocity since the sample before, so that its sum is the way within the play.
-    """
-    kept = np.exp(-step_s / crossing_s)
-    aim = -0.5 * width * seated
-    start = aim[:1]
-    place = start + signal.lfilter([0.0, 1.0 - kept], [1.0, -kept], aim - start, axis=0)
-    return np.asarray(np.diff(place, axis=0, prepend=place[:1]) / step_s)
