@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,11 @@ from edp.data.coverage import Coverage, cover
 from edp.data.prepared import Prepared, prepare
 from edp.data.spectrum import LAGS
 from edp.data.splits import SPLITS
+from edp.data_sets import SimulationOrder, simulate_data_set
 from edp.errors import ConfigError, DataError, StorageError, closest
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
-from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
 from edp.models.predictor import ModelSpec, Predictor, build_model, describe
-from edp.recording import Recording
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
 from edp.sources import DataSource
@@ -40,95 +38,6 @@ from edp.training.fit import thread_count
 
 SHOWN_RECORDINGS = 6
 SHOWN_TICKS = 60_000
-MANIFEST = "data_set.json"
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulationOrder:
-    """A simulated data set: the same order gives the same bits, whatever the number of workers.
-
-    Attributes:
-        machine: machine parameter set.
-        minutes: length of all recordings together.
-        recordings: how many recordings.
-        seed: root of every random choice.
-        family: how many machines of 10 to 50 t take turns in place of `machine`; 0 for none.
-        suffix: ending of the logs, which settles their format.
-        layout: layout of MAT files, a name in `edp.logs.LAYOUTS`; empty for the plain one.
-        truth: where the channels go that only a simulation knows, see `edp.logs.WriteOptions`; empty for ``apart``
-            in a layout that was asked for, else ``with`` the others.
-    """
-
-    machine: str = "M22"
-    minutes: float = 60.0
-    recordings: int = 30
-    seed: int = 0
-    family: int = 0
-    suffix: str = ".parquet"
-    layout: str = ""
-    truth: str = ""
-
-    def files(self) -> WriteOptions:
-        """How the logs are written.
-
-        Raises:
-            EdpError: an ending without a format, an unknown layout, or one of another format.
-        """
-        if self.suffix not in known_suffixes():
-            hint = closest(self.suffix, known_suffixes())
-            raise ConfigError(f"there is no log format for the ending '{self.suffix}'{hint}")
-        if self.layout:
-            LAYOUTS[self.layout]
-            if self.suffix != ".mat":
-                raise ConfigError(f"layout '{self.layout}' is one of MAT files, not of '{self.suffix}'; ask for mat")
-        truth = self.truth or ("apart" if self.layout else "with")
-        return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
-
-
-def simulate_data_set(
-    out: str | Path,
-    order: SimulationOrder | None = None,
-    workers: int = 0,
-    on_done: Callable[[Recording, bool], None] | None = None,
-) -> list[Path]:
-    """Simulate a data set into a folder, a log each; logs already there from the same order are kept.
-
-    Args:
-        out: folder; it may hold nothing but an earlier part of the same data set.
-        order: what to simulate; an hour of machine M22 by default.
-        workers: processes; 0 for one a core.
-        on_done: called with each recording and whether it was there already.
-
-    Raises:
-        StorageError: the folder holds another data set or cannot be written.
-        ConfigError: an ending without a format, or a number out of range.
-    """
-    from edp.sim import over_family, plan_data_set, simulate_many
-
-    order = order or SimulationOrder()
-    suffix, files = order.suffix, order.files()
-    plan = plan_data_set(order.machine, order.minutes, order.recordings, order.seed)
-    if order.family:
-        plan = over_family(plan, order.family, order.seed)
-    folder = make_folder(out)
-    identity = {"schema": 1, "edp": __version__, "plan": [asdict(entry) for entry in plan]}
-    if files != WriteOptions():
-        identity["files"] = asdict(files)
-    manifest = folder / MANIFEST
-    if manifest.exists() and read_json(manifest) != identity:
-        raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
-    write_json(manifest, identity)
-    paths = [folder / f"{scenario.name}{suffix}" for scenario in plan]
-    missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
-    for scenario, path in zip(plan, paths, strict=True):
-        if on_done is not None and scenario not in missing:
-            on_done(read_recording(path), True)
-    count = workers or os.cpu_count() or 1
-    for recording in simulate_many(missing, min(count, max(1, len(missing)))):
-        write_recording(recording, folder / f"{recording.name}{suffix}", files)
-        if on_done is not None:
-            on_done(recording, False)
-    return paths
 
 
 def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:

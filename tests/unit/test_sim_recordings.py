@@ -128,7 +128,7 @@ def test_plan_spreads_the_mix_and_the_seeds():
     kinds = [s.excitation for s in scenarios]
     assert kinds.count("isolated") == 8
     assert kinds.count("combined") in (9, 10)
-    assert set(kinds) == set(EXCITATIONS)
+    assert set(kinds) == set(plan.DEFAULT_MIX)
     assert scenarios == plan_data_set("M22", 60.0, 20, seed=3)
     assert scenarios != plan_data_set("M22", 60.0, 20, seed=4)
     only = plan_data_set("M22", 1.0, 2, seed=0, mix={"isolated": 2.0})

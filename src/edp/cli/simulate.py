@@ -11,38 +11,51 @@ import typer
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
 
 if TYPE_CHECKING:
+    from edp.data_sets import SimulationOrder
     from edp.recording import Recording
-    from edp.workflow import SimulationOrder
 
 
 def simulate(
     folder: Annotated[Path, typer.Argument(help="Folder for the logs; an unfinished data set goes on.")],
-    machine: Annotated[str, typer.Option(help="M22, C14, or the path of a machine file (.toml).")] = "M22",
-    minutes: Annotated[float, typer.Option(help="Length of all recordings together.")] = 60.0,
-    recordings: Annotated[int, typer.Option(help="How many recordings.")] = 30,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same bits.")] = 0,
-    family: Annotated[int, typer.Option(help="So many random machines of 10 to 50 t in place of one.")] = 0,
-    form: Annotated[str, typer.Option("--format", help="Ending of the logs: parquet, csv or mat.")] = "parquet",
-    layout: Annotated[str, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, dataset, ...")] = "",
-    truth: Annotated[str, typer.Option(help="What only a simulation knows: with the rest, apart or without.")] = "",
+    scenario: Annotated[
+        Path | None, typer.Option(help="Scenario file (.toml) with all that follows; options given here go first.")
+    ] = None,
+    machine: Annotated[str | None, typer.Option(help="M22 (default), C14, or the path of a machine file.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Length of all recordings together; default: 60.")] = None,
+    recordings: Annotated[int | None, typer.Option(help="How many recordings; default: 30.")] = None,
+    seed: Annotated[int | None, typer.Option(help="The same seed gives the same bits; default: 0.")] = None,
+    family: Annotated[int | None, typer.Option(help="So many random machines of 10 to 50 t in place of one.")] = None,
+    form: Annotated[
+        str | None, typer.Option("--format", help="Ending of the logs: parquet (default), csv or mat.")
+    ] = None,
+    layout: Annotated[str | None, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, ...")] = None,
+    truth: Annotated[str | None, typer.Option(help="What only a simulation knows: with, apart or without.")] = None,
     workers: Annotated[int, typer.Option(help="Processes; 0 for one a core.")] = 0,
     as_json: JsonFlag = False,
 ) -> None:
-    """Simulate recordings of the built-in excavator in free air.
+    """Simulate recordings of an excavator: M22 in free air, or what a scenario file describes.
 
     Example: `edp simulate data/m22 --minutes 90 --recordings 30 --seed 1`
-    """
-    from edp.workflow import SimulationOrder
 
-    suffix = f".{form.lstrip('.')}"
-    files = {"suffix": suffix, "layout": layout, "truth": truth}
-    order = SimulationOrder(machine=machine, minutes=minutes, recordings=recordings, seed=seed, family=family, **files)
+    Example: `edp simulate data/c14 --scenario examples/scenarios/c14_soil.toml`
+    """
+    from edp.data_sets import SimulationOrder, suffix_of
+
+    given = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
+    suffix = None if form is None else suffix_of(form)
+    order = SimulationOrder.of(scenario, **given, suffix=suffix, layout=layout, truth=truth)
     paths = run(folder, order, workers, as_json)
-    made = f"{family} machines" if family else machine
-    facts = {"folder": str(folder), "recordings": len(paths), "minutes": minutes, "machine": made, "seed": seed}
+    made = f"{order.family} machines" if order.family else order.machine
+    facts = {
+        "folder": str(folder),
+        "recordings": len(paths),
+        "minutes": order.minutes,
+        "machine": made,
+        "seed": order.seed,
+    }
 
     def show() -> None:
-        out.print(f"{len(paths)} recordings of {made}, {minutes:g} min, in {folder}")
+        out.print(f"{len(paths)} recordings of {made}, {order.minutes:g} min, in {folder}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
 
     emit(as_json, facts, show)
@@ -50,7 +63,7 @@ def simulate(
 
 def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = False) -> list[Path]:
     """Simulate with a progress display."""
-    from edp.workflow import simulate_data_set
+    from edp.data_sets import simulate_data_set
 
     began, steps, made = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
     with progress(quiet) as shown:

@@ -3,13 +3,16 @@
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine import Machine
 from edp.sim.machine_files import load_machine, machine_family, machine_names
-from edp.sim.plan import DEFAULT_MIX, over_family, plan_data_set, simulate_many
-from edp.sim.simulate import Scenario, Simulation, SimulationError, simulate
+from edp.sim.plan import DEFAULT_MIX, DataSetSpec, over_family, plan_data_set, simulate_many
+from edp.sim.scenario import Scenario, SimulationError
+from edp.sim.scenario_file import read_scenario_file
+from edp.sim.simulate import Simulation, simulate
 from edp.sim.snapshot import Snapshot
 
 __all__ = [
     "DEFAULT_MIX",
     "EXCITATIONS",
+    "DataSetSpec",
     "Machine",
     "Scenario",
     "Simulation",
@@ -20,6 +23,7 @@ __all__ = [
     "machine_names",
     "over_family",
     "plan_data_set",
+    "read_scenario_file",
     "simulate",
     "simulate_many",
 ]

@@ -2,64 +2,146 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from edp.errors import ConfigError
 from edp.recording import Recording
+from edp.sim import soil
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine_files import load_machine
-from edp.sim.simulate import Scenario, SimulationError, simulate
+from edp.sim.scenario import START_STROKES, Scenario, SimulationError
+from edp.sim.simulate import simulate
 
 DEFAULT_MIX: Mapping[str, float] = {"isolated": 0.40, "combined": 0.48, "reversals": 0.05, "end_stops": 0.07}
 """Share of the recordings by excitation."""
 
 
+AIR = "air"
+"""Free air in a mix of materials."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSetSpec:
+    """A data set to simulate: the same one gives the same bits, whatever the number of workers.
+
+    Attributes:
+        machine: name of a machine, or path of a machine file.
+        minutes: length of all recordings together.
+        recordings: how many recordings, all of one length.
+        seed: root of every random choice.
+        family: how many machines of 10 to 50 t take turns in place of `machine`; 0 for none.
+        mix: share of the recordings by excitation.
+        materials: share of the recordings of families that work the ground (grading, dig) by soil; ``air`` is none.
+            The other families always move in free air.
+        rate_hz: samples per second.
+        step_s: integration step.
+        start_strokes: range of the strokes to start from, as shares of full.
+        sensor_noise: False logs the truth.
+        sensors: values that replace those of the machine's ``[sensors]``.
+
+    Raises:
+        ConfigError: a value is out of range or a name is unknown.
+    """
+
+    machine: str = "M22"
+    minutes: float = 60.0
+    recordings: int = 30
+    seed: int = 0
+    family: int = 0
+    mix: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_MIX))
+    materials: Mapping[str, float] = field(default_factory=dict)
+    rate_hz: float = 100.0
+    step_s: float = 1e-3
+    start_strokes: tuple[float, float] = START_STROKES
+    sensor_noise: bool = True
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.recordings < 1 or not 0 < self.minutes < math.inf:
+            raise ConfigError(
+                f"data set of recordings = {self.recordings} and minutes = {self.minutes}; both must be positive"
+            )
+        if self.family < 0:
+            raise ConfigError(f"family = {self.family} machines; must be at least 0")
+        for name in self.mix:
+            EXCITATIONS[name]
+        _check_shares("mix", self.mix)
+        for name in self.materials:
+            if name != AIR:
+                soil.load_material(name)
+        if self.materials:
+            _check_shares("materials", self.materials)
+            if not any(EXCITATIONS[name].works_ground and share > 0 for name, share in self.mix.items()):
+                working = ", ".join(name for name in EXCITATIONS if EXCITATIONS[name].works_ground)
+                raise ConfigError(f"materials are given, but no family of mix works the ground; add one of {working}")
+
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """Equally long scenarios, each with its own seed derived from `seed`."""
+        root = np.random.SeedSequence(self.seed)
+        order_seed, *seeds = root.spawn(self.recordings + 1)
+        rng = np.random.default_rng(order_seed)
+        names = _apportion(self.mix, self.recordings)
+        order = rng.permutation(self.recordings)
+        excitations = [names[place] for place in order]
+        soils = self._soils(excitations, rng)
+        label = load_machine(self.machine).name.lower()
+        plan = tuple(
+            Scenario(
+                machine=self.machine,
+                excitation=excitations[i],
+                duration_s=round(self.minutes * 60.0 / self.recordings, 2),
+                rate_hz=self.rate_hz,
+                step_s=self.step_s,
+                sensor_noise=self.sensor_noise,
+                seed=int(seeds[i].generate_state(1)[0]),
+                name="_".join(part for part in (label, f"{i:03d}", excitations[i], Path(soils[i]).stem) if part),
+                material=soils[i],
+                start_strokes=self.start_strokes,
+                sensors=self.sensors,
+            )
+            for i in range(self.recordings)
+        )
+        return over_family(plan, self.family, self.seed) if self.family else plan
+
+    def _soils(self, excitations: Sequence[str], rng: np.random.Generator) -> list[str]:
+        """The material of each recording; empty for free air."""
+        soils = [""] * len(excitations)
+        places = [i for i, name in enumerate(excitations) if EXCITATIONS[name].works_ground]
+        if self.materials and places:
+            chosen = _apportion(self.materials, len(places))
+            for place, k in zip(places, rng.permutation(len(places)), strict=True):
+                soils[place] = "" if chosen[k] == AIR else chosen[k]
+        return soils
+
+
+def _check_shares(what: str, shares: Mapping[str, float]) -> None:
+    for name, share in shares.items():
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < math.inf:
+            raise ConfigError(f"{what}: share {share!r} of '{name}' must not be negative, and a number")
+    if not sum(shares.values()) > 0:
+        raise ConfigError(f"{what}: the shares add up to nothing; give at least one a positive share")
+
+
 def plan_data_set(
     machine: str, minutes: float, recordings: int, seed: int, mix: Mapping[str, float] | None = None
 ) -> tuple[Scenario, ...]:
-    """Equally long scenarios, each with its own seed derived from `seed`.
-
-    Args:
-        machine: name of a machine file.
-        minutes: total length of all recordings.
-        recordings: how many.
-        seed: seed of the data set.
-        mix: share of the recordings by excitation; default `DEFAULT_MIX`.
+    """The scenarios of a `DataSetSpec`.
 
     Raises:
         ConfigError: a count or length is not positive, or the mix names an unknown excitation.
     """
     shares = dict(DEFAULT_MIX if mix is None else mix)
-    if recordings < 1 or not minutes > 0:
-        raise ConfigError(f"data set of {recordings} recordings and {minutes} minutes; both must be positive")
-    for name, share in shares.items():
-        EXCITATIONS[name]
-        if not share >= 0:
-            raise ConfigError(f"mix: share {share} of '{name}' must not be negative")
-    if not sum(shares.values()) > 0:
-        raise ConfigError("mix: the shares add up to nothing; give at least one excitation a positive share")
-    root = np.random.SeedSequence(seed)
-    order_seed, *seeds = root.spawn(recordings + 1)
-    names = _apportion(shares, recordings)
-    order = np.random.default_rng(order_seed).permutation(recordings)
-    label = load_machine(machine).name.lower()
-    return tuple(
-        Scenario(
-            machine=machine,
-            excitation=names[order[i]],
-            duration_s=round(minutes * 60.0 / recordings, 2),
-            seed=int(seeds[i].generate_state(1)[0]),
-            name=f"{label}_{i:03d}_{names[order[i]]}",
-        )
-        for i in range(recordings)
-    )
+    return DataSetSpec(machine=machine, minutes=minutes, recordings=recordings, seed=seed, mix=shares).scenarios()
 
 
 def over_family(scenarios: Sequence[Scenario], count: int, seed: int) -> tuple[Scenario, ...]:
@@ -71,9 +153,13 @@ def over_family(scenarios: Sequence[Scenario], count: int, seed: int) -> tuple[S
     if count < 1:
         raise ConfigError(f"family = {count} machines; at least one is needed")
     return tuple(
-        replace(s, machine=f"family-{seed}-{i % count}", name=f"family-{seed}-{i % count}_{i:03d}_{s.excitation}")
+        replace(s, machine=f"family-{seed}-{i % count}", name=_named(s.name, f"family-{seed}-{i % count}"))
         for i, s in enumerate(scenarios)
     )
+
+
+def _named(name: str, machine: str) -> str:
+    return "_".join([machine, *name.split("_", 1)[1:]])
 
 
 def _apportion(shares: Mapping[str, float], count: int) -> list[str]:

@@ -86,6 +86,21 @@ def smooth_levers(targets: Array, hand: Array, step_s: float, out: Array) -> Non
             out[k, i] = hand[i, 0]
 
 
+def steps_per_sample(rate_hz: float, step_s: float) -> int:
+    """Whole number of integration steps that fill a sample.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    steps = round(1.0 / (rate_hz * step_s))
+    if steps < 1 or abs(steps * step_s * rate_hz - 1.0) > 1e-9:
+        raise ConfigError(
+            f"step_s = {step_s} s does not divide the sample time {1.0 / rate_hz} s of rate_hz = {rate_hz}; "
+            "choose a step such as 0.001 or 0.0005"
+        )
+    return steps
+
+
 class Plant:
     """One machine in motion: levers in, logged samples out.
 
@@ -108,12 +123,7 @@ class Plant:
         step_s: float = 1e-3,
         ground: soil.Ground | None = None,
     ) -> None:
-        steps = round(1.0 / (rate_hz * step_s))
-        if steps < 1 or abs(steps * step_s * rate_hz - 1.0) > 1e-9:
-            raise ConfigError(
-                f"step_s = {step_s} s does not divide the sample time {1.0 / rate_hz} s of rate_hz = {rate_hz}; "
-                "choose a step such as 0.001 or 0.0005"
-            )
+        steps = steps_per_sample(rate_hz, step_s)
         self.machine = machine
         self.rate_hz = rate_hz
         self.axes, self.plant = pack(machine)

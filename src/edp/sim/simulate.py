@@ -4,88 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import ConfigError, EdpError
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim import layout as at
 from edp.sim import pose, sensors, soil, terramechanics
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine import Machine
-from edp.sim.machine_files import load_machine
 from edp.sim.parameters import pack
 from edp.sim.plant import Plant
+from edp.sim.scenario import Scenario, SimulationError, plain
 from edp.sim.snapshot import Snapshot, capture, restored
 from edp.sim.view import view_of
 
 Array = NDArray[np.float64]
-START_STROKES = (0.3, 0.7)
 START_CLEARANCE_M, START_TRIES = 0.3, 100
-
-
-class SimulationError(EdpError):
-    """A simulation failed: the state diverged, or a worker process died."""
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """One recording to simulate.
-
-    Attributes:
-        machine: name of a machine, or path of a machine file (`.toml`).
-        excitation: name in `EXCITATIONS`.
-        duration_s: length of the recording.
-        rate_hz: samples per second, also the rate of commands.
-        step_s: integration step; cut in four near the ends of the stroke.
-        sensor_noise: False logs the truth.
-        material: soil that the bucket works in, see `soil.material_names`; empty for free air.
-        seed: the same seed gives the same bits on the same machine.
-        name: name of the recording; empty builds one from machine, excitation and seed.
-
-    Raises:
-        ConfigError: a value is out of range, or machine or excitation are unknown (the closest is offered).
-    """
-
-    machine: str = "M22"
-    excitation: str = "combined"
-    duration_s: float = 120.0
-    rate_hz: float = 100.0
-    step_s: float = 1e-3
-    sensor_noise: bool = True
-    seed: int = 0
-    name: str = ""
-    material: str = ""
-
-    def __post_init__(self) -> None:
-        load_machine(self.machine)
-        EXCITATIONS[self.excitation]
-        if self.material:
-            soil.load_material(self.material)
-        for key in ("duration_s", "rate_hz", "step_s"):
-            value = getattr(self, key)
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"scenario: {key} = {value} must be a positive number")
-        if self.duration_s * self.rate_hz < 2:
-            raise ConfigError(f"scenario: duration_s = {self.duration_s} is less than two samples; make it longer")
-        if self.step_s > 2.5e-3:
-            raise ConfigError(f"scenario: step_s = {self.step_s} is above 0.0025 s, where accuracy is lost")
-        if self.seed < 0:
-            raise ConfigError(f"scenario: seed = {self.seed} must not be negative")
-
-    @property
-    def samples(self) -> int:
-        """Number of samples."""
-        return round(self.duration_s * self.rate_hz)
-
-    @property
-    def label(self) -> str:
-        """Name of the recording."""
-        return self.name or f"{load_machine(self.machine).name.lower()}_{self.excitation}_{self.seed}"
 
 
 class Simulation:
@@ -97,14 +34,14 @@ class Simulation:
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        machine = load_machine(scenario.machine)
+        machine = scenario.load()
         start, hand = (np.random.default_rng(s) for s in _seeds(scenario)[:2])
         self.machine = machine
         ground = None
         if scenario.material:
             material = soil.load_material(scenario.material)
             ground = soil.Ground(material, machine, np.random.default_rng(_seeds(scenario)[3]))
-        strokes = _start_strokes(machine, ground, start)
+        strokes = _start_strokes(scenario, machine, ground, start)
         self.plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground)
         self.operator = EXCITATIONS[scenario.excitation](hand, scenario.rate_hz, machine)
         self.samples = 0
@@ -170,7 +107,7 @@ class Simulation:
         """This moment: plant, operator, random state and log; nothing that follows changes it."""
         arrays: list[NDArray[Any]] = []
         state = capture({key: getattr(self, key) for key in _CHANGING}, arrays)
-        return Snapshot(asdict(self.scenario), self.samples, state, tuple(arrays), tuple(self._logs))
+        return Snapshot(plain(self.scenario), self.samples, state, tuple(arrays), tuple(self._logs))
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go to a moment of the same scenario, exactly: what follows gives the same bits as it gave then.
@@ -178,9 +115,9 @@ class Simulation:
         Raises:
             SimulationError: the snapshot belongs to another scenario.
         """
-        if snapshot.scenario != asdict(self.scenario):
+        if snapshot.scenario != plain(self.scenario):
             raise SimulationError(
-                f"the snapshot belongs to scenario {snapshot.scenario}, not to {asdict(self.scenario)}; "
+                f"the snapshot belongs to scenario {snapshot.scenario}, not to {plain(self.scenario)}; "
                 "make the simulation from it with Simulation.of(snapshot)"
             )
         present = {key: getattr(self, key) for key in _CHANGING}
@@ -219,9 +156,9 @@ def _seeds(scenario: Scenario) -> list[np.random.SeedSequence]:
     return np.random.SeedSequence(scenario.seed).spawn(4)
 
 
-def _start_strokes(machine: Machine, ground: soil.Ground | None, rng: np.random.Generator) -> Array:
+def _start_strokes(scenario: Scenario, machine: Machine, ground: soil.Ground | None, rng: np.random.Generator) -> Array:
     """Strokes (shares of full) to start from, near the middle, and with the bucket clear of any ground."""
-    strokes = rng.uniform(*START_STROKES, 3)
+    strokes = rng.uniform(*scenario.start_strokes, 3)
     if ground is None:
         return strokes
     kinematics = pose.Kinematics(*pack(machine))
@@ -229,8 +166,8 @@ def _start_strokes(machine: Machine, ground: soil.Ground | None, rng: np.random.
         x, y, _ = kinematics.pose_at(strokes)
         if y > ground.height(x) + START_CLEARANCE_M:
             break
-        strokes = rng.uniform(*START_STROKES, 3)
-        strokes[0] = rng.uniform(START_STROKES[1], 0.9)
+        strokes = rng.uniform(*scenario.start_strokes, 3)
+        strokes[0] = rng.uniform(scenario.start_strokes[1], 0.9)
     return strokes
 
 
@@ -258,7 +195,7 @@ def _recording(
     measured = sensors.measured_signals(log, machine, scenario.rate_hz, noise, log[:, at.LOG_OIL] + 273.15)
     truth = sensors.truth_signals(log)
     extra = {name: channel for name, channel in {**EXTRA_CHANNELS, **GROUND_CHANNELS}.items() if name in truth}
-    facts = {key: value for key, value in asdict(scenario).items() if key != "name"}
+    facts = {key: value for key, value in plain(scenario).items() if key != "name"}
     return Recording(
         name=scenario.label,
         channels=(*TABLE_A1.values(), *extra.values()),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,8 +42,8 @@ class Excitation:
         """
 
 
-EXCITATIONS: Registry[Callable[[np.random.Generator, float, Machine], Excitation]] = Registry("excitation")
-"""By name: a subclass of `Excitation`, made from a random generator, the command rate in Hz and the machine."""
+EXCITATIONS: Registry[type[Excitation]] = Registry("excitation")
+"""By name; made from a random generator, the command rate in Hz and the machine."""
 
 
 def extend_probability(stroke: float, pull: float = 1.1) -> float:

@@ -1,0 +1,155 @@
+"""Simulated data sets on disk: what is asked for, room for it, and writing it so that it can go on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.errors import ConfigError, EdpError, StorageError, closest
+from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
+from edp.recording import Recording
+from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.sim.plan import DataSetSpec, simulate_many
+from edp.sim.scenario import Scenario, plain
+from edp.sim.scenario_file import read_scenario_file
+from edp.storage import make_folder, read_json, write_json
+
+MANIFEST = "data_set.json"
+BYTES_PER_VALUE = {".parquet": 3.0, ".csv": 10.0, ".mat": 3.0}
+"""Room a logged value takes, rounded up; measured on M22: 1.7, 8.0 and 2.1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOrder(DataSetSpec):
+    """A simulated data set and how it is written.
+
+    Attributes:
+        suffix: ending of the logs, which settles their format.
+        layout: layout of MAT files, a name in `edp.logs.LAYOUTS`; empty for the plain one.
+        truth: where the channels go that only a simulation knows, see `edp.logs.WriteOptions`; empty for ``apart``
+            in a layout that was asked for, else ``with`` the others.
+    """
+
+    suffix: str = ".parquet"
+    layout: str = ""
+    truth: str = ""
+
+    @staticmethod
+    def of(scenario: str | Path | None = None, **changes: Any) -> SimulationOrder:
+        """The order of a scenario file, or the default one; `changes` that are not None replace its values.
+
+        Raises:
+            ConfigError: a key or value that cannot be; file, key, value and bound are named.
+        """
+        values: dict[str, Any] = {}
+        if scenario is not None:
+            values, files = read_scenario_file(scenario)
+            values |= {key: value for key, value in files.items() if key != "format"}
+            if "format" in files:
+                values["suffix"] = suffix_of(files["format"])
+        values |= {key: value for key, value in changes.items() if value is not None}
+        try:
+            order = SimulationOrder(**values)
+            order.files()
+        except EdpError as error:
+            raise ConfigError(str(error) if scenario is None else f"scenario file {scenario}: {error}") from error
+        return order
+
+    def files(self) -> WriteOptions:
+        """How the logs are written.
+
+        Raises:
+            EdpError: an ending without a format, an unknown layout, or one of another format.
+        """
+        if self.suffix not in known_suffixes():
+            hint = closest(self.suffix, known_suffixes())
+            raise ConfigError(f"there is no log format for the ending '{self.suffix}'{hint}")
+        if self.layout:
+            LAYOUTS[self.layout]
+            if self.suffix != ".mat":
+                raise ConfigError(f"layout '{self.layout}' is one of MAT files, not of '{self.suffix}'; ask for mat")
+        truth = self.truth or ("apart" if self.layout else "with")
+        return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
+
+
+def suffix_of(form: str) -> str:
+    """``parquet`` or ``.parquet`` to ``.parquet``."""
+    return f".{form.lstrip('.')}"
+
+
+def simulate_data_set(
+    out: str | Path,
+    order: SimulationOrder | None = None,
+    workers: int = 0,
+    on_done: Callable[[Recording, bool], None] | None = None,
+) -> list[Path]:
+    """Simulate a data set into a folder, a log each; logs already there from the same order are kept.
+
+    Args:
+        out: folder; it may hold nothing but an earlier part of the same data set.
+        order: what to simulate; an hour of machine M22 by default.
+        workers: processes; 0 for one a core.
+        on_done: called with each recording and whether it was there already.
+
+    Raises:
+        StorageError: the folder holds another data set, cannot be written, or its disk has not room enough.
+        ConfigError: an ending without a format, or a number out of range.
+    """
+    order = order or SimulationOrder()
+    suffix, files = order.suffix, order.files()
+    plan = order.scenarios()
+    folder = make_folder(out)
+    identity = identity_of(plan, files)
+    manifest = folder / MANIFEST
+    if manifest.exists() and read_json(manifest) != identity:
+        raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
+    paths = [folder / f"{scenario.name}{suffix}" for scenario in plan]
+    missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
+    check_room(folder, missing, suffix)
+    write_json(manifest, identity)
+    for scenario, path in zip(plan, paths, strict=True):
+        if on_done is not None and scenario not in missing:
+            on_done(read_recording(path), True)
+    count = workers or os.cpu_count() or 1
+    for recording in simulate_many(missing, min(count, max(1, len(missing)))):
+        write_recording(recording, folder / f"{recording.name}{suffix}", files)
+        if on_done is not None:
+            on_done(recording, False)
+    return paths
+
+
+def identity_of(plan: Sequence[Scenario], files: WriteOptions) -> dict[str, Any]:
+    """What makes two simulated data sets the same, as JSON gives it back."""
+    identity: dict[str, Any] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
+    if files != WriteOptions():
+        identity["files"] = asdict(files)
+    kept: dict[str, Any] = json.loads(json.dumps(identity))
+    return kept
+
+
+def bytes_needed(plan: Sequence[Scenario], suffix: str) -> int:
+    """Room that the logs of a plan take, rounded up."""
+    usual = len(TABLE_A1) + len(EXTRA_CHANNELS)
+    values = sum(s.samples * (usual + (len(GROUND_CHANNELS) if s.material else 0)) for s in plan)
+    return int(values * BYTES_PER_VALUE.get(suffix, max(BYTES_PER_VALUE.values())))
+
+
+def check_room(folder: Path, plan: Sequence[Scenario], suffix: str) -> None:
+    """Refuse a plan whose logs would not fit on the disk of `folder`.
+
+    Raises:
+        StorageError: not room enough.
+    """
+    needed, free = bytes_needed(plan, suffix), shutil.disk_usage(folder).free
+    if needed > free:
+        minutes = sum(s.duration_s for s in plan) / 60.0
+        raise StorageError(
+            f"minutes: {minutes:g} min as {suffix} need about {needed / 1e9:,.1f} GB, but the disk of '{folder}' has "
+            f"{free / 1e9:,.1f} GB free; simulate at most {minutes * free / needed:,.0f} min, or choose another folder"
+        )

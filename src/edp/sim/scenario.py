@@ -1,0 +1,112 @@
+"""One recording to simulate, checked before the first step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from edp.errors import ConfigError, EdpError, closest
+from edp.sim import soil
+from edp.sim.excitation import EXCITATIONS
+from edp.sim.machine import Machine, Sensors
+from edp.sim.machine_checks import check_machine
+from edp.sim.machine_files import load_machine
+from edp.sim.plant import steps_per_sample
+
+START_STROKES = (0.3, 0.7)
+LARGEST_STEP_S = 2.5e-3
+
+
+class SimulationError(EdpError):
+    """A simulation failed: the state diverged, or a worker process died."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One recording to simulate.
+
+    Attributes:
+        machine: name of a machine, or path of a machine file (`.toml`).
+        excitation: name in `EXCITATIONS`.
+        duration_s: length of the recording.
+        rate_hz: samples per second, also the rate of commands.
+        step_s: integration step; cut in four near the ends of the stroke.
+        sensor_noise: False logs the truth.
+        material: soil that the bucket works in, see `soil.material_names`; empty for free air.
+        start_strokes: range of the strokes to start from, as shares of full.
+        sensors: values that replace those of the machine's ``[sensors]``, by key: to switch faults on or off.
+        seed: the same seed gives the same bits on the same machine.
+        name: name of the recording; empty builds one from machine, excitation and seed.
+
+    Raises:
+        ConfigError: a value is out of range, or machine or excitation are unknown (the closest is offered).
+    """
+
+    machine: str = "M22"
+    excitation: str = "combined"
+    duration_s: float = 120.0
+    rate_hz: float = 100.0
+    step_s: float = 1e-3
+    sensor_noise: bool = True
+    seed: int = 0
+    name: str = ""
+    material: str = ""
+    start_strokes: tuple[float, float] = START_STROKES
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "start_strokes", tuple(self.start_strokes))
+        self.load()
+        EXCITATIONS[self.excitation]
+        if self.material:
+            soil.load_material(self.material)
+        for key in ("duration_s", "rate_hz", "step_s"):
+            value = getattr(self, key)
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"scenario: {key} = {value} must be a positive number")
+        if self.duration_s * self.rate_hz < 2:
+            raise ConfigError(f"scenario: duration_s = {self.duration_s} is less than two samples; make it longer")
+        if self.step_s > LARGEST_STEP_S:
+            raise ConfigError(f"scenario: step_s = {self.step_s} is above {LARGEST_STEP_S} s, where accuracy is lost")
+        steps_per_sample(self.rate_hz, self.step_s)
+        if self.seed < 0:
+            raise ConfigError(f"scenario: seed = {self.seed} must not be negative")
+        low, high = self.start_strokes
+        if not 0.0 <= low <= high <= 1.0:
+            raise ConfigError(f"scenario: start_strokes = {[low, high]} must be shares with 0 <= low <= high <= 1")
+
+    def load(self) -> Machine:
+        """The machine, with the scenario's sensors.
+
+        Raises:
+            ConfigError: unknown machine or sensor value, or one out of its bounds.
+        """
+        machine = load_machine(self.machine)
+        if not self.sensors:
+            return machine
+        known = [entry.name for entry in fields(Sensors)]
+        for key in self.sensors:
+            if key not in known:
+                raise ConfigError(f"scenario: sensors.{key} is unknown{closest(key, known)}")
+        chosen: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in self.sensors.items()}
+        changed = replace(machine, sensors=replace(machine.sensors, **chosen))
+        check_machine(changed, f"{machine.name} with the scenario's sensors")
+        return changed
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return round(self.duration_s * self.rate_hz)
+
+    @property
+    def label(self) -> str:
+        """Name of the recording."""
+        return self.name or f"{load_machine(self.machine).name.lower()}_{self.excitation}_{self.seed}"
+
+
+def plain(scenario: Scenario) -> dict[str, Any]:
+    """A scenario as JSON gives it back; `Scenario(**plain(s)) == s`."""
+    found = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
+    return {**found, "start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}

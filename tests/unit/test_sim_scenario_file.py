@@ -1,0 +1,140 @@
+"""Data sets described in one file."""
+
+from pathlib import Path
+
+import pytest
+
+import edp.data_sets
+from edp.data_sets import SimulationOrder, bytes_needed, simulate_data_set
+from edp.errors import ConfigError, StorageError
+from edp.sim import DEFAULT_MIX, DataSetSpec, Scenario, read_scenario_file, simulate_many
+from edp.sim.scenario import plain
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "scenarios").glob("*.toml"))
+
+
+def written(tmp_path, text):
+    path = tmp_path / "set.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_are_valid(path):
+    order = SimulationOrder.of(path)
+    plan = order.scenarios()
+    assert len(plan) == order.recordings
+    assert {s.excitation for s in plan} == {name for name, share in order.mix.items() if share > 0}
+
+
+def test_the_default_example_is_the_default():
+    default = next(path for path in EXAMPLES if path.stem == "m22")
+    assert SimulationOrder.of(default) == SimulationOrder()
+    assert SimulationOrder().mix == DEFAULT_MIX
+
+
+def test_every_key_arrives_and_options_go_first(tmp_path):
+    path = written(
+        tmp_path,
+        """
+        machine = "C14"
+        minutes = 4
+        recordings = 8
+        seed = 3
+        rate_hz = 200.0
+        step_s = 0.0005
+        start_strokes = [0.4, 0.6]
+        sensor_noise = true
+        [mix]
+        dig = 3
+        isolated = 1
+        [materials]
+        air = 1
+        clay = 2
+        [sensors]
+        can_loss = 0.01
+        can_latency = [0.002, 0.004]
+        [files]
+        format = "mat"
+        layout = "simulink"
+        """,
+    )
+    order = SimulationOrder.of(path, minutes=6.0, seed=None)
+    assert (order.minutes, order.seed, order.suffix, order.layout) == (6.0, 3, ".mat", "simulink")
+    plan = order.scenarios()
+    assert [s.excitation for s in plan].count("dig") == 6
+    assert sorted(s.material for s in plan if s.excitation == "dig") == ["", "", *["clay"] * 4]
+    assert all(not s.material for s in plan if s.excitation == "isolated")
+    first = plan[0]
+    assert (first.rate_hz, first.step_s, first.start_strokes, first.duration_s) == (200.0, 0.0005, (0.4, 0.6), 45.0)
+    assert first.load().sensors.can_loss == 0.01
+    assert Scenario(**plain(first)) == first
+    assert {s.name for s in plan if s.material} <= {f"c14_{i:03d}_dig_clay" for i in range(8)}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("minutes = ", "not valid TOML"),
+        ("minuts = 5", "unknown key 'minuts'; did you mean 'minutes'"),
+        ("minutes = -1", "minutes = -1 must be a number above 0 and at most 1e"),
+        ("minutes = nan", "minutes = nan must be a number"),
+        ("recordings = 2.5", "recordings = 2.5 must be a whole number from 1"),
+        ("seed = true", "seed = True must be a whole number"),
+        ("step_s = 0.01", "step_s = 0.01 must be a number above 0 and at most 0.0025"),
+        ("step_s = 0.0003", "does not divide the sample time"),
+        ("machine = 'C15'", "unknown machine 'C15'; did you mean 'C14'"),
+        ("machine = 'absent.toml'", "absent.toml cannot be read"),
+        ("machine = 4", "machine = 4 must be a text"),
+        ("[mix]\ndigg = 1", "unknown excitation 'digg'; did you mean 'dig'"),
+        ("[mix]\ndig = -0.5", "mix: share -0.5 of 'dig' must not be negative"),
+        ("[mix]\ndig = 'much'", "mix: share 'much' of 'dig'"),
+        ("[mix]\ndig = 0", "mix: the shares add up to nothing"),
+        ("mix = 3", r"\[mix\]: is 3, expected a table"),
+        ("[materials]\nsandy_lome = 1", "unknown material 'sandy_lome'; did you mean 'sandy_loam'"),
+        ("[materials]\nclay = 1", "no family of mix works the ground"),
+        ("[sensors]\ncan_los = 0.1", "sensors.can_los is unknown; did you mean 'can_loss'"),
+        ("[sensors]\ncan_loss = 2.0", "can_loss = 2.0"),
+        ("start_strokes = [0.9]", "start_strokes = .0.9. must be .low, high."),
+        ("start_strokes = [0.9, 0.1]", "0 <= low <= high <= 1"),
+        ("sensor_noise = 1", "sensor_noise = 1 must be true or false"),
+        ("[files]\nformat = 'parket'", "no log format for the ending '.parket'; did you mean '.parquet'"),
+        ("[files]\nlayot = 'x'", "unknown key 'layot'; did you mean 'layout'"),
+        ("[files]\nlayout = 'simulnk'\nformat = 'mat'", "did you mean 'simulink'"),
+        ("[files]\nformat = 3", "format = 3 must be a text"),
+    ],
+)
+def test_bad_files_are_refused_with_file_key_value_and_bound(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        SimulationOrder.of(written(tmp_path, text))
+    assert "set.toml" in str(caught.value)
+
+
+def test_an_absent_file_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_scenario_file(tmp_path / "absent.toml")
+
+
+def test_a_data_set_longer_than_the_disk_is_refused_before_the_first_step(tmp_path, monkeypatch):
+    order = SimulationOrder.of(minutes=1e6, recordings=50)
+    monkeypatch.setattr(edp.data_sets.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 10**9}))
+    with pytest.raises(StorageError, match=r"minutes: 1e\+06 min as .parquet need about .* GB free; simulate at most"):
+        simulate_data_set(tmp_path / "set", order)
+    assert list((tmp_path / "set").iterdir()) == []
+
+
+def test_room_is_estimated_from_above(tmp_path):
+    order = SimulationOrder.of(minutes=0.5, recordings=1, suffix=".csv")
+    (path,) = simulate_data_set(tmp_path, order, workers=1)
+    assert 0.5 < path.stat().st_size / bytes_needed(order.scenarios(), ".csv") < 1.0
+
+
+@pytest.mark.parametrize("material", ["", "sandy_loam"])
+def test_closed_loops_give_the_same_bits_for_any_number_of_workers(material):
+    materials = {material: 1.0} if material else {}
+    spec = DataSetSpec(minutes=0.4, recordings=3, seed=5, mix={"grading": 1, "dig": 2}, materials=materials)
+    plan = spec.scenarios()
+    alone, together = (list(simulate_many(plan, workers)) for workers in (1, 3))
+    assert [r.digest for r in alone] == [r.digest for r in together]
+    assert len({r.digest for r in alone}) == 3
+    assert [r.meta["material"] for r in together] == [material] * 3
