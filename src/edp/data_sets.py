@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -15,12 +16,14 @@ from edp.errors import ConfigError, EdpError, StorageError, closest
 from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.sim.limit import LimitJob, LimitSpec, find_limit, plan_limit
 from edp.sim.plan import DataSetSpec, simulate_many
 from edp.sim.scenario import Scenario, plain
 from edp.sim.scenario_file import read_scenario_file
 from edp.storage import make_folder, read_json, write_json
 
 MANIFEST = "data_set.json"
+LIMIT = "limit.json"
 BYTES_PER_VALUE = {".parquet": 3.0, ".csv": 10.0, ".mat": 3.0}
 """Room a logged value takes, rounded up; measured on M22: 1.7, 8.0 and 2.1."""
 
@@ -122,6 +125,53 @@ def simulate_data_set(
         if on_done is not None:
             on_done(recording, False)
     return paths
+
+
+def find_data_set_limit(
+    folder: str | Path,
+    order: SimulationOrder,
+    spec: LimitSpec | None = None,
+    workers: int = 0,
+    on_done: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """The limit of predictability of a simulated data set, written beside its logs as ``limit.json``.
+
+    A limit that is there already from the same order and settings is kept.
+
+    Args:
+        folder: the folder of the data set.
+        order: what was simulated into it.
+        spec: moments, branches and horizons.
+        workers: processes; 0 for one a core.
+        on_done: called with how many recordings are done, and of how many.
+
+    Raises:
+        ConfigError: the recordings are too short.
+        StorageError: the folder cannot be written.
+    """
+    spec = spec or LimitSpec()
+    plan = order.scenarios()
+    key = _digest([identity_of(plan, WriteOptions()), asdict(spec)])
+    target = make_folder(folder) / LIMIT
+    if target.exists():
+        kept = read_json(target)
+        if isinstance(kept, dict) and kept.get("key") == key:
+            return kept
+    jobs, done = len(plan_limit(plan, spec)), 0
+
+    def count(job: LimitJob) -> None:
+        nonlocal done
+        done += 1
+        if on_done is not None:
+            on_done(done, jobs)
+
+    found = find_limit(plan, spec, min(workers or os.cpu_count() or 1, jobs), count) | {"key": key}
+    write_json(target, found)
+    return found
+
+
+def _digest(value: Any) -> str:
+    return hashlib.blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
 def identity_of(plan: Sequence[Scenario], files: WriteOptions) -> dict[str, Any]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
 
 if TYPE_CHECKING:
     from edp.data_sets import SimulationOrder
     from edp.recording import Recording
+    from edp.sim.limit import LimitSpec
 
 
 def simulate(
@@ -31,6 +32,10 @@ def simulate(
     layout: Annotated[str | None, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, ...")] = None,
     truth: Annotated[str | None, typer.Option(help="What only a simulation knows: with, apart or without.")] = None,
     workers: Annotated[int, typer.Option(help="Processes; 0 for one a core.")] = 0,
+    limit: Annotated[bool, typer.Option("--limit", help="Also find the limit of predictability: limit.json.")] = False,
+    moments: Annotated[int, typer.Option(help="Of --limit: moments that are branched.")] = 240,
+    branches: Annotated[int, typer.Option(help="Of --limit: futures from each moment.")] = 32,
+    horizons: Annotated[str, typer.Option(help="Of --limit: samples ahead.")] = "1,2,5,10,20,50",
     as_json: JsonFlag = False,
 ) -> None:
     """Simulate recordings of an excavator: M22 in free air, or what a scenario file describes.
@@ -38,15 +43,21 @@ def simulate(
     Example: `edp simulate data/m22 --minutes 90 --recordings 30 --seed 1`
 
     Example: `edp simulate data/c14 --scenario examples/scenarios/c14_soil.toml`
+
+    With --limit, moments of the recordings are branched with fresh randomness of operator, soil and sensors. Of each
+    later velocity the least mean absolute error follows that any predictor could reach: one that knows the true state
+    and all laws, but neither the operator's future choices nor, in the second column, anything but them.
     """
     from edp.data_sets import SimulationOrder, suffix_of
 
     given = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
     suffix = None if form is None else suffix_of(form)
     order = SimulationOrder.of(scenario, **given, suffix=suffix, layout=layout, truth=truth)
+    spec = _limit_spec(moments, branches, horizons) if limit else None
     paths = run(folder, order, workers, as_json)
+    found = None if spec is None else run_limit(folder, order, spec, workers, as_json)
     made = f"{order.family} machines" if order.family else order.machine
-    facts = {
+    facts: dict[str, Any] = {
         "folder": str(folder),
         "recordings": len(paths),
         "minutes": order.minutes,
@@ -54,7 +65,12 @@ def simulate(
         "seed": order.seed,
     }
 
+    if found is not None:
+        facts["limit"] = found
+
     def show() -> None:
+        if found is not None:
+            limit_table(found)
         out.print(f"{len(paths)} recordings of {made}, {order.minutes:g} min, in {folder}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
 
@@ -80,3 +96,49 @@ def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = Fa
             steps.say(f"simulate: {done:g} of {order.recordings} recordings, {note}, {duration(left)} left")
 
         return simulate_data_set(folder, order, workers, on_done)
+
+
+def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: int, quiet: bool) -> dict[str, Any]:
+    """Find the limit of predictability with a progress display."""
+    from edp.data_sets import find_data_set_limit
+
+    began, steps = time.monotonic(), Steps(quiet)
+    with progress(quiet) as shown:
+        bar = shown.add_task("limit", total=None, note="")
+
+        def on_done(done: int, total: int) -> None:
+            left = (time.monotonic() - began) / done * (total - done)
+            shown.update(bar, completed=done, total=total)
+            steps.say(f"limit: {done} of {total} recordings branched, {duration(left)} left")
+
+        return find_data_set_limit(folder, order, spec, workers, on_done)
+
+
+def limit_table(found: dict[str, Any]) -> None:
+    """Print the limit beside persistence."""
+    names = [
+        target.replace("CylVels_1", "boom").replace("CylVels_2", "arm").replace("CylVels_3", "bucket")
+        for target in found["targets"]
+    ]
+    rows = []
+    for n, samples in enumerate(found["horizons"]):
+        unknown, known = found["commands_unknown"], found["commands_known"]
+        spread = f"{unknown['low'][n][-1]:.2f}-{unknown['high'][n][-1]:.2f}"
+        row = [f"{1000 * samples / found['rate_hz']:g} ms (k = {samples})", *(f"{v:.2f}" for v in unknown["mae"][n])]
+        rows.append([*row, spread, f"{known['mae'][n][-1]:.2f}", f"{found['persistence']['mae'][n][-1]:.2f}"])
+    title = (
+        f"Least mean absolute error of any predictor, {found['unit']} "
+        f"({found['moments']} moments of {found['recordings']} recordings, {found['branches']} futures each)"
+    )
+    table(title, ["ahead", *names, "mean", "95 %", "commands known", "persistence"], rows)
+
+
+def _limit_spec(moments: int, branches: int, horizons: str) -> LimitSpec:
+    from edp.errors import ConfigError
+    from edp.sim.limit import LimitSpec
+
+    try:
+        ahead = tuple(int(part) for part in horizons.split(",") if part.strip())
+    except ValueError as error:
+        raise ConfigError(f"--horizons {horizons}: give whole numbers of samples, such as 1,10") from error
+    return LimitSpec(horizons=ahead, moments=moments, branches=branches)

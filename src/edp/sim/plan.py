@@ -10,7 +10,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -183,26 +183,44 @@ def simulate_many(
     Raises:
         SimulationError: a simulation diverged, or a worker process died.
     """
-    source = _serial(scenarios) if workers <= 1 or len(scenarios) <= 1 else _parallel(scenarios, workers)
-    for recording in source:
+    for recording in ordered(simulate, scenarios, workers):
         if on_done is not None:
             on_done(recording)
         yield recording
 
 
-def _serial(scenarios: Sequence[Scenario]) -> Iterator[Recording]:
-    return (simulate(scenario) for scenario in scenarios)
+class Labelled(Protocol):
+    """A job with a name for messages."""
+
+    @property
+    def label(self) -> str:
+        """The name."""
+        ...
 
 
-def _parallel(scenarios: Sequence[Scenario], workers: int) -> Iterator[Recording]:
+Job = TypeVar("Job", bound=Labelled)
+Result = TypeVar("Result")
+
+
+def ordered(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
+    """`function` of each job in `workers` processes, in the order of the jobs.
+
+    Raises:
+        SimulationError: a worker process died.
+    """
+    if workers <= 1 or len(jobs) <= 1:
+        return (function(job) for job in jobs)
+    return _parallel(function, jobs, workers)
+
+
+def _parallel(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
     # Spawned rather than forked: a forked child may inherit locks of threads that do not exist in it.
     context = multiprocessing.get_context("spawn")
-    running: deque[tuple[Scenario, Future[Recording]]] = deque()
-    with ProcessPoolExecutor(min(workers, len(scenarios)), mp_context=context) as pool:
-        waiting = iter(scenarios)
+    running: deque[tuple[Job, Future[Result]]] = deque()
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
         try:
-            for scenario in waiting:
-                running.append((scenario, pool.submit(simulate, scenario)))
+            for job in jobs:
+                running.append((job, pool.submit(function, job)))
                 if len(running) >= 2 * workers:
                     yield _result(*running.popleft())
             while running:
@@ -211,11 +229,11 @@ def _parallel(scenarios: Sequence[Scenario], workers: int) -> Iterator[Recording
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _result(scenario: Scenario, future: Future[Recording]) -> Recording:
+def _result(job: Job, future: Future[Result]) -> Result:
     try:
         return future.result()
     except BrokenProcessPool as error:
         raise SimulationError(
-            f"a worker process died while '{scenario.label}' was being simulated (out of memory, or stopped from "
+            f"a worker process died while '{job.label}' was being simulated (out of memory, or stopped from "
             "outside; a calling script needs `if __name__ == '__main__':`); run again with fewer workers"
         ) from error

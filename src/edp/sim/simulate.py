@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim import layout as at
-from edp.sim import pose, sensors, soil, terramechanics
+from edp.sim import pose, sensors, soil
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine import Machine
 from edp.sim.parameters import pack
@@ -143,9 +143,8 @@ class Simulation:
 
     def branch_soil(self, seed: np.random.SeedSequence) -> None:
         """Give the soil that is still to be met a fresh course of its resistance; commands stay as they are."""
-        ground = self.plant.ground
-        if ground is not None:
-            ground.course[...] = terramechanics.draw_course(ground.material, np.random.default_rng(seed))
+        if self.plant.ground is not None:
+            self.plant.ground.redraw(np.random.default_rng(seed))
 
 
 _CHANGING = ("plant", "operator", "_hand", "_waiting")

@@ -175,6 +175,23 @@ class Ground:
         """Height (m above the boom foot) at a distance (m) in front of it."""
         return float(np.interp(x, self.start_m + SPACING_M * np.arange(len(self.heights)), self.heights))
 
+    def redraw(self, rng: np.random.Generator) -> None:
+        """Draw the resistance that is still to be met anew; what the edge is in now goes on from its present value."""
+        old = self.course.copy()
+        fresh = terramechanics.draw_course(self.material, rng)
+        count = len(old)
+        # The unit process forgets its present value over a few cells: fresh[0] is independent, so it is bridged.
+        here = int(self.memory[at.DISTANCE] / self.numbers[terramechanics.COURSE_STEP])
+        keep = np.exp(-np.arange(count) / 8.0)
+        ahead = (here + np.arange(count)) % count
+        self.course[ahead, 0] = keep * old[here % count, 0] + np.sqrt(1.0 - keep**2) * fresh[:, 0]
+        stone = (int(self.memory[at.DISTANCE] / terramechanics.STONE_STEP) + np.arange(count)) % count
+        inside = np.logical_and.accumulate(old[stone, 1] > 0.0)
+        self.course[stone, 1] = np.where(inside, old[stone, 1], fresh[:, 1])
+        dig = int(self.memory[at.DIGS]) % count
+        self.course[:, 2] = fresh[:, 2]
+        self.course[dig, 2] = old[dig, 2]
+
     def arrays(self) -> tuple[Array, ...]:
         """What the compiled code reads and writes: numbers, tables, course, heights, memory."""
         return self.numbers, self.tables, self.course, self.heights, self.memory
