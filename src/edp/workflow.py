@@ -24,7 +24,7 @@ from edp.data.prepared import Prepared, prepare
 from edp.data.spectrum import LAGS
 from edp.data.splits import SPLITS
 from edp.data_sets import SimulationOrder, simulate_data_set
-from edp.errors import ConfigError, DataError, StorageError, closest
+from edp.errors import DataError, StorageError
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
 from edp.models.predictor import ModelSpec, Predictor, build_model, describe

@@ -8,17 +8,17 @@ import pytest
 from edp.errors import StorageError
 from edp.sim import EXCITATIONS, Scenario, Simulation, SimulationError, Snapshot, simulate
 
-FAMILIES = list(EXCITATIONS)
+FAMILIES = [(family, "") for family in EXCITATIONS] + [("grading", "clay"), ("dig", "sandy_loam")]
 
 
 def scenario_of(family, **changes):
     return Scenario(**{"excitation": family, "duration_s": 12.0, "seed": 6, **changes})
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_running_in_pieces_and_going_on_from_a_snapshot_give_the_same_bits(family, tmp_path):
-    whole = simulate(scenario_of(family))
-    pieces = Simulation(scenario_of(family))
+@pytest.mark.parametrize(("family", "material"), FAMILIES)
+def test_running_in_pieces_and_going_on_from_a_snapshot_give_the_same_bits(family, material, tmp_path):
+    whole = simulate(scenario_of(family, material=material))
+    pieces = Simulation(scenario_of(family, material=material))
     pieces.run(333)
     moment = pieces.snapshot()
     rest = pieces.run(867)
@@ -33,9 +33,9 @@ def test_running_in_pieces_and_going_on_from_a_snapshot_give_the_same_bits(famil
     assert again.recording().meta == whole.meta
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_branches_share_the_past_and_differ_later(family):
-    simulation = Simulation(scenario_of(family, duration_s=60.0))
+@pytest.mark.parametrize(("family", "material"), FAMILIES)
+def test_branches_share_the_past_and_differ_later(family, material):
+    simulation = Simulation(scenario_of(family, material=material, duration_s=60.0))
     simulation.run(1000)
     moment = simulation.snapshot()
     futures = []
