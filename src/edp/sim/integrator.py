@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edp.sim import dynamics, earth, friction, hydraulics, linkage, pump, terramechanics, valve
 from edp.sim import layout as at
-from edp.sim.jit import compiled, inlined
+from edp.sim.jit import inlined
 from edp.sim.machine import Machine
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ PUMP_ROW, LOST_1, C_PUMP_1 = 3, 0, 2
 FROZEN_W, STROKES_W, OPENED, LU, SLOPE, CONTACT, RATES, RHS, K1, K2, STAGE = range(11)
 
 
-@compiled
+@inlined
 def freeze_geometry(state: Array, axes: Array, plant: Array, strokes: Array, s: Array) -> None:
     """Strokes, lever arms, volumes, mass matrix, gravity and Coriolis coefficients at the current angles."""
     c1, s1 = math.cos(state[at.PSI]), math.sin(state[at.PSI])
@@ -209,7 +209,7 @@ def solve(g: float, axes: Array, work: tuple[Array, ...], out: Array) -> None:
         out[at.BRISTLE + i] = e[i, BRISTLE_K] + e[i, Z_BY_W] * k
 
 
-@compiled
+@inlined
 def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Array, ...]) -> None:
     """ROS2 on w: (I - gJ) k1 = F(w), (I - gJ) k2 = F(w + h k1) - 2 k1, w += 1.5 h k1 + 0.5 h k2, g = gamma h."""
     s, rhs, f, k1, k2, stage = work[FROZEN_W], work[RHS], work[RATES], work[K1], work[K2], work[STAGE]
@@ -246,7 +246,7 @@ def clamp_pressures(state: Array) -> int:
     return lifted
 
 
-@compiled
+@inlined
 def step(
     state: Array,
     valves: Array,
@@ -276,14 +276,12 @@ def step(
     valve.open_spools(valves, work[STROKES_W], axes, work[OPENED])
     bypass = pump.bypass_conductances(valves, axes, plant)
     work[FROZEN_W][BYPASS], work[FROZEN_W][BYPASS + 1] = bypass
+    work[CONTACT][terramechanics.ON] = 0.0
     if near_soil:
-        angles = work[FROZEN_W][ANGLES:]
-        terramechanics.engage(state, angles, axes, ground, work[CONTACT])
-        rosenbrock(state, h, axes, plant, work)
+        terramechanics.engage(state, work[FROZEN_W][ANGLES:], axes, ground, work[CONTACT])
+    rosenbrock(state, h, axes, plant, work)
+    if near_soil:
         earth.settle(state, h, work[CONTACT], ground)
-    else:
-        work[CONTACT][terramechanics.ON] = 0.0
-        rosenbrock(state, h, axes, plant, work)
     for i in range(at.AXES):
         state[at.PSI + i] += 0.5 * h * state[at.RATE + i]
     pump.displacement_step(state, valves, axes, plant, share)

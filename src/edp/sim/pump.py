@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim import layout as at
-from edp.sim.jit import compiled, inlined
+from edp.sim.jit import inlined
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def demand(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
     return first, second
 
 
-@compiled
+@inlined
 def displacement_step(state: Array, valves: Array, axes: Array, plant: Array, share: float) -> None:
     """Move both displacements towards demand under the power limit; `share` = exp(-step / time constant)."""
     first, second = demand(valves, axes, plant)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
-from edp.sim import can, pins, transducers
+from edp.sim import can, filters, pins, transducers
 from edp.sim import layout as at
 from edp.sim.machine import Machine
 from edp.sim.parameters import pack
@@ -54,8 +53,7 @@ def filtered_derivative(values: Array, bandwidth_hz: float, rate_hz: float) -> A
     The filter starts at rest at the first value.
     """
     omega = 2.0 * np.pi * min(bandwidth_hz, 0.4 * rate_hz)
-    b, a = signal.bilinear([omega**2, 0.0], [1.0, 2.0 * DERIVATIVE_DAMPING * omega, omega**2], fs=rate_hz)
-    return np.asarray(signal.lfilter(b, a, values - values[:1], axis=0))
+    return filters.lfilter(*filters.bilinear_derivative(omega, DERIVATIVE_DAMPING, rate_hz), values - values[:1])
 
 
 def pilot_demands(demands: Array, full_pressure: float) -> Array:

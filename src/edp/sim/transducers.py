@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+
+from edp.sim import filters
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ def lagged(values: Array, time_constant_s: float, step_s: float) -> Array:
         return values
     kept = np.exp(-step_s / time_constant_s)
     new = 1.0 - time_constant_s * (1.0 - kept) / step_s
-    return np.asarray(values[:1] + signal.lfilter([new, 1.0 - kept - new], [1.0, -kept], values - values[:1], axis=0))
+    return values[:1] + filters.lfilter([new, 1.0 - kept - new], [1.0, -kept], values - values[:1])
 
 
 def limited(values: Array, full_scale: float) -> Array:

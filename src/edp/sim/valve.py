@@ -101,7 +101,7 @@ def cushion(distance: float, length: float, least: float) -> float:
     return least + (1.0 - least) * r * r * (3.0 - 2.0 * r)
 
 
-@compiled
+@inlined
 def open_spools(valves: Array, stroke: Array, axes: Array, out: Array) -> None:
     """Conductances of this step from spool positions and cushions, `out` shape (3, OPENINGS)."""
     for i in range(at.AXES):
