@@ -263,7 +263,8 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
         c[ON] = 1.0
         engage_heel(numbers, memory, c)
     if c[ON] > 0.0:
-        damp(w1, w2, w3, c)
+        hold(w1, w2, w3, c)
+        damp(c)
 
 
 @inlined
@@ -278,18 +279,11 @@ def velocities(c: Array, w1: float, w2: float, w3: float) -> Four:
 
 @inlined
 def forces(c: Array, v: Four) -> Four:
-    """Force (N) of the ground on tip and on heel at their velocities."""
-    slow = 1.0 / math.sqrt(v[0] * v[0] + v[1] * v[1] + CREEP * CREEP)
-    fx = slow * (-c[DRAG] * v[0] - c[ACROSS] * v[1])
-    fy = slow * (-c[DRAG] * v[1] + c[ACROSS] * v[0])
-    into = v[0] * c[EDGE_X] + v[1] * c[EDGE_Y]
-    if into > 0.0:
-        edge = c[EDGE] * into / math.sqrt(into * into + CREEP * CREEP)
-        fx -= edge * c[EDGE_X]
-        fy -= edge * c[EDGE_Y]
-    normal = max(c[NORMAL] - c[NORMAL_DAMPING] * v[3], 0.0)
-    slide = -c[SLIDE] * v[2] / math.sqrt(v[2] * v[2] + CREEP * CREEP)
-    return fx, fy, slide, normal
+    """Force (N) of the ground on tip and on heel at their velocities, with the dampers of this step, see `hold`."""
+    into = c[EDGE] * (v[0] * c[EDGE_X] + v[1] * c[EDGE_Y])
+    fx = -c[DRAG] * v[0] - c[ACROSS] * v[1] - into * c[EDGE_X]
+    fy = -c[DRAG] * v[1] + c[ACROSS] * v[0] - into * c[EDGE_Y]
+    return fx, fy, -c[SLIDE] * v[2], c[NORMAL] - c[NORMAL_DAMPING] * v[3]
 
 
 @inlined
@@ -304,21 +298,33 @@ def torques(c: Array, w1: float, w2: float, w3: float) -> tuple[float, float, fl
 
 
 @compiled
-def damp(w1: float, w2: float, w3: float, c: Array) -> None:
-    """Damping of the joints by the soil at these rates, N m s, into `c[DAMPING:]`, row by row."""
+def hold(w1: float, w2: float, w3: float, c: Array) -> None:
+    """Turn forces of a size into dampers for one step, from the velocities at its beginning.
+
+    Force over speed stands still within a step: both stages of the integrator see the linear damper that its
+    Jacobian knows. A force that keeps its size while the velocity turns round is what ROS2 would amplify, by 2.4 a
+    step where soil is stiff against the mass of the bucket.
+    """
     v = velocities(c, w1, w2, w3)
     slow = 1.0 / math.sqrt(v[0] * v[0] + v[1] * v[1] + CREEP * CREEP)
-    drag, across = c[DRAG] * slow, c[ACROSS] * slow
+    c[DRAG] *= slow
+    c[ACROSS] *= slow
     into = v[0] * c[EDGE_X] + v[1] * c[EDGE_Y]
-    # the edge's part also where it is about to come: too much damping in the Jacobian costs little, too little all
-    edge = c[EDGE] / math.sqrt(into * into + CREEP * CREEP) if into > -5.0 * CREEP else 0.0
-    slide = c[SLIDE] / math.sqrt(v[2] * v[2] + CREEP * CREEP)
+    c[EDGE] = c[EDGE] / math.sqrt(into * into + CREEP * CREEP) if into > 0.0 else 0.0
+    c[SLIDE] /= math.sqrt(v[2] * v[2] + CREEP * CREEP)
+    if c[NORMAL] < c[NORMAL_DAMPING] * v[3]:
+        c[NORMAL] = c[NORMAL_DAMPING] = 0.0  # leaves faster than the soil follows: it does not pull
+
+
+@compiled
+def damp(c: Array) -> None:
+    """Damping of the joints by the soil, N m s, into `c[DAMPING:]`, row by row: minus the Jacobian of `torques`."""
+    drag, edge, slide, across = c[DRAG], c[EDGE], c[SLIDE], c[ACROSS]
     xx, xy, yy = drag + edge * c[EDGE_X] * c[EDGE_X], edge * c[EDGE_X] * c[EDGE_Y], drag + edge * c[EDGE_Y] * c[EDGE_Y]
     for i in range(3):
         for j in range(3):
             ix, iy, jx, jy = c[TIP_JX + i], c[TIP_JY + i], c[TIP_JX + j], c[TIP_JY + j]
-            value = xx * ix * jx + xy * (ix * jy + iy * jx) + yy * iy * jy
-            value += across * (ix * jy - iy * jx)
+            value = xx * ix * jx + xy * (ix * jy + iy * jx) + yy * iy * jy + across * (ix * jy - iy * jx)
             value += slide * c[HEEL_JX + i] * c[HEEL_JX + j] + c[NORMAL_DAMPING] * c[HEEL_JY + i] * c[HEEL_JY + j]
             c[DAMPING + 3 * i + j] = value
 
