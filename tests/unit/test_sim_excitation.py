@@ -112,3 +112,27 @@ def test_measured_speeds_rise_with_the_lever_from_the_end_of_the_dead_band():
     np.testing.assert_array_equal(levers[:, :, 0], dead_lever(MACHINE))
     assert (speeds[:, :, 0] == 0).all()
     assert (speeds[:, :, -1] > 0.15).all()
+
+
+@pytest.mark.parametrize(("machine", "material"), [("M22", "sandy_loam"), ("C14", "clay")])
+def test_dig_cycles_in_soil_fill_the_bucket_and_empty_it(machine, material):
+    simulation = Simulation(Scenario(machine, "dig", 300.0, seed=2, material=material))
+    ends = []
+    for _ in range(900):
+        before, load = simulation.operator._phase, simulation.plant.payload_kg
+        simulation.run(10)
+        if simulation.operator._phase != before:
+            ends.append((before, load))
+    cycles = [load for phase, load in ends if phase == 4]
+    assert len(cycles) >= 3
+    full = 1700.0 * simulation.machine.bucket.capacity
+    assert max(load for phase, load in ends if phase == 2) > 0.3 * full
+    assert min(load for phase, load in ends if phase == 0) < 0.2 * full
+
+
+def test_grading_over_ground_works_at_its_surface():
+    simulation = Simulation(Scenario(excitation="grading", duration_s=200.0, seed=1, material="sandy_loam"))
+    simulation.run(9000)
+    touching = simulation.log[:, at.LOG_EVENTS + at.SOIL_CONTACT]
+    assert 0.2 < touching.mean() < 0.98
+    assert np.isfinite(simulation.recording().values).all()

@@ -14,6 +14,9 @@ def report(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train.")],
     output: Annotated[Path | None, typer.Option("--out", help="The page; default: report.html in the run.")] = None,
     title: Annotated[str | None, typer.Option(help="Title of the page.")] = None,
+    limit: Annotated[
+        Path | None, typer.Option(help="Limit of predictability (limit.json); default: beside the run's data.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Write one offline page: predictions, errors, baselines, footprint, settings.
@@ -22,8 +25,8 @@ def report(
     """
     from edp.report import build_report, headline, read_facts
 
-    page = build_report(run, output, title)
-    line = headline(read_facts(run))
+    page = build_report(run, output, title, limit)
+    line = headline(read_facts(run, limit))
 
     def show() -> None:
         out.print(line)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError
+from edp.report.limit import limit_line, read_limit
 from edp.report.wording import decimals_for, listed, number, percent
 from edp.storage import read_json
 
@@ -44,6 +45,7 @@ class Facts:
     """What a run folder holds; a part that is missing is None or empty, and `absent` names its file.
 
     Attributes:
+        limit: the limit of predictability of the run's data, see `edp.report.limit`.
         predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI.
     """
 
@@ -55,6 +57,7 @@ class Facts:
     footprint: Mapping[str, Any] | None = None
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
+    limit: Mapping[str, Any] | None = None
 
     @property
     def targets(self) -> tuple[Target, ...]:
@@ -92,8 +95,12 @@ class Facts:
         return units.pop() if len(units) == 1 else ""
 
 
-def read_facts(run_folder: str | Path) -> Facts:
+def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts:
     """Read every part of a run folder that is there.
+
+    Args:
+        run_folder: the folder.
+        limit: file of the limit of predictability, or a folder with one; None looks beside the run's data.
 
     Raises:
         StorageError: the folder is missing, holds no part of a run, or a part is damaged.
@@ -109,15 +116,17 @@ def read_facts(run_folder: str | Path) -> Facts:
     def json_part(name: str) -> Any:
         return None if name in absent else _read_object(folder / name)
 
+    provenance = json_part("provenance.json")
     facts = Facts(
         folder=folder,
         config=None if "config.toml" in absent else _read_text(folder / "config.toml"),
-        provenance=json_part("provenance.json"),
+        provenance=provenance,
         history=() if "history.jsonl" in absent else read_history(folder / "history.jsonl"),
         scores=json_part("scores.json"),
         footprint=json_part("footprint.json"),
         predictions={} if "predictions.safetensors" in absent else _read_predictions(folder),
         absent=absent,
+        limit=read_limit(None if limit is None else Path(limit), provenance),
     )
     _check_predictions(facts)
     return facts
@@ -279,6 +288,9 @@ def verdict_lines(facts: Facts) -> list[str]:
         won, both = recordings_won(facts, best["model"])
         if both:
             lines.append(f"It is the better of the two on {won} of {both} test recordings.")
+    limit = limit_line(facts, main_horizon(facts))
+    if limit:
+        lines.append(limit)
     checks = (facts.footprint or {}).get("verdict", [])
     if checks:
         over = [str(check["what"]) for check in checks if not check["fits"]]

@@ -18,13 +18,19 @@ from edp.report.wording import moment, unbroken
 from edp.storage import write_bytes
 
 
-def build_report(run_folder: str | Path, output: str | Path | None = None, title: str | None = None) -> Path:
+def build_report(
+    run_folder: str | Path,
+    output: str | Path | None = None,
+    title: str | None = None,
+    limit: str | Path | None = None,
+) -> Path:
     """Write the report of a run as one HTML file that opens with no network.
 
     Args:
         run_folder: Folder that training and evaluation wrote; what is missing in it is named on the page.
         output: Where to write; ``report.html`` in the run folder by default.
         title: Heading of the page; the task's name by default.
+        limit: File of the limit of predictability; by default the one beside the run's data, where there is one.
 
     Returns:
         The file written.
@@ -33,7 +39,7 @@ def build_report(run_folder: str | Path, output: str | Path | None = None, title
         StorageError: the folder or one of its files cannot be read, or the page cannot be written.
         DataError: predictions and scores do not belong together.
     """
-    facts = run.read_facts(run_folder)
+    facts = run.read_facts(run_folder, limit)
     target = Path(output) if output is not None else facts.folder / "report.html"
     write_bytes(target, render(facts, title).encode())
     return target

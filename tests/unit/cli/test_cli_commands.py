@@ -127,3 +127,20 @@ def test_other_recordings_can_be_judged(edp, logs, trained):
 )
 def test_durations_read_well(seconds, text):
     assert duration(seconds) == text
+
+
+def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
+    file = tmp_path / "set.toml"
+    file.write_text('minutes = 5\nrecordings = 2\nseed = 4\n[mix]\nisolated = 1\n[files]\nformat = "csv"\n')
+    command = ("simulate", tmp_path / "data", "--scenario", file, "--minutes", 0.4, "--workers", 1)
+    asked = ("--limit", "--moments", 4, "--branches", 4, "--horizons", "1,10")
+    made = edp(*command, *asked, "--json").json
+    assert (made["minutes"], made["seed"], made["recordings"]) == (0.4, 4, 2)
+    assert len(list((tmp_path / "data").glob("*.csv"))) == 2
+    assert made["limit"]["horizons"] == [1, 10]
+    assert json.loads((tmp_path / "data" / "limit.json").read_text()) == made["limit"]
+    shown = edp(*command, *asked).out
+    assert "100 ms (k = 10)" in shown
+    assert "commands known" in shown
+    assert "give whole numbers" in edp(*command, "--limit", "--horizons", "1,x").err
+    assert "must be even" in edp(*command, "--limit", "--branches", 3).err

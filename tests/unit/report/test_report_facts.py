@@ -149,3 +149,41 @@ def test_wording_of_columns_shares_and_spans():
 
 def test_figures_stay_on_the_line_of_their_unit_and_name():
     assert unbroken("off by 7.1 mm/s on average; ridge 13.0.") == "off by 7.1\u00a0mm/s on average; ridge\u00a013.0."
+
+
+def limit_of(**changes):
+    table = {"mae": [[1, 1, 1, 0.32], [6, 5, 4, 5.04]], "low": [[0, 0, 0, 0.3], [4, 4, 4, 4.1]]}
+    table["high"] = [[1, 1, 1, 0.35], [7, 7, 7, 6.2]]
+    known = {"mae": [[0, 0, 0, 0.3], [0, 0, 0, 0.33]]}
+    tables = {"commands_unknown": table, "commands_known": known, "persistence": known}
+    targets = ["CylVels_1", "CylVels_2", "CylVels_3"]
+    return {"unit": "mm/s", "rate_hz": 100.0, "horizons": [1, 10], "targets": targets, **tables, **changes}
+
+
+def test_the_limit_of_the_data_becomes_a_line(run_folder, tmp_path):
+    data = tmp_path / "data"
+    data.mkdir()
+    (data / "limit.json").write_text(json.dumps(limit_of()))
+    assert not any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder)))
+    for place in (data, data / "limit.json"):
+        (line,) = [text for text in verdict_lines(read_facts(run_folder, place)) if "limit" in text]
+        assert "5.04 mm/s (95 %: 4.10 to 6.20)" in line
+        assert "off by 0.33" in line
+    provenance = json.loads((run_folder / "provenance.json").read_text())
+    provenance["data"]["reader"] = {"path": str(data)}
+    (run_folder / "provenance.json").write_text(json.dumps(provenance))
+    assert any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder)))
+
+
+@pytest.mark.parametrize("change", [{"horizons": [1, 20]}, {"rate_hz": 50.0}, {"targets": ["CylVels_1"]}])
+def test_a_limit_of_other_signals_or_horizons_is_not_shown(run_folder, tmp_path, change):
+    path = tmp_path / "limit.json"
+    path.write_text(json.dumps(limit_of(**change)))
+    assert not any("limit of predictability" in line for line in verdict_lines(read_facts(run_folder, path)))
+
+
+def test_a_file_that_is_no_limit_is_refused(run_folder, tmp_path):
+    path = tmp_path / "limit.json"
+    path.write_text("{}")
+    with pytest.raises(StorageError, match="holds no limit of predictability"):
+        read_facts(run_folder, path)

@@ -38,7 +38,9 @@ class Dig(Tracked):
     """Attitude of a closed bucket."""
     MIME_M = (-2.5, 0.5)
     MOVE = (0.15, 0.4)
-    LIFT_M = (0.8, 2.2)
+    LIFT_M, DUMP_M, ABOVE_M = (0.8, 2.2), (1.0, 2.8), 0.4
+    """Tip above the surface after lifting, at dumping and before penetrating."""
+    OPEN_DEG = (-125.0, -60.0)
     RELIEF_RATE = 0.12
     """m/s at which a stalled drag is raised."""
     FULL = 0.9
@@ -62,9 +64,8 @@ class Dig(Tracked):
             if not self._plan(view):
                 self._phase = DUMP
                 return self.stroke_leg(rng.uniform(0.35, 0.65, 3), 0.2)
-            above = self.kinematics.strokes_at(self._in[0], self._in[1] + self._depth + 0.3, self._in[2])
-            goal = above if above is not None else self.kinematics.strokes_at(*self._in)
-            return self.stroke_leg(np.full(3, 0.5) if goal is None else goal, rng.uniform(*self.MOVE))
+            above = self.kinematics.strokes_at(self._in[0], self._in[1] + self._depth + self.ABOVE_M, self._in[2])
+            return self.stroke_leg(np.full(3, 0.5) if above is None else above, rng.uniform(*self.MOVE))
         if self._phase == PENETRATE:
             if view.ground == view.ground:  # the real surface here, now that the bucket is above it
                 shift = view.ground - self._depth - self._in[1]
@@ -76,23 +77,23 @@ class Dig(Tracked):
             return self.cartesian_leg(tuple(self._in), tuple(self._out), length / rng.uniform(*self.DRAG_SPEED))
         if self._phase == CURL:
             return self._curl(view)
-        return self.stroke_leg(
-            np.array([rng.uniform(0.35, 0.8), rng.uniform(0.1, 0.5), rng.uniform(0.02, 0.2)]), rng.uniform(*self.MOVE)
-        )
+        return self.stroke_leg(self._dump(view), rng.uniform(*self.MOVE))
 
     def _plan(self, view: View) -> bool:
         """Choose surface, depth and the line of the drag; False where none was found in reach."""
-        rng = self._rng
+        rng, reach = self._rng, self.reach_m
         for _ in range(self.TRIES):
             self._surface = view.ground if view.ground == view.ground else rng.uniform(*self.MIME_M)
             self._depth = rng.uniform(*self.DEPTH_M)
             y = self._surface - self._depth
-            x = rng.uniform(0.45, 0.95) * float(self._axes[:, 0].sum())
+            x = rng.uniform(0.5, 0.95) * reach
             entry = math.radians(rng.uniform(*self.ENTRY_DEG))
             closing = math.radians(rng.uniform(*self.CLOSING_DEG))
             self._in = np.array([x, y, entry])
-            self._out = np.array([x - rng.uniform(*self.LENGTH_M), y, entry - closing])
-            if self.line_fits(tuple(self._in), tuple(self._out), margin=0.02):
+            self._out = np.array([max(x - rng.uniform(*self.LENGTH_M), 0.3 * reach), y, entry - closing])
+            above = self.kinematics.strokes_at(x, self._surface + self.ABOVE_M, entry)
+            fits = above is not None and self.line_fits(tuple(self._in), tuple(self._out), margin=0.02)
+            if fits and above is not None and self.stays_above(above, self._surface + 0.1):
                 return True
         return False
 
@@ -105,6 +106,16 @@ class Dig(Tracked):
         if strokes is None:
             strokes = np.array([min(1.0, view.strokes[0] + 0.3), view.strokes[1], 0.95])
         return self.stroke_leg(strokes, rng.uniform(*self.MOVE))
+
+    def _dump(self, view: View) -> Array:
+        """Strokes of an open bucket high above the ground, with a way there that stays above it."""
+        rng = self._rng
+        for _ in range(self.TRIES):
+            x, y = rng.uniform(0.45, 0.85) * self.reach_m, self._surface + rng.uniform(*self.DUMP_M)
+            strokes = self.kinematics.strokes_at(x, y, math.radians(rng.uniform(*self.OPEN_DEG)))
+            if strokes is not None and self.stays_above(strokes, self._surface + 0.3):
+                return strokes
+        return np.array([min(view.strokes[0] + 0.2, 0.95), view.strokes[1], 0.1])
 
     def steer(self, view: View) -> None:
         """In the drag: end with a full bucket, and rise where it stalls."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from edp.sim.excitation.base import EXCITATIONS, Array
@@ -27,34 +29,62 @@ class Grading(Tracked):
     BITE_M = (-0.02, 0.05)
     PASSES = (1, 4)
     TRIES = 60
+    ABOVE_M, LIFT_S = 0.4, 1.5
+    """Over ground: height at which the tip goes from line to line, and the time to get there."""
+    NEAREST = 0.25
+    """Nearest point of a line, as a share of the machine's reach."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
         self._from = np.zeros(3)
         self._to = np.zeros(3)
-        self._passes = 0
+        self._passes, self._raised = 0, True
 
     def next_leg(self, view: View) -> Array:
-        """A pass over the line, or the move to the start of a new one."""
+        """A pass over the line, or the way to a new one: up, across, and down to it."""
+        rng = self._rng
         if self._passes > 0:
+            self._raised = False
+            x, y, attitude = self.reference_pose()
+            if np.hypot(x - self._from[0], y - self._from[1]) > 0.05:
+                return self.cartesian_leg((x, y, attitude), tuple(self._from), self.LIFT_S)
             self._passes -= 1
             length = float(np.hypot(*(self._to - self._from)[:2]))
-            leg = self.cartesian_leg(tuple(self._from), tuple(self._to), length / self._rng.uniform(*self.SPEED))
+            leg = self.cartesian_leg(tuple(self._from), tuple(self._to), length / rng.uniform(*self.SPEED))
             self._from, self._to = self._to, self._from
             return leg
+        over_ground = not math.isnan(view.ground)
+        if over_ground and not self._raised:
+            self._raised = True
+            x, y, attitude = self.reference_pose()
+            up = (x, y + self.ABOVE_M, attitude)
+            return self.cartesian_leg((x, y, attitude), up, self.LIFT_S) if self._reaches(up) else self._lift(view)
         for _ in range(self.TRIES):
-            strokes = self._rng.uniform(0.1, 0.9, 3)
-            x, y, attitude = self.kinematics.pose_at(strokes)
-            along = self._rng.uniform(*self.LENGTH_M) * self._rng.choice([-1.0, 1.0])
-            rise = along * self._rng.uniform(-self.SLOPE, self.SLOPE)
-            if view.ground == view.ground:  # over ground: NaN is free air
-                y, rise = view.ground - self._rng.uniform(*self.BITE_M), 0.0
-            start, goal = (x, y, attitude), (x + along, y + rise, attitude)
-            if x > 0.0 and self.line_fits(start, goal):
-                self._from, self._to = np.array(start), np.array(goal)
-                self._passes = int(self._rng.integers(self.PASSES[0], self.PASSES[1] + 1))
-                there = self.kinematics.strokes_at(*start)
-                if there is not None:
-                    return self.stroke_leg(there, self._rng.uniform(0.1, 0.3))
-        # nothing fits from here: stretch towards the middle, and try again from there
-        return self.stroke_leg(self._rng.uniform(0.35, 0.65, 3), 0.2)
+            there = self._choose(view)
+            if there is not None and (not over_ground or self.stays_above(there, view.ground + 0.1)):
+                self._passes = int(rng.integers(self.PASSES[0], self.PASSES[1] + 1))
+                return self.stroke_leg(there, rng.uniform(0.1, 0.3))
+        # nothing fits from here: try again from elsewhere
+        return self._lift(view) if over_ground else self.stroke_leg(rng.uniform(0.35, 0.65, 3), 0.2)
+
+    def _choose(self, view: View) -> Array | None:
+        """Draw a line; strokes at (over ground: above) its start, or None where it does not fit."""
+        rng = self._rng
+        x, y, attitude = self.kinematics.pose_at(rng.uniform(0.1, 0.9, 3))
+        along = rng.uniform(*self.LENGTH_M) * rng.choice([-1.0, 1.0])
+        rise, above = along * rng.uniform(-self.SLOPE, self.SLOPE), 0.0
+        if not math.isnan(view.ground):
+            y, rise, above = view.ground - rng.uniform(*self.BITE_M), 0.0, self.ABOVE_M
+        self._from, self._to = np.array([x, y, attitude]), np.array([x + along, y + rise, attitude])
+        if min(x, x + along) < self.NEAREST * self.reach_m or not self.line_fits(tuple(self._from), tuple(self._to)):
+            return None
+        return self.kinematics.strokes_at(x, y + above, attitude)
+
+    def _reaches(self, tip: tuple[float, float, float]) -> bool:
+        return self.kinematics.strokes_at(*tip) is not None
+
+    def _lift(self, view: View) -> Array:
+        goal = view.strokes.copy()
+        goal[0] = min(goal[0] + self.RESCUE, 0.95)
+        goal[1:] = np.clip(goal[1:] + self._rng.uniform(-0.2, 0.2, 2), 0.1, 0.9)
+        return self.stroke_leg(goal, 0.2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from edp.sim import layout as at
 from edp.sim import pose, tip_control
 from edp.sim.excitation.base import AXES, Array, Excitation
 from edp.sim.excitation.levers import speed_table
@@ -38,11 +39,16 @@ class Tracked(Excitation):
     """Wanted speeds below this (m/s) leave the lever centred."""
     WAITS_BEHIND = 0.12
     """Stroke error (m) at which the reference stands still."""
+    PATIENCE_S = 1.5
+    """A leg that is blocked for so long is given up: the boom is raised instead."""
+    RESCUE = 0.15
+    """Share of the boom's stroke by which it is raised then."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
         self._axes, plant = pack(machine)
         self.kinematics = pose.Kinematics(self._axes, plant)
+        self.reach_m = float(self._axes[:, at.LENGTH].sum())
         levers, speeds = speed_table(machine)
         limits, scratch = self.kinematics.limits, np.zeros(pose.REACHED_VALUES)
         self._setup = (speeds, levers, self._axes, plant, limits, scratch)
@@ -52,7 +58,7 @@ class Tracked(Excitation):
             [self.RAMP_S, step, self.PROPORTIONAL, self.INTEGRAL, self.REST_SPEED, self.WAITS_BEHIND]
         )
         self._leg, self._begun = np.zeros(tip_control.LEG_VALUES), False
-        self._memory = np.zeros(tip_control.MEMORY)
+        self._memory, self._blocked = np.zeros(tip_control.MEMORY), 0.0
         self._queue = np.zeros((1 + max(1, round(self.LEAD_S / step)), AXES))
 
     def next_leg(self, view: View) -> Array:
@@ -72,9 +78,20 @@ class Tracked(Excitation):
         elif memory[tip_control.TIME] >= self._leg[tip_control.LENGTH]:
             self._leg, memory[tip_control.TIME] = self.next_leg(view), 0.0
         self.steer(view)
+        self._blocked = self._blocked + self.step_s if self.behind > 0.75 * self.WAITS_BEHIND else 0.0
+        if self._blocked > self.PATIENCE_S:
+            self._give_up(view)
         targets = np.empty((self._samples, AXES))
         tip_control.control(self._leg, view.strokes, self._queue, memory, self._gains, self._setup, targets)
         return targets
+
+    def _give_up(self, view: View) -> None:
+        """Let go of a leg that soil or an end blocks: forget errors, and raise the boom from where it is."""
+        self._blocked, self._queue[:] = 0.0, view.strokes
+        self._memory[: tip_control.LEVER] = 0.0
+        goal = view.strokes.copy()
+        goal[0] = min(goal[0] + self.RESCUE, 0.97)
+        self._leg = self.stroke_leg(goal, 0.2)
 
     @property
     def step_s(self) -> float:
@@ -102,6 +119,11 @@ class Tracked(Excitation):
             if strokes is None or strokes.min() < margin or strokes.max() > 1.0 - margin:
                 return False
         return True
+
+    def stays_above(self, goal: Array, floor: float) -> bool:
+        """Whether the tip stays above a height (m) on a stroke leg to `goal`."""
+        start = self._queue[-1]
+        return all(self.kinematics.pose_at(start + q * (goal - start))[1] > floor for q in (0.25, 0.5, 0.75, 1.0))
 
     def stroke_leg(self, goal: Array, speed: float) -> Array:
         """From the present reference to strokes, the slowest cylinder at `speed` in shares of stroke per second."""
