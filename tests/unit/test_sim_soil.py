@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError
-from edp.sim import layout as at
 from edp.sim import Scenario, load_machine, simulate, soil
+from edp.sim import layout as at
 from edp.sim import terramechanics as tm
 from edp.sim.plant import Plant
 
