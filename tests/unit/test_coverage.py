@@ -70,11 +70,11 @@ def test_a_filtered_input_is_flat_up_to_its_bandwidth():
     rng = np.random.default_rng(1)
     white = rng.normal(size=200_000)
     frequency, power = spectrum.density([white[:, None]], 100.0)
-    flat, drop = spectrum.flat_to(frequency, power[:, 0])
+    flat, drop = spectrum.flat_to(frequency, power[:, 0], 4.0)
     assert (flat, abs(drop) < 2) == (50.0, True)
     slow = signal.lfilter(*signal.butter(2, 2.0, fs=100.0), white)
     frequency, power = spectrum.density([slow[:, None]], 100.0)
-    flat, drop = spectrum.flat_to(frequency, power[:, 0])
+    flat, drop = spectrum.flat_to(frequency, power[:, 0], 4.0)
     assert flat == pytest.approx(2.0 * 9**0.25, rel=0.1)  # |H|^2 = 1 / (1 + (f / 2)^4) = 0.1
     assert drop == pytest.approx(10 * np.log10(1 + 2**4), abs=1.5)
 
@@ -168,6 +168,13 @@ def test_roles_go_by_kind_by_order_or_by_what_is_asked():
     named = roles_of(rig, ["p", "q"])
     assert [axis.command for axis in named.axes] == [("p",), ("q",)]
     assert named.inputs == ("p", "q")
+    plain = record({"r:generic": ones, "s:generic": ones, "y:generic": ones, "z:generic": ones})
+    assert roles_of(plain).axes == ()
+    assert [(axis.command, axis.velocity) for axis in roles_of(plain, ["r", "s"]).axes] == [
+        (("r",), "y"),
+        (("s",), "z"),
+    ]
+    assert cover([plain], ["r", "s"]).occupancy is None
     with pytest.raises(DataError, match="input 'w' is not a channel"):
         roles_of(rig, ["w"])
 

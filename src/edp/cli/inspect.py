@@ -49,7 +49,7 @@ def inspect(
     if found is not None and page is not None:
         from edp.report import build_coverage_page
 
-        build_coverage_page(found, page, data.resolve().name)
+        build_coverage_page(found, page, data.resolve().stem)
 
     def show() -> None:
         for report in plain:
@@ -112,7 +112,13 @@ def show_coverage(found: Coverage) -> None:
         rows.append((f"smallest singular value, {lags} lags", f"{found.singular[lags]:.3g}", "white noise: 1"))
     if found.spectrum is not None:
         for name, flat, drop in zip(found.spectrum.names, found.spectrum.flat_to_hz, found.spectrum.drop_db):
-            rows.append((f"{name}: flat within 10 dB to", f"{flat:.2g} Hz", f"{drop:.0f} dB down at 4 Hz"))
+            rows.append(
+                (
+                    f"{name}: flat within 10 dB to",
+                    f"{flat:.2g} Hz",
+                    f"{drop:.0f} dB down at {found.spectrum.used_hz:.2g} Hz",
+                )
+            )
     if found.occupancy is not None:
         spans = "full strokes" if found.occupancy.full_stroke else "range that was seen"
         cells = found.occupancy.samples.size

@@ -19,7 +19,7 @@ from edp.data.roles import Axis, Roles, roles_of, signed
 from edp.data.splits import Split
 from edp.errors import DataError
 from edp.recording import Recording
-from edp.signals import KINDS
+from edp.signals import KINDS, Kind
 
 Array = NDArray[np.float64]
 CELLS = 6
@@ -44,7 +44,8 @@ class Spectrum:
         frequency_hz: shape ``(frequency,)``.
         density: power spectral density, shape ``(frequency, command)``.
         flat_to_hz: how far each stays within 10 dB of its maximum.
-        drop_db: how far each lies below its maximum at `USED_HZ`.
+        drop_db: how far each lies below its maximum at `used_hz`.
+        used_hz: up to here they should be flat.
     """
 
     names: tuple[str, ...]
@@ -52,6 +53,7 @@ class Spectrum:
     density: Array
     flat_to_hz: tuple[float, ...]
     drop_db: tuple[float, ...]
+    used_hz: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +204,13 @@ def _spectrum(recordings: Sequence[Recording], roles: Roles) -> Spectrum | None:
         return None
     stretches = [np.stack([signed(r, command) for command in sources], axis=1) for r in recordings]
     frequency, power = spectrum.density(stretches, recordings[0].rate_hz)
-    flat, drop = zip(*(spectrum.flat_to(frequency, power[:, i]) for i in range(len(sources))))
+    used = spectrum.used_hz(recordings[0].rate_hz)
+    flat, drop = zip(*(spectrum.flat_to(frequency, power[:, i], used) for i in range(len(sources))))
     # a tenth of an octave is enough for a picture
     wanted = np.geomspace(frequency[0], frequency[-1], 90) if len(frequency) else np.zeros(0)
     kept = np.unique(np.minimum(np.searchsorted(frequency, wanted), max(len(frequency) - 1, 0)))
     names = tuple(" - ".join(command) for command in sources)
-    return Spectrum(names, frequency[kept], power[kept], flat, drop)
+    return Spectrum(names, frequency[kept], power[kept], flat, drop, used)
 
 
 def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> Occupancy | None:
@@ -217,7 +220,8 @@ def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: li
         names, source = tuple(axis.stroke for axis in stroked), MEASURED
         places = np.concatenate([r.select(names) for r in recordings])
     else:
-        names = tuple(axis.velocity for axis in axes if axis.velocity)[:3]
+        moves = {c.name for c in recordings[0].channels if c.kind in (Kind.VELOCITY, Kind.ANGULAR_VELOCITY)}
+        names = tuple(axis.velocity for axis in axes if axis.velocity in moves)[:3]
         source = INTEGRATED
         if not names:
             absent.append("occupancy: neither strokes nor velocities")

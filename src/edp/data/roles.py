@@ -29,7 +29,7 @@ class Axis:
     Attributes:
         name: for readers.
         command: channels that command it: extend and retract, one signed channel, or none.
-        velocity: its velocity, extension positive.
+        velocity: its velocity, extension positive; where kinds tell none, another signal that answers.
         pressures: head and rod pressure, or as many as there are.
         stroke: its position.
         conflux: channels that give it the second pump.
@@ -106,7 +106,7 @@ def _by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
         return [name for name, kind in kinds.items() if kind in wanted and name not in inputs]
 
     commands = list(inputs) or next((found for kind in COMMANDS if (found := of(kind))), [])
-    speeds = of(Kind.VELOCITY) or of(Kind.ANGULAR_VELOCITY)
+    speeds = of(Kind.VELOCITY) or of(Kind.ANGULAR_VELOCITY) or (of(Kind.GENERIC) if commands else [])
     places, pressures = of(Kind.POSITION) or of(Kind.ANGLE), of(Kind.PRESSURE)
     count = max(len(speeds), min(len(commands), 1))
     one_sided = len(commands) == 2 * count and all(kinds[name] == Kind.PILOT_PRESSURE for name in commands)

@@ -13,7 +13,7 @@ LAGS = 50
 LAG_STEPS = (1, 2, 3, 5, 8, 12, 16, 20, 25, 30, 35, 40, 45, 50)
 FLAT_DB = 10.0
 USED_HZ = 4.0
-"""Up to here a machine's axes answer their commands."""
+"""Up to here an excavator's axes answer their commands; slower logs are judged up to 0.4 of their rate."""
 SEGMENT_S = 10.24
 
 
@@ -86,12 +86,17 @@ def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
     return np.asarray(parts[0][0][1:]), np.asarray(power[1:])
 
 
-def flat_to(frequency: Array, power: Array, within_db: float = FLAT_DB) -> tuple[float, float]:
+def used_hz(rate_hz: float) -> float:
+    """The frequency up to which commands of a log should be flat."""
+    return min(USED_HZ, 0.4 * rate_hz)
+
+
+def flat_to(frequency: Array, power: Array, used: float, within_db: float = FLAT_DB) -> tuple[float, float]:
     """How flat a density is, averaged over a third of an octave.
 
     Returns:
         the highest frequency up to which it stays within some dB of its maximum, Hz; how far it lies below the maximum
-        at `USED_HZ`, dB. Zeros for silence.
+        at `used` Hz, dB. Zeros for silence.
     """
     if len(power) == 0 or not power.max() > 0:
         return 0.0, 0.0
@@ -103,6 +108,6 @@ def flat_to(frequency: Array, power: Array, within_db: float = FLAT_DB) -> tuple
     peak = int(np.argmax(smooth))
     below = np.flatnonzero(smooth[peak:] < smooth[peak] * 10.0 ** (-within_db / 10.0))
     flat = frequency[max(peak + int(below[0]) - 1, 0)] if len(below) else frequency[-1]
-    used = smooth[min(int(np.searchsorted(frequency, USED_HZ)), len(smooth) - 1)]
-    drop = 10.0 * np.log10(smooth[peak] / max(used, 1e-30 * smooth[peak]))
+    there = smooth[min(int(np.searchsorted(frequency, used)), len(smooth) - 1)]
+    drop = 10.0 * np.log10(smooth[peak] / max(there, 1e-30 * smooth[peak]))
     return float(flat), float(drop)

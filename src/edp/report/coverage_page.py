@@ -10,13 +10,15 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from edp.data.coverage import INTEGRATED, Coverage
-from edp.data.spectrum import FLAT_DB, USED_HZ
+from edp.data.spectrum import FLAT_DB
 from edp.report.coverage_plots import coverage_plots
 from edp.report.page import asset, script_json
 from edp.report.tables import Table
 from edp.report.wording import MISSING, listed, number, percent, unbroken, whole
 from edp.storage import write_bytes
 
+FAR = 0.1
+"""Share of the tests beyond 95 % of the training from which the headline says so; 5 % where both are alike."""
 WANTED_OCCUPANCY = 0.9
 """Share of the cells that a data set should visit."""
 
@@ -78,22 +80,20 @@ def headline(found: Coverage) -> str:
         parts.append(f"visits {percent(found.occupancy.share)} {kind}")
     if found.spectrum is not None and any(found.spectrum.flat_to_hz):
         parts.append(f"excites its commands up to {number(min(found.spectrum.flat_to_hz), 1)} Hz")
-    if found.distance is not None:
-        parts.append(f"leaves {percent(found.distance.beyond)} of the tests outside what was trained")
+    if found.distance is not None and found.distance.beyond > FAR:
+        parts.append(f"leaves {percent(found.distance.beyond)} of the tests far from training")
     size = f"{number(found.hours, 1 if found.hours >= 1 else 2)} h of data"
-    return (
-        f"{size}: {listed(parts)}." if not parts else f"{size} that {listed(parts)}.".replace(" that that ", " that ")
-    )
+    return f"{size} that {listed(parts)}." if parts else f"{size}."
 
 
 def verdict(found: Coverage) -> list[str]:
     """What is missing for learning a model of the machine from these data."""
     lines = []
-    if found.spectrum is not None and any(found.spectrum.flat_to_hz) and min(found.spectrum.flat_to_hz) < USED_HZ:
-        drop = max(found.spectrum.drop_db)
+    inputs = found.spectrum
+    if inputs is not None and any(inputs.flat_to_hz) and min(inputs.flat_to_hz) < inputs.used_hz:
         lines.append(
-            f"Commands fall by {FLAT_DB:g} dB before {USED_HZ:g} Hz, where they lie up to {number(drop, 0)} dB below "
-            "their maximum: faster changes teach little here."
+            f"Commands fall by {FLAT_DB:g} dB before {inputs.used_hz:.2g} Hz, where they lie up to "
+            f"{number(max(inputs.drop_db), 0)} dB below their maximum: faster changes teach little here."
         )
     if found.occupancy is not None and found.occupancy.share < WANTED_OCCUPANCY:
         lines.append(f"Fewer than {percent(WANTED_OCCUPANCY)} of the cells were visited; the white ones were never.")
@@ -132,7 +132,7 @@ def activity_table(found: Coverage) -> Table | None:
         for axis in found.activity
         if axis.reversals is not None
     )
-    columns = (("Axis", ""), ("Reversals", ""), ("Dead band left", ""), ("Commanded", "of the time"))
+    columns = (("Axis", ""), ("Reversals", ""), ("Left the dead band", "times"), ("Commanded", "of the time"))
     return Table("Commands", columns, rows) if rows else None
 
 

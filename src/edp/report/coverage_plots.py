@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from edp.data.coverage import Coverage, Joint, Occupancy
-from edp.data.spectrum import FLAT_DB, USED_HZ
+from edp.data.spectrum import FLAT_DB
 from edp.report.style import BLUE, INK, MUTED, RULE, SOFT, Plot, styled, with_unit
 
 SCALE = [[0.0, "#eef4fe"], [0.25, "#b7d0f7"], [0.5, "#6d9fec"], [0.75, "#2567d3"], [1.0, "#062c74"]]
@@ -19,10 +19,10 @@ SCALE = [[0.0, "#eef4fe"], [0.25, "#b7d0f7"], [0.5, "#6d9fec"], [0.75, "#2567d3"
 LINES = (BLUE, *MUTED)
 DASHES = ("solid", "dash", "dot", "dashdot")
 GROUPS = {
-    "command": ("joint_command", "Command", "Velocity"),
-    "head pressure": ("joint_head", "Head pressure", "Velocity"),
-    "rod pressure": ("joint_rod", "Rod pressure", "Velocity"),
-    "velocities": ("joint_velocities", "Velocity", "Velocity"),
+    "command": "joint_command",
+    "head pressure": "joint_head",
+    "rod pressure": "joint_rod",
+    "velocities": "joint_velocities",
 }
 
 
@@ -53,12 +53,18 @@ def spectrum_plot(found: Coverage) -> Plot | None:
             line={"color": LINES[i % len(LINES)], "width": 2.2 if i == 0 else 1.6, "dash": DASHES[i % len(DASHES)]},
             hovertemplate="%{x:.3~g} Hz: %{y:.1f} dB<extra></extra>",
         )
-    figure.add_vline(x=USED_HZ, line={"color": SOFT, "width": 1, "dash": "dot"})
+    figure.add_vline(x=inputs.used_hz, line={"color": SOFT, "width": 1, "dash": "dot"})
     styled(figure, 360)
     figure.add_annotation(
-        x=np.log10(USED_HZ), y=-FLAT_DB, text=f"wanted: within {FLAT_DB:g} dB up to {USED_HZ:g} Hz", showarrow=False,
-        xanchor="right", yanchor="bottom", xshift=-6, font={"size": 12, "color": SOFT},
-    )  # fmt: skip
+        x=np.log10(inputs.used_hz),
+        y=-FLAT_DB,
+        text=f"wanted: within {FLAT_DB:g} dB up to {inputs.used_hz:.2g} Hz",
+        showarrow=False,
+        xanchor="right",
+        yanchor="bottom",
+        xshift=-6,
+        font={"size": 12, "color": SOFT},
+    )
     figure.update_xaxes(type="log", title_text="Frequency [Hz]", dtick=1)
     figure.update_yaxes(title_text="Density below its maximum [dB]", range=[-60, 3])
     return Plot("spectrum", figure)
@@ -145,7 +151,7 @@ def joint_plot(found: Coverage, group: str) -> Plot | None:
     joints = [joint for joint in found.joints if joint.group == group][:6]
     if not joints:
         return None
-    name, x_title, y_title = GROUPS[group]
+    name = GROUPS[group]
     columns = min(len(joints), 3)
     rows = -(-len(joints) // columns)
     figure = make_subplots(
@@ -168,9 +174,8 @@ def joint_plot(found: Coverage, group: str) -> Plot | None:
             hovertemplate="%{x:.4~g}, %{y:.4~g}: %{customdata:.3f} %<extra></extra>",
             **place,
         )
-        figure.update_xaxes(title_text=with_unit(f"{x_title} {_short_name(joint.x)}", joint.x_unit), **place)
-        left = f"{y_title} {_short_name(joint.y)}" if group == "velocities" else y_title
-        figure.update_yaxes(title_text=with_unit(left, joint.y_unit), title_standoff=2, **place)
+        figure.update_xaxes(title_text=with_unit(_clipped(joint.x), joint.x_unit), **place)
+        figure.update_yaxes(title_text=with_unit(_clipped(joint.y), joint.y_unit), title_standoff=2, **place)
     styled(figure, 60 + 270 * rows, coloraxis=_colours(top, "% of the samples"))
     figure.update_layout(margin={"t": 34, "r": 80})
     figure.update_annotations(font={"size": 12, "color": SOFT})
@@ -207,8 +212,12 @@ def _title(joint: Joint) -> str:
     return f"correlation {joint.correlation:.2f}, {joint.information:.2f} nat".replace("-", "−")
 
 
+def _clipped(name: str) -> str:
+    return name if len(name) <= 18 else name[:17] + "…"
+
+
 def _short_name(name: str) -> str:
-    return html.escape(name if len(name) <= 16 else name[:15] + "…")
+    return html.escape(_clipped(name))
 
 
 def _centres(occupancy: Occupancy, axis: int) -> list[float]:

@@ -144,3 +144,19 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     assert "commands known" in shown
     assert "give whole numbers" in edp(*command, "--limit", "--horizons", "1,x").err
     assert "must be even" in edp(*command, "--limit", "--branches", 3).err
+
+
+def test_inspect_shows_and_draws_what_the_data_cover(edp, logs, tmp_path):
+    page = tmp_path / "coverage.html"
+    shown = edp("inspect", logs, "--no-channels", "--split", "time", "--page", page)
+    assert shown.code == 0
+    assert "smallest singular value" in shown.out
+    assert "test to train, median" in shown.out
+    assert page.read_text(encoding="utf-8").lower().startswith("<!doctype html>")
+    plain = edp("inspect", logs, "--json").json
+    assert plain["coverage"]["recordings"] == len(plain["recordings"])
+    assert edp("inspect", logs, "--no-coverage", "--json").json["coverage"] is None
+    wrong = edp("inspect", logs, "--inputs", "BmUpp")
+    assert wrong.code == 1
+    assert "did you mean 'BmUp'" in wrong.err
+    assert "did you mean 'time'" in edp("inspect", logs, "--split", "tme").err
