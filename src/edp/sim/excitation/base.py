@@ -101,11 +101,13 @@ class AxisStream:
 
     LEVELS = (0.15, 1.0)
     HOLD_S = (0.25, 1.6)
-    VIGOUR = (0.2, 1.0)
+    PACE = (1.0, 0.5, 0.25)
+    STRENGTH = (0.8, 0.7, 1.2)
+    VIGOUR = (0.2, 0.9)
     CHANGE = 0.1
 
-    def __init__(self, rng: np.random.Generator, rate_hz: float, pause: float = 0.45) -> None:
-        self._rng, self._pause = rng, pause
+    def __init__(self, rng: np.random.Generator, rate_hz: float, pause: float = 0.45, axis: int | None = None) -> None:
+        self._rng, self._pause, self.axis = rng, pause, axis
         self._vigour = rng.uniform(*self.VIGOUR)
         self.level = 0.0
         self.hold = Hold(rng, rate_hz)
@@ -116,9 +118,12 @@ class AxisStream:
             self._vigour = self._rng.uniform(*self.VIGOUR)
         sign = 1.0 if self._rng.random() < extend_probability(stroke) else -1.0
         low, high = self.LEVELS
-        return sign * (low + (high - low) * self._vigour * self._rng.random())
+        strength = 1.0 if self.axis is None else self.STRENGTH[self.axis]
+        return sign * (low + (high - low) * min(strength * self._vigour, 1.0) * self._rng.random())
 
     def next(self, stroke: float) -> None:
         """Take a new lever position and its length: a pause or a move."""
         self.level = 0.0 if self._rng.random() < self._pause else self.move(stroke)
-        self.hold.start(*self.HOLD_S)
+        shortest, longest = self.HOLD_S
+        pace = 1.0 if self.axis is None else self.PACE[self.axis]
+        self.hold.start(pace * shortest, pace * longest)

@@ -15,7 +15,7 @@ class Combined(Excitation):
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
-        self._streams = [AxisStream(rng, rate_hz) for _ in range(AXES)]
+        self._streams = [AxisStream(rng, rate_hz, axis=axis) for axis in range(AXES)]
 
     def block(self, view: View) -> Array:
         """Levers up to the next change of any of them."""

@@ -23,6 +23,7 @@ class Isolated(Excitation):
         if self._stream.hold.left == 0:
             if self._rng.random() < 0.5:
                 self._axis = int(self._rng.integers(AXES))
+                self._stream.axis = self._axis
             self._stream.next(view.strokes[self._axis])
         targets = np.zeros((self._stream.hold.left, AXES))
         targets[:, self._axis] = self._stream.level
