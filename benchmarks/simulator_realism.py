@@ -28,8 +28,10 @@ CYLINDERS = ("boom", "arm", "bucket")
 PILOTS = (("BmUp", "BmDwn"), ("AmIn", "AmOut"), ("BktIn", "BktOut"))
 MOST = 30
 """Longest lag searched, samples."""
-NEIGHBOURS_FROM = 4000
-"""Points of the nearest-neighbour estimate of mutual information."""
+NEIGHBOURS_FROM = 2000
+"""Points of a recording for the nearest-neighbour estimate of mutual information."""
+STILL = 1e-3
+"""rms velocity (m/s) below which a cylinder stands still in a recording."""
 SOIL_MIX = {"dig": 0.4, "grading": 0.2, "combined": 0.4}
 MATERIALS = ("dry_sand", "sandy_loam", "clay", "gravel")
 
@@ -76,6 +78,19 @@ def bins_mi(x: Array, y: Array, bins: int = 32) -> float:
     return float(np.sum(share[some] * np.log(share[some] / alone[some])) - bias)
 
 
+def neighbours_mi(signals: Signals, name: str, speed: str, seed: int) -> float:
+    """Mutual information in nat by 3 nearest neighbours, each recording for itself, mean over recordings with motion.
+
+    The thesis computed its scores per data set and compared them between sets.
+    """
+    found = []
+    for x, y in zip(signals.each(name), signals.each(speed), strict=True):
+        if y.std() > STILL:
+            every = max(1, len(x) // NEIGHBOURS_FROM)
+            found.append(mutual_info_regression(x[::every, None], y[::every], random_state=seed)[0])
+    return float(np.mean(found))
+
+
 @dataclass(frozen=True, eq=False)
 class Signals:
     """Columns of a set of recordings."""
@@ -114,7 +129,6 @@ def lags(signals: Signals) -> dict[str, tuple[int, ...]]:
 def dependencies(signals: Signals, seed: int) -> dict[str, dict[str, tuple[float, ...]]]:
     """Pearson and both estimates of mutual information at zero lag, by feature, a value a cylinder."""
     found: dict[str, dict[str, list[float]]] = {}
-    rng = np.random.default_rng(seed)
     for i in range(3):
         up, down = PILOTS[i]
         names = {
@@ -127,15 +141,13 @@ def dependencies(signals: Signals, seed: int) -> dict[str, dict[str, tuple[float
             "conflux retract": down + "Conf",
         }
         speed = signals.whole(f"CylVels_{i + 1}")
-        some = rng.choice(len(speed), min(NEIGHBOURS_FROM, len(speed)), replace=False)
         for feature, name in names.items():
             values = signals.whole(name)
             row = found.setdefault(feature, {"pearson": [], "bins": [], "neighbours": []})
             flat = values.std() < 1e-9
             row["pearson"].append(0.0 if flat else float(np.corrcoef(values, speed)[0, 1]))
             row["bins"].append(bins_mi(values, speed))
-            near = mutual_info_regression(values[some, None], speed[some], random_state=seed)
-            row["neighbours"].append(float(near[0]))
+            row["neighbours"].append(neighbours_mi(signals, name, f"CylVels_{i + 1}", seed))
     return {f: {k: tuple(v) for k, v in row.items()} for f, row in found.items()}
 
 
@@ -193,7 +205,7 @@ def facts_of(signals: Signals, machine: str, seed: int) -> list[Fact]:
     ]  # fmt: skip
     pearson = link["acceleration"]["pearson"]
     facts.append(Fact("acceleration, Pearson", pearson, "negligible", within(np.abs(pearson), 0, 0.1)))
-    for estimate, title in (("bins", "32 bins"), ("neighbours", "3 neighbours")):
+    for estimate, title in (("bins", "32 bins"), ("neighbours", "per recording")):
         found = {feature: row[estimate] for feature, row in link.items()}
         pilots = np.max([v for f, v in found.items() if f.startswith(("pilot", "conflux"))], axis=0)
         pressures = np.max([found["head pressure"], found["rod pressure"]], axis=0)

@@ -88,13 +88,16 @@ class AxisStream:
     """One lever: moves of random size, sign and length, with pauses between them.
 
     Its vigour changes every few moves, from careful positioning to full-lever work, so that a data set holds both.
+    The boom is held long, the bucket pulsed: fitted to the lags and spreads of the thesis's signals.
 
     Args:
         rng: source of randomness.
         rate_hz: samples per second.
         pause: chance that a hold is a pause.
+        axis: of a cylinder, for its own pace and strength; None for neither.
 
     Attributes:
+        axis: as given; a stream may turn to another cylinder.
         level: lever position now.
         hold: how long it stays.
     """
