@@ -104,6 +104,17 @@ def test_a_dig_goes_through_its_phases_and_mimes_depth_in_free_air():
     assert np.mean(high) > 0.5
 
 
+@pytest.mark.parametrize("machine", ["M22", "C14"])
+def test_a_dig_in_soil_fills_the_bucket_and_empties_it_again_and_again(machine):
+    simulation = Simulation(
+        Scenario(machine=machine, excitation="dig", material="sandy_loam", duration_s=120.0, seed=1)
+    )
+    load = simulation.run(12_000)[:, at.LOG_PAYLOAD]
+    emptied = (load[:-1] > 50) & (load[1:] <= 50)
+    assert emptied.sum() >= 4
+    assert load.max() > 300
+
+
 def test_measured_speeds_rise_with_the_lever_from_the_end_of_the_dead_band():
     levers, speeds = speed_table(MACHINE)
     assert levers.shape == speeds.shape == (3, 2, 6)
