@@ -114,3 +114,16 @@ def test_logs_without_truth_or_of_nothing_else(tmp_path):
         write_recording(simulated(names=tuple(TRUTH)), tmp_path / "b.csv", WriteOptions(truth="without"))
     with pytest.raises(DataError, match="did you mean 'apart'"):
         WriteOptions(truth="aparts")
+
+
+def test_truth_that_only_some_logs_hold_does_not_part_a_data_set(tmp_path):
+    soil = simulated()
+    air = simulated(names=(*TABLE_A1, "CylStroke_1"))
+    write_recording(soil, tmp_path / "a.parquet")
+    write_recording(air, tmp_path / "b.parquet")
+    read = read_data_set(tmp_path)
+    assert [r.channel_names for r in read] == [(*TABLE_A1, "CylStroke_1")] * 2
+    np.testing.assert_array_equal(read[0].values, soil.select([*TABLE_A1, "CylStroke_1"]))
+    write_recording(simulated(names=("BmUp", "CylStroke_1")), tmp_path / "c.parquet")
+    with pytest.raises(DataError, match=r"mixed channels: c\.parquet lacks"):
+        read_data_set(tmp_path)

@@ -110,9 +110,14 @@ class WriteOptions:
             raise DataError(f"truth = '{self.truth}' cannot be written{closest(self.truth, TRUTH_PLACES)}")
 
 
+def is_truth(name: str) -> bool:
+    """Whether a channel is one that only a simulation knows: of the vocabulary, but not of Table A.1."""
+    return name in VOCABULARY and name not in TABLE_A1
+
+
 def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
     """The measured channels and the truth of a recording; None for a part without channels."""
-    of_truth = [name in VOCABULARY and name not in TABLE_A1 for name in recording.channel_names]
+    of_truth = [is_truth(name) for name in recording.channel_names]
 
     def part(wanted: bool) -> Recording | None:
         places = [i for i, found in enumerate(of_truth) if found == wanted]

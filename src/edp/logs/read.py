@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.logs.detect import known_suffixes, open_log
-from edp.logs.raw import TRUTH, RawLog, RawSignal
+from edp.logs.raw import TRUTH, RawLog, RawSignal, is_truth
 from edp.logs.repair import Repair, mend_gaps, mend_stamps, mend_values
 from edp.logs.resolve import Wanted, resolve
 from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
@@ -226,17 +226,33 @@ def read_data_set(
         repair: as in `read_recording`.
 
     Raises:
-        DataError: as `read_recording`, and for mixed rates or channel sets.
+        DataError: as `read_recording`, and for mixed rates or channel sets. Truth of a simulation that only some of
+            them hold is left out instead, unless the map asks for it.
     """
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     files = list(dict.fromkeys(file for path in given for file in find_recordings(path)))
     if not files:
         raise DataError("no log files given; give at least one file or folder")
     recordings = [read_recording(file, signal_map, repair=repair) for file in files]
+    if signal_map is None or not signal_map.channels:
+        recordings = _without_partial_truth(recordings)
     _check_same(recordings, files)
     rate = recordings[0].rate_hz
     names = _unique_names([recording.name for recording in recordings], files)
     return [replace(recording, name=name, rate_hz=rate) for recording, name in zip(recordings, names)]
+
+
+def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
+    """Recordings less the truth that only some of them hold: ground heights exist in soil, not in free air."""
+    if len({recording.channel_names for recording in recordings}) == 1:
+        return recordings
+    common = set.intersection(*(set(recording.channel_names) for recording in recordings))
+    made = []
+    for recording in recordings:
+        kept = [i for i, name in enumerate(recording.channel_names) if name in common or not is_truth(name)]
+        channels = tuple(recording.channels[i] for i in kept)
+        made.append(replace(recording, channels=channels, values=np.ascontiguousarray(recording.values[:, kept])))
+    return made
 
 
 def _check_same(recordings: Sequence[Recording], files: Sequence[Path]) -> None:
