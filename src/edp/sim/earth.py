@@ -21,6 +21,10 @@ HOLDS_RAD, EMPTY_RAD = 0.61, 1.75
 """Tilt of the bucket's mouth from level up to which it holds a struck load, and at which it holds nothing; E."""
 DROP_CELLS = 8
 """How far (cells) ahead of the edge soil falls that the heap cannot hold."""
+NEAR_M = 0.1
+"""Gap (m) below which the bucket may touch the ground within a sample: it moves by less than 5 cm."""
+LANDING = 0.02
+"""Speed (m/s) from which a landing is taken in fine steps."""
 LEFT_M = 0.03
 """Height above the ground at which a dig has ended."""
 
@@ -171,10 +175,13 @@ def look(row: Array, time_s: float, axes: Array, ground: tuple[Array, ...]) -> t
     for k in range(max(first - 3, 0), min(last + 4, heights.shape[0])):
         top = max(top, heights[k])
     gap = low - top
-    w = math.fabs(row[at.RATE]) * 10.0 + math.fabs(row[at.RATE + 1]) * 5.0 + math.fabs(row[at.RATE + 2]) * 2.0
+    boom, arm = row[at.PSI], row[at.PSI] + row[at.PSI + 1]
+    elbow = axes[0, at.LENGTH] * math.cos(boom)
+    pin = elbow + axes[1, at.LENGTH] * math.cos(arm)
+    down = -x * row[at.RATE] - (x - elbow) * row[at.RATE + 1] - (x - pin) * row[at.RATE + 2]
     rocking = abs(pitch) > 1e-6 or abs(memory[at.PITCH_RATE]) > 1e-6
     inside = memory[at.IN_SOIL] > 0.0
-    near = gap < 0.05 + 2.0 * w * time_s or rocking or inside
+    near = gap < NEAR_M or rocking or inside
     if not inside and memory[at.PAYLOAD] > 0.0:
         spill(angle, x - 0.5 * axes[2, at.LENGTH] * math.cos(angle), time_s, numbers, heights, memory)
     if near:
@@ -182,4 +189,5 @@ def look(row: Array, time_s: float, axes: Array, ground: tuple[Array, ...]) -> t
     else:
         memory[at.FORCE_X] = memory[at.FORCE_Y] = memory[at.PITCH] = memory[at.PITCH_RATE] = 0.0
     carry(numbers, memory, axes)
-    return near, near and row[at.LOG_EVENTS + at.SOIL_CONTACT] == 0.0 and gap < 0.01 + w * time_s
+    untouched = row[at.LOG_EVENTS + at.SOIL_CONTACT] == 0.0
+    return near, near and untouched and down > LANDING and gap < 0.005 + 1.5 * down * time_s

@@ -75,6 +75,14 @@ def bucket_closes(psi: Array, plant: Array) -> NDArray[np.bool_]:
     return np.asarray((apart > folded + 1e-6) & (apart < straight - 1e-6))
 
 
+@compiled
+def _tabulate(psi: Array, wanted: NDArray[np.bool_], plant: Array, length: Array, lever: Array) -> None:
+    """The bucket cylinder's length and lever arm at the wanted angles."""
+    for k in range(psi.shape[0]):
+        if wanted[k]:
+            length[k], lever[k] = cylinder(2, psi[k], plant)
+
+
 def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Array]:
     """Angles (rad, rising) and lengths (m, falling) of the stretch on which the bucket cylinder works.
 
@@ -82,8 +90,8 @@ def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Arra
     covers most of the lengths from `closed` to `full`; empty when there is none.
     """
     psi = np.linspace(-1.3 * np.pi, 0.7 * np.pi, 1801)
-    pairs = [cylinder(2, p, plant) if ok else (np.nan, np.nan) for p, ok in zip(psi, bucket_closes(psi, plant))]
-    length, lever = np.array(pairs).T
+    length, lever = np.full(len(psi), np.nan), np.full(len(psi), np.nan)
+    _tabulate(psi, bucket_closes(psi, plant), plant, length, lever)
     falling = np.concatenate(([False], lever < 0.0, [False]))
     edges = np.flatnonzero(np.diff(falling.astype(int))).reshape(-1, 2)
 

@@ -8,11 +8,13 @@ gives energy; directions are regularised over `CREEP`. The front's frame is the 
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.sim import filters
 from edp.sim import layout as at
 from edp.sim.jit import compiled, inlined
 
@@ -70,8 +72,12 @@ def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> t
     return float(weight[n]), float(cohesion), max(float(adhesion), 0.0)
 
 
+@cache
 def cutting_table(material: Material) -> Array:
-    """`cutting_factors` for every degree of rake, shape (181, 3); constant where no wedge of soil can form."""
+    """`cutting_factors` for every degree of rake, shape (181, 3); constant where no wedge of soil can form.
+
+    Shared by all grounds of a material: not to be changed.
+    """
     # a wedge needs rake + failure angle + both frictions below 180 degrees
     most = min(MOST_RAKE, 160.0 - material.friction_deg - material.metal_friction_deg)
     angles = np.clip(np.arange(181), LEAST_RAKE, most)
@@ -86,11 +92,9 @@ def draw_course(material: Material, rng: np.random.Generator) -> Array:
     """
     course = np.zeros((COURSE, 3))
     keep = math.exp(-1.0 / 8.0)
-    shocks = rng.normal(0.0, math.sqrt(1.0 - keep * keep), COURSE)
-    value = rng.normal()
-    for n in range(COURSE):
-        value = keep * value + shocks[n]
-        course[n, 0] = value
+    shocks = rng.normal(0.0, math.sqrt(1.0 - keep * keep), (COURSE, 1))
+    shocks[0] /= math.sqrt(1.0 - keep * keep)
+    course[:, 0] = filters.lfilter([1.0], [1.0, -keep], shocks)[:, 0]
     for _ in range(rng.poisson(material.stones_per_m * STONE_STEP * COURSE)):
         length = max(2, round(rng.uniform(0.02, 0.08) / STONE_STEP))
         where = (int(rng.integers(COURSE)) + np.arange(length)) % COURSE
