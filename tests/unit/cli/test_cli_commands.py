@@ -12,7 +12,7 @@ from edp.cli import train as train_command
 from edp.cli.console import duration
 
 COMMANDS = [command.name for command in app.registered_commands]
-EXPECTED = ["demo", "simulate", "inspect", "train", "evaluate", "footprint", "report"]
+EXPECTED = ["demo", "simulate", "inspect", "animate", "train", "evaluate", "footprint", "report"]
 
 
 def test_all_commands_are_known_here():
