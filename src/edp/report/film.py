@@ -97,7 +97,7 @@ class _Front:
         if scene.ground.shape[1]:
             line = scene.ground_x + 1j * scene.ground[k]
             line = line[line.real < far]
-            edge = np.concatenate(([self.left + 1j * level, 1j * level], line))
+            edge = np.concatenate(([self.left + 1j * level, 1j * level], line, [far + 1j * line[-1].imag]))
             image.polygon(self.at(np.concatenate((edge, [far + 1j * low, self.left + 1j * low]))), SOIL)
         else:
             image.line(self.at(np.array([self.left + 1j * level, far + 1j * level])), RULE, 2.0)
