@@ -173,7 +173,13 @@ def load_signal_map(path: str | Path) -> SignalMap:
 def load_data_set(path: str | Path) -> DataSetSettings:
     """A data-set file; `map` entries that name files are left as paths relative to it."""
     table = read_toml(path)
-    for entry in [table, *table.get("recordings", [])]:
+    listed = table.get("recordings", [])
+    if not isinstance(listed, list):
+        raise ConfigError(
+            f"'{path}': recordings = {listed!r} is no list of [[recordings]]; a scenario file is simulated first, "
+            "with `edp simulate FOLDER --scenario`, and then the folder is read"
+        )
+    for entry in [table, *listed]:
         if isinstance(entry, dict) and isinstance(entry.get("map"), dict):
             entry["map"] = _map_table(entry["map"])
     settings = build(DataSetSettings, table, f"'{path}'")

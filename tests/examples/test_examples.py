@@ -15,6 +15,7 @@ from edp.cli import app
 from edp.cli.console import run_app
 from edp.config import TAGGED, RecordingEntry, TaskSettings, load_data_set, load_experiment, load_signal_map
 from edp.data.chunks import ChunkSpec
+from edp.data_sets import SimulationOrder
 from edp.evaluation.judge import JudgeSpec
 from edp.logs import write_recording
 from edp.models.heads import HeadSpec
@@ -40,12 +41,19 @@ SMALL = (
 
 def loader_of(path: Path) -> Callable[[Path], object]:
     table = tomllib.loads(path.read_text(encoding="utf-8"))
+    if path.parent.name == "scenarios":
+        return SimulationOrder.of
     return load_data_set if "recordings" in table else load_signal_map if "channels" in table else load_experiment
 
 
 def test_there_are_examples():
     assert len(SETTINGS) >= 10
-    assert {loader_of(path) for path in SETTINGS} == {load_signal_map, load_data_set, load_experiment}
+    assert {loader_of(path) for path in SETTINGS} == {
+        load_signal_map,
+        load_data_set,
+        load_experiment,
+        SimulationOrder.of,
+    }
 
 
 @pytest.mark.parametrize("path", SETTINGS, ids=lambda path: str(path.relative_to(EXAMPLES)))

@@ -124,13 +124,13 @@ def limit_table(found: dict[str, Any]) -> None:
     for n, samples in enumerate(found["horizons"]):
         unknown, known = found["commands_unknown"], found["commands_known"]
         spread = f"{unknown['low'][n][-1]:.2f}-{unknown['high'][n][-1]:.2f}"
-        row = [f"{1000 * samples / found['rate_hz']:g} ms (k = {samples})", *(f"{v:.2f}" for v in unknown["mae"][n])]
+        row = [f"{samples} ({1000 * samples / found['rate_hz']:g} ms)", *(f"{v:.2f}" for v in unknown["mae"][n])]
         rows.append([*row, spread, f"{known['mae'][n][-1]:.2f}", f"{found['persistence']['mae'][n][-1]:.2f}"])
     title = (
         f"Least mean absolute error of any predictor, {found['unit']} "
         f"({found['moments']} moments of {found['recordings']} recordings, {found['branches']} futures each)"
     )
-    table(title, ["ahead", *names, "mean", "95 %", "commands known", "persistence"], rows)
+    table(title, ["k", *names, "mean", "95 %", "commands known", "persistence"], rows)
 
 
 def _limit_spec(moments: int, branches: int, horizons: str) -> LimitSpec:

@@ -140,7 +140,7 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     assert made["limit"]["horizons"] == [1, 10]
     assert json.loads((tmp_path / "data" / "limit.json").read_text()) == made["limit"]
     shown = edp(*command, *asked).out
-    assert "100 ms (k = 10)" in shown
+    assert "10 (100 ms)" in shown
     assert "commands known" in shown
     assert "give whole numbers" in edp(*command, "--limit", "--horizons", "1,x").err
     assert "must be even" in edp(*command, "--limit", "--branches", 3).err

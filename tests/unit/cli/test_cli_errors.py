@@ -190,3 +190,9 @@ def test_a_folder_that_may_not_be_written(edp, trained, monkeypatch):
 
     monkeypatch.setattr("edp.storage.tempfile.mkstemp", read_only)
     refused(edp("report", trained), "cannot write", "report.html", "Permission denied", "choose a folder")
+
+
+def test_a_scenario_file_is_no_data_set_file(edp, tmp_path):
+    file = tmp_path / "set.toml"
+    file.write_text("recordings = 3")
+    refused(edp("inspect", file), "recordings = 3", "--scenario")
