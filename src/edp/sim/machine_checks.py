@@ -14,7 +14,7 @@ from edp.errors import ConfigError
 from edp.sim import layout as at
 from edp.sim import linkage
 from edp.sim.machine import Machine
-from edp.sim.parameters import pack
+from edp.sim.parameters import FLOW_SHARING, pack
 
 CYLINDERS = ("boom", "arm", "bucket")
 BEYOND_STOPS = math.radians(4.0)
@@ -173,8 +173,10 @@ def check_machine(machine: Machine, where: str) -> None:
         elif kind == "str":
             if not isinstance(value, str):
                 raise ConfigError(f"{place} = {value!r} must be text")
+            if key == "flow_sharing" and value not in FLOW_SHARING:
+                raise ConfigError(f"{place} = {value!r} must be one of {', '.join(FLOW_SHARING)}")
         else:
-            _check_numbers(value, BOUNDS.get(f"{section}.{key}" if section else key, ANY), place)
+            _check_numbers(value, kind, BOUNDS.get(f"{section}.{key}" if section else key, ANY), place)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", machine.name):
         raise ConfigError(
             f"machine file {where}: name = {machine.name!r} must be letters, digits, - and _: recordings carry it"
@@ -196,11 +198,16 @@ def _leaves(machine: Machine) -> Iterator[tuple[str, str, str, Any]]:
             yield "", field.name, str(field.type), value
 
 
-def _check_numbers(value: Any, bound: Bound, place: str) -> None:
-    if isinstance(value, tuple):
+def _check_numbers(value: Any, kind: str, bound: Bound, place: str) -> None:
+    """A number, or the numbers of a list where the key's type is one."""
+    if kind not in ("float", "int") and isinstance(value, tuple):
         for i, part in enumerate(value):
-            _check_numbers(part, bound, f"{place}[{CYLINDERS[i] if len(value) == 3 else i}]")
-        return
+            _check_number(part, bound, f"{place}[{CYLINDERS[i] if len(value) == 3 else i}]")
+    else:
+        _check_number(value, bound, place)
+
+
+def _check_number(value: Any, bound: Bound, place: str) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ConfigError(f"{place} = {value!r} must be a number")
     if not math.isfinite(value) or not bound.holds(value):
@@ -214,8 +221,8 @@ def _check_ratings(value: Any, key: str, place: str) -> None:
         return
     if not isinstance(value, tuple) or len(value) != 2:
         raise ConfigError(f"{place} = {value!r} must be [L/min, bar]")
-    _check_numbers(value[0], POSITIVE if key in FLOWING else NOT_NEGATIVE, f"{place}, flow in L/min,")
-    _check_numbers(value[1], POSITIVE, f"{place}, pressure in bar,")
+    _check_number(value[0], POSITIVE if key in FLOWING else NOT_NEGATIVE, f"{place}, flow in L/min,")
+    _check_number(value[1], POSITIVE, f"{place}, pressure in bar,")
 
 
 def _check_pairs(machine: Machine, where: str) -> None:
