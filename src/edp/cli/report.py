@@ -24,12 +24,17 @@ def report(
     Example: `edp report runs/first`
     """
     from edp.report import build_report, headline, read_facts
+    from edp.report.facts import main_horizon
+    from edp.report.limit import limit_line
 
     page = build_report(run, output, title, limit)
-    line = headline(read_facts(run, limit))
+    facts = read_facts(run, limit)
+    line, least = headline(facts), limit_line(facts, main_horizon(facts))
 
     def show() -> None:
         out.print(line)
+        if least:
+            out.print(least)
         out.print(f"report: {page.resolve()}")
 
-    emit(as_json, {"report": str(page), "headline": line}, show)
+    emit(as_json, {"report": str(page), "headline": line, "limit": least}, show)

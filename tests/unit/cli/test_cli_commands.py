@@ -160,3 +160,13 @@ def test_inspect_shows_and_draws_what_the_data_cover(edp, logs, tmp_path):
     assert wrong.code == 1
     assert "did you mean 'BmUp'" in wrong.err
     assert "did you mean 'time'" in edp("inspect", logs, "--split", "tme").err
+
+
+def test_the_report_says_the_limit_of_a_simulated_data_set(edp, tmp_path, small):
+    data, run = tmp_path / "data", tmp_path / "run"
+    asked = ("--limit", "--moments", 4, "--branches", 4, "--horizons", "1,10")
+    edp("simulate", data, "--minutes", 0.8, "--recordings", 4, "--seed", 3, "--workers", 1, *asked)
+    edp("train", data, "--out", run, *small)
+    edp("evaluate", run, "--baselines", "persistence")
+    assert "limit of predictability here is" in " ".join(edp("report", run).out.split())
+    assert "limit of predictability here is" in (run / "report.html").read_text(encoding="utf-8")
