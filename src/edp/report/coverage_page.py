@@ -148,7 +148,7 @@ def events_table(found: Coverage) -> Table:
         (_first_up(event.name), whole(event.count), percent(event.share), event.note or "recorded")
         for event in found.events
     )
-    return Table("Events", (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", "")), rows)
+    return Table("How often", (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", "")), rows)
 
 
 def joints_table(found: Coverage) -> Table | None:

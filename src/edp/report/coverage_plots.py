@@ -60,9 +60,9 @@ def spectrum_plot(found: Coverage) -> Plot | None:
         y=-FLAT_DB,
         text=f"wanted: within {FLAT_DB:g} dB up to {inputs.used_hz:.2g} Hz",
         showarrow=False,
-        xanchor="right",
+        xanchor="left",
         yanchor="bottom",
-        xshift=-6,
+        xshift=6,
         font={"size": 12, "color": SOFT},
     )
     figure.update_xaxes(type="log", title_text="Frequency [Hz]", dtick=1)
