@@ -23,7 +23,7 @@ DROP_CELLS = 8
 """How far (cells) ahead of the edge soil falls that the heap cannot hold."""
 NEAR_M = 0.1
 """Gap (m) below which the bucket may touch the ground within a sample: it moves by less than 5 cm."""
-LANDING = 0.02
+LANDING = 0.05
 """Speed (m/s) from which a landing is taken in fine steps."""
 LEFT_M = 0.03
 """Height above the ground at which a dig has ended."""
@@ -190,4 +190,4 @@ def look(row: Array, time_s: float, axes: Array, ground: tuple[Array, ...]) -> t
         memory[at.FORCE_X] = memory[at.FORCE_Y] = memory[at.PITCH] = memory[at.PITCH_RATE] = 0.0
     carry(numbers, memory, axes)
     untouched = row[at.LOG_EVENTS + at.SOIL_CONTACT] == 0.0
-    return near, near and untouched and down > LANDING and gap < 0.005 + 1.5 * down * time_s
+    return near, near and untouched and down > LANDING and gap < 0.002 + 1.5 * down * time_s
