@@ -12,6 +12,7 @@ from edp.logs import (
     open_log,
     read_data_set,
     read_recording,
+    read_truth,
     truth_path,
     write_recording,
 )
@@ -41,8 +42,7 @@ def test_truth_apart_is_not_read_with_the_log_but_can_be_read_alone(tmp_path, su
     read = read_recording(path)
     np.testing.assert_array_equal(columns(read, TABLE_A1), recording.select(list(TABLE_A1)))
     assert len(read_data_set(tmp_path)) == 1
-    beside = truth_path(path)
-    truth = read_recording(beside) if beside.exists() else read_recording(path, SignalMap(variable="truth"))
+    truth = read_truth(path)
     np.testing.assert_array_equal(columns(truth, TRUTH), recording.select(list(TRUTH)))
     assert [c.kind for c in truth.channels] == [c.kind for c in TRUTH.values()]
 
@@ -51,6 +51,7 @@ def test_truth_apart_is_not_read_with_the_log_but_can_be_read_alone(tmp_path, su
 def test_truth_can_be_left_out(tmp_path, suffix):
     path = write_recording(simulated(), tmp_path / f"run{suffix}", WriteOptions(truth="without"))
     assert read_recording(path).channel_names == tuple(TABLE_A1)
+    assert read_truth(path) is None
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 

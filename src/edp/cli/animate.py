@@ -52,17 +52,17 @@ def animate(
 
 
 def _read(log: Path, signal_map: Path | None) -> Recording:
-    """One recording, with the truth that lies beside its log."""
-    from edp.logs import read_recording, truth_path
+    """One recording, with the truth that lies in or beside its log."""
+    from edp.logs import known_suffixes, read_truth
     from edp.sources import DataSource
 
     found = DataSource.of(log, signal_map).read()
     if len(found) != 1:
         raise DataError(f"'{log}' holds {len(found)} recordings; give one log to animate")
-    recording, beside = found[0], truth_path(log)
-    if not log.is_file() or not beside.is_file():
+    recording = found[0]
+    truth = read_truth(log) if log.suffix.lower() in known_suffixes() and log.is_file() else None
+    if truth is None:
         return recording
-    truth = read_recording(beside)
     new = [c for c in truth.channels if c.name not in recording.channel_names]
     rows = min(recording.samples, truth.samples)
     values = np.concatenate((recording.values[:rows], truth.select([c.name for c in new])[:rows]), axis=1)

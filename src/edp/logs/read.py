@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.logs.detect import known_suffixes, open_log
+from edp.logs.detect import format_for, known_suffixes, open_log
 from edp.logs.raw import TRUTH, RawLog, RawSignal, is_truth
 from edp.logs.repair import Repair, mend_gaps, mend_stamps, mend_values
 from edp.logs.resolve import Wanted, resolve
 from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
+from edp.logs.write import truth_path
 from edp.recording import Recording
 from edp.signals import SignalMap
 
@@ -183,6 +184,24 @@ def _rows(rows: tuple[int, int | None] | None, count: int, where: str) -> slice:
     if not 0 <= start < stop <= count:
         raise DataError(f"{where}: rows {start}:{stop} asked for, but 0 <= start < stop <= {count} must hold")
     return slice(start, stop)
+
+
+def read_truth(path: str | Path) -> Recording | None:
+    """What only the simulation knew of a log: from the file beside it or from its own variable; None where unknown.
+
+    Args:
+        path: the log file.
+    """
+    log = Path(path)
+    beside = truth_path(log)
+    if beside.is_file():
+        return read_recording(beside)
+    if not format_for(log).parts:
+        return None
+    try:
+        return read_recording(log, SignalMap(variable=TRUTH))
+    except DataError:  # no such variable: logs of real machines have none
+        return None
 
 
 def find_recordings(path: str | Path) -> tuple[Path, ...]:
