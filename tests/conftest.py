@@ -5,20 +5,22 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 
 from edp.blocks import BLOCKS
-from edp.blocks.base import Slot
+from edp.blocks.base import OUTPUT_SLOTS, SHARED_SLOTS
 from edp.data.features import Derived, FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, HybridSpec, LstmSpec, TcnSpec
-from edp.models.heads import HeadSpec
-from edp.models.predictor import ModelSpec, Predictor, build_model
+from edp.models.heads import HEADS, GluHead, MlpHead
+from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination
 
 WINDOW = 9
 # Small options, so that every combination is cheap; a part that is absent here is tested with its defaults.
@@ -27,6 +29,10 @@ SMALL = {
     "tcn": [TcnSpec(channels=(6, 4), kernel=3, dropout=0.2)],
     "hybrid": [HybridSpec(channels=(6,), kernel=3, units=5, dropout=0.2), HybridSpec(channels=(4,), kernel=1, units=4)],
     "cylinder_gate": [BLOCKS["cylinder_gate"](), BLOCKS["cylinder_gate"](form="linear")],
+    "attention_bridge": [BLOCKS["attention_bridge"](heads=2)],
+    "squeeze_excitation": [BLOCKS["squeeze_excitation"](reduction=2)],
+    "mlp": [MlpHead(hidden=6), MlpHead(hidden=5, layers=2)],
+    "glu": [GluHead(hidden=4), GluHead(hidden=4, layers=2)],
     "linear_bypass": [BLOCKS["linear_bypass"](taps=4), BLOCKS["linear_bypass"](taps=1, trained=False)],
 }
 FEATURES = FeatureSet(
@@ -44,45 +50,75 @@ FORMS = [
 Form = tuple[str, tuple[int, ...], TargetMode]
 
 
+class Structure(NamedTuple):
+    backbone: object
+    blocks: tuple[object, ...] = ()
+    head: object = MlpHead(hidden=6)
+
+
 def options_of(name: str, registry: object) -> list[object]:
     return list(SMALL.get(name, [])) or [registry[name]()]  # type: ignore[index]
 
 
-def _structures() -> dict[str, tuple[object, tuple[object, ...]]]:
-    """Each backbone alone, with each block that fits it, and with one block in each of its slots."""
-    found: dict[str, tuple[object, tuple[object, ...]]] = {}
+def _structures() -> dict[str, Structure]:
+    """Each backbone alone, with each block that fits it, with each head, and with its slots full."""
+    found: dict[str, Structure] = {}
     for name in BACKBONES:
         for number, backbone in enumerate(options_of(name, BACKBONES)):
-            found[f"{name}{number or ''}"] = (backbone, ())
+            found[f"{name}{number or ''}"] = Structure(backbone)
         backbone = options_of(name, BACKBONES)[0]
-        slots = {*backbone.slots(), Slot.GATE, Slot.BYPASS}  # type: ignore[attr-defined]
-        one_of_each = {}
+        slots = {*backbone.slots(), *OUTPUT_SLOTS}  # type: ignore[attr-defined]
+        full: dict[str, object] = {}
         for block in BLOCKS:
-            if BLOCKS[block].slot in slots:
-                one_of_each[BLOCKS[block].slot] = options_of(block, BLOCKS)[0]
+            slot = BLOCKS[block].slot
+            if slot in slots:
+                full.setdefault(block if slot in SHARED_SLOTS else slot, options_of(block, BLOCKS)[0])
                 for number, spec in enumerate(options_of(block, BLOCKS)):
-                    found[f"{name}+{block}{number or ''}"] = (backbone, (spec,))
-        found[f"{name}+all"] = (backbone, tuple(one_of_each.values()))
+                    found[f"{name}+{block}{number or ''}"] = Structure(backbone, (spec,))
+        for head in HEADS:
+            for number, spec in enumerate(options_of(head, HEADS)):
+                if (head, number) != ("mlp", 0):
+                    found[f"{name}+{head}{number or ''}"] = Structure(backbone, (), spec)
+        found[f"{name}+all"] = Structure(backbone, tuple(full.values()), options_of("glu", HEADS)[0])
     return found
 
 
 STRUCTURES = _structures()
 
 
-@cache
-def _build(structure: str, form: Form) -> Predictor:
-    activation, horizons, mode = form
-    task = Task(FEATURES, ("speed_1", "speed_2"), horizons, mode, 100.0)
-    backbone, blocks = STRUCTURES[structure]
-    spec = ModelSpec(
+def model_of(structure: str, activation: str) -> ModelSpec:
+    backbone, blocks, head = STRUCTURES[structure]
+    return ModelSpec(
         backbone=backbone,  # type: ignore[arg-type]
-        head=HeadSpec(hidden=6),
+        head=head,  # type: ignore[arg-type]
         activation=ACTIVATIONS[activation](),
         blocks=blocks,
         window=WINDOW,
     )
+
+
+def task_of(form: Form) -> Task:
+    return Task(FEATURES, ("speed_1", "speed_2"), form[1], form[2], 100.0)
+
+
+@cache
+def forms_of(structure: str) -> list[Form]:
+    """The forms in which the parts of a structure agree to be built."""
+    agreed = []
+    for form in FORMS:
+        try:
+            check_combination(task_of(form), model_of(structure, form[0]))
+        except ConfigError:
+            continue
+        agreed.append(form)
+    return agreed
+
+
+@cache
+def _build(structure: str, form: Form) -> Predictor:
+    task, spec = task_of(form), model_of(structure, form[0])
+    shape = (len(form[1]), 2)
     rng = np.random.default_rng(7)
-    shape = (len(horizons), 2)
     scaler = Scaler(rng.normal(size=6), rng.uniform(0.5, 2, 6), rng.normal(size=shape), rng.uniform(0.5, 2, shape))
     predictor = build_model(task, spec, scaler, seed=3)
     # Some parts start at zero or fully open; shaken weights let every path take part.
@@ -100,7 +136,8 @@ def predictor_of() -> Callable[..., Predictor]:
     @cache
     def make(structure: str, form: Form | None = None, dtype: torch.dtype = torch.float64) -> Predictor:
         # Where a test does not go through all forms, neighbouring structures still take different ones.
-        chosen = form or FORMS[list(STRUCTURES).index(structure) % len(FORMS)]
+        agreed = forms_of(structure)
+        chosen = form or agreed[list(STRUCTURES).index(structure) % len(agreed)]
         return copy.deepcopy(_build(structure, chosen)).to(dtype).eval()
 
     return make
@@ -113,15 +150,16 @@ def one_thread() -> None:
 
 
 @pytest.fixture(scope="session")
-def parts() -> tuple[dict[str, tuple[object, tuple[object, ...]]], list[Form]]:
+def parts() -> tuple[dict[str, Structure], list[Form]]:
     """All structures and all forms, to count that the tests are total."""
     return STRUCTURES, FORMS
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """An argument `structure` or `form` runs a test for every structure or form."""
-    if "structure" in metafunc.fixturenames:
+    """An argument `structure` runs a test for every structure; with `form`, in every form that it agrees to."""
+    if {"structure", "form"} <= set(metafunc.fixturenames):
+        pairs = [(structure, form) for structure in STRUCTURES for form in forms_of(structure)]
+        ids = [f"{structure}-{form[0]}-{len(form[1])}-{form[2]}" for structure, form in pairs]
+        metafunc.parametrize(("structure", "form"), pairs, ids=ids)
+    elif "structure" in metafunc.fixturenames:
         metafunc.parametrize("structure", list(STRUCTURES))
-    if "form" in metafunc.fixturenames:
-        names = [f"{activation}-{len(horizons)}-{mode}" for activation, horizons, mode in FORMS]
-        metafunc.parametrize("form", FORMS, ids=names)

@@ -23,6 +23,7 @@ from edp.logs.repair import Repair
 from edp.losses import LOSSES
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
+from edp.models.heads import HEADS
 from edp.models.plain import options
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
@@ -33,6 +34,7 @@ from edp.training.schedules import SCHEDULES
 
 TAGGED: Mapping[str, Registry[type]] = {
     "backbone": BACKBONES,
+    "head": HEADS,
     "activation": ACTIVATIONS,
     "blocks": BLOCKS,
     "loss": LOSSES,
@@ -41,6 +43,8 @@ TAGGED: Mapping[str, Registry[type]] = {
     "split": SPLITS,
 }
 """Fields whose tables say with ``kind = "..."`` which registered part they set."""
+USUAL_KIND = {"head": "mlp"}
+"""What a table without ``kind`` means, where that is not an error."""
 
 PRESETS = ("quick", "small", "standard", "thesis")
 Table = dict[str, Any]
@@ -334,6 +338,8 @@ def _tagged(name: str, table: Any, path: str, problems: list[str]) -> Any:
     registry = TAGGED[name]
     if isinstance(table, str):
         table = {"kind": table}
+    if isinstance(table, Mapping) and name in USUAL_KIND:
+        table = {"kind": USUAL_KIND[name], **table}
     if not isinstance(table, Mapping) or "kind" not in table:
         problems.append(f'{path}: say which {registry.what} with kind = "..."{closest("", registry)}')
         return None

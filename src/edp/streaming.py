@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import torch
@@ -42,12 +43,39 @@ class Cost:
     per_time_step: bool = True
 
 
+class Operation(StrEnum):
+    """Primitive operations that networks are made of: what an export target must be able to compute.
+
+    Moving numbers (concatenation, slices, ring buffers) and element-wise arithmetic (sums, products, quotients,
+    choice by a mask) are understood and not listed.
+    """
+
+    LINEAR = "linear"
+    MATMUL = "matmul"
+    CONV1D = "conv1d"
+    LSTM = "lstm"
+    GRU = "gru"
+    SIGMOID = "sigmoid"
+    TANH = "tanh"
+    RELU = "relu"
+    GELU = "gelu"
+    GLU = "glu"
+    SOFTMAX = "softmax"
+    LAYER_NORM = "layer_norm"
+    TRAILING_MEAN = "trailing_mean"
+
+
 class Streaming(nn.Module, ABC):
     """A causal map from ticks to features with explicit state.
 
     For any split of a sequence into chunks, running the chunks in order and handing the state on gives the same
     output as one call (chunk invariance); output t never depends on inputs after t (causality).
+
+    Attributes:
+        operations: what the part itself computes, without the parts inside it.
     """
+
+    operations: frozenset[Operation] = frozenset()
 
     @abstractmethod
     def initial_state(self, batch: int, like: Tensor) -> State:
@@ -65,6 +93,35 @@ class Streaming(nn.Module, ABC):
         """Run the module (typed shadow of ``nn.Module.__call__``)."""
         result: tuple[Tensor, State] = super().__call__(x, state)
         return result
+
+
+class Chain(Streaming):
+    """Parts in series, each on ``(batch, time, width)``."""
+
+    def __init__(self, parts: Sequence[Streaming]) -> None:
+        super().__init__()
+        self.parts = nn.ModuleList(parts)
+
+    def _streams(self) -> list[Streaming]:
+        return [part for part in self.parts if isinstance(part, Streaming)]
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        return tuple(part.initial_state(batch, like) for part in self._streams())
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        new = []
+        for part, old in zip(self._streams(), state, strict=True):
+            x, part_state = part(x, old)
+            new.append(part_state)
+        return x, tuple(new)
+
+    def costs(self) -> list[Cost]:
+        return [cost for part in self._streams() for cost in part.costs()]
+
+
+def operations_of(module: nn.Module) -> frozenset[Operation]:
+    """Every primitive operation that a network declares, the parts inside it included."""
+    return frozenset().union(*(getattr(part, "operations", ()) for part in module.modules()))
 
 
 def parameters_of(module: nn.Module) -> int:

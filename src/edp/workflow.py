@@ -27,7 +27,7 @@ from edp.data_sets import SimulationOrder, simulate_data_set
 from edp.errors import DataError, StorageError
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
-from edp.models.predictor import ModelSpec, Predictor, build_model, describe
+from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination, describe
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
 from edp.sources import DataSource
@@ -61,6 +61,7 @@ def prepare_data(source: DataSource, experiment: Experiment) -> Prepared:
     recordings = source.read()
     first = recordings[0]
     task = experiment.task.resolve(first.rate_hz, first.channel_names)
+    check_combination(task, experiment.model)
     return prepare(recordings, task, experiment.split, experiment.model.window)
 
 

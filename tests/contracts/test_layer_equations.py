@@ -8,7 +8,7 @@ import torch
 from edp.blocks import BLOCKS
 from edp.models.activations import ACTIVATIONS, ScaledTanh
 from edp.models.convolution import CausalConv, ConvolutionStack, TemporalBlock, receptive_field
-from edp.models.heads import HeadSpec
+from edp.models.heads import MlpHead
 from edp.models.recurrent import AttentionPooling, Lstm
 
 
@@ -113,7 +113,7 @@ def test_pooling_stands_large_scores():
 
 def test_the_difference_is_that_of_neighbouring_states():
     x = draw(1, 9, 3)
-    found = run(BLOCKS["temporal_difference"]().build(3), x)
+    found = run(BLOCKS["temporal_difference"]().build(3, 5), x)
     torch.testing.assert_close(found[:, 1:], x[:, 1:] - x[:, :-1], rtol=0, atol=0)
     assert torch.equal(found[:, 0], x[:, 0])
 
@@ -145,7 +145,7 @@ def test_parallel_stacks_stand_side_by_side():
 
 @pytest.mark.parametrize("gated", [False, True])
 def test_each_head_is_its_own_small_network(gated):
-    heads = HeadSpec(hidden=5, layers=2).build(4, 3, 2)
+    heads = MlpHead(hidden=5, layers=2).build(4, 3, 2)
     x = draw(2, 6, 3, 4) if gated else draw(2, 6, 4)
     found = run(heads, x)
     assert found.shape == (2, 6, 2, 3)

@@ -7,42 +7,43 @@ import pytest
 
 import edp.blocks
 from edp.blocks import BLOCKS
-from edp.blocks.base import BlockSpec, Slot
+from edp.blocks.base import OUTPUT_SLOTS, BlockSpec, Slot
 from edp.data.features import DERIVATIONS
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, EdpError
 from edp.losses import LOSSES
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, LstmSpec, TcnSpec
+from edp.models.heads import HEADS
 from edp.models.plain import tagged, untagged
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import SCHEDULES
 
-SPECS = [BACKBONES, BLOCKS, ACTIVATIONS, LOSSES, OPTIMIZERS, SCHEDULES, SPLITS]
+SPECS = [BACKBONES, BLOCKS, HEADS, ACTIVATIONS, LOSSES, OPTIMIZERS, SCHEDULES, SPLITS]
 ENTRIES = [pytest.param(registry, name, id=f"{registry.what}-{name}") for registry in SPECS for name in registry]
 
 
 def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(parts):
     structures, forms = parts
     tested = {
-        (BACKBONES.name_of(b), BLOCKS.name_of(blocks[0])) for b, blocks in structures.values() if len(blocks) == 1
+        (BACKBONES.name_of(s.backbone), BLOCKS.name_of(s.blocks[0])) for s in structures.values() if len(s.blocks) == 1
     }
     fitting = {
         (backbone, block)
         for backbone in BACKBONES
         for block in BLOCKS
-        if BLOCKS[block].slot in {*BACKBONES[backbone]().slots(), Slot.GATE, Slot.BYPASS}
+        if BLOCKS[block].slot in {*BACKBONES[backbone]().slots(), *OUTPUT_SLOTS}
     }
     assert tested == fitting
-    # Three backbones and four blocks: 3 + 3 + 4 pairs. A new part must move these numbers.
-    assert (len(BACKBONES), len(BLOCKS), len(fitting)) == (3, 4, 10)
+    # A new part must move these numbers: backbones, blocks, pairs of them that fit, heads.
+    assert (len(BACKBONES), len(BLOCKS), len(fitting), len(HEADS)) == (3, 9, 22, 2)
     assert {block for _, block in fitting} == set(BLOCKS)
     assert {backbone for backbone, _ in fitting} == set(BACKBONES)
     assert len(forms) == len(ACTIVATIONS) * 2 * 2
-    # Plain ones, pairs, further options of a part, and one with a block in each slot for each backbone.
-    assert len(structures) == 5 + 10 + 2 * 3 + 3
+    # Plain ones, pairs, further options of two blocks, further heads, and one with all slots full for each backbone.
+    assert len(structures) == 5 + 22 + 2 * 3 + 3 * 3 + 3
 
 
 def test_every_file_in_blocks_registers_a_block():
@@ -86,14 +87,14 @@ def test_a_misspelt_name_is_answered_with_the_closest(registry: Registry):
 @pytest.mark.parametrize("block", list(BLOCKS))
 def test_a_block_without_its_slot_is_refused(backbone, block):
     spec = BACKBONES[backbone]()
-    if BLOCKS[block].slot in {*spec.slots(), Slot.GATE, Slot.BYPASS}:
+    if BLOCKS[block].slot in {*spec.slots(), *OUTPUT_SLOTS}:
         ModelSpec(backbone=spec, blocks=(BLOCKS[block](),))
     else:
         with pytest.raises(ConfigError, match=f"block '{block}' needs the slot '{BLOCKS[block].slot}'"):
             ModelSpec(backbone=spec, blocks=(BLOCKS[block](),))
 
 
-@pytest.mark.parametrize("slot", [Slot.GATE, Slot.BYPASS])
+@pytest.mark.parametrize("slot", OUTPUT_SLOTS)
 def test_two_blocks_in_a_single_slot_are_refused(slot):
     block = next(BLOCKS[name]() for name in BLOCKS if BLOCKS[name].slot is slot)
     with pytest.raises(ConfigError, match=f"share the slot '{slot}'"):

@@ -11,7 +11,7 @@ from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.models.activations import Identity, ScaledTanh
 from edp.models.backbones import HybridSpec
-from edp.models.heads import HeadSpec
+from edp.models.heads import MlpHead
 from edp.models.predictor import ModelSpec, build_model
 
 W = 50
@@ -35,15 +35,15 @@ DIFFERENCE, SCALES = (TemporalDifference(),), (MultiScaleTcn(),)
 # Network; parameters, those left after folding, MACs per window in M and per tick in k, to the digits known.
 GOLDEN = {
     "Table B.1": (
-        ((256, 128, 64, 32), 3, HeadSpec(hidden=64, layers=2), (*SCALES, CylinderGate()), ScaledTanh()),
+        ((256, 128, 64, 32), 3, MlpHead(hidden=64, layers=2), (*SCALES, CylinderGate()), ScaledTanh()),
         (1_376_775, 1_374_852, "62.88", "1379"),
     ),
-    "teacher": (((256,), 5, HeadSpec(hidden=128), DIFFERENCE, ScaledTanh()), (1_197_319, 1_196_804, "45.198", "1206")),
-    "A_u64": (((64,), 5, HeadSpec(hidden=32), DIFFERENCE), (84_292, 84_164, "3.257", "86.6")),
-    "A_u32": (((32,), 5, HeadSpec(hidden=16), DIFFERENCE), (24_228, 24_164, "0.958", "25.4")),
-    "teacher P4": (((128, 64, 32), 7, HeadSpec(hidden=64), SCALES), (677_572, 676_676, "31.281", "680.5")),
-    "P4 A_u64": (((64, 32), 7, HeadSpec(hidden=32), SCALES), (181_956, 181_572, "8.409", "183.6")),
-    "P4 A_u32": (((32, 16), 7, HeadSpec(hidden=16), SCALES), (53_604, 53_412, "2.486", "54.4")),
+    "teacher": (((256,), 5, MlpHead(hidden=128), DIFFERENCE, ScaledTanh()), (1_197_319, 1_196_804, "45.198", "1206")),
+    "A_u64": (((64,), 5, MlpHead(hidden=32), DIFFERENCE), (84_292, 84_164, "3.257", "86.6")),
+    "A_u32": (((32,), 5, MlpHead(hidden=16), DIFFERENCE), (24_228, 24_164, "0.958", "25.4")),
+    "teacher P4": (((128, 64, 32), 7, MlpHead(hidden=64), SCALES), (677_572, 676_676, "31.281", "680.5")),
+    "P4 A_u64": (((64, 32), 7, MlpHead(hidden=32), SCALES), (181_956, 181_572, "8.409", "183.6")),
+    "P4 A_u32": (((32, 16), 7, MlpHead(hidden=16), SCALES), (53_604, 53_412, "2.486", "54.4")),
 }
 
 

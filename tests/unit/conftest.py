@@ -12,7 +12,7 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.models.backbones import HybridSpec
-from edp.models.heads import HeadSpec
+from edp.models.heads import MlpHead
 from edp.models.predictor import ModelSpec
 from edp.signals import Channel, Kind
 from edp.training.fit import TrainingSpec
@@ -21,9 +21,7 @@ SPEEDS = ("boom", "arm", "bucket")
 TASK = Task(
     FeatureSet("tiny", (*SPEEDS, "lever"), (Derived("dlever", "lever"),)), SPEEDS, (1, 3), TargetMode.DELTA, 100.0
 )
-MODEL = ModelSpec(
-    backbone=HybridSpec(channels=(8,), kernel=3, units=8, dropout=0.1), head=HeadSpec(hidden=8), window=10
-)
+MODEL = ModelSpec(backbone=HybridSpec(channels=(8,), kernel=3, units=8, dropout=0.1), head=MlpHead(hidden=8), window=10)
 TRAINING = TrainingSpec(
     chunks=ChunkSpec(length=32, batch=4, burn_in=20), epochs=5, updates=30, seed=3, threads=1, device="cpu"
 )

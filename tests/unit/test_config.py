@@ -39,6 +39,7 @@ def test_every_registered_part_survives_a_round_trip(tmp_path):
     places = {
         "backbone": ("model", "backbone"),
         "activation": ("model", "activation"),
+        "head": ("model", "head"),
         "loss": ("training", "loss"),
         "optimizer": ("training", "optimizer"),
         "schedule": ("training", "schedule"),

@@ -11,7 +11,7 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import DataError
 from edp.models.backbones import TcnSpec
-from edp.models.heads import HeadSpec
+from edp.models.heads import MlpHead
 from edp.models.predictor import ModelSpec, Predictor, build_model
 from edp.signals import Kind
 from edp.training.ridge_start import start_bypass
@@ -55,7 +55,7 @@ def start(task: Task, **options: object) -> tuple[Predictor, list[Series], list[
     kinds = (Kind.VELOCITY, Kind.PRESSURE, Kind.GENERIC, Kind.POSITION, Kind.GENERIC, Kind.GENERIC)
     spec = ModelSpec(
         backbone=TcnSpec(channels=(4,)),
-        head=HeadSpec(hidden=4),
+        head=MlpHead(hidden=4),
         window=3,
         blocks=(LinearBypass(taps=TAPS, **options),),  # type: ignore[arg-type]
     )

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, Slot
 from edp.errors import ConfigError, closest
-from edp.streaming import Cost, State, Streaming, parameters_of
+from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
 OPEN_BIAS = 4.0  # sigmoid(4) = 0.98: transparent at the start of training (thesis 3.2.2.2)
 
@@ -41,6 +41,8 @@ class CylinderGate:
 
 
 class _DiagonalGate(Streaming):
+    operations = frozenset({Operation.SIGMOID})
+
     def __init__(self, width: int, outputs: int) -> None:
         super().__init__()
         self.scale = nn.Parameter(torch.zeros(outputs, width))
@@ -61,6 +63,8 @@ class _DiagonalGate(Streaming):
 
 
 class _LinearGate(Streaming):
+    operations = frozenset({Operation.LINEAR, Operation.SIGMOID})
+
     def __init__(self, width: int, outputs: int) -> None:
         super().__init__()
         self.width, self.outputs = width, outputs

@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from edp.blocks.base import BLOCKS, Slot
+from edp.blocks.base import BLOCKS, OutputSpace, Slot
 from edp.errors import ConfigError, closest
-from edp.streaming import Cost, State, Streaming, parameters_of
+from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
 STARTS = ("ridge", "crossed", "zero")
 
@@ -46,13 +46,15 @@ class LinearBypass:
         if self.start == "zero" and not self.trained:
             raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
 
-    def build(self, features: int, horizons: int, outputs: int) -> Streaming:
+    def build(self, space: OutputSpace) -> Streaming:
         """The by-pass, at zero; training puts the ridge solution in."""
-        return Bypass(features, horizons, outputs, self)
+        return Bypass(space.features, space.horizons, space.outputs, self)
 
 
 class Bypass(Streaming):
     """Causal linear filter; ``weight`` has shape ``(horizon * output, feature, tap)``, the last tap is the present."""
+
+    operations = frozenset({Operation.CONV1D})
 
     def __init__(self, features: int, horizons: int, outputs: int, spec: LinearBypass) -> None:
         super().__init__()

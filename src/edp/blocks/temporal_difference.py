@@ -24,7 +24,7 @@ class TemporalDifference:
         """Features added for recurrent states of `width`."""
         return width
 
-    def build(self, width: int) -> Streaming:
+    def build(self, width: int, window: int) -> Streaming:
         """The differencing module."""
         return _Difference(width)
 

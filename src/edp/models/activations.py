@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from edp.errors import ConfigError
 from edp.registry import Registry
+from edp.streaming import Operation
 
 
 class ActivationSpec(Protocol):
@@ -48,11 +49,15 @@ class Tanh:
 
     def build(self, outputs: int) -> nn.Module:
         """The hyperbolic tangent."""
-        return nn.Tanh()
+        return _Tanh()
 
     def bound(self) -> float | None:
         """One standard deviation of the target."""
         return 1.0
+
+
+class _Tanh(nn.Tanh):
+    operations = frozenset({Operation.TANH})
 
 
 @ACTIVATIONS.register("stanh")
@@ -92,6 +97,8 @@ class ScaledTanh:
 
 
 class _ScaledTanh(nn.Module):
+    operations = frozenset({Operation.SIGMOID, Operation.TANH})
+
     def __init__(self, outputs: int, spec: ScaledTanh) -> None:
         super().__init__()
         self.spec = spec

@@ -14,7 +14,7 @@ from edp.errors import ConfigError
 from edp.models.convolution import ConvolutionStack, receptive_field
 from edp.models.recurrent import AttentionPooling, Lstm
 from edp.registry import Registry
-from edp.streaming import Cost, State, Streaming
+from edp.streaming import Chain, Cost, State, Streaming
 
 Blocks = Sequence[object]
 
@@ -81,8 +81,8 @@ class TcnSpec:
         _check(self.dropout, kernel=self.kernel, levels=len(self.channels), channels=min(self.channels, default=0))
 
     def slots(self) -> tuple[Slot, ...]:
-        """Parallel stacks."""
-        return (Slot.BRANCHES,)
+        """Parallel stacks, and what works on their channels."""
+        return (Slot.BRANCHES, Slot.CHANNELS)
 
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """The convolution stack(s); refused where the receptive field is shorter than the window."""
@@ -94,7 +94,7 @@ class TcnSpec:
                 f"tcn: {len(self.channels)} level(s) of kernel {self.kernel} see {reach} samples, the window is "
                 f"{window}; R >= W must hold (thesis 3.2.3.2): {change}, a larger kernel or a smaller window"
             )
-        return _convolutions(features, self.channels, self.kernel, self.dropout, blocks)
+        return _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
 
 
 @BACKBONES.register("hybrid")
@@ -124,12 +124,12 @@ class HybridSpec:
         )
 
     def slots(self) -> tuple[Slot, ...]:
-        """Parallel stacks in front, features derived from the recurrent states behind."""
-        return (Slot.BRANCHES, Slot.FEATURES)
+        """Parallel stacks, what works on their channels, and features derived from the recurrent states."""
+        return (Slot.BRANCHES, Slot.CHANNELS, Slot.FEATURES)
 
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """Convolutions and the recurrent backbone on their channels."""
-        encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, blocks)
+        encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
         net = RecurrentBackbone(encoder, width, self.units, 1, self.dropout, window, blocks)
         return net, net.width
 
@@ -153,7 +153,7 @@ class RecurrentBackbone(Streaming):
         self.dropout = nn.Dropout(dropout)
         self.pooling = AttentionPooling(units, window)
         extras = in_slot(blocks, Slot.FEATURES)
-        self.extras = nn.ModuleList(spec.build(units) for spec in extras)  # type: ignore[attr-defined]
+        self.extras = nn.ModuleList(spec.build(units, window) for spec in extras)  # type: ignore[attr-defined]
         self.width = 2 * units + sum(spec.extra(units) for spec in extras)  # type: ignore[attr-defined]
 
     def _tail(self) -> list[Streaming]:
@@ -184,17 +184,19 @@ def in_slot(blocks: Blocks, slot: Slot) -> list[object]:
 
 
 def _convolutions(
-    features: int, channels: tuple[int, ...], kernel: int, dropout: float, blocks: Blocks
+    features: int, channels: tuple[int, ...], kernel: int, dropout: float, window: int, blocks: Blocks
 ) -> tuple[Streaming, int]:
     def make_branch(first_dilation: int) -> Streaming:
         return ConvolutionStack(features, channels, kernel, first_dilation, dropout)
 
+    net, width = make_branch(1), channels[-1]
     branches = in_slot(blocks, Slot.BRANCHES)
-    if not branches:
-        return make_branch(1), channels[-1]
-    build: BranchMaker = make_branch
-    net = branches[0].build(build)  # type: ignore[attr-defined]
-    return net, channels[-1] * len(net.branches)
+    if branches:
+        build: BranchMaker = make_branch
+        net = branches[0].build(build)  # type: ignore[attr-defined]
+        width *= len(net.branches)
+    behind = [spec.build(width, window) for spec in in_slot(blocks, Slot.CHANNELS)]  # type: ignore[attr-defined]
+    return (Chain([net, *behind]) if behind else net), width
 
 
 def _check(dropout: float, **at_least_one: int) -> None:

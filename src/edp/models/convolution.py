@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from edp.streaming import Cost, State, Streaming
+from edp.streaming import Cost, Operation, State, Streaming
 
 
 class CausalConv(Streaming):
@@ -17,6 +17,8 @@ class CausalConv(Streaming):
     Maps ``(batch, time, channels_in)`` to ``(batch, time, channels_out)``; the state is the last
     ``(kernel - 1) * dilation`` inputs, zero at reset, which equals zero padding on the left.
     """
+
+    operations = frozenset({Operation.CONV1D})
 
     def __init__(self, channels_in: int, channels_out: int, kernel: int, dilation: int) -> None:
         super().__init__()
@@ -68,6 +70,7 @@ class TemporalBlock(Streaming):
         self.second = CausalConv(channels_out, channels_out, kernel, dilation)
         self.dropout = nn.Dropout(dropout)
         self.shortcut = nn.Linear(channels_in, channels_out) if channels_in != channels_out else None
+        self.operations = frozenset({Operation.RELU, *([Operation.LINEAR] if self.shortcut else [])})
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         return self.first.initial_state(batch, like), self.second.initial_state(batch, like)

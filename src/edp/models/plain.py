@@ -13,7 +13,7 @@ from edp.data.task import TargetMode, Task
 from edp.errors import BundleError, ConfigError
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
-from edp.models.heads import HeadSpec
+from edp.models.heads import HEADS
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
 from edp.signals import Kind
@@ -61,7 +61,7 @@ def model_to_plain(spec: ModelSpec) -> Plain:
     """A network spec as JSON values."""
     return {
         "backbone": tagged(spec.backbone, BACKBONES),
-        "head": options(spec.head),
+        "head": tagged(spec.head, HEADS),
         "activation": tagged(spec.activation, ACTIVATIONS),
         "blocks": [tagged(block, BLOCKS) for block in spec.blocks],
         "window": spec.window,
@@ -72,7 +72,7 @@ def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
     """A network spec from JSON values."""
     return ModelSpec(
         backbone=untagged(plain["backbone"], BACKBONES),
-        head=HeadSpec(**plain["head"]),
+        head=untagged({"kind": "mlp", **plain["head"]}, HEADS),
         activation=untagged(plain["activation"], ACTIVATIONS),
         blocks=tuple(untagged(block, BLOCKS) for block in plain["blocks"]),
         window=plain["window"],

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from edp.blocks.base import BLOCKS, Slot
+from edp.blocks.base import BLOCKS, OUTPUT_SLOTS, SHARED_SLOTS, OutputSpace, Particular, Slot
 from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import ConfigError
 from edp.models.activations import ActivationSpec, Identity
 from edp.models.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.models.frontend import FrontEnd, TargetCode
-from edp.models.heads import HeadSpec
+from edp.models.heads import HeadSpec, MlpHead
 from edp.streaming import Cost, State, Streaming, parameters_of
 
 
@@ -24,14 +24,14 @@ class ModelSpec:
 
     Attributes:
         backbone: options of a registered backbone.
-        head: options of the per-output heads.
+        head: options of registered per-output heads.
         activation: options of a registered output activation.
         blocks: options of registered blocks; absent means not built.
         window: W, samples of trailing context of pooling, and the length of the window regime.
     """
 
     backbone: BackboneSpec = field(default_factory=HybridSpec)
-    head: HeadSpec = field(default_factory=HeadSpec)
+    head: HeadSpec = field(default_factory=MlpHead)
     activation: ActivationSpec = field(default_factory=Identity)
     blocks: tuple[object, ...] = ()
     window: int = 50
@@ -39,7 +39,7 @@ class ModelSpec:
     def __post_init__(self) -> None:
         if self.window < 1:
             raise ConfigError(f"model: window = {self.window}; at least 1 must hold")
-        offered = {*self.backbone.slots(), Slot.GATE, Slot.BYPASS}
+        offered = {*self.backbone.slots(), *OUTPUT_SLOTS}
         for block in self.blocks:
             slot = getattr(block, "slot", None)
             if slot not in offered:
@@ -47,10 +47,23 @@ class ModelSpec:
                     f"block '{BLOCKS.name_of(block)}' needs the slot '{slot}', which this backbone does not offer "
                     f"(it has {', '.join(sorted(offered))}); remove the block or choose another backbone"
                 )
-        for single in (Slot.BRANCHES, Slot.GATE, Slot.BYPASS):
-            names = [BLOCKS.name_of(block) for block in in_slot(self.blocks, single)]
-            if len(names) > 1:
-                raise ConfigError(f"blocks {', '.join(names)} share the slot '{single}'; keep one of them")
+        for taken in Slot:
+            names = [BLOCKS.name_of(block) for block in in_slot(self.blocks, taken)]
+            if len(names) > 1 and (taken not in SHARED_SLOTS or len(set(names)) < len(names)):
+                raise ConfigError(f"blocks {', '.join(names)} share the slot '{taken}'; keep one of them")
+
+
+def check_combination(task: Task, spec: ModelSpec) -> None:
+    """Refuse parts that contradict the task or one another.
+
+    Raises:
+        ConfigError: the reason that each of them gives.
+    """
+    parts = (spec.backbone, spec.head, spec.activation, *spec.blocks)
+    reasons = [part.conflicts(spec, task) for part in parts if isinstance(part, Particular)]
+    given = [reason for reason in reasons if reason]
+    if given:
+        raise ConfigError("; ".join(given))
 
 
 class Predictor(Streaming):
@@ -62,19 +75,27 @@ class Predictor(Streaming):
 
     def __init__(self, task: Task, spec: ModelSpec, scaler: Scaler) -> None:
         super().__init__()
+        check_combination(task, spec)
         self.task, self.spec = task, spec
         features, outputs, horizons = len(task.features.features), len(task.targets), len(task.horizons)
         self.front = FrontEnd(task, scaler)
         self.code = TargetCode(task, scaler)
         self.backbone, width = spec.backbone.build(features, spec.window, spec.blocks)
-        gates = in_slot(spec.blocks, Slot.GATE)
-        self.gate: Streaming | None = gates[0].build(width, outputs) if gates else None  # type: ignore[attr-defined]
-        self.heads = spec.head.build(width, outputs, horizons)
+        self.gate = self._block(Slot.GATE, width, outputs)
+        self.heads = spec.head.build(width, outputs, horizons, self._block(Slot.MIX, spec.head.hidden, outputs))
         self.activation = spec.activation.build(outputs)
-        bypasses = in_slot(spec.blocks, Slot.BYPASS)
-        self.bypass: Streaming | None = (
-            bypasses[0].build(features, horizons, outputs) if bypasses else None  # type: ignore[attr-defined]
-        )
+        self.bypass = self._block(Slot.BYPASS, OutputSpace(features, horizons, outputs, task.present, *self._present()))
+
+    def _block(self, slot: Slot, *sizes: object) -> Streaming | None:
+        """The block in a slot that takes one, built; None where there is none."""
+        found = in_slot(self.spec.blocks, slot)
+        return found[0].build(*sizes) if found else None  # type: ignore[attr-defined]
+
+    def _present(self) -> tuple[Tensor, Tensor]:
+        """Gain and shift, ``(horizon, target)``, from scaled features to present values in target space."""
+        columns = [column or 0 for column in self.task.present]
+        gain = self.front.width[columns] / self.code.width
+        return gain, (self.front.offset[columns] - self.code.offset) / self.code.width
 
     def _parts(self) -> dict[str, Streaming]:
         parts = {"backbone": self.backbone, "gate": self.gate, "heads": self.heads, "bypass": self.bypass}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from edp.streaming import Cost, State, Streaming, parameters_of
+from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
 # A score that no softmax notices; finite, because inf - inf is NaN.
 UNSEEN = -1e30
@@ -19,6 +19,8 @@ class Lstm(Streaming):
     Maps ``(batch, time, width_in)`` to hidden states ``(batch, time, units)``; state ``(h, c)``, each
     ``(batch, layer, units)``, zero at reset.
     """
+
+    operations = frozenset({Operation.LSTM})
 
     def __init__(self, width_in: int, units: int, layers: int, dropout: float) -> None:
         super().__init__()
@@ -62,6 +64,8 @@ class AttentionPooling(Streaming):
     runs over the trailing window; before `window` ticks have passed, over those seen. At the last tick of a window
     from reset this is the thesis's sum over the whole window. State: ring of states and of scores.
     """
+
+    operations = frozenset({Operation.LINEAR, Operation.MATMUL, Operation.SOFTMAX})
 
     def __init__(self, units: int, window: int) -> None:
         super().__init__()

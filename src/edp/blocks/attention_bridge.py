@@ -1,0 +1,123 @@
+"""Attention bridge: a transformer layer between the convolutions and the LSTM (eq. 3.10, 3.11)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor, nn
+
+from edp.blocks.base import BLOCKS, Slot
+from edp.errors import ConfigError
+from edp.streaming import Cost, Operation, State, Streaming, parameters_of
+
+# A score that no softmax notices; finite, because inf - inf is NaN.
+UNSEEN = -1e30
+# Query rows per block of the banded softmax: memory stays linear in the sequence length.
+BLOCK = 128
+
+
+@BLOCKS.register("attention_bridge")
+@dataclass(frozen=True, kw_only=True)
+class AttentionBridge:
+    """Self-attention and a feed-forward network on the channels, both behind a layer norm and beside a residual path.
+
+    ``R' = R + MHA(LN(R))`` (eq. 3.10) and ``R'' = R' + FFN(LN(R'))`` (eq. 3.11); the FFN has ``2 C`` hidden units and
+    GELU. Each tick attends to itself and the ``window - 1`` ticks before it, never to later ones. The thesis lets every
+    tick of a window attend to the whole window, later ticks included: there the last tick is the same number, the
+    earlier ones, which the LSTM has read by then, are not.
+
+    Attributes:
+        heads: attention heads; they must divide the channels.
+
+    Raises:
+        ConfigError: fewer than one head.
+    """
+
+    slot: ClassVar[Slot] = Slot.CHANNELS
+    space: ClassVar[dict[str, Any]] = {"heads": (2, 4)}
+    heads: int = 4
+
+    def __post_init__(self) -> None:
+        if self.heads < 1:
+            raise ConfigError(f"attention_bridge: heads = {self.heads}; at least 1 must hold")
+
+    def build(self, width: int, window: int) -> Streaming:
+        """The bridge on `width` channels."""
+        if width % self.heads:
+            fitting = [heads for heads in range(1, min(width, 16) + 1) if width % heads == 0]
+            raise ConfigError(
+                f"attention_bridge: heads = {self.heads} do not divide the {width} channels of the convolutions; "
+                f"heads in {fitting} do, or change the last entry of the backbone's channels"
+            )
+        return _Bridge(width, window, self.heads)
+
+
+class _Bridge(Streaming):
+    """State: ring of keys and of values of the last ``window - 1`` ticks, and a score offset that hides unseen ones."""
+
+    operations = frozenset(
+        {Operation.LAYER_NORM, Operation.LINEAR, Operation.MATMUL, Operation.SOFTMAX, Operation.GELU}
+    )
+
+    def __init__(self, width: int, window: int, heads: int) -> None:
+        super().__init__()
+        self.width, self.window, self.heads = width, window, heads
+        self.norm_attention, self.norm_feed = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.project, self.gather = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.widen, self.narrow = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+        nn.init.xavier_uniform_(self.project.weight)
+        for bias in (self.project.bias, self.gather.bias):
+            nn.init.zeros_(bias)
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        past = self.window - 1
+        keys = like.new_zeros(batch, past, self.width)
+        return keys, keys.clone(), like.new_full((batch, past), UNSEEN)
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        ticks = x.shape[1]
+        query, key, value = self.project(self.norm_attention(x)).chunk(3, dim=-1)
+        keys, values = torch.cat([state[0], key], dim=1), torch.cat([state[1], value], dim=1)
+        hidden = torch.cat([state[2], x.new_zeros(len(x), ticks)], dim=1)
+        found = []
+        for start in range(0, ticks, BLOCK):
+            stop = min(start + BLOCK, ticks)
+            seen = slice(start, stop + self.window - 1)
+            found.append(self._attend(query[:, start:stop], keys[:, seen], values[:, seen], hidden[:, seen]))
+        y = x + self.gather(torch.cat(found, dim=1))
+        y = y + self.narrow(functional.gelu(self.widen(self.norm_feed(y))))
+        return y, (keys[:, ticks:], values[:, ticks:], hidden[:, ticks:])
+
+    def _attend(self, query: Tensor, keys: Tensor, values: Tensor, hidden: Tensor) -> Tensor:
+        """Each query row attends to its own `window` columns: row i to columns i to ``i + window - 1``."""
+        q, k, v = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in (query, keys, values))
+        lag = torch.arange(k.shape[2], device=q.device) - torch.arange(q.shape[2], device=q.device)[:, None]
+        band = (lag >= 0) & (lag < self.window)
+        scores = q @ k.transpose(2, 3) / math.sqrt(q.shape[-1]) + hidden[:, None, None]
+        weights = scores.masked_fill(~band, 2 * UNSEEN).softmax(dim=-1)
+        return (weights @ v).transpose(1, 2).flatten(2)
+
+    def costs(self) -> list[Cost]:
+        """Scores and weighted values cost ``2 W C`` a tick; a window of W ticks costs the thesis's ``2 W^2 C``."""
+        wide, attention = self.width, nn.ModuleList([self.norm_attention, self.project, self.gather])
+        feed = nn.ModuleList([self.norm_feed, self.widen, self.narrow])
+        return [
+            Cost(
+                f"attention bridge, {self.heads} heads over {self.window}",
+                parameters_of(attention),
+                per_column=4 * wide * wide + 2 * self.window * wide,
+                width_in=wide,
+                width_out=3 * wide,
+            ),
+            Cost(
+                "bridge feed-forward",
+                parameters_of(feed),
+                per_column=4 * wide * wide,
+                width_in=wide,
+                width_out=2 * wide,
+            ),
+        ]
