@@ -24,6 +24,7 @@ from edp.losses import LOSSES
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.heads import HEADS
+from edp.models.outputs import OUTPUTS
 from edp.models.plain import options
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
@@ -36,6 +37,7 @@ TAGGED: Mapping[str, Registry[type]] = {
     "backbone": BACKBONES,
     "head": HEADS,
     "activation": ACTIVATIONS,
+    "output": OUTPUTS,
     "blocks": BLOCKS,
     "loss": LOSSES,
     "optimizer": OPTIMIZERS,
@@ -314,7 +316,7 @@ def _build(cls: type, table: Any, path: str, problems: list[str]) -> Any:
 
 def _value(name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
     if name in TAGGED:
-        if name == "blocks":
+        if typing.get_origin(hint) is tuple:
             items = value if isinstance(value, list) else [value]
             return tuple(_tagged(name, item, f"{path}[{i}]", problems) for i, item in enumerate(items))
         return _tagged(name, value, path, problems)

@@ -11,17 +11,18 @@ from edp.blocks.base import OUTPUT_SLOTS, BlockSpec, Slot
 from edp.data.features import DERIVATIONS
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, EdpError
-from edp.losses import LOSSES
+from edp.losses import LOSSES, TERMS
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, LstmSpec, TcnSpec
 from edp.models.heads import HEADS
+from edp.models.outputs import OUTPUTS
 from edp.models.plain import tagged, untagged
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import SCHEDULES
 
-SPECS = [BACKBONES, BLOCKS, HEADS, ACTIVATIONS, LOSSES, OPTIMIZERS, SCHEDULES, SPLITS]
+SPECS = [BACKBONES, BLOCKS, HEADS, ACTIVATIONS, OUTPUTS, LOSSES, TERMS, OPTIMIZERS, SCHEDULES, SPLITS]
 ENTRIES = [pytest.param(registry, name, id=f"{registry.what}-{name}") for registry in SPECS for name in registry]
 
 

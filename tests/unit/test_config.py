@@ -40,6 +40,7 @@ def test_every_registered_part_survives_a_round_trip(tmp_path):
         "backbone": ("model", "backbone"),
         "activation": ("model", "activation"),
         "head": ("model", "head"),
+        "output": ("model", "output"),
         "loss": ("training", "loss"),
         "optimizer": ("training", "optimizer"),
         "schedule": ("training", "schedule"),

@@ -14,6 +14,7 @@ from edp.errors import BundleError, ConfigError
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.heads import HEADS
+from edp.models.outputs import OUTPUTS
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
 from edp.signals import Kind
@@ -63,6 +64,7 @@ def model_to_plain(spec: ModelSpec) -> Plain:
         "backbone": tagged(spec.backbone, BACKBONES),
         "head": tagged(spec.head, HEADS),
         "activation": tagged(spec.activation, ACTIVATIONS),
+        "output": tagged(spec.output, OUTPUTS),
         "blocks": [tagged(block, BLOCKS) for block in spec.blocks],
         "window": spec.window,
     }
@@ -74,6 +76,7 @@ def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
         backbone=untagged(plain["backbone"], BACKBONES),
         head=untagged({"kind": "mlp", **plain["head"]}, HEADS),
         activation=untagged(plain["activation"], ACTIVATIONS),
+        output=untagged(plain.get("output", {"kind": "point"}), OUTPUTS),
         blocks=tuple(untagged(block, BLOCKS) for block in plain["blocks"]),
         window=plain["window"],
     )

@@ -11,10 +11,12 @@ from edp.blocks.base import BLOCKS, OUTPUT_SLOTS, SHARED_SLOTS, OutputSpace, Par
 from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import ConfigError
+from edp.losses import Answer
 from edp.models.activations import ActivationSpec, Identity
 from edp.models.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.models.frontend import FrontEnd, TargetCode
 from edp.models.heads import HeadSpec, MlpHead
+from edp.models.outputs import OutputSpec, Point
 from edp.streaming import Cost, State, Streaming, parameters_of
 
 
@@ -26,6 +28,7 @@ class ModelSpec:
         backbone: options of a registered backbone.
         head: options of registered per-output heads.
         activation: options of a registered output activation.
+        output: options of a registered output: what is said of each target besides a prediction.
         blocks: options of registered blocks; absent means not built.
         window: W, samples of trailing context of pooling, and the length of the window regime.
     """
@@ -33,6 +36,7 @@ class ModelSpec:
     backbone: BackboneSpec = field(default_factory=HybridSpec)
     head: HeadSpec = field(default_factory=MlpHead)
     activation: ActivationSpec = field(default_factory=Identity)
+    output: OutputSpec = field(default_factory=Point)
     blocks: tuple[object, ...] = ()
     window: int = 50
 
@@ -70,7 +74,8 @@ class Predictor(Streaming):
     """A look-ahead predictor (eq. 3.6) that reads and writes SI units.
 
     ``forward`` maps inputs ``(batch, time, input)`` to standardised predictions ``(batch, time, horizon, target)``;
-    ``predict`` gives them in SI units. Both obey the streaming contract.
+    ``predict`` gives them in SI units. Both obey the streaming contract. Where the output says more than a point,
+    ``intervals`` gives lower and upper bounds too.
     """
 
     def __init__(self, task: Task, spec: ModelSpec, scaler: Scaler) -> None:
@@ -82,7 +87,9 @@ class Predictor(Streaming):
         self.code = TargetCode(task, scaler)
         self.backbone, width = spec.backbone.build(features, spec.window, spec.blocks)
         self.gate = self._block(Slot.GATE, width, outputs)
-        self.heads = spec.head.build(width, outputs, horizons, self._block(Slot.MIX, spec.head.hidden, outputs))
+        mix = self._block(Slot.MIX, spec.head.hidden, outputs)
+        self.heads = spec.head.build(width, outputs, horizons * spec.output.values, mix)
+        self.output = spec.output.build(horizons, outputs)
         self.activation = spec.activation.build(outputs)
         self.bypass = self._block(Slot.BYPASS, OutputSpace(features, horizons, outputs, task.present, *self._present()))
 
@@ -108,11 +115,11 @@ class Predictor(Streaming):
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Standardised predictions ``(batch, time, horizon, target)`` and the next state."""
-        code, _, new = self.run(x, state)
-        return code, new
+        answer, _, new = self.run(x, state)
+        return answer.center, new
 
-    def run(self, x: Tensor, state: State) -> tuple[Tensor, Tensor, State]:
-        """Standardised predictions, physical features ``(batch, time, feature)`` and the next state."""
+    def run(self, x: Tensor, state: State) -> tuple[Answer, Tensor, State]:
+        """What the network says, standardised; physical features ``(batch, time, feature)``; and the next state."""
         new: dict[str, State] = {}
         features, new["front"] = self.front(x, state["front"])
         scaled = self.front.scale(features)
@@ -120,16 +127,30 @@ class Predictor(Streaming):
         if self.gate is not None:
             y, new["gate"] = self.gate(y, state["gate"])
         y, new["heads"] = self.heads(y, state["heads"])
-        y = self.activation(y)
+        values = y.unflatten(-2, (len(self.task.horizons), self.spec.output.values))
+        # Activation and by-pass act on the prediction; the spread is counted from where they leave it.
+        center = self.activation(values[..., 0, :])
         if self.bypass is not None:
             direct, new["bypass"] = self.bypass(scaled, state["bypass"])
-            y = y + direct
-        return y, features, new
+            center = center + direct
+        return self.output.answer(center, values[..., 1:, :]), features, new
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
-        code, features, new = self.run(x, state)
-        return self.code.decode(code, features), new
+        answer, features, new = self.run(x, state)
+        return self.code.decode(answer.center, features), new
+
+    def intervals(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper, and the next state.
+
+        The coverages are those of ``spec.output.coverages``, in their order.
+        """
+        answer, features, new = self.run(x, state)
+        bounds = [
+            torch.stack([self.code.decode(bound, features) for bound in self.output.interval(answer, which)], dim=2)
+            for which in range(len(self.output.coverages))
+        ]
+        return torch.stack(bounds, dim=2), new
 
     def costs(self) -> list[Cost]:
         """Analytic costs of every part."""

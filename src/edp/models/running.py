@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edp.data.series import Series
+from edp.losses import Answer
 from edp.models.predictor import Predictor
+from edp.streaming import State
 
+Run = Callable[[Tensor, State], tuple[Tensor, State]]
 PIECE = 512  # ticks per call: long enough for speed, short enough for memory
 
 
@@ -21,7 +24,34 @@ def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: in
     Returns:
         For each series float32 ``(time, horizon, target)`` in SI units: row t is the prediction made at t.
     """
-    device = next(predictor.parameters()).device
+    return _stream(predictor, predictor.predict, series, batch)
+
+
+def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:
+    """Interval bounds for every tick of every series, each from reset.
+
+    Returns:
+        For each series float32 ``(time, coverage, 2, horizon, target)`` in SI units, lower then upper, in the order of
+        ``predictor.spec.output.coverages``.
+    """
+    return _stream(predictor, predictor.intervals, series, batch)
+
+
+def stream_answers(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[Answer]:
+    """All that the network says at every tick, standardised, with a batch of one; double precision, on the CPU."""
+    form: list[Answer] = []
+
+    def run(x: Tensor, state: State) -> tuple[Tensor, State]:
+        answer, _, new = predictor.run(x, state)
+        form[:] = [answer]
+        return torch.cat([answer.center.unsqueeze(-2), answer.spread], dim=-2), new
+
+    values = [torch.from_numpy(found).double().unsqueeze(0) for found in _stream(predictor, run, series, batch)]
+    levels, law = (form[0].levels, form[0].law) if form else ((), "")
+    return [Answer(every[..., 0, :], every[..., 1:, :], levels, law) for every in values]
+
+
+def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int) -> list[NDArray[np.float32]]:
     order = sorted(range(len(series)), key=lambda i: series[i].samples)
     results: dict[int, NDArray[np.float32]] = {}
     was_training = predictor.training
@@ -30,14 +60,14 @@ def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: in
         with torch.inference_mode():
             for at in range(0, len(order), batch):
                 group = order[at : at + batch]
-                for index, values in zip(group, _run_group(predictor, [series[i] for i in group], device), strict=True):
-                    results[index] = values
+                found = _run_group(predictor, run, [series[i] for i in group])
+                results.update(zip(group, found, strict=True))
     finally:
         predictor.train(was_training)
     return [results[i] for i in range(len(series))]
 
 
-def _run_group(predictor: Predictor, group: list[Series], device: torch.device) -> list[NDArray[np.float32]]:
+def _run_group(predictor: Predictor, run: Run, group: list[Series]) -> list[NDArray[np.float32]]:
     longest = max(part.samples for part in group)
     like = next(predictor.parameters())
     state = predictor.initial_state(len(group), like)
@@ -47,7 +77,7 @@ def _run_group(predictor: Predictor, group: list[Series], device: torch.device) 
         rows = np.arange(start, stop)
         # A shorter stream repeats its last tick; those predictions are cut off below.
         x = np.stack([part.inputs[np.minimum(rows, part.samples - 1)] for part in group])
-        y, state = predictor.predict(torch.from_numpy(x).to(device=device, dtype=like.dtype), state)
+        y, state = run(torch.from_numpy(x).to(device=like.device, dtype=like.dtype), state)
         values = y.float().cpu().numpy()
         for i, part in enumerate(group):
             if start < part.samples:
@@ -79,9 +109,24 @@ class Stream:
 
     def step(self, inputs: Sequence[float] | NDArray[np.floating] | Tensor) -> NDArray[np.float32]:
         """Feed one tick ``(input,)`` in SI units; returns the prediction ``(horizon, target)`` in SI units."""
+        return self._feed(self.predictor.predict, inputs)
+
+    def step_interval(
+        self, inputs: Sequence[float] | NDArray[np.floating] | Tensor, coverage: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Feed one tick; returns lower and upper bounds ``(horizon, target)`` of an interval in SI units.
+
+        Raises:
+            ConfigError: the network has no interval of this coverage.
+        """
+        which = self.predictor.output.place(coverage)
+        lower, upper = self._feed(self.predictor.intervals, inputs)[which]
+        return lower, upper
+
+    def _feed(self, run: Run, inputs: Sequence[float] | NDArray[np.floating] | Tensor) -> NDArray[np.float32]:
         x = torch.as_tensor(inputs, dtype=self._like.dtype, device=self._like.device).reshape(1, 1, -1)
         with torch.inference_mode():
-            y, self._state = self.predictor.predict(x, self._state)
+            y, self._state = run(x, self._state)
         self.ticks += 1
         result: NDArray[np.float32] = y[0, 0].float().cpu().numpy()
         return result

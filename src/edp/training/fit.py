@@ -6,11 +6,12 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from edp.data.chunks import Batch, ChunkSampler, ChunkSpec
 from edp.data.prepared import Prepared
@@ -18,7 +19,7 @@ from edp.data.series import Series
 from edp.errors import ConfigError, DataError, EdpError
 from edp.losses import Huber, LossSpec, masked_loss, output_weights
 from edp.models.predictor import ModelSpec, Predictor, build_model, trainable
-from edp.models.running import stream_predictions
+from edp.models.running import stream_answers
 from edp.runs import RunFolder
 from edp.signals import KINDS
 from edp.streaming import State, detach_state, reset_where
@@ -243,10 +244,10 @@ class _Loop:
         factor = self.spec.schedule.factor(share, self.progress.schedule)
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * factor
-        code, features, state = self.net.run(x, state)
+        answer, features, state = self.net.run(x, state)
         target = self.net.code.encode(torch.from_numpy(batch.future).to(self.device), features)
         valid = torch.from_numpy(batch.valid).to(self.device)
-        loss = masked_loss(self.spec.loss, code, target, valid, self.weights)
+        loss = masked_loss(self.spec.loss, answer, target, valid, self.weights)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise TrainingError(
@@ -321,19 +322,33 @@ def validation_scores(
     net: Predictor, series: list[Series], spec: TrainingSpec, data: Prepared
 ) -> tuple[float, float, float]:
     """Mean absolute error in standard deviations, in report units, and the loss, streamed over `series`."""
-    scale = net.code.width.detach().cpu().double().numpy()
-    factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
+    scale = net.code.width.detach().cpu().double()
+    factors = torch.tensor([KINDS[kind].report_factor for kind in data.target_kinds], dtype=torch.float64)
     skip = spec.chunks.burn_in if spec.chunks.regime == "chunk" else net.spec.window - 1
-    absolute, count, loss = np.zeros_like(scale), 0, 0.0
-    for part, predicted in zip(series, stream_predictions(net, series), strict=True):
-        ticks = part.samples - data.task.reach
-        future = np.stack([part.targets[k : k + ticks] for k in data.task.horizons], axis=1)
-        error = (predicted[:ticks] - future)[skip:].astype(np.float64)
-        absolute += np.abs(error).sum(axis=0)
-        count += len(error)
-        loss += float(spec.loss.penalty(torch.from_numpy(error / scale)).mean(dim=(1, 2)).sum())
+    absolute, count, loss = torch.zeros_like(scale), 0, 0.0
+    for part, said in zip(series, stream_answers(net, series), strict=True):
+        target = standard_targets(net, part)[:, skip:]
+        ticks = slice(skip, skip + target.shape[1])
+        answer = replace(said, center=said.center[:, ticks], spread=said.spread[:, ticks])
+        absolute += (answer.center - target).abs().sum(dim=(0, 1)) * scale
+        count += target.shape[1]
+        loss += float(spec.loss.evaluate(answer, target).mean(dim=(-1, -2)).sum())
     mean = absolute / max(1, count)
     return float((mean / scale).mean()), float((mean * factors).mean()), loss / max(1, count)
+
+
+def standard_targets(net: Predictor, part: Series) -> Tensor:
+    """Targets of a whole series as the network is trained on them, ``(1, tick, horizon, output)``, double precision.
+
+    Ticks whose targets lie beyond the end are left out.
+    """
+    ticks = part.samples - net.task.reach
+    future = np.stack([part.targets[k : k + ticks] for k in net.task.horizons], axis=1)
+    like = next(net.parameters())
+    x = torch.from_numpy(part.inputs[:ticks]).unsqueeze(0).to(like)
+    with torch.inference_mode():
+        features, _ = net.front(x, net.front.initial_state(1, x))
+        return net.code.encode(torch.from_numpy(future).unsqueeze(0).to(like), features).cpu().double()
 
 
 def _device(name: str) -> torch.device:
