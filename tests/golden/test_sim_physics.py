@@ -175,8 +175,8 @@ def test_persistence_lies_above_the_thesis_models():
         speed = 1e3 * simulate(scenario).values[:, :3].astype(float)
         near.append(np.abs(speed[1:] - speed[:-1]).mean())
         far.append(np.abs(speed[10:] - speed[:-10]).mean())
-    assert 1.8 < np.mean(near) < 3.3
-    assert 14 < np.mean(far) < 26
+    assert 2.2 < np.mean(near) < 3.1
+    assert 17 < np.mean(far) < 23
 
 
 def test_millisecond_error_is_below_sensor_noise():

@@ -6,7 +6,9 @@ import os
 import numpy as np
 import pytest
 
+from edp.data.splits import ByRecording
 from edp.errors import ConfigError
+from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, TABLE_A1
 from edp.sim import (
     EXCITATIONS,
@@ -20,6 +22,7 @@ from edp.sim import (
     simulate_many,
 )
 from edp.sim.machine_files import parse_machine
+from edp.sim.plan import hand_out
 from edp.sim.sensors import filtered_derivative
 
 SHORT = 4.0
@@ -126,13 +129,34 @@ def test_plan_spreads_the_mix_and_the_seeds():
     assert len({s.seed for s in scenarios}) == 20
     assert scenarios[3].name == f"m22_003_{scenarios[3].excitation}"
     kinds = [s.excitation for s in scenarios]
-    assert kinds.count("isolated") == 8
-    assert kinds.count("combined") in (9, 10)
-    assert set(kinds) == set(plan.DEFAULT_MIX)
+    assert [kinds.count(name) for name in plan.DEFAULT_MIX] == [5, 5, 3, 2, 2, 2, 1]
     assert scenarios == plan_data_set("M22", 60.0, 20, seed=3)
     assert scenarios != plan_data_set("M22", 60.0, 20, seed=4)
     only = plan_data_set("M22", 1.0, 2, seed=0, mix={"isolated": 2.0})
     assert [s.excitation for s in only] == ["isolated", "isolated"]
+
+
+def test_families_are_handed_out_in_proportion_from_the_first_recording_on():
+    whole = hand_out(plan.DEFAULT_MIX, 100)
+    assert {name: whole.count(name) / 100 for name in plan.DEFAULT_MIX} == plan.DEFAULT_MIX
+    assert whole[:2] == ["combined", "isolated"]
+    assert set(whole[:7]) == set(plan.DEFAULT_MIX)
+    for count in range(7, 100):
+        assert whole[:count] == hand_out(plan.DEFAULT_MIX, count)
+        for name, share in plan.DEFAULT_MIX.items():
+            assert abs(whole[:count].count(name) - count * share) < 1
+    assert hand_out({"a": 0.0, "b": 1.0}, 2) == ["b", "b"]
+
+
+def test_a_held_out_fifth_has_every_family():
+    empty = np.zeros((100, 0), np.float32)
+    scenarios = plan_data_set("M22", 60.0, 60, seed=1)
+    logged = [Recording(s.name, (), empty, 100.0, meta={"excitation": s.excitation}) for s in scenarios]
+    for seed in range(10):
+        split = ByRecording(seed=seed).split(logged, 10)
+        assert len(split.test) == 12
+        for part in (split.train, split.validation, split.test):
+            assert {logged[s.recording].meta["excitation"] for s in part} == set(plan.DEFAULT_MIX)
 
 
 @pytest.mark.parametrize(

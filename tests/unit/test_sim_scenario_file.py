@@ -92,7 +92,7 @@ def test_every_key_arrives_and_options_go_first(tmp_path):
         ("[mix]\ndig = 0", "mix: the shares add up to nothing"),
         ("mix = 3", r"\[mix\]: is 3, expected a table"),
         ("[materials]\nsandy_lome = 1", "unknown material 'sandy_lome'; did you mean 'sandy_loam'"),
-        ("[materials]\nclay = 1", "no family of mix works the ground"),
+        ("[mix]\nisolated = 1\n[materials]\nclay = 1", "no family of mix works the ground"),
         ("[sensors]\ncan_los = 0.1", "sensors.can_los is unknown; did you mean 'can_loss'"),
         ("[sensors]\ncan_loss = 2.0", "can_loss = 2.0"),
         ("start_strokes = [0.9]", "start_strokes = .0.9. must be .low, high."),

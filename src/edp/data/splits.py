@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,6 +15,8 @@ from edp.recording import Recording
 from edp.registry import Registry
 
 PARTS = ("train", "validation", "test")
+FAMILY = "excitation"
+"""Where the meta of a simulated recording says how it was driven."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ SPLITS: Registry[type] = Registry("split")
 class ByRecording:
     """Whole recordings, drawn at random with a seed, or named.
 
+    Simulated recordings, whose meta has an ``excitation``, are drawn so that each part has its share of every family.
+
     Attributes:
         validation_share: share of the recordings that validate (when not named).
         test_share: share that tests.
@@ -75,10 +80,12 @@ class ByRecording:
             raise DataError("split: a recording is named both in validation and in test; keep it in one")
         test, validation = list(self.test), list(self.validation)
         free = [name for name in names if name not in {*test, *validation}]
+        families = {r.name: str(r.meta.get(FAMILY, "")) for r in recordings}
         order = np.random.default_rng(self.seed).permutation(len(free))
-        drawn = [free[i] for i in order]
+        drawn = _spread([free[i] for i in order], families)
         if not test:
             test, drawn = _take(drawn, self.test_share, len(names))
+            drawn = _spread(drawn, families)
         if not validation and len(drawn) >= 3:
             validation, drawn = _take(drawn, self.validation_share, len(names))
         whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
@@ -171,6 +178,18 @@ class ByBlocks:
         if self.validation_share <= 0:
             return "train"
         return "validation" if other % max(2, round(1 / self.validation_share)) == 0 else "train"
+
+
+def _spread(names: Sequence[str], families: Mapping[str, str]) -> list[str]:
+    """Names in the order given, but each family spread evenly over it, so that any cut has its share of all."""
+    size = Counter(families[name] for name in names)
+    seen: Counter[str] = Counter()
+    place = {}
+    for name in names:
+        family = families[name]
+        place[name] = (seen[family] + 0.5) / size[family]
+        seen[family] += 1
+    return sorted(names, key=lambda name: place[name])
 
 
 def _take(names: list[str], share: float, total: int) -> tuple[list[str], list[str]]:

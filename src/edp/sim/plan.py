@@ -22,9 +22,16 @@ from edp.sim.machine_files import load_machine
 from edp.sim.scenario import START_STROKES, Scenario, SimulationError
 from edp.sim.simulate import simulate
 
-DEFAULT_MIX: Mapping[str, float] = {"isolated": 0.40, "combined": 0.48, "reversals": 0.05, "end_stops": 0.07}
+DEFAULT_MIX: Mapping[str, float] = {
+    "combined": 0.24,
+    "isolated": 0.22,
+    "grading": 0.14,
+    "aprbs": 0.12,
+    "dig": 0.12,
+    "end_stops": 0.09,
+    "reversals": 0.07,
+}
 """Share of the recordings by excitation."""
-
 
 AIR = "air"
 """Free air in a mix of materials."""
@@ -86,14 +93,10 @@ class DataSetSpec:
                 raise ConfigError(f"materials are given, but no family of mix works the ground; add one of {working}")
 
     def scenarios(self) -> tuple[Scenario, ...]:
-        """Equally long scenarios, each with its own seed derived from `seed`."""
-        root = np.random.SeedSequence(self.seed)
-        order_seed, *seeds = root.spawn(self.recordings + 1)
-        rng = np.random.default_rng(order_seed)
-        names = _apportion(self.mix, self.recordings)
-        order = rng.permutation(self.recordings)
-        excitations = [names[place] for place in order]
-        soils = self._soils(excitations, rng)
+        """Equally long scenarios, each with its own seed derived from `seed`; only these seeds depend on it."""
+        seeds = np.random.SeedSequence(self.seed).spawn(self.recordings)
+        excitations = hand_out(self.mix, self.recordings)
+        soils = self._soils(excitations)
         label = load_machine(self.machine).name.lower()
         plan = tuple(
             Scenario(
@@ -113,15 +116,19 @@ class DataSetSpec:
         )
         return over_family(plan, self.family, self.seed) if self.family else plan
 
-    def _soils(self, excitations: Sequence[str], rng: np.random.Generator) -> list[str]:
-        """The material of each recording; empty for free air."""
+    def _soils(self, excitations: Sequence[str]) -> list[str]:
+        """The material of each recording; empty for free air. Each family gets all of them in turn."""
         soils = [""] * len(excitations)
-        places = [i for i, name in enumerate(excitations) if EXCITATIONS[name].works_ground]
-        if self.materials and places:
-            chosen = _apportion(self.materials, len(places))
-            for place, k in zip(places, rng.permutation(len(places)), strict=True):
-                soils[place] = "" if chosen[k] == AIR else chosen[k]
+        places = [i for i in _by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
+        if self.materials:
+            for place, chosen in zip(places, hand_out(self.materials, len(places)), strict=True):
+                soils[place] = "" if chosen == AIR else chosen
         return soils
+
+
+def _by_family(excitations: Sequence[str]) -> list[int]:
+    """Places of the recordings, those of one family after another."""
+    return sorted(range(len(excitations)), key=lambda i: excitations[i])
 
 
 def _check_shares(what: str, shares: Mapping[str, float]) -> None:
@@ -145,32 +152,34 @@ def plan_data_set(
 
 
 def over_family(scenarios: Sequence[Scenario], count: int, seed: int) -> tuple[Scenario, ...]:
-    """The same scenarios on `count` machines of other sizes in turn, see `machine_family`.
+    """The same scenarios on `count` machines of other sizes, which take turns in each excitation; see `machine_family`.
 
     Raises:
         ConfigError: the count is not positive.
     """
     if count < 1:
         raise ConfigError(f"family = {count} machines; at least one is needed")
-    return tuple(
-        replace(s, machine=f"family-{seed}-{i % count}", name=_named(s.name, f"family-{seed}-{i % count}"))
-        for i, s in enumerate(scenarios)
-    )
+    turns = {place: turn % count for turn, place in enumerate(_by_family([s.excitation for s in scenarios]))}
+    names = [f"family-{seed}-{turns[i]}" for i in range(len(scenarios))]
+    return tuple(replace(s, machine=n, name=_named(s.name, n)) for s, n in zip(scenarios, names, strict=True))
 
 
 def _named(name: str, machine: str) -> str:
     return "_".join([machine, *name.split("_", 1)[1:]])
 
 
-def _apportion(shares: Mapping[str, float], count: int) -> list[str]:
-    """`count` names in proportion to `shares`, by largest remainder."""
-    total = sum(shares.values())
-    exact = {name: count * share / total for name, share in shares.items()}
-    given = {name: int(value) for name, value in exact.items()}
-    by_remainder = sorted(exact, key=lambda name: exact[name] - given[name], reverse=True)
-    for name in by_remainder[: count - sum(given.values())]:
-        given[name] += 1
-    return [name for name, n in given.items() for _ in range(n)]
+def hand_out(shares: Mapping[str, float], count: int) -> list[str]:
+    """`count` names in proportion to `shares`, mixed so that the first ones of them are in proportion as well.
+
+    Each has its turn once, the largest share first, and then the one that is farthest behind, by Webster's method.
+    """
+    given = {name: 0 for name, share in sorted(shares.items(), key=lambda entry: (-entry[1], entry[0])) if share > 0}
+    names = []
+    for turn in range(count):
+        waiting = given if turn >= len(given) else [name for name, n in given.items() if n == 0]
+        names.append(max(waiting, key=lambda name: shares[name] / (2 * given[name] + 1)))
+        given[names[-1]] += 1
+    return names
 
 
 def simulate_many(

@@ -16,7 +16,7 @@ from edp.sim.view import View
 class Aprbs(Excitation):
     """Steps between nine levels on all levers, with chirps on one lever in between.
 
-    Levels are zero and four of each sign, just inside, just beyond and clear of the dead band, and near full lever.
+    Levels are zero and four of each sign, just inside, just beyond and clear of the dead band, and well open.
     A chirp rises from 0.05 to 5 Hz, 0.1-0.3 in amplitude, on a bias that keeps it beyond the dead band; its sign
     turns where the cylinder nears an end.
     """
@@ -25,7 +25,8 @@ class Aprbs(Excitation):
     HOLD_S = (0.15, 2.5)
     LEVELS = (0.92, 1.2, 1.9)
     """Beside zero and `TOP`, as multiples of the dead band."""
-    TOP = 0.85
+    TOP = (0.75, 0.65, 0.85)
+    """Highest level of boom, arm and bucket."""
     CHIRP_HZ = (0.05, 5.0)
     CHIRP_S = (12.0, 25.0)
     CHIRP_SHARE = 0.35
@@ -72,7 +73,7 @@ class Aprbs(Excitation):
             return 0.0
         sign = 1.0 if self._rng.random() < extend_probability(stroke, 2.0) else -1.0
         place = choice % 4
-        return sign * (self.TOP if place == 3 else self.LEVELS[place] * self._dead[axis, 0 if sign > 0 else 1])
+        return sign * (self.TOP[axis] if place == 3 else self.LEVELS[place] * self._dead[axis, 0 if sign > 0 else 1])
 
     def _begin_chirp(self, view: View) -> None:
         rng = self._rng

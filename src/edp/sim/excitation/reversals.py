@@ -15,6 +15,9 @@ class Reversals(Excitation):
 
     FLIP_S = (0.15, 0.6)
     PAUSE_S = (0.2, 1.0)
+    LEVELS = (0.3, 1.0)
+    STRENGTH = (0.8, 0.65, 1.0)
+    """Of boom, arm and bucket: the bucket is the one that is shaken."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
@@ -42,7 +45,7 @@ class Reversals(Excitation):
             towards = [1.0 if rng.random() < extend_probability(s, 3.0) else -1.0 for s in view.strokes]
             self._signs = active * np.array(towards)
             self._flips = int(rng.integers(4, 11))
-        self._levels = rng.uniform(0.3, 1.0, AXES) * self._signs
+        self._levels = rng.uniform(*self.LEVELS, AXES) * self.STRENGTH * self._signs
         self._signs, self._flips = -self._signs, self._flips - 1
         self._hold.start(*self.FLIP_S)
 
