@@ -13,7 +13,7 @@ from edp.data.splits import SPLITS
 from edp.errors import ConfigError, EdpError
 from edp.losses import LOSSES, TERMS
 from edp.models.activations import ACTIVATIONS
-from edp.models.backbones import BACKBONES, LstmSpec, TcnSpec
+from edp.models.backbones import BACKBONES, TcnSpec
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
 from edp.models.plain import tagged, untagged
@@ -93,13 +93,6 @@ def test_a_block_without_its_slot_is_refused(backbone, block):
     else:
         with pytest.raises(ConfigError, match=f"block '{block}' needs the slot '{BLOCKS[block].slot}'"):
             ModelSpec(backbone=spec, blocks=(BLOCKS[block](),))
-
-
-@pytest.mark.parametrize("slot", OUTPUT_SLOTS)
-def test_two_blocks_in_a_single_slot_are_refused(slot):
-    block = next(BLOCKS[name]() for name in BLOCKS if BLOCKS[name].slot is slot)
-    with pytest.raises(ConfigError, match=f"share the slot '{slot}'"):
-        ModelSpec(backbone=LstmSpec(), blocks=(block, block))
 
 
 @pytest.mark.parametrize(

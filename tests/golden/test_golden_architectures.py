@@ -87,10 +87,3 @@ def test_the_counter_agrees_with_the_operations_that_run(name):
     backbone = window["Predictor.backbone"] - window["Predictor.backbone.pooling"]
     heads = window["Predictor.heads"] // W
     assert backbone + heads == sum(W * row.per_column + row.per_prediction for row in rows)
-
-
-def test_the_counter_agrees_for_every_structure(structure, predictor_of):
-    predictor = predictor_of(structure)
-    x = torch.zeros(1, 1, predictor.front.inputs, dtype=torch.float64)
-    rows = predictor.costs()
-    assert counted(predictor, x)["Global"] == sum(row.per_column + row.per_prediction + row.pooling for row in rows)

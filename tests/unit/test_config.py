@@ -19,6 +19,9 @@ from edp.config import (
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.repair import Repair
+from edp.models.heads import GluHead, MlpHead
+from edp.models.plain import model_from_plain, model_to_plain
+from edp.models.predictor import ModelSpec
 from edp.signals import Kind
 
 
@@ -56,6 +59,17 @@ def test_every_registered_part_survives_a_round_trip(tmp_path):
             for key in place:
                 part = part[key]
             assert part["kind"] == kind
+
+
+def test_a_head_without_a_kind_is_the_usual_one():
+    old = load_experiment(overrides=["model.head={ hidden = 7, layers = 2 }"]).model.head
+    assert old == MlpHead(hidden=7, layers=2)
+    assert load_experiment(overrides=["model.head=glu"]).model.head == GluHead()
+    with pytest.raises(ConfigError, match=r"model.head.kind: unknown head 'glue'.*did you mean 'glu'"):
+        load_experiment(overrides=["model.head=glue"])
+    plain = model_to_plain(ModelSpec(head=old))
+    del plain["head"]["kind"]  # as bundles were written before heads had kinds
+    assert model_from_plain(plain).head == old
 
 
 def test_files_lie_over_the_preset_and_overrides_over_the_file(tmp_path):

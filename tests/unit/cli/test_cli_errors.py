@@ -52,6 +52,11 @@ def test_a_missing_target(train_on, logs):
     refused(train_on(logs, "--set", 'task.targets=["CylVel_1"]'), "CylVel_1", "CylVels_1")
 
 
+def test_blocks_that_contradict_the_task(train_on, logs):
+    ended = train_on(logs, "--set", 'model.blocks=["velocity_skip"]')
+    refused(ended, "velocity_skip", "mode = 'delta' does already", "task.mode = 'absolute'")
+
+
 def test_a_wrong_unit_in_the_map(train_on, tmp_path):
     (tmp_path / "a.csv").write_text(TABLE_HEAD + rows())
     (tmp_path / "map.toml").write_text('[channels.CylVels_1]\nunit = "bar"\n')

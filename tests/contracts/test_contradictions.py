@@ -1,0 +1,80 @@
+"""Parts that contradict the task or one another are refused with the reason; every part that can refuse is here."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.blocks import BLOCKS
+from edp.blocks.base import Particular
+from edp.data.features import FeatureSet
+from edp.data.scaling import Scaler
+from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError
+from edp.models.activations import ACTIVATIONS
+from edp.models.backbones import BACKBONES
+from edp.models.heads import HEADS
+from edp.models.predictor import ModelSpec, build_model, check_combination
+
+REGISTRIES = (BACKBONES, HEADS, ACTIVATIONS, BLOCKS)
+TASK = Task(FeatureSet("two", ("v_1", "v_2")), ("v_1", "v_2"), (1,), TargetMode.ABSOLUTE, 100.0)
+PLAIN = ModelSpec()
+
+
+def with_blocks(*names):
+    return replace(PLAIN, blocks=tuple(BLOCKS[name]() for name in names))
+
+
+# The part that refuses, the task, the network, and words of the reason.
+REFUSED = [
+    (
+        "velocity_skip",
+        replace(TASK, mode=TargetMode.DELTA),
+        with_blocks("velocity_skip"),
+        "mode = 'delta' does already",
+    ),
+    ("velocity_skip", replace(TASK, features=FeatureSet("one", ("v_1",))), with_blocks("velocity_skip"), "v_2 is not"),
+    ("cross_cylinder_attention", replace(TASK, targets=("v_1",)), with_blocks("cross_cylinder_attention"), "has one"),
+]
+ALONE = {name: make() for registry in REGISTRIES for name, make in registry.items() if issubclass(make, Particular)}
+
+
+def test_every_part_that_can_refuse_is_refused_here():
+    assert {name for name, *_ in REFUSED} == set(ALONE)
+
+
+@pytest.mark.parametrize(("name", "task", "model", "reason"), REFUSED)
+def test_contradictions_are_refused_with_the_reason(name, task, model, reason):
+    with pytest.raises(ConfigError, match=reason) as refused:
+        check_combination(task, model)
+    assert name in str(refused.value)
+    features = len(task.features.features)
+    blank = Scaler(np.zeros(features), np.ones(features), np.zeros((1, 2)), np.ones((1, 2)))
+    with pytest.raises(ConfigError, match=reason):
+        build_model(task, model, blank, 0)
+
+
+def test_all_reasons_are_given_at_once():
+    task = replace(TASK, targets=("v_1",), mode=TargetMode.DELTA)
+    with pytest.raises(ConfigError, match="velocity_skip.*; cross_cylinder_attention"):
+        check_combination(task, with_blocks("velocity_skip", "cross_cylinder_attention"))
+
+
+def test_what_does_not_contradict_is_built(structure, predictor_of):
+    predictor = predictor_of(structure)
+    check_combination(predictor.task, predictor.spec)
+
+
+@pytest.mark.parametrize("name", list(BLOCKS))
+def test_the_same_block_twice_is_refused(name):
+    backbone = next(
+        spec() for spec in BACKBONES.values() if BLOCKS[name].slot in (*spec().slots(), "gate", "mix", "bypass")
+    )
+    with pytest.raises(ConfigError, match=f"blocks {name}, {name} share the slot"):
+        ModelSpec(backbone=backbone, blocks=(BLOCKS[name](), BLOCKS[name]()))
+
+
+def test_two_blocks_of_one_slot_are_refused_unless_it_takes_several():
+    with pytest.raises(ConfigError, match="blocks linear_bypass, velocity_skip share the slot 'bypass'; keep one"):
+        with_blocks("linear_bypass", "velocity_skip")
+    with_blocks("squeeze_excitation", "attention_bridge", "temporal_difference", "global_average_pooling")
