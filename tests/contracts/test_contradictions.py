@@ -14,9 +14,10 @@ from edp.errors import ConfigError
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.heads import HEADS
+from edp.models.outputs import OUTPUTS
 from edp.models.predictor import ModelSpec, build_model, check_combination
 
-REGISTRIES = (BACKBONES, HEADS, ACTIVATIONS, BLOCKS)
+REGISTRIES = (BACKBONES, HEADS, OUTPUTS, ACTIVATIONS, BLOCKS)
 TASK = Task(FeatureSet("two", ("v_1", "v_2")), ("v_1", "v_2"), (1,), TargetMode.ABSOLUTE, 100.0)
 PLAIN = ModelSpec()
 
@@ -56,7 +57,7 @@ def test_contradictions_are_refused_with_the_reason(name, task, model, reason):
 
 def test_all_reasons_are_given_at_once():
     task = replace(TASK, targets=("v_1",), mode=TargetMode.DELTA)
-    with pytest.raises(ConfigError, match="velocity_skip.*; cross_cylinder_attention"):
+    with pytest.raises(ConfigError, match=r"velocity_skip.*; cross_cylinder_attention"):
         check_combination(task, with_blocks("velocity_skip", "cross_cylinder_attention"))
 
 

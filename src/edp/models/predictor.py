@@ -63,7 +63,7 @@ def check_combination(task: Task, spec: ModelSpec) -> None:
     Raises:
         ConfigError: the reason that each of them gives.
     """
-    parts = (spec.backbone, spec.head, spec.activation, *spec.blocks)
+    parts = (spec.backbone, spec.head, spec.output, spec.activation, *spec.blocks)
     reasons = [part.conflicts(spec, task) for part in parts if isinstance(part, Particular)]
     given = [reason for reason in reasons if reason]
     if given:
