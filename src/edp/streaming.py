@@ -62,7 +62,6 @@ class Operation(StrEnum):
     GLU = "glu"
     SOFTMAX = "softmax"
     LAYER_NORM = "layer_norm"
-    TRAILING_MEAN = "trailing_mean"
 
 
 class Streaming(nn.Module, ABC):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
-from edp.streaming import Cost, Operation, State, Streaming
+from edp.streaming import Cost, State, Streaming
 
 
 class TrailingMean(Streaming):
@@ -14,10 +13,8 @@ class TrailingMean(Streaming):
 
     Before `window` ticks have passed, the mean of those seen; at the last tick of a window from reset that is the mean
     over the whole window. State: ring of the last ``window - 1`` inputs and how many ticks were seen, up to `window`.
-    Only additions over at most `window` terms are made, so no error grows with the length of the stream.
+    Only sums of at most `window` terms are made, so no error grows with the length of the stream.
     """
-
-    operations = frozenset({Operation.TRAILING_MEAN})
 
     def __init__(self, width: int, window: int) -> None:
         super().__init__()
@@ -41,13 +38,15 @@ class TrailingMean(Streaming):
 def _sums(history: Tensor, window: int) -> Tensor:
     """Sums over every `window` neighbouring rows of ``(batch, time, width)``.
 
-    Rows are cut into blocks of `window`. A run of `window` rows is the end of one block and the beginning of the next,
-    so it is a running sum from the right plus one from the left: linear in time, and nothing is ever subtracted.
+    Sums of 1, 2, 4, ... rows are made by doubling, and those that `window` consists of are added up: every sum takes
+    the same additions wherever a stream is cut into chunks, and nothing is ever subtracted.
     """
-    rows = history.shape[1]
-    ticks = rows - window + 1
-    blocks = functional.pad(history, (0, 0, 0, -rows % window)).unflatten(1, (-1, window))
-    left = blocks.cumsum(dim=2).flatten(1, 2)[:, window - 1 : rows]
-    right = blocks.flip(2).cumsum(dim=2).flip(2).flatten(1, 2)[:, :ticks]
-    whole = torch.arange(ticks, device=history.device) % window == 0
-    return left + right.masked_fill(whole[:, None], 0.0)
+    ticks = history.shape[1] - window + 1
+    runs, size, start = history, 1, 0
+    total = torch.zeros_like(history[:, :ticks])
+    while size <= window:
+        if window & size:
+            total = total + runs[:, start : start + ticks]
+            start += size
+        runs, size = runs[:, :-size] + runs[:, size:], 2 * size
+    return total

@@ -240,3 +240,13 @@ def test_the_cylinder_gate_is_open_at_the_start(form):
     assert torch.equal(bias, torch.full_like(bias, 4.0))
     share = run(gate, torch.zeros(1, 1, 16, dtype=torch.float64) + 1e-9) / 1e-9
     torch.testing.assert_close(share, torch.full_like(share, 0.98201379), rtol=0, atol=1e-6)
+
+
+def test_the_trailing_mean_has_the_same_bits_however_a_stream_is_cut():
+    layer, x = TrailingMean(2, 13), torch.randn(1, 90, 2)
+    whole, _ = layer(x, layer.initial_state(1, x))
+    state, pieces = layer.initial_state(1, x), []
+    for piece in x.split((1, 1, 40, 7, 41), dim=1):
+        y, state = layer(piece, state)
+        pieces.append(y)
+    assert torch.equal(torch.cat(pieces, dim=1), whole)

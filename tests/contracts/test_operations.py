@@ -18,6 +18,7 @@ ALLOWED = {
     "mm": PRODUCTS,
     "addmm": PRODUCTS,
     "bmm": PRODUCTS,
+    "baddbmm": PRODUCTS,
     "convolution": {Operation.CONV1D},
     "linalg_vector_norm": {Operation.CONV1D},  # the weight norm, folded when exported
     "sigmoid": {Operation.SIGMOID, Operation.LSTM, Operation.GRU},
@@ -27,8 +28,6 @@ ALLOWED = {
     "glu": {Operation.GLU},
     "_softmax": {Operation.SOFTMAX},
     "native_layer_norm": {Operation.LAYER_NORM},
-    "cumsum": {Operation.TRAILING_MEAN},
-    "flip": {Operation.TRAILING_MEAN},
 }
 # Moving numbers, making masks, and element-wise arithmetic: understood, not declared.
 FREE = {
@@ -47,7 +46,7 @@ FREE = {
         "zeros",
         "zeros_like",
     ),
-    *("bitwise_and", "bitwise_not", "eq", "ge", "gt", "lt", "masked_fill", "remainder", "where"),
+    *("bitwise_and", "bitwise_not", "bitwise_or", "eq", "ge", "gt", "lt", "masked_fill", "remainder", "where"),
     *("add", "clamp", "div", "mul", "neg", "rsub", "sub"),
 }
 
@@ -85,7 +84,7 @@ class Trace(TorchDispatchMode):
 def macs_of(name, args, result):
     if name in ("mm", "bmm"):
         return result.numel() * args[0].shape[-1]
-    if name == "addmm":
+    if name in ("addmm", "baddbmm"):
         return result.numel() * args[1].shape[-1]
     if name == "convolution":
         return result.numel() * math.prod(args[1].shape[1:])
