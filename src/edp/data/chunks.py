@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.data.augment import AugmentationSpec, input_deviation
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
 
@@ -23,6 +24,8 @@ class ChunkSpec:
         length: samples per chunk, or W.
         batch: lanes in parallel, or windows per update.
         burn_in: samples after a reset that give no loss (chunk regime).
+        consecutive: windows that end at consecutive samples and are drawn together, for terms of the loss that
+            compare neighbours (window regime).
 
     Raises:
         ConfigError: a value out of range.
@@ -32,6 +35,7 @@ class ChunkSpec:
     length: int = 128
     batch: int = 16
     burn_in: int = 50
+    consecutive: int = 1
 
     def __post_init__(self) -> None:
         if self.regime not in ("chunk", "window"):
@@ -40,6 +44,16 @@ class ChunkSpec:
             raise ConfigError(
                 f"chunks: length = {self.length}, batch = {self.batch}, burn_in = {self.burn_in}; "
                 "length and batch of at least 1 and burn_in of at least 0 must hold"
+            )
+        if self.consecutive < 1 or self.batch % self.consecutive:
+            raise ConfigError(
+                f"chunks: consecutive = {self.consecutive}, batch = {self.batch}; consecutive of at least 1 and a batch "
+                "that is a multiple of it must hold"
+            )
+        if self.consecutive > 1 and self.regime == "chunk":
+            raise ConfigError(
+                f"chunks: consecutive = {self.consecutive} with regime = 'chunk'; the ticks of a chunk are consecutive "
+                "already, so 1 must hold"
             )
 
 
@@ -73,14 +87,24 @@ class ChunkSampler:
         horizons: look-ahead samples.
         spec: chunk length, lanes, burn-in.
         seed: root of the random order.
+        augmentations: applied in order to each stretch from a reset to the next one.
 
     Raises:
         DataError: a stretch shorter than burn-in (or window) plus the largest horizon.
     """
 
-    def __init__(self, series: Sequence[Series], horizons: Sequence[int], spec: ChunkSpec, seed: int) -> None:
+    def __init__(
+        self,
+        series: Sequence[Series],
+        horizons: Sequence[int],
+        spec: ChunkSpec,
+        seed: int,
+        augmentations: Sequence[AugmentationSpec] = (),
+    ) -> None:
         self.series, self.horizons, self.spec, self.seed = list(series), tuple(horizons), spec, seed
-        lead = spec.burn_in if spec.regime == "chunk" else spec.length - 1
+        self.augmentations = tuple(augmentations)
+        self.deviation = input_deviation(self.series) if augmentations else None
+        lead = spec.burn_in if spec.regime == "chunk" else spec.length + spec.consecutive - 2
         for part in self.series:
             if part.samples <= lead + max(horizons):
                 raise DataError(
@@ -91,12 +115,12 @@ class ChunkSampler:
     def epoch(self, number: int) -> Iterator[Batch]:
         """The batches of epoch `number`."""
         rng = np.random.default_rng([self.seed, number])
-        return self._windows(rng) if self.spec.regime == "window" else self._lanes(rng)
+        return self._windows(rng, number) if self.spec.regime == "window" else self._lanes(rng, number)
 
     def updates(self, number: int = 0) -> int:
         """How many batches an epoch has."""
         if self.spec.regime == "window":
-            total = sum(part.samples - self.spec.length + 1 - max(self.horizons) for part in self.series)
+            total = sum(self._groups(part, 0) for part in self.series) * self.spec.consecutive
             return -(-total // self.spec.batch)
         return max(_ticks(lane) for lane in self._plan(np.random.default_rng([self.seed, number]))) // self.spec.length
 
@@ -125,37 +149,64 @@ class ChunkSampler:
             load[lane] += entry[2] - entry[1]
         return [[lane[i] for i in rng.permutation(len(lane))] for lane in plan]
 
-    def _lanes(self, rng: np.random.Generator) -> Iterator[Batch]:
+    def _lanes(self, rng: np.random.Generator, number: int) -> Iterator[Batch]:
         length, burn_in = self.spec.length, self.spec.burn_in
-        steps = []
-        for lane in self._plan(rng):
-            steps.append([(i, at, at - start) for i, start, stop in lane for at in range(start, stop, length)])
+        steps = [
+            [(i, start, stop, at) for i, start, stop in lane for at in range(start, stop, length)]
+            for lane in self._plan(rng)
+        ]
+        held = [(self.series[0], 0)] * len(steps)
         for step in range(max(len(lane) for lane in steps)):
             rows, resets = [], []
-            for lane_steps in steps:
-                i, at, age = lane_steps[step] if step < len(lane_steps) else (0, -1, 0)
-                rows.append(self._cut(i, at, age, burn_in))
-                resets.append(age == 0)
+            for which, lane in enumerate(steps):
+                if step < len(lane):
+                    i, start, stop, at = lane[step]
+                    if at == start:
+                        held[which] = self._stretch(i, start, stop, number)
+                    part, origin = held[which]
+                    rows.append(self._cut(part, at - origin, at - start, burn_in))
+                    resets.append(at == start)
+                else:  # A lane that has run out: nothing counts.
+                    rows.append(self._cut(self.series[0], 0, 0, length))
+                    resets.append(True)
             yield _stack(rows, resets)
 
-    def _windows(self, rng: np.random.Generator) -> Iterator[Batch]:
-        length = self.spec.length
-        ends = np.cumsum([part.samples - length + 1 - max(self.horizons) for part in self.series])
+    def _windows(self, rng: np.random.Generator, number: int) -> Iterator[Batch]:
+        length, together = self.spec.length, self.spec.consecutive
+        # Groups of consecutive windows begin at another sample in each epoch.
+        offsets = rng.integers(0, together, len(self.series)) if together > 1 else np.zeros(len(self.series), np.int64)
+        ends = np.cumsum([self._groups(part, int(at)) for part, at in zip(self.series, offsets, strict=True)])
         order = rng.permutation(ends[-1])
-        for first in range(0, len(order), self.spec.batch):
-            chosen = order[first : first + self.spec.batch]
-            owners = np.searchsorted(ends, chosen, side="right")
-            rows = [
-                self._cut(int(i), int(j - (ends[i - 1] if i else 0)), 0, length - 1)
-                for i, j in zip(owners, chosen, strict=True)
-            ]
+        groups = self.spec.batch // together
+        for first in range(0, len(order), groups):
+            chosen = order[first : first + groups]
+            rows = []
+            for i, j in zip(np.searchsorted(ends, chosen, side="right"), chosen, strict=True):
+                start = int(offsets[i] + (j - (ends[i - 1] if i else 0)) * together)
+                part, origin = self._stretch(int(i), start, start + length + together - 1, number)
+                rows += [self._cut(part, start + late - origin, 0, length - 1) for late in range(together)]
             yield _stack(rows, [True] * len(rows))
 
-    def _cut(self, number: int, at: int, age: int, burn_in: int) -> tuple[Any, Any, Any]:
+    def _groups(self, part: Series, offset: int) -> int:
+        """How many groups of consecutive windows a series holds from `offset` on."""
+        return max(0, part.samples - self.spec.length + 1 - max(self.horizons) - offset) // self.spec.consecutive
+
+    def _stretch(self, i: int, start: int, stop: int, number: int) -> tuple[Series, int]:
+        """The series to cut ``start:stop`` from in epoch `number`, and the row of series i at which it begins."""
+        part = self.series[i]
+        if self.deviation is None:
+            return part, 0
+        stop = min(stop + max(self.horizons), part.samples)
+        part = Series(part.name, part.inputs[start:stop], part.targets[start:stop])
+        # Its own source of chance: neither the order of the lanes nor a stop in between matters.
+        rng = np.random.default_rng([self.seed, number, i, start])
+        for augmentation in self.augmentations:
+            part = augmentation.apply(part, self.deviation, rng)
+        return part, start
+
+    def _cut(self, part: Series, at: int, age: int, burn_in: int) -> tuple[Any, Any, Any]:
         """Inputs, future targets and validity of one chunk; rows past the end repeat the last and count nothing."""
-        part, length = self.series[number], self.spec.length
-        if at < 0:
-            at, age, burn_in = 0, 0, length
+        length = self.spec.length
         inside = at + length + max(self.horizons) <= part.samples
         rows = np.arange(at, at + length)
         valid = (rows - at + age >= burn_in) & (rows + max(self.horizons) < part.samples)
