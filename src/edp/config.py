@@ -14,13 +14,14 @@ import pydantic
 import tomli_w
 
 from edp.blocks import BLOCKS
+from edp.data.augment import AUGMENTATIONS
 from edp.data.features import FEATURE_SETS, Derived, FeatureSet
 from edp.data.splits import SPLITS, ByRecording, SplitSpec
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, StorageError, closest
 from edp.evaluation.judge import JudgeSpec
 from edp.logs.repair import Repair
-from edp.losses import LOSSES
+from edp.losses import LOSSES, TERMS
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.heads import HEADS
@@ -29,6 +30,7 @@ from edp.models.plain import options
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
 from edp.signals import ChannelMap, SignalMap
+from edp.training.averages import AVERAGES
 from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import SCHEDULES
@@ -39,9 +41,12 @@ TAGGED: Mapping[str, Registry[type]] = {
     "activation": ACTIVATIONS,
     "output": OUTPUTS,
     "blocks": BLOCKS,
+    "augmentations": AUGMENTATIONS,
     "loss": LOSSES,
+    "terms": TERMS,
     "optimizer": OPTIMIZERS,
     "schedule": SCHEDULES,
+    "average": AVERAGES,
     "split": SPLITS,
 }
 """Fields whose tables say with ``kind = "..."`` which registered part they set."""

@@ -35,6 +35,7 @@ from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.training import Bundle, Event, fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler, weights_digest
 from edp.training.fit import thread_count
+from edp.training.spec import check_training
 
 SHOWN_RECORDINGS = 6
 SHOWN_TICKS = 60_000
@@ -62,6 +63,7 @@ def prepare_data(source: DataSource, experiment: Experiment) -> Prepared:
     first = recordings[0]
     task = experiment.task.resolve(first.rate_hz, first.channel_names)
     check_combination(task, experiment.model)
+    check_training(task, experiment.model, experiment.training)
     return prepare(recordings, task, experiment.split, experiment.model.window)
 
 

@@ -8,6 +8,7 @@ import pytest
 import edp.blocks
 from edp.blocks import BLOCKS
 from edp.blocks.base import OUTPUT_SLOTS, BlockSpec, Slot
+from edp.data.augment import AUGMENTATIONS
 from edp.data.features import DERIVATIONS
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, EdpError
@@ -19,10 +20,24 @@ from edp.models.outputs import OUTPUTS
 from edp.models.plain import tagged, untagged
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
+from edp.training.averages import AVERAGES
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import SCHEDULES
 
-SPECS = [BACKBONES, BLOCKS, HEADS, ACTIVATIONS, OUTPUTS, LOSSES, TERMS, OPTIMIZERS, SCHEDULES, SPLITS]
+SPECS = [
+    BACKBONES,
+    BLOCKS,
+    HEADS,
+    ACTIVATIONS,
+    OUTPUTS,
+    LOSSES,
+    TERMS,
+    AUGMENTATIONS,
+    AVERAGES,
+    OPTIMIZERS,
+    SCHEDULES,
+    SPLITS,
+]
 ENTRIES = [pytest.param(registry, name, id=f"{registry.what}-{name}") for registry in SPECS for name in registry]
 
 

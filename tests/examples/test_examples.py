@@ -18,6 +18,7 @@ from edp.data.chunks import ChunkSpec
 from edp.data_sets import SimulationOrder
 from edp.evaluation.judge import JudgeSpec
 from edp.logs import write_recording
+from edp.losses import AdaptiveWeights
 from edp.models.predictor import ModelSpec
 from edp.recording import Recording
 from edp.signals import TABLE_A1
@@ -91,7 +92,11 @@ def test_settings_page_names_every_part_and_key():
     sections = dict(part.partition("\n")[::2] for part in re.split(r"^#+ ", page, flags=re.MULTILINE))
     classes = {f'{name}: `kind = "{kind}"`': TAGGED[name][kind] for name in TAGGED for kind in TAGGED[name]}
     classes |= {"`[task]`": TaskSettings, "`[model]`": ModelSpec, "`[training]`": TrainingSpec, "`[judge]`": JudgeSpec}
-    classes |= {"`[training.chunks]`": ChunkSpec, "`[[recordings]]`": RecordingEntry}
+    classes |= {
+        "`[training.chunks]`": ChunkSpec,
+        "`[training.adaptive]`": AdaptiveWeights,
+        "`[[recordings]]`": RecordingEntry,
+    }
     assert {title for title in sections if "kind =" in title} == {title for title in classes if "kind =" in title}
     for title, cls in classes.items():
         keys = re.findall(r"^\| `(\w+)` \|", sections[title], re.MULTILINE)

@@ -47,9 +47,16 @@ def test_every_registered_part_survives_a_round_trip(tmp_path):
         "loss": ("training", "loss"),
         "optimizer": ("training", "optimizer"),
         "schedule": ("training", "schedule"),
+        "average": ("training", "average"),
         "split": ("split",),
     }
-    assert set(TAGGED) == {*places, "blocks"}
+    lists = {"terms", "augmentations"}
+    assert set(TAGGED) == {*places, *lists, "blocks"}
+    for name in lists:
+        kinds = ", ".join(f'{{kind="{kind}"}}' for kind in TAGGED[name])
+        experiment = load_experiment(overrides=[f"training.{name}=[{kinds}]"])
+        again = load_experiment(saved(tmp_path, experiment_toml(experiment)))
+        assert [TAGGED[name].name_of(part) for part in getattr(again.training, name)] == list(TAGGED[name])
     for name, place in places.items():
         for kind in TAGGED[name]:
             experiment = load_experiment(overrides=[f"{'.'.join(place)}.kind={kind}", "model.blocks=[]"])

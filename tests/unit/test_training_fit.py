@@ -10,6 +10,7 @@ from edp.errors import ConfigError, DataError
 from edp.losses import MeanSquared
 from edp.models.predictor import build_model
 from edp.models.running import stream_predictions
+from edp.training.averages import NoAverage
 from edp.training.fit import TrainingError, TrainingSpec, fit, thread_count, validation_scores
 from edp.training.optimizers import OPTIMIZERS, AdamW
 from edp.training.schedules import SCHEDULES, Constant
@@ -95,7 +96,7 @@ def test_every_optimizer_and_schedule_trains_with_either_regime(schedule, optimi
             schedule=SCHEDULES[schedule](),
             epochs=2,
             updates=12,
-            ema=0.0,
+            average=NoAverage(),
             device="cpu",
         )
         made = fit(tiny, tiny_bypass, spec)
@@ -120,13 +121,13 @@ def test_a_by_pass_that_is_not_trained_stays(tiny, tiny_bypass, tiny_training):
 def test_patience_stops_a_training_that_does_not_get_better(tiny, tiny_model, tiny_training):
     # At this rate no weight moves, so the first epoch stays the best but for rounding.
     still = AdamW(learning_rate=1e-30, weight_decay=0.0)
-    spec = dataclasses.replace(tiny_training, optimizer=still, patience=2, epochs=9, ema=0.0)
+    spec = dataclasses.replace(tiny_training, optimizer=still, patience=2, epochs=9, average=NoAverage())
     assert [row["best"] for row in fit(tiny, tiny_model, spec).history] == [True, False, False]
 
 
 def test_a_loss_that_is_not_finite_is_a_training_error(tiny, tiny_model, tiny_training):
     wild = dataclasses.replace(tiny_training, optimizer=AdamW(learning_rate=1e38), schedule=Constant())
-    with pytest.raises(TrainingError, match=r"loss is (nan|inf) at update \d+: .* lower the learning rate"):
+    with pytest.raises(TrainingError, match=r"loss is (nan|inf) at update \d+ .epoch 1.: .* Lower the learning rate"):
         fit(tiny, tiny_model, wild)
 
 
@@ -149,7 +150,8 @@ def test_recordings_shorter_than_the_burn_in_are_refused(tiny, tiny_model, tiny_
         {"updates": -1},
         {"patience": -1},
         {"clip_norm": 0.0},
-        {"ema": 1.0},
+        {"horizon_decay": 0.0},
+        {"horizon_decay": 1.5},
         {"threads": -1},
         {"device": "tpu"},
     ],

@@ -47,8 +47,8 @@ class ChunkSpec:
             )
         if self.consecutive < 1 or self.batch % self.consecutive:
             raise ConfigError(
-                f"chunks: consecutive = {self.consecutive}, batch = {self.batch}; consecutive of at least 1 and a batch "
-                "that is a multiple of it must hold"
+                f"chunks: consecutive = {self.consecutive}, batch = {self.batch}; consecutive of at least 1 and a "
+                "batch that is a multiple of it must hold"
             )
         if self.consecutive > 1 and self.regime == "chunk":
             raise ConfigError(

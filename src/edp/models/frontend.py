@@ -69,6 +69,14 @@ class TargetCode(nn.Module):
         """Present target values ``(batch, time, 1, target)`` in delta mode, else 0."""
         return features[..., self.present].unsqueeze(-2) if self.delta else 0.0
 
+    def level(self, features: Tensor) -> Tensor:
+        """What standardised targets are counted from: present values in standard deviations; zero in absolute mode.
+
+        Shape ``(batch, time, horizon, target)``; in absolute mode ``(batch, time, 1, 1)``.
+        """
+        base = self._base(features)
+        return base / self.width if isinstance(base, Tensor) else features.new_zeros(*features.shape[:2], 1, 1)
+
     def encode(self, future: Tensor, features: Tensor) -> Tensor:
         """Standardised targets from future SI values ``(batch, time, horizon, target)``."""
         return (future - self._base(features) - self.offset) / self.width

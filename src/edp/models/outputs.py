@@ -32,6 +32,11 @@ class OutputSpec(Protocol):
         """Shares of the targets that its intervals mean to hold, the widest first."""
         ...
 
+    @property
+    def calibrated(self) -> bool:
+        """Whether training ends with a calibration of the intervals."""
+        ...
+
     def build(self, horizons: int, outputs: int) -> Output:
         """The output layer."""
         ...
@@ -116,6 +121,11 @@ class Point:
     def coverages(self) -> tuple[float, ...]:
         """No intervals."""
         return ()
+
+    @property
+    def calibrated(self) -> bool:
+        """There is nothing to calibrate."""
+        return False
 
     def build(self, horizons: int, outputs: int) -> Output:
         """A layer that passes the prediction on."""

@@ -34,18 +34,19 @@ class Progress:
 
 @dataclass
 class Weights:
-    """Named tensors of the net itself, its average, and the best so far."""
+    """Named tensors of the net itself, its average, and the best so far; and the running errors of its outputs."""
 
     current: dict[str, Tensor]
     average: dict[str, Tensor]
     best: dict[str, Tensor]
+    running: Tensor
 
 
 def save_checkpoint(
     folder: Path, key: str, progress: Progress, weights: Weights, optimizer: torch.optim.Optimizer
 ) -> None:
     """Write the checkpoint atomically; an earlier one stays until the new one is whole."""
-    tensors: dict[str, Tensor] = {}
+    tensors = {"running": weights.running.detach().cpu().contiguous()}
     for group, named in (("current", weights.current), ("average", weights.average), ("best", weights.best)):
         tensors |= {f"{group}/{name}": tensor.detach().cpu().contiguous() for name, tensor in named.items()}
     state = optimizer.state_dict()
@@ -84,7 +85,7 @@ def load_checkpoint(folder: Path, key: str) -> tuple[Progress, Weights, dict[str
         "state": {int(index): value for index, value in state.items()},
         "param_groups": header["optimizer"]["param_groups"],
     }
-    return progress, Weights(**groups), optimizer
+    return progress, Weights(**groups, running=tensors["running"]), optimizer
 
 
 def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:

@@ -6,81 +6,26 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
-from edp.data.chunks import Batch, ChunkSampler, ChunkSpec
+from edp.data.chunks import Batch, ChunkSampler
 from edp.data.prepared import Prepared
-from edp.data.series import Series
 from edp.errors import ConfigError, DataError, EdpError
-from edp.losses import Huber, LossSpec, masked_loss, output_weights
 from edp.models.predictor import ModelSpec, Predictor, build_model, trainable
-from edp.models.running import stream_answers
 from edp.runs import RunFolder
-from edp.signals import KINDS
 from edp.streaming import State, detach_state, reset_where
 from edp.training.checkpoint import Progress, Weights, load_checkpoint, save_checkpoint
-from edp.training.optimizers import AdamW, OptimizerSpec
+from edp.training.objective import Objective
 from edp.training.ridge_start import start_bypass
-from edp.training.schedules import Cosine, ScheduleSpec
+from edp.training.spec import TrainingSpec, check_training
+from edp.training.validation import calibrate, validation_scores
 
 
 class TrainingError(EdpError):
     """Training cannot go on."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingSpec:
-    """How to train.
-
-    Attributes:
-        chunks: chunk or window regime, lengths, batch.
-        loss: a registered loss.
-        weight_power: p of the per-output weights (eq. 3.31); 0 for standardised targets.
-        optimizer: a registered optimiser.
-        schedule: a registered learning-rate schedule.
-        epochs: the longest training.
-        updates: updates per epoch; 0 for one pass over the data.
-        patience: epochs without a better validation score before an early stop; 0 never stops early.
-        clip_norm: largest global gradient norm.
-        ema: decay of the weight average that is validated and kept; 0 keeps the weights themselves.
-        seed: root of every random choice.
-        threads: CPU threads, 0 for all cores; more than one pays for wide networks on an idle machine only, and
-            another count gives other bits.
-        device: ``auto``, ``cpu`` or ``cuda``.
-
-    Raises:
-        ConfigError: a value out of range.
-    """
-
-    chunks: ChunkSpec = field(default_factory=ChunkSpec)
-    loss: LossSpec = field(default_factory=Huber)
-    weight_power: float = 0.0
-    optimizer: OptimizerSpec = field(default_factory=AdamW)
-    schedule: ScheduleSpec = field(default_factory=Cosine)
-    epochs: int = 20
-    updates: int = 0
-    patience: int = 8
-    clip_norm: float = 1.0
-    ema: float = 0.995
-    seed: int = 0
-    threads: int = 1
-    device: str = "auto"
-
-    def __post_init__(self) -> None:
-        if self.epochs < 1 or self.updates < 0 or self.patience < 0 or self.threads < 0:
-            raise ConfigError(
-                f"training: epochs = {self.epochs} (at least 1), updates = {self.updates}, patience = "
-                f"{self.patience}, threads = {self.threads} (all at least 0) must hold"
-            )
-        if not self.clip_norm > 0 or not 0 <= self.ema < 1:
-            raise ConfigError(f"training: clip_norm = {self.clip_norm} > 0 and 0 <= ema = {self.ema} < 1 must hold")
-        if self.device not in ("auto", "cpu", "cuda"):
-            raise ConfigError(f"training: device = '{self.device}'; 'auto', 'cpu' or 'cuda' must hold")
 
 
 @dataclass(frozen=True)
@@ -115,6 +60,21 @@ class Fitted:
     resumed_at: int
 
 
+class Diverged(TrainingError):
+    """The loss or the validation score is not finite any more.
+
+    Attributes:
+        fitted: the best weights before that, None where no epoch was finished.
+        facts: where it happened, plain values.
+    """
+
+    exit_code = 4
+
+    def __init__(self, message: str, fitted: Fitted | None, facts: dict[str, Any]) -> None:
+        super().__init__(message)
+        self.fitted, self.facts = fitted, facts
+
+
 def fit(
     data: Prepared,
     model: ModelSpec,
@@ -132,8 +92,9 @@ def fit(
         on_event: called with progress.
 
     Raises:
+        ConfigError: settings that contradict one another.
         DataError: a recording is shorter than the burn-in.
-        TrainingError: the loss is not finite.
+        Diverged: the loss is not finite any more; it carries the best weights before that.
     """
     torch.set_num_threads(thread_count(spec))
     return _Loop(data, model, spec, run).fit(on_event or (lambda event: None))
@@ -150,15 +111,15 @@ class _Loop:
     def __init__(self, data: Prepared, model: ModelSpec, spec: TrainingSpec, run: tuple[RunFolder, str] | None) -> None:
         self.data, self.spec, self.run = data, spec, run
         self.device = _device(spec.device)
-        self.sampler = ChunkSampler(data.train, data.task.horizons, spec.chunks, spec.seed)
+        check_training(data.task, model, spec)
+        self.sampler = ChunkSampler(data.train, data.task.horizons, spec.chunks, spec.seed, spec.augmentations)
         for part in data.validation:
             if part.samples <= spec.chunks.burn_in + data.task.reach:
                 raise DataError(
                     f"validation recording '{part.name}' has {part.samples} samples, no more than the burn-in of "
                     f"{spec.chunks.burn_in} plus the horizon of {data.task.reach}; give a longer one"
                 )
-        scaler = data.scaler()
-        self.net = build_model(data.task, model, scaler, spec.seed)
+        self.net = build_model(data.task, model, data.scaler(), spec.seed)
         started = start_bypass(self.net, data.train, data.validation)
         self.net.to(self.device)
         named = [(name, parameter) for name, parameter in self.net.named_parameters() if parameter.requires_grad]
@@ -167,33 +128,63 @@ class _Loop:
         self.average = {name: tensor.detach().clone() for name, tensor in self.net.named_parameters()}
         self.best = {name: tensor.clone() for name, tensor in self.average.items()}
         self.progress = Progress()
-        sigma = torch.tensor(scaler.target_scale, dtype=torch.float32, device=self.device)
-        self.weights = output_weights(sigma, spec.weight_power)
+        self.objective = Objective(spec, self.net.code)
         self.updates = spec.updates or max(1, self.sampler.updates())
         if started:  # The regression is a candidate itself: training must improve on it to be kept.
             self.progress.best_score = self._validate()[0]
 
     def fit(self, on_event: Callable[[Event], None]) -> Fitted:
         self._resume()
-        resumed_at, seen, busy = self.progress.epoch, 0, 0.0
+        self.resumed_at, self.rate = self.progress.epoch, 0.0
+        seen, busy = 0, 0.0
         while self.progress.epoch < self.spec.epochs and not self._stalled():
             began = time.perf_counter()
             loss, targets = self._epoch(on_event)
             busy += time.perf_counter() - began
             seen += targets
             row = self._close_epoch(loss, time.perf_counter() - began)
-            on_event(self._event(self.progress.epoch, self.updates, seen / busy, time.perf_counter() - began, row))
+            self.rate = seen / busy
+            on_event(self._event(self.progress.epoch, self.updates, self.rate, time.perf_counter() - began, row))
+        return self._fitted()
+
+    def _fitted(self) -> Fitted:
+        """The net with the best weights so far."""
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.best[name])
-        rate = seen / busy if busy else 0.0
-        return Fitted(self.net.eval(), self.progress.history, self.progress.seconds, rate, resumed_at)
+        if self.net.spec.output.calibrated:
+            calibrate(self.net, self.data.validation, self.spec)
+        return Fitted(self.net.eval(), self.progress.history, self.progress.seconds, self.rate, self.resumed_at)
+
+    def _diverged(self, what: str, value: float) -> Diverged:
+        progress = self.progress
+        kept = [row for row in progress.history if row["epoch"] == progress.best_epoch]
+        if kept:
+            saved = (
+                f"the weights of epoch {progress.best_epoch} (validation MAE {kept[0]['validation_mae']:.4g}) are kept"
+            )
+        elif math.isfinite(progress.best_score):
+            saved = "the weights of the start are kept"
+        else:
+            saved = "no epoch was finished before, so nothing is kept"
+        facts = {
+            "epoch": progress.epoch + 1,
+            "update": progress.updates,
+            "kept_epoch": progress.best_epoch if kept else None,
+        }
+        return Diverged(
+            f"{what} is {value} at update {progress.updates} (epoch {facts['epoch']}): the training diverged; {saved}. "
+            "Lower the learning rate or clip_norm, or look for outliers with edp inspect",
+            self._fitted() if math.isfinite(progress.best_score) else None,
+            facts,
+        )
 
     def _resume(self) -> None:
         held = load_checkpoint(self.run[0].path, self.run[1]) if self.run else None
         if held is None:
             return
         self.progress, weights, optimizer = held
+        self.objective.running.copy_(weights.running)
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(weights.current[name])
@@ -203,7 +194,7 @@ class _Loop:
 
     def _stalled(self) -> bool:
         waited = self.progress.epoch - self.progress.best_epoch
-        return 0 < self.spec.patience <= waited
+        return 0 < self.spec.patience <= waited and self.spec.average.may_stop()
 
     def _batches(self) -> Iterator[Batch]:
         """Exactly `updates` batches; the order depends on the seed and the epoch alone."""
@@ -240,40 +231,41 @@ class _Loop:
             state = initial
         else:
             state = reset_where(reset, initial, state)
-        share = self.progress.updates / (self.updates * self.spec.epochs)
-        factor = self.spec.schedule.factor(share, self.progress.schedule)
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * factor
+            group["lr"] = rate * self._factor()
         answer, features, state = self.net.run(x, state)
-        target = self.net.code.encode(torch.from_numpy(batch.future).to(self.device), features)
-        valid = torch.from_numpy(batch.valid).to(self.device)
-        loss = masked_loss(self.spec.loss, answer, target, valid, self.weights)
+        future, valid = (torch.from_numpy(part).to(self.device) for part in (batch.future, batch.valid))
+        loss = self.objective.evaluate(answer, future, features, valid)
+        self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):
-            raise TrainingError(
-                f"the training loss is {value} at update {self.progress.updates + 1}: the training diverged; lower "
-                "the learning rate or clip_norm, or look for outliers with edp inspect"
-            )
+            raise self._diverged("the training loss", value)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(trainable(self.net), self.spec.clip_norm)
         self.optimizer.step()
-        self.progress.updates += 1
         self._follow()
         return value, detach_state(state)
 
+    def _factor(self) -> float:
+        """Share of the base learning rate at the coming update."""
+        done, total = self.progress.updates, self.updates * self.spec.epochs
+        factor = self.spec.schedule.factor(done / total, self.progress.schedule)
+        return self.spec.average.factor(factor, done + 1, total)
+
     def _follow(self) -> None:
-        """Move the average towards the weights; young averages move faster."""
-        count = self.progress.updates
-        decay = min(self.spec.ema, (1 + count) / (10 + count)) if self.spec.ema else 0.0
+        """Move the average towards the weights."""
+        step = self.spec.average.step(self.progress.updates, self.updates * self.spec.epochs)
         targets = list(self.average.values())
         with torch.no_grad():
             current = [parameter.detach() for parameter in self.net.parameters()]
-            torch._foreach_lerp_(targets, current, 1.0 - decay)
+            torch._foreach_lerp_(targets, current, step)
 
     def _close_epoch(self, loss: float, seconds: float) -> dict[str, Any]:
         progress = self.progress
         score, report, validation_loss = self._validate()
+        if not math.isfinite(score):
+            raise self._diverged("the validation score", score)
         progress.epoch += 1
         progress.seconds += seconds
         better = score < progress.best_score
@@ -294,7 +286,7 @@ class _Loop:
         }
         progress.history.append(row)
         if self.run:
-            weights = Weights(dict(self.net.named_parameters()), self.average, self.best)
+            weights = Weights(dict(self.net.named_parameters()), self.average, self.best, self.objective.running)
             save_checkpoint(self.run[0].path, self.run[1], progress, weights, self.optimizer)
             self.run[0].write_history(progress.history)
         return row
@@ -318,43 +310,10 @@ class _Loop:
         return Event(epoch, self.spec.epochs, update, self.updates, rate, left * seconds / max(1, update), row)
 
 
-def validation_scores(
-    net: Predictor, series: list[Series], spec: TrainingSpec, data: Prepared
-) -> tuple[float, float, float]:
-    """Mean absolute error in standard deviations, in report units, and the loss, streamed over `series`."""
-    scale = net.code.width.detach().cpu().double()
-    factors = torch.tensor([KINDS[kind].report_factor for kind in data.target_kinds], dtype=torch.float64)
-    skip = spec.chunks.burn_in if spec.chunks.regime == "chunk" else net.spec.window - 1
-    absolute, count, loss = torch.zeros_like(scale), 0, 0.0
-    for part, said in zip(series, stream_answers(net, series), strict=True):
-        target = standard_targets(net, part)[:, skip:]
-        ticks = slice(skip, skip + target.shape[1])
-        answer = replace(said, center=said.center[:, ticks], spread=said.spread[:, ticks])
-        absolute += (answer.center - target).abs().sum(dim=(0, 1)) * scale
-        count += target.shape[1]
-        loss += float(spec.loss.evaluate(answer, target).mean(dim=(-1, -2)).sum())
-    mean = absolute / max(1, count)
-    return float((mean / scale).mean()), float((mean * factors).mean()), loss / max(1, count)
-
-
-def standard_targets(net: Predictor, part: Series) -> Tensor:
-    """Targets of a whole series as the network is trained on them, ``(1, tick, horizon, output)``, double precision.
-
-    Ticks whose targets lie beyond the end are left out.
-    """
-    ticks = part.samples - net.task.reach
-    future = np.stack([part.targets[k : k + ticks] for k in net.task.horizons], axis=1)
-    like = next(net.parameters())
-    x = torch.from_numpy(part.inputs[:ticks]).unsqueeze(0).to(like)
-    with torch.inference_mode():
-        features, _ = net.front(x, net.front.initial_state(1, x))
-        return net.code.encode(torch.from_numpy(future).unsqueeze(0).to(like), features).cpu().double()
-
-
 def _device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("training: device = 'cuda' but no CUDA device is present; use device = 'auto' or 'cpu'")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-__all__ = ["Event", "Fitted", "TrainingError", "TrainingSpec", "fit", "thread_count", "validation_scores"]
+__all__ = ["Diverged", "Event", "Fitted", "TrainingError", "TrainingSpec", "fit", "thread_count", "validation_scores"]

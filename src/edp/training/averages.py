@@ -1,0 +1,117 @@
+"""Averages of the weights over training: what is validated and kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from edp.errors import ConfigError
+from edp.registry import Registry
+
+
+class AverageSpec(Protocol):
+    """Options of an average. Pure functions of the update count, so that a resumed run averages alike."""
+
+    def step(self, update: int, updates: int) -> float:
+        """Share of the way to the weights that the average goes after `update` of `updates`; 1 takes them over."""
+        ...
+
+    def factor(self, factor: float, update: int, updates: int) -> float:
+        """Share of the base learning rate at an update, from that of the schedule."""
+        ...
+
+    def may_stop(self) -> bool:
+        """Whether a training may end early without losing what the average is for."""
+        ...
+
+
+AVERAGES: Registry[type] = Registry("average")
+
+
+@AVERAGES.register("none")
+@dataclass(frozen=True, kw_only=True)
+class NoAverage:
+    """The weights themselves."""
+
+    def step(self, update: int, updates: int) -> float:
+        """Take the weights over."""
+        return 1.0
+
+    def factor(self, factor: float, update: int, updates: int) -> float:
+        """As the schedule says."""
+        return factor
+
+    def may_stop(self) -> bool:
+        """At any time."""
+        return True
+
+
+@AVERAGES.register("ema")
+@dataclass(frozen=True, kw_only=True)
+class Exponential:
+    """Exponential moving average after each update; young averages move faster.
+
+    Attributes:
+        decay: share that an update keeps.
+
+    Raises:
+        ConfigError: decay outside ]0, 1[.
+    """
+
+    decay: float = 0.995
+
+    def __post_init__(self) -> None:
+        if not 0 < self.decay < 1:
+            raise ConfigError(f"ema: decay = {self.decay}; 0 < decay < 1 must hold (kind = 'none' averages nothing)")
+
+    def step(self, update: int, updates: int) -> float:
+        """Towards the weights by ``1 - decay``, at first by ``9 / (10 + n)``."""
+        return 1.0 - min(self.decay, (1 + update) / (10 + update))
+
+    def factor(self, factor: float, update: int, updates: int) -> float:
+        """As the schedule says."""
+        return factor
+
+    def may_stop(self) -> bool:
+        """At any time."""
+        return True
+
+
+@AVERAGES.register("swa")
+@dataclass(frozen=True, kw_only=True)
+class Stochastic:
+    """Stochastic weight averaging: the plain mean over the last updates, at a constant rate (thesis 3.2.4.2).
+
+    Before, the weights themselves are validated. A training with it is not stopped early.
+
+    Attributes:
+        share: of all updates, at the end, that are averaged.
+        rate: learning rate while averaging, as a share of the base rate; 0 leaves it to the schedule.
+
+    Raises:
+        ConfigError: share outside ]0, 1], or rate outside [0, 1].
+    """
+
+    share: float = 0.2
+    rate: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share <= 1 or not 0 <= self.rate <= 1:
+            raise ConfigError(
+                f"swa: share = {self.share}, rate = {self.rate}; 0 < share <= 1 and 0 <= rate <= 1 must hold"
+            )
+
+    def _begin(self, updates: int) -> int:
+        return updates - max(1, round(self.share * updates))
+
+    def step(self, update: int, updates: int) -> float:
+        """The n-th averaged update moves the mean by ``1 / n``."""
+        return 1.0 / max(1, update - self._begin(updates))
+
+    def factor(self, factor: float, update: int, updates: int) -> float:
+        """The constant rate while averaging."""
+        return self.rate if self.rate and update > self._begin(updates) else factor
+
+    def may_stop(self) -> bool:
+        """Not before the average is whole."""
+        return False

@@ -1,0 +1,60 @@
+"""What a training makes small: the main loss with its weights, and further terms."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from edp.losses import Answer, Course, horizon_weights, masked_loss, output_weights
+from edp.models.frontend import TargetCode
+from edp.training.spec import TrainingSpec
+
+
+class Objective:
+    """The training loss of a batch; it remembers the running error of each output where weights adapt to it.
+
+    Args:
+        spec: how to train.
+        code: of the network's targets.
+
+    Attributes:
+        running: mean absolute error ``(horizon, output)`` in standard deviations, led on by `follow`.
+    """
+
+    def __init__(self, spec: TrainingSpec, code: TargetCode) -> None:
+        self.spec, self.code = spec, code
+        self.weights = output_weights(code.width, spec.weight_power)
+        self.weights = self.weights * horizon_weights(len(self.weights), spec.horizon_decay).to(self.weights)
+        self.running = torch.ones_like(self.weights)
+
+    def evaluate(self, answer: Answer, future: Tensor, features: Tensor, valid: Tensor) -> Tensor:
+        """The loss of a batch.
+
+        Args:
+            answer: what the network says.
+            future: targets, SI units, ``(batch, time, horizon, output)``.
+            features: physical, ``(batch, time, feature)``.
+            valid: ``(batch, time)``: ticks that count.
+        """
+        target = self.code.encode(future, features)
+        weights = self.weights
+        if self.spec.adaptive.blend:
+            weights = weights * self.spec.adaptive.weights(self.running)
+            self.running = self.spec.adaptive.follow(self.running, (answer.center - target).detach(), valid)
+        loss = masked_loss(self.spec.loss, answer, target, valid, weights)
+        if self.spec.terms:
+            course = self._course(answer.center, target, self.code.level(features), valid)
+            for term in self.spec.terms:
+                loss = loss + term.weight * term.evaluate(course)
+        return loss
+
+    def _course(self, predicted: Tensor, target: Tensor, level: Tensor, valid: Tensor) -> Course:
+        """Consecutive predictions: the ticks of a chunk, or the last ticks of windows drawn together."""
+        chunks = self.spec.chunks
+        if chunks.regime == "chunk":
+            return Course(predicted, target, level, valid)
+
+        def last(x: Tensor) -> Tensor:
+            return x[:, -1].unflatten(0, (-1, chunks.consecutive))
+
+        return Course(last(predicted), last(target), last(level), last(valid))

@@ -1,0 +1,124 @@
+"""How to train: the settings, and which of them contradict one another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from edp.data.augment import AugmentationSpec
+from edp.data.chunks import ChunkSpec
+from edp.data.task import Task
+from edp.errors import ConfigError
+from edp.losses import LOSSES, TERMS, AdaptiveWeights, Huber, LossSpec, TermSpec
+from edp.models.outputs import OUTPUTS
+from edp.models.predictor import ModelSpec
+from edp.training.averages import AverageSpec, Exponential
+from edp.training.optimizers import AdamW, OptimizerSpec
+from edp.training.schedules import Cosine, ScheduleSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSpec:
+    """How to train.
+
+    Attributes:
+        chunks: chunk or window regime, lengths, batch.
+        augmentations: options of registered augmentations of the training data, applied in order.
+        loss: a registered loss.
+        terms: options of registered terms, added to the loss.
+        weight_power: p of the per-output weights (eq. 3.31); 0 for standardised targets.
+        horizon_decay: weight of each horizon relative to the one before it; the mean over horizons stays one.
+        adaptive: weights of outputs by their running error.
+        optimizer: a registered optimiser.
+        schedule: a registered learning-rate schedule.
+        average: a registered average of the weights, which is validated and kept.
+        epochs: the longest training.
+        updates: updates per epoch; 0 for one pass over the data.
+        patience: epochs without a better validation score before an early stop; 0 never stops early.
+        clip_norm: largest global gradient norm.
+        seed: root of every random choice.
+        threads: CPU threads, 0 for all cores; more than one pays for wide networks on an idle machine only, and
+            another count gives other bits.
+        device: ``auto``, ``cpu`` or ``cuda``.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    chunks: ChunkSpec = field(default_factory=ChunkSpec)
+    augmentations: tuple[AugmentationSpec, ...] = ()
+    loss: LossSpec = field(default_factory=Huber)
+    terms: tuple[TermSpec, ...] = ()
+    weight_power: float = 0.0
+    horizon_decay: float = 1.0
+    adaptive: AdaptiveWeights = field(default_factory=AdaptiveWeights)
+    optimizer: OptimizerSpec = field(default_factory=AdamW)
+    schedule: ScheduleSpec = field(default_factory=Cosine)
+    average: AverageSpec = field(default_factory=Exponential)
+    epochs: int = 20
+    updates: int = 0
+    patience: int = 8
+    clip_norm: float = 1.0
+    seed: int = 0
+    threads: int = 1
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.epochs < 1 or self.updates < 0 or self.patience < 0 or self.threads < 0:
+            raise ConfigError(
+                f"training: epochs = {self.epochs} (at least 1), updates = {self.updates}, patience = "
+                f"{self.patience}, threads = {self.threads} (all at least 0) must hold"
+            )
+        if not self.clip_norm > 0 or not 0 < self.horizon_decay <= 1:
+            raise ConfigError(
+                f"training: clip_norm = {self.clip_norm}, horizon_decay = {self.horizon_decay}; clip_norm > 0 and "
+                "0 < horizon_decay <= 1 must hold"
+            )
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ConfigError(f"training: device = '{self.device}'; 'auto', 'cpu' or 'cuda' must hold")
+        names = [TERMS.name_of(term) for term in self.terms]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"training: terms {', '.join(names)}; each at most once must hold")
+        seen = self.chunks.consecutive if self.chunks.regime == "window" else self.chunks.length
+        for name, term in zip(names, self.terms, strict=True):
+            if term.span > seen:
+                raise ConfigError(
+                    f"training: the term '{name}' compares {term.span} consecutive predictions, but "
+                    + (
+                        f"windows are drawn {seen} at a time; set chunks.consecutive = {term.span} and a batch that is "
+                        "a multiple of it, or train on chunks"
+                        if self.chunks.regime == "window"
+                        else f"chunks have {seen} ticks; {term.span} or more must hold"
+                    )
+                )
+
+
+def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:
+    """Refuse settings of a training that contradict the network or the task.
+
+    Raises:
+        ConfigError: every reason found.
+    """
+    reasons = []
+    loss, output = LOSSES.name_of(spec.loss), OUTPUTS.name_of(model.output)
+    if output not in spec.loss.outputs:
+        fitting = [name for name, part in LOSSES.items() if output in getattr(part, "outputs", ())]
+        reasons.append(
+            f"the loss '{loss}' trains the output {_either(spec.loss.outputs)}, but model.output is '{output}', which "
+            f"is trained by the loss {_either(fitting)}; change one of the two"
+        )
+    if spec.horizon_decay < 1 and len(task.horizons) == 1:
+        reasons.append(
+            f"horizon_decay = {spec.horizon_decay} weighs horizons against one another, but the task has one "
+            f"({task.horizons[0]}); set it to 1"
+        )
+    if spec.adaptive.blend and len(task.targets) == 1:
+        reasons.append(
+            f"adaptive.blend = {spec.adaptive.blend} weighs outputs against one another, but the task has one target "
+            f"('{task.targets[0]}'); set it to 0"
+        )
+    if reasons:
+        raise ConfigError("training: " + "; ".join(reasons))
+
+
+def _either(names: tuple[str, ...] | list[str]) -> str:
+    return " or ".join(f"'{name}'" for name in names)
