@@ -20,6 +20,7 @@ from edp.errors import ConfigError
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, HybridSpec, LstmSpec, TcnSpec
 from edp.models.heads import HEADS, GluHead, MlpHead
+from edp.models.outputs import OUTPUTS, Point
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination
 
 WINDOW = 9
@@ -54,6 +55,7 @@ class Structure(NamedTuple):
     backbone: object
     blocks: tuple[object, ...] = ()
     head: object = MlpHead(hidden=6)
+    output: object = Point()
 
 
 def options_of(name: str, registry: object) -> list[object]:
@@ -61,7 +63,7 @@ def options_of(name: str, registry: object) -> list[object]:
 
 
 def _structures() -> dict[str, Structure]:
-    """Each backbone alone, with each block that fits it, with each head, and with its slots full."""
+    """Each backbone alone, with each block that fits it, with each head and output, and with its slots full."""
     found: dict[str, Structure] = {}
     for name in BACKBONES:
         for number, backbone in enumerate(options_of(name, BACKBONES)):
@@ -79,6 +81,9 @@ def _structures() -> dict[str, Structure]:
             for number, spec in enumerate(options_of(head, HEADS)):
                 if (head, number) != ("mlp", 0):
                     found[f"{name}+{head}{number or ''}"] = Structure(backbone, (), spec)
+        for output in OUTPUTS:
+            if output != "point":
+                found[f"{name}+{output}"] = Structure(backbone, output=OUTPUTS[output]())
         found[f"{name}+all"] = Structure(backbone, tuple(full.values()), options_of("glu", HEADS)[0])
     return found
 
@@ -87,10 +92,11 @@ STRUCTURES = _structures()
 
 
 def model_of(structure: str, activation: str) -> ModelSpec:
-    backbone, blocks, head = STRUCTURES[structure]
+    backbone, blocks, head, output = STRUCTURES[structure]
     return ModelSpec(
         backbone=backbone,  # type: ignore[arg-type]
         head=head,  # type: ignore[arg-type]
+        output=output,  # type: ignore[arg-type]
         activation=ACTIVATIONS[activation](),
         blocks=blocks,
         window=WINDOW,

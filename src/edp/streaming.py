@@ -60,6 +60,7 @@ class Operation(StrEnum):
     RELU = "relu"
     GELU = "gelu"
     GLU = "glu"
+    SOFTPLUS = "softplus"
     SOFTMAX = "softmax"
     LAYER_NORM = "layer_norm"
 

@@ -58,8 +58,8 @@ def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(p
     assert {block for _, block in fitting} == set(BLOCKS)
     assert {backbone for backbone, _ in fitting} == set(BACKBONES)
     assert len(forms) == len(ACTIVATIONS) * 2 * 2
-    # Plain ones, pairs, further options of two blocks, further heads, and one with all slots full for each backbone.
-    assert len(structures) == 5 + 22 + 2 * 3 + 3 * 3 + 3
+    # Plain ones, pairs, further options of two blocks, further heads and outputs, and full slots for each backbone.
+    assert len(structures) == 5 + 22 + 2 * 3 + 3 * 3 + 3 * 3 + 3
 
 
 def test_every_file_in_blocks_registers_a_block():

@@ -14,6 +14,7 @@ from torch.nn import functional
 from edp.errors import ConfigError
 from edp.losses import Answer
 from edp.registry import Registry
+from edp.streaming import Operation
 
 SMALLEST = 1e-4  # least distance of neighbouring quantiles, in standard deviations of the target
 LOW_LOG_VARIANCE = 2.0 * math.log(1e-3)
@@ -54,6 +55,7 @@ class Output(nn.Module):
         outputs: number of targets.
     """
 
+    operations: frozenset[Operation] = frozenset()
     stretch: Tensor
 
     def __init__(self, coverages: Sequence[float], horizons: int, outputs: int) -> None:
@@ -176,6 +178,8 @@ class Quantiles:
 
 
 class _Quantiles(Output):
+    operations = frozenset({Operation.SOFTPLUS})
+
     def __init__(self, spec: Quantiles, horizons: int, outputs: int) -> None:
         super().__init__(spec.coverages, horizons, outputs)
         self.pairs = len(spec.levels) // 2
@@ -244,6 +248,8 @@ class Laplace(_Law):
 
 class _Spread(Output):
     """Intervals of `sizes` standard deviations to each side."""
+
+    operations = frozenset({Operation.SOFTPLUS})
 
     def __init__(self, law: str, coverages: Sequence[float], sizes: Sequence[float], shape: tuple[int, int]) -> None:
         super().__init__(coverages, *shape)
