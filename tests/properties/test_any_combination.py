@@ -1,0 +1,73 @@
+"""Any combination of registered parts is a working network or refused with a reason; nothing else happens."""
+
+import re
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edp.blocks import BLOCKS
+from edp.data.features import FeatureSet
+from edp.data.scaling import Scaler
+from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError
+from edp.models.activations import ACTIVATIONS
+from edp.models.backbones import BACKBONES
+from edp.models.heads import HEADS
+from edp.models.outputs import OUTPUTS
+from edp.models.plain import model_from_plain, model_to_plain
+from edp.models.predictor import ModelSpec, build_model
+
+FEATURES = FeatureSet("three", ("v_1", "v_2", "lever"))
+
+
+def one_of(registry):
+    return st.sampled_from(list(registry)).map(lambda name: registry[name]())
+
+
+PARTS = st.fixed_dictionaries(
+    {
+        "backbone": one_of(BACKBONES),
+        "head": one_of(HEADS),
+        "output": one_of(OUTPUTS),
+        "activation": one_of(ACTIVATIONS),
+        "blocks": st.lists(one_of(BLOCKS), max_size=6).map(tuple),
+    }
+)
+TASKS = st.builds(
+    lambda targets, horizons, mode: Task(FEATURES, targets, horizons, mode, 100.0),
+    st.sampled_from([("v_1",), ("v_2", "v_1")]),
+    st.sampled_from([(1,), (2, 5)]),
+    st.sampled_from(list(TargetMode)),
+)
+built: list[ModelSpec] = []
+refusals: list[str] = []
+
+
+def test_any_combination_is_built_or_refused():
+    check()
+    assert len(built) >= 20
+    assert len(refusals) >= 20
+    for message in refusals:
+        assert re.search("keep one of them|remove the block", message), message
+
+
+@settings(max_examples=150, deadline=None, database=None, derandomize=True)
+@given(parts=PARTS, task=TASKS)
+def check(parts, task):
+    shape = (len(task.horizons), len(task.targets))
+    try:
+        spec = ModelSpec(**parts)
+        predictor = build_model(task, spec, Scaler(np.zeros(3), np.ones(3), np.zeros(shape), np.ones(shape)), 0)
+    except ConfigError as error:
+        refusals.append(str(error))
+        return
+    built.append(spec)
+    assert model_from_plain(model_to_plain(spec)) == spec
+    x = torch.randn(1, 4, len(task.features.inputs))
+    with torch.no_grad():
+        found, _ = predictor.predict(x, predictor.initial_state(1, x))
+    assert found.shape == (1, 4, *shape)
+    assert torch.isfinite(found).all()
+    assert sum(row.parameters for row in predictor.costs()) == sum(p.numel() for p in predictor.parameters())
