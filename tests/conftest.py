@@ -21,6 +21,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, HybridSpec, LstmSpec, TcnSpec
 from edp.models.heads import HEADS, GluHead, MlpHead
 from edp.models.outputs import OUTPUTS, Point
+from edp.models.physics import PHYSICS
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination
 
 WINDOW = 9
@@ -38,7 +39,7 @@ SMALL = {
 }
 FEATURES = FeatureSet(
     "contract",
-    ("speed_1", "speed_2", "pressure", "lever"),
+    ("CylVels_1", "CylVels_3", "pressure", "lever"),
     (Derived("dpressure", "pressure"), Derived("dload", "load", "derivative")),
     hidden=("load",),
 )
@@ -56,6 +57,7 @@ class Structure(NamedTuple):
     blocks: tuple[object, ...] = ()
     head: object = MlpHead(hidden=6)
     output: object = Point()
+    physics: object = None
 
 
 def options_of(name: str, registry: object) -> list[object]:
@@ -88,11 +90,25 @@ def _structures() -> dict[str, Structure]:
     return found
 
 
-STRUCTURES = _structures()
+def _physical() -> dict[str, Structure]:
+    """Each physics base beside one backbone: it meets the network at the output only."""
+    variants = {
+        "kinematic": [{}, {"pose": "strokes"}],
+        "force": [{}, {"load": "none", "machine": "C14"}],
+        "hybrid": [{"fade_s": 0.05}, {"coupled": True, "pose": "strokes"}],
+    }
+    return {
+        f"lstm+{name} physics{number or ''}": Structure(SMALL["lstm"][0], physics=PHYSICS[name](**options))
+        for name in PHYSICS
+        for number, options in enumerate(variants.get(name, [{}]))
+    }
+
+
+STRUCTURES = _structures() | _physical()
 
 
 def model_of(structure: str, activation: str) -> ModelSpec:
-    backbone, blocks, head, output = STRUCTURES[structure]
+    backbone, blocks, head, output, physics = STRUCTURES[structure]
     return ModelSpec(
         backbone=backbone,  # type: ignore[arg-type]
         head=head,  # type: ignore[arg-type]
@@ -100,11 +116,14 @@ def model_of(structure: str, activation: str) -> ModelSpec:
         activation=ACTIVATIONS[activation](),
         blocks=blocks,
         window=WINDOW,
+        physics=physics,  # type: ignore[arg-type]
     )
 
 
-def task_of(form: Form) -> Task:
-    return Task(FEATURES, ("speed_1", "speed_2"), form[1], form[2], 100.0)
+def task_of(form: Form, model: ModelSpec) -> Task:
+    extra = () if model.physics is None else model.physics.channels()
+    physics = tuple(name for name in extra if name not in FEATURES.inputs)
+    return Task(FEATURES, ("CylVels_1", "CylVels_3"), form[1], form[2], 100.0, physics=physics)
 
 
 @cache
@@ -113,7 +132,8 @@ def forms_of(structure: str) -> list[Form]:
     agreed = []
     for form in FORMS:
         try:
-            check_combination(task_of(form), model_of(structure, form[0]))
+            model = model_of(structure, form[0])
+            check_combination(task_of(form, model), model)
         except ConfigError:
             continue
         agreed.append(form)
@@ -122,7 +142,8 @@ def forms_of(structure: str) -> list[Form]:
 
 @cache
 def _build(structure: str, form: Form) -> Predictor:
-    task, spec = task_of(form), model_of(structure, form[0])
+    spec = model_of(structure, form[0])
+    task = task_of(form, spec)
     shape = (len(form[1]), 2)
     rng = np.random.default_rng(7)
     scaler = Scaler(rng.normal(size=6), rng.uniform(0.5, 2, 6), rng.normal(size=shape), rng.uniform(0.5, 2, shape))

@@ -26,6 +26,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
+from edp.models.physics import PHYSICS, PhysicsSpec
 from edp.models.plain import options
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
@@ -42,6 +43,7 @@ TAGGED: Mapping[str, Registry[type]] = {
     "output": OUTPUTS,
     "blocks": BLOCKS,
     "augmentations": AUGMENTATIONS,
+    "physics": PHYSICS,
     "loss": LOSSES,
     "terms": TERMS,
     "optimizer": OPTIMIZERS,
@@ -87,8 +89,8 @@ class TaskSettings:
     derived_targets: tuple[Derived, ...] = ()
     integrate: tuple[str, ...] = ()
 
-    def resolve(self, rate_hz: float, channels: Sequence[str] = ()) -> Task:
-        """The task for recordings of `rate_hz` with these channels."""
+    def resolve(self, rate_hz: float, channels: Sequence[str] = (), physics: PhysicsSpec | None = None) -> Task:
+        """The task for recordings of `rate_hz` with these channels, with what a physics base reads beside them."""
         chosen = self.features
         if isinstance(chosen, FeatureSettings):
             features = FeatureSet(chosen.name, chosen.channels, chosen.derived, chosen.hidden)
@@ -99,7 +101,10 @@ class TaskSettings:
         else:
             hint = closest(chosen, [*FEATURE_SETS, "all"])
             raise ConfigError(f"task.features: there is no feature set '{chosen}'{hint}")
-        return Task(features, self.targets, self.horizons, self.mode, rate_hz, self.derived_targets, self.integrate)
+        extra = () if physics is None else tuple(n for n in physics.channels() if n not in features.inputs)
+        return Task(
+            features, self.targets, self.horizons, self.mode, rate_hz, self.derived_targets, self.integrate, extra
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

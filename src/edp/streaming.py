@@ -63,6 +63,9 @@ class Operation(StrEnum):
     SOFTPLUS = "softplus"
     SOFTMAX = "softmax"
     LAYER_NORM = "layer_norm"
+    SQRT = "sqrt"
+    EXP = "exp"
+    SINE = "sine"
 
 
 class Streaming(nn.Module, ABC):

@@ -61,7 +61,7 @@ def prepare_data(source: DataSource, experiment: Experiment) -> Prepared:
     """Read and cut a data set for an experiment."""
     recordings = source.read()
     first = recordings[0]
-    task = experiment.task.resolve(first.rate_hz, first.channel_names)
+    task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
     check_combination(task, experiment.model)
     check_training(task, experiment.model, experiment.training)
     return prepare(recordings, task, experiment.split, experiment.model.window)
@@ -84,8 +84,10 @@ def train(
     Raises:
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
     """
-    data = prepare_data(source, experiment)
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    if experiment.model.physics is not None:  # an unknown machine is told before recordings are read
+        settings["machine"] = experiment.model.physics.digest()
+    data = prepare_data(source, experiment)
     key = run_key(settings, data.digest)
     with RunFolder(out) as run:
         run.claim(key, experiment_toml(experiment))
@@ -211,7 +213,7 @@ def footprint_of(path: str | Path) -> tuple[Footprint, str]:
     source = Path(path)
     if source.suffix == ".toml":
         experiment = load_experiment(source)
-        task = experiment.task.resolve(100.0)
+        task = experiment.task.resolve(100.0, physics=experiment.model.physics)
         return footprint(_untrained(experiment.model, task)), source.stem
     bundle = load_bundle(source)
     return footprint(bundle.predictor), describe(bundle.predictor.spec)

@@ -15,15 +15,27 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
+from edp.models.physics import PHYSICS
+from edp.models.physics.base import SPEEDS
 from edp.models.predictor import ModelSpec, build_model, check_combination
 
-REGISTRIES = (BACKBONES, HEADS, OUTPUTS, ACTIVATIONS, BLOCKS)
+REGISTRIES = (BACKBONES, HEADS, OUTPUTS, ACTIVATIONS, BLOCKS, PHYSICS)
 TASK = Task(FeatureSet("two", ("v_1", "v_2")), ("v_1", "v_2"), (1,), TargetMode.ABSOLUTE, 100.0)
 PLAIN = ModelSpec()
 
 
 def with_blocks(*names):
     return replace(PLAIN, blocks=tuple(BLOCKS[name]() for name in names))
+
+
+def with_physics(name, *blocks):
+    return replace(with_blocks(*blocks), physics=PHYSICS[name]())
+
+
+def reads(name):
+    """A task that feeds a physics base what it reads."""
+    extra = tuple(channel for channel in PHYSICS[name]().channels() if channel not in SPEEDS)
+    return replace(TASK, features=FeatureSet("speeds", SPEEDS), targets=SPEEDS[:2], physics=extra)
 
 
 # The part that refuses, the task, the network, and words of the reason.
@@ -36,6 +48,19 @@ REFUSED = [
     ),
     ("velocity_skip", replace(TASK, features=FeatureSet("one", ("v_1",))), with_blocks("velocity_skip"), "v_2 is not"),
     ("cross_cylinder_attention", replace(TASK, targets=("v_1",)), with_blocks("cross_cylinder_attention"), "has one"),
+    (
+        "kinematic",
+        replace(reads("kinematic"), physics=()),
+        with_physics("kinematic"),
+        "reads JointAngle_1, .*JointVel_3",
+    ),
+    (
+        "force",
+        replace(TASK, physics=PHYSICS["force"]().channels()),
+        with_physics("force"),
+        "predicts CylVels_1.*targets are v_1, v_2",
+    ),
+    ("hybrid", reads("hybrid"), with_physics("hybrid", "linear_bypass"), "start = 'zero'"),
 ]
 ALONE = {name: make() for registry in REGISTRIES for name, make in registry.items() if issubclass(make, Particular)}
 

@@ -30,6 +30,10 @@ ALLOWED = {
     "softplus": {Operation.SOFTPLUS},
     "_softmax": {Operation.SOFTMAX},
     "native_layer_norm": {Operation.LAYER_NORM},
+    "sqrt": {Operation.SQRT},
+    "exp": {Operation.EXP},
+    "sin": {Operation.SINE},
+    "cos": {Operation.SINE},
 }
 # Moving numbers, making masks, and element-wise arithmetic: understood, not declared.
 FREE = {
@@ -49,7 +53,8 @@ FREE = {
         "zeros_like",
     ),
     *("bitwise_and", "bitwise_not", "bitwise_or", "eq", "ge", "gt", "lt", "masked_fill", "remainder", "where"),
-    *("add", "clamp", "cumsum", "div", "flip", "mul", "neg", "rsub", "sub"),
+    *("abs", "add", "clamp", "cumsum", "div", "flip", "maximum", "minimum", "mul", "neg", "pow", "reciprocal", "rsub"),
+    *("sign", "sub"),
 }
 
 
@@ -97,6 +102,8 @@ class Trace(TorchDispatchMode):
         name = function._schema.name.removeprefix("aten::")
         self.operations[self.inside[-1]][name if name.startswith("_") else name.rstrip("_")] += 1
         self.macs[self.inside[-1]] += macs_of(name, args, result)
+        if self.inside[-1] == "physics":
+            self.macs["physics"] += arithmetic_of(name, args, result)
         return result
 
 
@@ -108,6 +115,16 @@ def macs_of(name, args, result):
     if name == "convolution":
         return result.numel() * math.prod(args[1].shape[1:])
     return 0
+
+
+def arithmetic_of(name, args, result):
+    """A physics base is arithmetic only: what makes numbers from inputs counts, sums and choices apart.
+
+    What the machine's numbers alone give, tensors of at most one dimension, is computed once.
+    """
+    counted = name in ("mul", "div", "sqrt", "pow", "reciprocal", "exp", "sin", "cos")
+    of_inputs = any(isinstance(entry, torch.Tensor) and entry.dim() > 1 for entry in args)
+    return result.numel() if counted and of_inputs else 0
 
 
 def trace(predictor, ticks, state=None):
@@ -183,7 +200,7 @@ def test_each_tick_costs_what_every_part_says(structure, predictor_of):
 
 
 # Parts whose work counts once per prediction; pooling is left out of windowed counts, as in the thesis's tables.
-ONCE = ("backbone.extras", "gate", "heads", "bypass")
+ONCE = ("backbone.extras", "gate", "heads", "bypass", "physics")
 LEFT_OUT = "backbone.pooling"
 
 

@@ -17,6 +17,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, TcnSpec
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
+from edp.models.physics import PHYSICS
 from edp.models.plain import tagged, untagged
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
@@ -26,6 +27,7 @@ from edp.training.schedules import SCHEDULES
 
 SPECS = [
     BACKBONES,
+    PHYSICS,
     BLOCKS,
     HEADS,
     ACTIVATIONS,
@@ -59,7 +61,9 @@ def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(p
     assert {backbone for backbone, _ in fitting} == set(BACKBONES)
     assert len(forms) == len(ACTIVATIONS) * 2 * 2
     # Plain ones, pairs, further options of two blocks, further heads and outputs, and full slots for each backbone.
-    assert len(structures) == 5 + 22 + 2 * 3 + 3 * 3 + 3 * 3 + 3
+    # Two forms of each physics base.
+    assert len(structures) == 5 + 22 + 2 * 3 + 3 * 3 + 3 * 3 + 3 + 3 * 2
+    assert {PHYSICS.name_of(s.physics) for s in structures.values() if s.physics} == set(PHYSICS)
 
 
 def test_every_file_in_blocks_registers_a_block():
@@ -140,6 +144,10 @@ BAD = [
     lambda: OPTIMIZERS["adamw"](learning_rate=0.0),
     lambda: SCHEDULES["cosine"](floor=1.5),
     lambda: ModelSpec(window=0),
+    lambda: PHYSICS["kinematic"](pose="angels"),
+    lambda: PHYSICS["force"](load="gravitation"),
+    lambda: PHYSICS["hybrid"](fade_s=-0.1),
+    lambda: PHYSICS["hybrid"](coupled=True, load="gravity"),
 ]
 
 

@@ -112,7 +112,8 @@ def test_gradients_reach_every_parameter(structure, form, predictor_of):
     torch.manual_seed(5)
     x = inputs(predictor, batch=4)
     code, _ = predictor(x, predictor.initial_state(4, x))
-    loss = (code - torch.randn(code.shape, dtype=code.dtype)).square().sum()
+    # An error of the size of a standard deviation, however far a physics base goes on inputs drawn at random.
+    loss = (code - code.detach() - torch.randn(code.shape, dtype=code.dtype)).square().sum()
     learned = {name: parameter for name, parameter in predictor.named_parameters() if parameter.requires_grad}
     fixed = {name for name, _ in predictor.named_parameters()} - set(learned)
     bypass = getattr(predictor.bypass, "spec", None)

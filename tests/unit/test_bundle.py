@@ -49,7 +49,7 @@ def test_every_structure_survives_a_round_trip(structure, predictor_of, tmp_path
     save_bundle(Bundle(predictor, tiny.inputs, (Kind.VELOCITY,) * 2, ("", "")), tmp_path)
     loaded = load_bundle(tmp_path).predictor
     assert (loaded.task, loaded.spec) == (predictor.task, predictor.spec)
-    x = torch.randn(1, 15, 5)
+    x = torch.randn(1, 15, predictor.front.inputs)
     with torch.no_grad():
         found = loaded.predict(x, loaded.initial_state(1, x))[0]
         assert torch.equal(found, predictor.predict(x, predictor.initial_state(1, x))[0])

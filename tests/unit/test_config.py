@@ -49,6 +49,7 @@ def test_every_registered_part_survives_a_round_trip(tmp_path):
         "schedule": ("training", "schedule"),
         "average": ("training", "average"),
         "split": ("split",),
+        "physics": ("model", "physics"),
     }
     lists = {"terms", "augmentations"}
     assert set(TAGGED) == {*places, *lists, "blocks"}

@@ -77,7 +77,7 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
         train=series(parts.train),
         validation=series(parts.validation),
         test=series(parts.test),
-        inputs=tuple(first.channels[first.index(name)] for name in task.features.inputs),
+        inputs=tuple(first.channels[first.index(name)] for name in task.inputs),
         feature_kinds=tuple(kind_of(name, first, task.derived) for name in task.features.features),
         target_kinds=task.kinds(first),
         descriptions=tuple(_description(first, name) for name in task.targets),

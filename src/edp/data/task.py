@@ -34,6 +34,8 @@ class Task:
         derived_targets: derived channels that serve as targets only.
         integrate: targets at horizon 0 whose running integral is judged too: a plant that integrates (a position
             behind a velocity) is predicted through its rate and integrated outside.
+        physics: further logged channels that only a physics base reads: inputs, but neither features nor known to
+            baselines.
 
     Raises:
         ConfigError: a horizon or combination that cannot hold.
@@ -46,6 +48,7 @@ class Task:
     rate_hz: float
     derived_targets: tuple[Derived, ...] = ()
     integrate: tuple[str, ...] = ()
+    physics: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.targets:
@@ -69,8 +72,16 @@ class Task:
         for target in self.integrate:
             if target not in self.targets:
                 raise ConfigError(f"task: integrate names '{target}', not a target{closest(target, self.targets)}")
+        twice = [name for name in self.physics if name in self.features.inputs or self.physics.count(name) > 1]
+        if twice:
+            raise ConfigError(f"task: physics names {', '.join(twice)}, which is read already; keep one entry each")
         if self.integrate and 0 not in self.horizons:
             raise ConfigError("task: integrate judges a free run, which needs horizon 0; add it to horizons")
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Logged channels that must be fed at each tick: those of the features, then those of the physics base."""
+        return self.features.inputs + self.physics
 
     @property
     def derived(self) -> tuple[Derived, ...]:
@@ -103,10 +114,17 @@ class Task:
                 f"recording '{recording.name}' has {recording.rate_hz:g} Hz, the task {self.rate_hz:g} Hz; all rates "
                 "must be equal: set rate_hz in the signal map"
             )
+        missing = [name for name in self.physics if name not in recording.channel_names]
+        if missing:
+            raise DataError(
+                f"recording '{recording.name}' ({recording.source}) lacks {', '.join(missing)}, which the physics base "
+                "reads; map the columns that hold them (rad, rad/s, m), choose another pose for the base ('angles' or "
+                "'strokes'), or remove model.physics"
+            )
         rows = slice(start, stop)
-        inputs = np.ascontiguousarray(recording.select(self.features.inputs)[rows])
+        inputs = np.ascontiguousarray(recording.select(self.inputs)[rows])
         targets = np.stack([column(recording, target, self.derived) for target in self.targets], axis=1)[rows]
-        for values, names in ((inputs, self.features.inputs), (targets, self.targets)):
+        for values, names in ((inputs, self.inputs), (targets, self.targets)):
             bad = ~np.isfinite(values)
             if bad.any():
                 row, which = (int(i) for i in np.argwhere(bad)[0])

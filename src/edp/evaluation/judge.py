@@ -120,11 +120,15 @@ def _derived_targets(data: Prepared) -> list[str]:
 def _with_derived_targets(data: Prepared, parts: Sequence[Series]) -> list[Series]:
     """Inputs as the baselines read them: where the network knows a target's present value, so must they."""
     names = _derived_targets(data)
-    if not names:
+    if not names and not data.task.physics:
         return list(parts)
+    # Baselines do not read what only a physics base reads.
+    own = len(data.task.features.inputs)
     columns = [data.task.features.features.index(name) for name in names]
     return [
-        replace(part, inputs=np.concatenate([part.inputs, feature_matrix(data.task, part)[:, columns]], axis=1))
+        replace(
+            part, inputs=np.concatenate([part.inputs[:, :own], feature_matrix(data.task, part)[:, columns]], axis=1)
+        )
         for part in parts
     ]
 

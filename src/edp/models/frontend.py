@@ -16,7 +16,7 @@ class FrontEnd(Streaming):
 
     Maps inputs ``(batch, time, input)`` in SI units to physical features ``(batch, time, feature)``; `scale` gives
     the standardised ones. State: the previous tick's inputs and whether there was one; at the first tick after a
-    reset every derived value is 0.
+    reset every derived value is 0. Inputs of the physics base follow those of the features and are passed over.
     """
 
     offset: Tensor
@@ -26,17 +26,19 @@ class FrontEnd(Streaming):
         super().__init__()
         inputs = task.features.inputs
         self.logged = len(task.features.channels)
-        self.inputs = len(inputs)
+        self.inputs = len(task.inputs)
+        self.sources = len(inputs)
         self.rate_hz = task.rate_hz
         self.derived = [(DERIVATIONS[entry.how], inputs.index(entry.source)) for entry in task.features.derived]
         self.register_buffer("offset", torch.tensor(scaler.feature_offset, dtype=torch.get_default_dtype()))
         self.register_buffer("width", torch.tensor(scaler.feature_scale, dtype=torch.get_default_dtype()))
 
     def initial_state(self, batch: int, like: Tensor) -> State:
-        return like.new_zeros(batch, 1, self.inputs), like.new_zeros(batch, 1, 1)
+        return like.new_zeros(batch, 1, self.sources), like.new_zeros(batch, 1, 1)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         previous, seen = state
+        x = x[..., : self.sources]
         first = torch.where(seen > 0.5, previous, x[:, :1])
         before = torch.cat([first, x[:, :-1]], dim=1)
         columns = [x[..., : self.logged]]

@@ -15,6 +15,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
+from edp.models.physics import PHYSICS
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
 from edp.signals import Kind
@@ -67,11 +68,13 @@ def model_to_plain(spec: ModelSpec) -> Plain:
         "output": tagged(spec.output, OUTPUTS),
         "blocks": [tagged(block, BLOCKS) for block in spec.blocks],
         "window": spec.window,
+        "physics": None if spec.physics is None else tagged(spec.physics, PHYSICS),
     }
 
 
 def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
-    """A network spec from JSON values."""
+    """A network spec from JSON values; one without ``physics`` has no physics base."""
+    physics = plain.get("physics")
     return ModelSpec(
         backbone=untagged(plain["backbone"], BACKBONES),
         head=untagged({"kind": "mlp", **plain["head"]}, HEADS),
@@ -79,6 +82,7 @@ def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
         output=untagged(plain.get("output", {"kind": "point"}), OUTPUTS),
         blocks=tuple(untagged(block, BLOCKS) for block in plain["blocks"]),
         window=plain["window"],
+        physics=None if physics is None else untagged(physics, PHYSICS),
     )
 
 
@@ -98,6 +102,7 @@ def task_to_plain(task: Task) -> Plain:
         "rate_hz": task.rate_hz,
         "derived_targets": [options(entry) for entry in task.derived_targets],
         "integrate": listed(task.integrate),
+        "physics": listed(task.physics),
     }
 
 
@@ -120,6 +125,7 @@ def task_from_plain(plain: Mapping[str, Any]) -> Task:
             rate_hz=float(plain["rate_hz"]),
             derived_targets=tuple(map(_derived, plain["derived_targets"])),
             integrate=tuple(plain["integrate"]),
+            physics=tuple(plain.get("physics", ())),
         )
     except (KeyError, TypeError, ValueError, ConfigError) as error:
         raise BundleError(f"the bundle's task is not understood by this version: {error}") from error

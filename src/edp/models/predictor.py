@@ -17,6 +17,7 @@ from edp.models.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.models.frontend import FrontEnd, TargetCode
 from edp.models.heads import HeadSpec, MlpHead
 from edp.models.outputs import OutputSpec, Point
+from edp.models.physics import PHYSICS, PhysicsBase, PhysicsSpec
 from edp.streaming import Cost, State, Streaming, parameters_of
 
 
@@ -31,6 +32,7 @@ class ModelSpec:
         output: options of a registered output: what is said of each target besides a prediction.
         blocks: options of registered blocks; absent means not built.
         window: W, samples of trailing context of pooling, and the length of the window regime.
+        physics: options of a registered physics base; None for no base.
     """
 
     backbone: BackboneSpec = field(default_factory=HybridSpec)
@@ -39,6 +41,7 @@ class ModelSpec:
     output: OutputSpec = field(default_factory=Point)
     blocks: tuple[object, ...] = ()
     window: int = 50
+    physics: PhysicsSpec | None = None
 
     def __post_init__(self) -> None:
         if self.window < 1:
@@ -63,7 +66,7 @@ def check_combination(task: Task, spec: ModelSpec) -> None:
     Raises:
         ConfigError: the reason that each of them gives.
     """
-    parts = (spec.backbone, spec.head, spec.output, spec.activation, *spec.blocks)
+    parts = (spec.backbone, spec.head, spec.output, spec.activation, *spec.blocks, spec.physics)
     reasons = [part.conflicts(spec, task) for part in parts if isinstance(part, Particular)]
     given = [reason for reason in reasons if reason]
     if given:
@@ -92,6 +95,7 @@ class Predictor(Streaming):
         self.output = spec.output.build(horizons, outputs)
         self.activation = spec.activation.build(outputs)
         self.bypass = self._block(Slot.BYPASS, OutputSpace(features, horizons, outputs, task.present, *self._present()))
+        self.physics: PhysicsBase | None = spec.physics.build(task) if spec.physics is not None else None
 
     def _block(self, slot: Slot, *sizes: object) -> Streaming | None:
         """The block in a slot that takes one, built; None where there is none."""
@@ -106,6 +110,7 @@ class Predictor(Streaming):
 
     def _parts(self) -> dict[str, Streaming]:
         parts = {"backbone": self.backbone, "gate": self.gate, "heads": self.heads, "bypass": self.bypass}
+        parts["physics"] = self.physics
         return {name: part for name, part in parts.items() if part is not None}
 
     def initial_state(self, batch: int, like: Tensor) -> State:
@@ -133,6 +138,10 @@ class Predictor(Streaming):
         if self.bypass is not None:
             direct, new["bypass"] = self.bypass(scaled, state["bypass"])
             center = center + direct
+        if self.physics is not None:
+            # Outside g, so that the bound of g limits the correction and not the physics.
+            ahead, new["physics"] = self.physics(x, state["physics"])
+            center = center + self.physics.known * self.code.encode(ahead, features)
         return self.output.answer(center, values[..., 1:, :]), features, new
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
@@ -169,7 +178,10 @@ def build_model(task: Task, spec: ModelSpec, scaler: Scaler, seed: int) -> Predi
     """A predictor with freshly drawn weights; the same seed gives the same weights."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return Predictor(task, spec, scaler)
+        predictor = Predictor(task, spec, scaler)
+    if predictor.physics is not None:
+        predictor.physics.read()
+    return predictor
 
 
 def trainable(module: nn.Module) -> list[nn.Parameter]:
@@ -179,4 +191,5 @@ def trainable(module: nn.Module) -> list[nn.Parameter]:
 
 def describe(spec: ModelSpec) -> str:
     """A short label for tables, for example ``hybrid + temporal_difference``."""
-    return " + ".join([BACKBONES.name_of(spec.backbone), *(BLOCKS.name_of(block) for block in spec.blocks)])
+    physics = [] if spec.physics is None else [f"{PHYSICS.name_of(spec.physics)} physics"]
+    return " + ".join([BACKBONES.name_of(spec.backbone), *(BLOCKS.name_of(block) for block in spec.blocks), *physics])

@@ -120,6 +120,8 @@ class _Loop:
                     f"{spec.chunks.burn_in} plus the horizon of {data.task.reach}; give a longer one"
                 )
         self.net = build_model(data.task, model, data.scaler(), spec.seed)
+        if self.net.physics is not None:
+            self.net.physics.settle([torch.from_numpy(part.inputs) for part in data.train])
         started = start_bypass(self.net, data.train, data.validation)
         self.net.to(self.device)
         named = [(name, parameter) for name, parameter in self.net.named_parameters() if parameter.requires_grad]
