@@ -89,6 +89,26 @@ def score(prediction: ArrayLike, truth: ArrayLike) -> Scores:
     return Scores(mae, rmse, r2, p95, p99, composite(mae, rmse, p95, p99), bias, int(error.size))
 
 
+def interval_scores(lower: ArrayLike, upper: ArrayLike, truth: ArrayLike) -> tuple[float, float]:
+    """Share of the true values that lie between two bounds, and the mean distance of the bounds.
+
+    Args:
+        lower: ``(sample,)`` in the unit of the width.
+        upper: likewise.
+        truth: likewise.
+
+    Raises:
+        DataError: the arrays are empty, not one-dimensional, of unequal length, or hold NaN or infinite values.
+    """
+    low, high, true = _vector(lower, "lower bound"), _vector(upper, "upper bound"), _vector(truth, "truth")
+    if not low.shape == high.shape == true.shape:
+        raise DataError(
+            f"{low.size} lower and {high.size} upper bounds came for {true.size} true values; score equal ticks of all"
+        )
+    inside = np.greater_equal(true, low) & np.less_equal(true, high)
+    return float(inside.mean()), float(np.subtract(high, low, dtype=np.float64).mean())
+
+
 def mean_scores(scores: Sequence[Scores]) -> Scores:
     """Mean over outputs (the thesis's mean over cylinders); `count` is the sum.
 

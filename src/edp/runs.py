@@ -105,6 +105,15 @@ class RunFolder:
         write_json(identity, {"schema": 1, "key": key, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")})
         return False
 
+    def write_status(self, status: str, **facts: Any) -> None:
+        """Say where the run stands: ``running``, ``finished`` or ``diverged``, with facts that fit into JSON."""
+        write_json(self.file("status.json"), {"status": status, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
+
+    def status(self) -> dict[str, Any]:
+        """Where the run stands; empty where nothing was written yet."""
+        held = self.file("status.json")
+        return dict(read_json(held)) if held.exists() else {}
+
     def write_history(self, rows: list[dict[str, Any]]) -> None:
         """Write all epochs so far, a JSON line each."""
         write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())

@@ -32,7 +32,7 @@ from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
 from edp.sources import DataSource
 from edp.storage import make_folder, read_json, write_bytes, write_json
-from edp.training import Bundle, Event, fit, load_bundle, make_bundle, save_bundle
+from edp.training import Bundle, Diverged, Event, Fitted, fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler, weights_digest
 from edp.training.fit import thread_count
 from edp.training.spec import check_training
@@ -83,6 +83,8 @@ def train(
 
     Raises:
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
+        Diverged: the loss was not finite any more, now or in an earlier sitting; a bundle holds the best weights
+            before that, where an epoch was finished.
     """
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
     if experiment.model.physics is not None:  # an unknown machine is told before recordings are read
@@ -91,13 +93,41 @@ def train(
     key = run_key(settings, data.digest)
     with RunFolder(out) as run:
         run.claim(key, experiment_toml(experiment))
-        fitted = fit(data, experiment.model, experiment.training, (run, key), on_event)
-        provenance = _provenance(source, experiment, data, fitted.seconds)
-        write_json(run.file("provenance.json"), provenance)
-        write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json(Budget()))
-        bundle = make_bundle(fitted.predictor, data, provenance)
-        save_bundle(bundle, run.file("bundle"))
+        _refuse_diverged(run)
+        run.write_status("running")
+        try:
+            fitted = fit(data, experiment.model, experiment.training, (run, key), on_event)
+        except Diverged as end:
+            if end.fitted is not None:
+                provenance = _provenance(source, experiment, data, end.fitted.seconds)
+                _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
+            run.write_status("diverged", message=str(end), **end.facts)
+            raise
+        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds), data)
+        run.write_status("finished")
     return bundle
+
+
+def _keep(run: RunFolder, fitted: Fitted, provenance: dict[str, Any], data: Prepared) -> Bundle:
+    """Write what a training leaves: provenance, footprint and the bundle."""
+    write_json(run.file("provenance.json"), provenance)
+    write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json(Budget()))
+    bundle = make_bundle(fitted.predictor, data, provenance)
+    save_bundle(bundle, run.file("bundle"))
+    return bundle
+
+
+def _refuse_diverged(run: RunFolder) -> None:
+    """A run that diverged would do so again, to the same bits."""
+    held = run.status()
+    if held.get("status") == "diverged":
+        kept = " Its bundle holds the weights from before." if run.file("bundle").exists() else ""
+        raise Diverged(
+            f"the run in '{run.path}' diverged on {held['time']}: {held['message']}. The same settings would do so "
+            f"again.{kept} Change them and choose another folder with --out, or remove this one",
+            None,
+            {name: held[name] for name in ("epoch", "update", "kept_epoch")},
+        )
 
 
 def _provenance(source: DataSource, experiment: Experiment, data: Prepared, seconds: float) -> dict[str, Any]:

@@ -1,4 +1,6 @@
 import dataclasses
+import math
+import sys
 
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ from edp.errors import ConfigError, DataError
 from edp.losses import MeanSquared
 from edp.models.predictor import build_model
 from edp.models.running import stream_predictions
-from edp.training.averages import NoAverage
-from edp.training.fit import TrainingError, TrainingSpec, fit, thread_count, validation_scores
+from edp.runs import RunFolder
+from edp.training.averages import NoAverage, Stochastic
+from edp.training.fit import Diverged, TrainingError, TrainingSpec, fit, thread_count, validation_scores
+from edp.training.objective import Objective
 from edp.training.optimizers import OPTIMIZERS, AdamW
 from edp.training.schedules import SCHEDULES, Constant
 
@@ -129,6 +133,62 @@ def test_a_loss_that_is_not_finite_is_a_training_error(tiny, tiny_model, tiny_tr
     wild = dataclasses.replace(tiny_training, optimizer=AdamW(learning_rate=1e38), schedule=Constant())
     with pytest.raises(TrainingError, match=r"loss is (nan|inf) at update \d+ .epoch 1.: .* Lower the learning rate"):
         fit(tiny, tiny_model, wild)
+
+
+def poisoned(tiny, rows):
+    """The tiny data set with infinite levers in a training recording, which the readers of logs would refuse."""
+    inputs = tiny.train[0].inputs.copy()
+    inputs[rows, 3] = np.inf
+    return dataclasses.replace(tiny, train=[Series("poisoned", inputs, tiny.train[0].targets), *tiny.train[1:]])
+
+
+def test_an_infinite_input_diverges_in_the_epoch_that_meets_it(tmp_path, tiny, tiny_model, tiny_training, monkeypatch):
+    # The scaler is that of the clean data, as if the value had come later; the epoch's batches meet it in any order.
+    clean = tiny.scaler()
+    monkeypatch.setattr(type(tiny), "scaler", lambda self: clean)
+    with RunFolder(tmp_path) as folder:
+        with pytest.raises(Diverged, match=r"no epoch was finished before, so nothing is kept") as caught:
+            fit(poisoned(tiny, slice(300, 302)), tiny_model, tiny_training, (folder, "k"))
+        assert caught.value.fitted is None
+        assert caught.value.facts["kept_epoch"] is None
+        assert not folder.file("checkpoint.safetensors").exists()
+
+
+def test_a_training_that_diverges_later_hands_over_the_best_weights_and_keeps_its_history(
+    tmp_path, tiny, tiny_model, tiny_training, fitted, monkeypatch
+):
+    real, calls = Objective.evaluate, []
+
+    def evaluate(self, *parts):
+        calls.append(1)
+        return real(self, *parts) * (math.inf if len(calls) == 70 else 1.0)
+
+    monkeypatch.setattr(Objective, "evaluate", evaluate)
+    with RunFolder(tmp_path) as folder, pytest.raises(Diverged) as caught:
+        fit(tiny, tiny_model, tiny_training, (folder, "k"))
+    end, history = caught.value, fitted[0].history[:2]
+    assert (end.facts["epoch"], end.facts["update"]) == (3, 70)
+    best = min(history, key=lambda row: row["validation_score"])
+    assert end.facts["kept_epoch"] == best["epoch"]
+    assert f"is inf at update 70 (epoch 3): the training diverged; the weights of epoch {best['epoch']}" in str(end)
+    score, _, _ = validation_scores(end.fitted.predictor, tiny.validation, tiny_training, tiny)
+    assert score == pytest.approx(best["validation_score"], rel=1e-6)
+    assert len((tmp_path / "history.jsonl").read_text().splitlines()) == 2
+
+
+def test_weights_that_break_in_the_last_update_of_an_epoch_are_not_kept(tiny, tiny_model, tiny_training, monkeypatch):
+    def scores(*parts):
+        return math.nan, math.nan, math.nan
+
+    monkeypatch.setattr(sys.modules[fit.__module__], "validation_scores", scores)
+    with pytest.raises(Diverged, match=r"the validation score is nan at update 30 \(epoch 1\)"):
+        fit(tiny, tiny_model, tiny_training)
+
+
+def test_swa_waits_for_its_average(tiny, tiny_model, tiny_training):
+    still = AdamW(learning_rate=1e-30, weight_decay=0.0)
+    spec = dataclasses.replace(tiny_training, optimizer=still, patience=1, epochs=5, average=Stochastic())
+    assert len(fit(tiny, tiny_model, spec).history) == 5
 
 
 def test_recordings_shorter_than_the_burn_in_are_refused(tiny, tiny_model, tiny_training):

@@ -7,8 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from edp.data.augment import AUGMENTATIONS
+from edp.data.chunks import ChunkSpec
 from edp.errors import StorageError
+from edp.losses import LOSSES, TERMS, AdaptiveWeights
+from edp.models.outputs import OUTPUTS
 from edp.runs import RunFolder, run_key
+from edp.training.averages import AVERAGES
 from edp.training.checkpoint import FILE
 from edp.training.fit import fit
 from edp.training.optimizers import OPTIMIZERS
@@ -69,6 +74,46 @@ def test_optimizers_schedules_with_memory_and_fixed_by_passes_go_on_too(
         fit(tiny, model, spec, (folder, KEY), stop_after(2))
     with RunFolder(tmp_path) as folder:
         assert_same(fit(tiny, model, spec, (folder, KEY)), fit(tiny, model, spec))
+
+
+WINDOWS = ChunkSpec(regime="window", length=10, batch=9, consecutive=3)
+KINDS = {
+    **{f"{name} on chunks": {"augmentations": (AUGMENTATIONS[name](),)} for name in AUGMENTATIONS},
+    **{f"{name} on windows": {"augmentations": (AUGMENTATIONS[name](),), "chunks": WINDOWS} for name in AUGMENTATIONS},
+    **{name: {"average": AVERAGES[name]()} for name in AVERAGES},
+    "swa throughout": {"average": AVERAGES["swa"](share=0.7, rate=0.0)},
+    "adaptive weights": {"adaptive": AdaptiveWeights(blend=0.5), "horizon_decay": 0.5},
+    "terms": {"terms": tuple(TERMS[name]() for name in TERMS)},
+    "terms on windows": {"terms": tuple(TERMS[name]() for name in TERMS), "chunks": WINDOWS},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_way_to_train_goes_on_to_the_same_bits(kind, tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
+    spec = dataclasses.replace(tiny_training, epochs=3, updates=10, **KINDS[kind])
+    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+        fit(tiny, tiny_model, spec, (folder, KEY), stop_after(2))
+    with RunFolder(tmp_path) as folder:
+        resumed = fit(tiny, tiny_model, spec, (folder, KEY))
+    assert resumed.resumed_at == 2
+    whole = fit(tiny, tiny_model, spec)
+    assert_same(resumed, whole)
+    plain = fit(tiny, tiny_model, dataclasses.replace(tiny_training, epochs=3, updates=10, chunks=spec.chunks))
+    same = [row["validation_score"] for row in plain.history] == [row["validation_score"] for row in whole.history]
+    assert same == (kind == "ema")  # no option that does nothing
+
+
+@pytest.mark.parametrize("output", ["quantiles", "normal"])
+def test_calibration_is_repeated_to_the_same_bits(output, tmp_path, tiny, tiny_model, tiny_training):
+    model = dataclasses.replace(tiny_model, output=OUTPUTS[output]())
+    loss = next(LOSSES[name]() for name in LOSSES if output in LOSSES[name].outputs)
+    spec = dataclasses.replace(tiny_training, epochs=2, updates=10, loss=loss)
+    found = []
+    for _ in range(2):
+        with RunFolder(tmp_path) as folder:
+            found.append(fit(tiny, model, spec, (folder, KEY)).predictor.output.stretch)
+    assert torch.equal(*found)
+    assert not torch.equal(found[0], torch.ones_like(found[0]))
 
 
 def test_a_finished_training_is_not_done_again(tmp_path, tiny, tiny_model, tiny_training, uninterrupted):

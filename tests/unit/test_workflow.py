@@ -1,23 +1,30 @@
 """The main jobs as functions: data-set files, provenance, evaluation and footprints."""
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from edp.cli import app
+from edp.cli.console import run_app
+from edp.cli.evaluate import score_table
 from edp.config import load_experiment
 from edp.data.prepared import Prepared
-from edp.errors import DataError, EdpError, StorageError
+from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.logs import open_log, read_recording, write_recording
 from edp.logs.repair import Repair
+from edp.models.running import stream_intervals
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, TABLE_A1, Channel, Kind, SignalMap
-from edp.training import load_bundle
+from edp.training import Diverged, load_bundle
+from edp.training.objective import Objective
 from edp.workflow import (
     DataSource,
     SimulationOrder,
+    build_report,
     evaluate,
     footprint_of,
     judge_bundle,
@@ -103,6 +110,79 @@ def test_evaluation_writes_scores_here_and_into_the_bundle(logs, tmp_path):
     assert steps == ["network", "persistence"]
     assert set(scores["models"]) == {"network", "persistence"}
     assert load_bundle(tmp_path / "run").scores == scores["models"]["network"]["overall"]
+
+
+def test_a_run_that_diverged_says_so_again_and_keeps_what_was_good(logs, tmp_path, monkeypatch):
+    run, real, calls = tmp_path / "run", Objective.evaluate, []
+
+    def evaluate_(self, *parts):
+        calls.append(1)
+        return real(self, *parts) * (np.nan if len(calls) == 5 else 1.0)
+
+    monkeypatch.setattr(Objective, "evaluate", evaluate_)
+    changed = load_experiment(preset="quick", overrides=[*SMALL, "training.epochs=4"])
+    with pytest.raises(Diverged, match=r"loss is nan at update 5 \(epoch 2\).*weights of epoch 1 .* are kept"):
+        train(source_of(logs), changed, run)
+    status = json.loads((run / "status.json").read_text())
+    assert (status["status"], status["epoch"], status["update"], status["kept_epoch"]) == ("diverged", 2, 5, 1)
+    assert len((run / "history.jsonl").read_text().splitlines()) == 1
+    kept = load_bundle(run)
+    assert "the training diverged" in kept.provenance["diverged"]
+    bits = {path.name: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    with pytest.raises(
+        Diverged, match=r"diverged on 20.*nan at update 5.*would do so again.*another folder with --out"
+    ):
+        train(source_of(logs), changed, run)
+    assert {path.name: path.read_bytes() for path in run.rglob("*") if path.is_file()} == bits
+    evaluate(run)
+
+
+def test_an_absurd_learning_rate_diverges_with_nothing_to_keep(logs, tmp_path, monkeypatch, capsys):
+    run = tmp_path / "run"
+    options = [*SMALL, "training.optimizer.learning_rate=1e38", 'training.schedule={kind="constant"}']
+    words = ["edp", "train", str(logs), "--map", str(logs.parent / "map.toml"), "--preset", "quick", "--out", str(run)]
+    monkeypatch.setattr(sys, "argv", [*words, *(word for option in options for word in ("--set", option))])
+    for _ in range(2):
+        assert run_app(app) == 4
+        assert "the training diverged; no epoch was finished before" in capsys.readouterr().err
+    assert json.loads((run / "status.json").read_text())["status"] == "diverged"
+    assert not (run / "bundle").exists()
+
+
+def test_a_finished_run_says_so(logs, tmp_path):
+    train(source_of(logs), experiment(), tmp_path / "run")
+    assert json.loads((tmp_path / "run" / "status.json").read_text())["status"] == "finished"
+
+
+def test_contradictory_settings_are_refused_before_anything_is_written(logs, tmp_path):
+    changed = load_experiment(preset="quick", overrides=[*SMALL, 'training.loss={kind="quantile"}'])
+    with pytest.raises(ConfigError, match=r"'quantile' trains the output 'quantiles', but model.output is 'point'"):
+        train(source_of(logs), changed, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("output", ["quantiles", "normal", "laplace"])
+def test_intervals_are_judged_and_shown(output, logs, tmp_path, capsys):
+    loss = "quantile" if output == "quantiles" else "heteroscedastic"
+    kinds = [f'model.output={{kind="{output}"}}', f'training.loss={{kind="{loss}"}}']
+    bundle = train(source_of(logs), load_experiment(preset="quick", overrides=[*SMALL, *kinds]), tmp_path / "run")
+    evaluate(tmp_path / "run")
+    scores = json.loads((tmp_path / "run" / "scores.json").read_text())
+    rows = scores["models"]["network"]["intervals"]["2"]
+    assert [row["coverage"] for row in rows] == [0.9, 0.5]
+    # The same by hand, from bounds in SI units.
+    data = prepare_data(source_of(logs), load_experiment(tmp_path / "run" / "config.toml", preset=None))
+    inside, width = [], []
+    for part, bounds in zip(data.test, stream_intervals(bundle.predictor, data.test), strict=True):
+        truth = part.targets[2 + 8 :]
+        lower, upper = bounds[8 : part.samples - 2, 0, :, 0].transpose(1, 0, 2)
+        inside.append((lower <= truth) & (truth <= upper))
+        width.append(1000 * (upper - lower))
+    assert rows[0]["covered"]["v"] == rows[0]["covered"]["mean"] == pytest.approx(np.concatenate(inside).mean())
+    assert rows[0]["width"]["v"] == pytest.approx(np.concatenate(width).mean(), rel=1e-5)
+    score_table(scores)
+    assert "meant" in capsys.readouterr().out
+    assert "Meant to hold" in build_report(tmp_path / "run").read_text(encoding="utf-8")
 
 
 def test_the_same_judgement_is_not_made_twice(logs, tmp_path):

@@ -80,14 +80,14 @@ def duration(seconds: float) -> str:
 
 
 def run_app(app: typer.Typer) -> int:
-    """Run the command line; a user's mistake ends in one message and exit code 1, Ctrl-C in 130."""
+    """Run the command line; a user's mistake ends in one message and that error's exit code, Ctrl-C in 130."""
     try:
         code = app(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:
         err.print(f"[bold red]error:[/] {_escaped(str(error))}")
-        return 1
+        return error.exit_code
     except typer.Exit as done:
         return done.exit_code
     except (KeyboardInterrupt, typer.Abort):

@@ -76,6 +76,19 @@ def score_table(scores: dict[str, Any]) -> None:
         ahead = f"{1e3 * horizon / rate:.0f} ms ahead (k = {horizon})"
         heads = ["model", "MAE", "RMSE", "P95", "P99", "composite", "R2"]
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
+    interval_rows(scores, unit)
     for name, model in scores["models"].items():
         for target, found in model.get("integrated", {}).items():
             out.print(f"free run of the integral of {target}, {name}: RMSE {found['rmse']:.4g} {unit} s")
+
+
+def interval_rows(scores: dict[str, Any], unit: str) -> None:
+    """Print how much of the truth the network's intervals hold, where it states any."""
+    held = scores["models"]["network"].get("intervals", {})
+    rows = [
+        [f"k = {horizon}", f"{row['coverage']:.1%}", f"{row['covered']['mean']:.1%}", f"{row['width']['mean']:.4g}"]
+        for horizon, entries in held.items()
+        for row in entries
+    ]
+    if rows:
+        table(f"intervals of the network, mean over outputs, {unit}", ["ahead", "meant", "holds", "mean width"], rows)

@@ -34,6 +34,8 @@ def train(
 ) -> None:
     """Train a causal network on recordings and write a bundle.
 
+    Ends with exit code 4 where the training diverged; the bundle then holds the best weights before that.
+
     Example: `edp train data/m22 --out runs/first --preset quick --set "task.horizons=[1, 10]"`
     """
     bundle, best = run(data, folder, config, preset, changes, source_of(data, signal_map, repair), as_json)

@@ -15,9 +15,9 @@ from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, BaselineTask
-from edp.metrics import Scores, mean_scores, score, spread
+from edp.metrics import Scores, interval_scores, mean_scores, score, spread
 from edp.models.predictor import Predictor
-from edp.models.running import stream_predictions
+from edp.models.running import stream_intervals, stream_predictions
 from edp.signals import KINDS
 
 Predictions = list[NDArray[np.float32]]
@@ -100,6 +100,10 @@ def judge(
         name: {"label": names[name], "seconds": times[name], **ruler.measure(predicted)}
         for name, predicted in predictions.items()
     }
+    coverages = predictor.spec.output.coverages
+    if coverages:
+        say("intervals")
+        models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
     return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
 
 
@@ -193,6 +197,22 @@ class _Ruler:
             speeds[str(horizon)] = self._by_speed(pairs)
         found = {"overall": overall, "recordings": recordings, "spread": spreads, "by_speed": speeds}
         return found | ({"integrated": self._integrated(predicted)} if self.task.integrate else {})
+
+    def intervals(self, bounds: Predictions, coverages: Sequence[float]) -> dict[str, Any]:
+        """Share of the truth that each interval holds and its mean width, by horizon, coverage and target."""
+        found: dict[str, Any] = {str(horizon): [] for horizon in self.task.horizons}
+        truth = np.concatenate([values[self.skip :] for values in self.truth])
+        for which, coverage in enumerate(coverages):
+            parts = [pair[self.skip : len(t), which] for pair, t in zip(bounds, self.truth, strict=True)]
+            lower, upper = np.moveaxis(np.concatenate(parts).astype(np.float64) * self.factors, 1, 0)
+            for h, horizon in enumerate(self.task.horizons):
+                each = [interval_scores(lower[:, h, i], upper[:, h, i], truth[:, h, i]) for i in range(truth.shape[-1])]
+                held, wide = (self._named(values) for values in zip(*each, strict=True))
+                found[str(horizon)].append({"coverage": coverage, "covered": held, "width": wide})
+        return found
+
+    def _named(self, values: Sequence[float]) -> dict[str, float]:
+        return {"mean": float(np.mean(values)), **dict(zip(self.task.targets, values, strict=True))}
 
     def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Scored ticks: after start-up and where the model has its history."""

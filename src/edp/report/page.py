@@ -72,6 +72,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "tiles": tables.key_figures(facts),
         "comparisons": tables.comparison_tables(facts),
         "outputs": tables.output_table(facts),
+        "intervals": tables.interval_table(facts),
         "spread": run.spread_text(facts),
         "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
         "worst": tables.worst_recordings_table(facts),

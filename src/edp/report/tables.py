@@ -72,6 +72,26 @@ def output_table(facts: Facts) -> Table | None:
     return Table(f"MAE by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
 
 
+def interval_table(facts: Facts) -> Table | None:
+    """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
+    held = facts.models.get(NETWORK, {}).get("intervals", {})
+    rows = [(k, row) for k in facts.horizons for row in held.get(str(k), ())]
+    if not rows:
+        return None
+    places = decimals_for(row["width"]["mean"] for _, row in rows)
+    lines = tuple(
+        (
+            f"{horizon_text(facts, k)} ahead",
+            percent(row["coverage"]),
+            percent(row["covered"]["mean"]),
+            number(row["width"]["mean"], places),
+        )
+        for k, row in rows
+    )
+    columns = (("Interval", ""), ("Meant to hold", ""), ("Holds", ""), ("Mean width", facts.unit))
+    return Table("The network's intervals: share of the truth inside, mean over outputs", columns, lines)
+
+
 def worst_recordings_table(facts: Facts, most: int = 10) -> Table | None:
     """The recordings on which the network does worst, worst first."""
     horizon = main_horizon(facts)
@@ -177,6 +197,7 @@ def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
     add("Seed", source.get("seed"))
     add("Regime", source.get("regime"))
     add("Device", source.get("device"))
+    add("Diverged", source.get("diverged"))
     add("Training time", duration(source["seconds"]) if "seconds" in source else None)
     add("Parameters", whole(source["parameters"]) if "parameters" in source else None)
     data = source.get("data", {})
