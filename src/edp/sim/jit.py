@@ -19,7 +19,13 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # No "nnan"/"ninf": a diverging state must stay visible as NaN.
-OPTIONS: dict[str, Any] = {"fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"}, "error_model": "numpy"}
+# No reference counts ("_nrt"): compiled functions read and write arrays of their callers and allocate none. Counting
+# references to them, with atomic operations at every use, took 40 % of a step.
+OPTIONS: dict[str, Any] = {
+    "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
+    "error_model": "numpy",
+    "_nrt": False,
+}
 
 
 @cache

@@ -41,19 +41,20 @@ def run_samples(
     state: Array,
     valves: Array,
     demands: Array,
-    delays: Array,
-    clocks: tuple[tuple[int, float, float, Array], tuple[int, float, float, Array]],
+    times: tuple[Array, tuple[tuple[int, float, float, Array], tuple[int, float, float, Array]]],
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     log: Array,
+    held: Array,
 ) -> int:
     """Run one sample per row of `log`; returns the number of clamped pressures.
 
-    `demands` holds past demands first: its last rows belong to `log`. `delays` is in samples. `clocks` holds the
-    number of steps in a sample and the clock of one step, for coarse and for fine steps.
+    `demands` holds past demands first: its last rows belong to `log`. `times` are delays in samples, and clocks: the
+    number of steps in a sample and the clock of one step, for coarse and for fine steps. `held` is scratch, one
+    value per spool.
     """
     first = demands.shape[0] - log.shape[0]
+    delays, clocks = times
     axes, plant, _, ground = setup
-    held = np.empty(at.SPOOLS)
     time_s = clocks[0][0] * clocks[0][1]
     in_soil = ground[0][terramechanics.ACTIVE] > 0.0
     clamps = 0
@@ -131,6 +132,7 @@ class Plant:
         self.valves = np.zeros((at.SPOOLS, 5))
         self.hand = np.zeros((at.AXES, 2))
         self.work = integrator.new_work()
+        self._held = np.zeros(at.SPOOLS)
         self._counts = np.zeros(1, dtype=np.int64)
         self.ground = ground
         self._ground = soil.no_ground() if ground is None else ground.arrays()
@@ -173,7 +175,8 @@ class Plant:
         demands = np.concatenate((self._demands, fresh))
         log = np.empty((len(levers), at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
         setup = (self.axes, self.plant, self.work, self._ground)
-        self._counts[0] += run_samples(self.state, self.valves, demands, self._delays, self._clocks, setup, log)
+        times = (self._delays, self._clocks)
+        self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
         self._demands[:] = demands[-self._past :]
         return log
 
