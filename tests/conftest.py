@@ -18,7 +18,8 @@ from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
 from edp.models.activations import ACTIVATIONS
-from edp.models.backbones import BACKBONES, HybridSpec, LstmSpec, TcnSpec
+from edp.models.backbones import BACKBONES, GruSpec, HybridSpec, LstmSpec, TcnSpec
+from edp.models.cells import CELLS
 from edp.models.heads import HEADS, GluHead, MlpHead
 from edp.models.outputs import OUTPUTS, Point
 from edp.models.physics import PHYSICS
@@ -27,9 +28,19 @@ from edp.models.predictor import ModelSpec, Predictor, build_model, check_combin
 WINDOW = 9
 # Small options, so that every combination is cheap; a part that is absent here is tested with its defaults.
 SMALL = {
-    "lstm": [LstmSpec(units=6), LstmSpec(units=5, layers=2, dropout=0.2)],
+    "lstm": [
+        LstmSpec(units=6),
+        LstmSpec(units=5, layers=2, dropout=0.2),
+        LstmSpec(units=4, zoneout=0.2, cell=CELLS["layer_norm_lstm"]()),
+    ],
+    "gru": [GruSpec(units=6), GruSpec(units=5, layers=2, dropout=0.2)],
     "tcn": [TcnSpec(channels=(6, 4), kernel=3, dropout=0.2)],
-    "hybrid": [HybridSpec(channels=(6,), kernel=3, units=5, dropout=0.2), HybridSpec(channels=(4,), kernel=1, units=4)],
+    "hybrid": [
+        HybridSpec(channels=(6,), kernel=3, units=5, dropout=0.2),
+        HybridSpec(channels=(4,), kernel=1, units=4),
+        HybridSpec(channels=(4,), kernel=2, units=4, zoneout=0.3),
+        *(HybridSpec(channels=(4,), kernel=2, units=4, layers=2, cell=CELLS[name]()) for name in CELLS),
+    ],
     "cylinder_gate": [BLOCKS["cylinder_gate"](), BLOCKS["cylinder_gate"](form="linear")],
     "attention_bridge": [BLOCKS["attention_bridge"](heads=2)],
     "squeeze_excitation": [BLOCKS["squeeze_excitation"](reduction=2)],

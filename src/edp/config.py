@@ -24,6 +24,7 @@ from edp.logs.repair import Repair
 from edp.losses import LOSSES, TERMS
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
+from edp.models.cells import CELLS
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
 from edp.models.physics import PHYSICS, PhysicsSpec
@@ -38,6 +39,7 @@ from edp.training.schedules import SCHEDULES
 
 TAGGED: Mapping[str, Registry[type]] = {
     "backbone": BACKBONES,
+    "cell": CELLS,
     "head": HEADS,
     "activation": ACTIVATIONS,
     "output": OUTPUTS,

@@ -9,7 +9,7 @@ from edp.blocks import BLOCKS
 from edp.models.activations import ACTIVATIONS, ScaledTanh
 from edp.models.convolution import CausalConv, ConvolutionStack, TemporalBlock, receptive_field
 from edp.models.heads import MlpHead
-from edp.models.recurrent import AttentionPooling, Lstm
+from edp.models.pooling import AttentionPooling
 
 
 @pytest.fixture(autouse=True)
@@ -72,25 +72,6 @@ def test_receptive_field_is_what_a_stack_sees(levels, kernel):
         changed[0, -1 - back] = 2.0
         seen.append(not torch.equal(run(stack, changed)[0, -1], base))
     assert seen == [True] * reach + [False] * 5
-
-
-@pytest.mark.parametrize("layers", [1, 2])
-def test_lstm_is_eq_2_2_to_2_7(layers):
-    layer, x = Lstm(3, 4, layers, 0.0), draw(2, 12, 3)
-    found, y = run(layer, x), x
-    for number in range(layers):
-        u = {
-            name: getattr(layer.cell, f"{name}_l{number}") for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-        }
-        h, c, rows = torch.zeros(2, 4).double(), torch.zeros(2, 4).double(), []
-        for t in range(12):
-            z = y[:, t] @ u["weight_ih"].T + u["bias_ih"] + h @ u["weight_hh"].T + u["bias_hh"]
-            i, f, candidate, o = z.chunk(4, dim=1)
-            c = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(candidate)
-            h = torch.sigmoid(o) * torch.tanh(c)
-            rows.append(h)
-        y = torch.stack(rows, dim=1).detach()
-    torch.testing.assert_close(found, y, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("window", "ticks"), [(1, 10), (5, 3), (5, 40), (50, 300)])

@@ -38,7 +38,20 @@ ALLOWED = {
 # Moving numbers, making masks, and element-wise arithmetic: understood, not declared.
 FREE = {
     *("_reshape_alias", "_to_copy", "_unsafe_view", "alias", "cat", "clone", "constant_pad_nd", "copy", "detach"),
-    *("expand", "index", "lift_fresh", "permute", "select", "slice", "split", "squeeze", "stack", "t", "transpose"),
+    *(
+        "expand",
+        "index",
+        "lift_fresh",
+        "permute",
+        "select",
+        "slice",
+        "split",
+        "split_with_sizes",
+        "squeeze",
+        "stack",
+        "t",
+        "transpose",
+    ),
     *("unbind", "unsafe_chunk", "unsafe_split", "unsqueeze", "view", "unfold"),
     *(
         "arange",
@@ -53,8 +66,23 @@ FREE = {
         "zeros_like",
     ),
     *("bitwise_and", "bitwise_not", "bitwise_or", "eq", "ge", "gt", "lt", "masked_fill", "remainder", "where"),
-    *("abs", "add", "clamp", "cumsum", "div", "flip", "maximum", "minimum", "mul", "neg", "pow", "reciprocal", "rsub"),
-    *("sign", "sub"),
+    *(
+        "abs",
+        "add",
+        "addcmul",
+        "clamp",
+        "cumsum",
+        "div",
+        "flip",
+        "maximum",
+        "minimum",
+        "mul",
+        "neg",
+        "pow",
+        "reciprocal",
+        "rsub",
+    ),
+    *("addcmul", "lerp", "sign", "sub"),
 }
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import edp.blocks
+import edp.models.cells
 from edp.blocks import BLOCKS
 from edp.blocks.base import OUTPUT_SLOTS, BlockSpec, Slot
 from edp.data.augment import AUGMENTATIONS
@@ -15,6 +16,7 @@ from edp.errors import ConfigError, EdpError
 from edp.losses import LOSSES, TERMS
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, TcnSpec
+from edp.models.cells import CELLS
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
 from edp.models.physics import PHYSICS
@@ -27,6 +29,7 @@ from edp.training.schedules import SCHEDULES
 
 SPECS = [
     BACKBONES,
+    CELLS,
     PHYSICS,
     BLOCKS,
     HEADS,
@@ -56,14 +59,20 @@ def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(p
     }
     assert tested == fitting
     # A new part must move these numbers: backbones, blocks, pairs of them that fit, heads.
-    assert (len(BACKBONES), len(BLOCKS), len(fitting), len(HEADS)) == (3, 9, 22, 2)
+    assert (len(BACKBONES), len(BLOCKS), len(fitting), len(HEADS)) == (4, 9, 28, 2)
     assert {block for _, block in fitting} == set(BLOCKS)
     assert {backbone for backbone, _ in fitting} == set(BACKBONES)
     assert len(forms) == len(ACTIVATIONS) * 2 * 2
-    # Plain ones, pairs, further options of two blocks, further heads and outputs, and full slots for each backbone.
-    # Two forms of each physics base.
-    assert len(structures) == 5 + 22 + 2 * 3 + 3 * 3 + 3 * 3 + 3 + 3 * 2
+    # Plain ones with every recurrent layer, pairs, further options of two blocks, further heads and outputs, and
+    # full slots for each backbone; two forms of each physics base.
+    assert len(structures) == 9 + len(CELLS) + 28 + 2 * 4 + 3 * 4 + 3 * 4 + 4 + 3 * 2
     assert {PHYSICS.name_of(s.physics) for s in structures.values() if s.physics} == set(PHYSICS)
+
+
+def test_every_file_in_cells_registers_a_recurrent_layer():
+    shared = {"__init__", "base", "lstm_steps"}
+    files = {path.stem for path in Path(edp.models.cells.__path__[0]).glob("*.py")} - shared
+    assert files == {CELLS[name].__module__.rpartition(".")[2] for name in CELLS}
 
 
 def test_every_file_in_blocks_registers_a_block():
@@ -130,6 +139,8 @@ def test_a_tcn_must_see_the_whole_window(channels, kernel, window, advice):
 BAD = [
     lambda: BACKBONES["lstm"](units=0),
     lambda: BACKBONES["lstm"](dropout=1.0),
+    lambda: BACKBONES["lstm"](zoneout=1.0),
+    lambda: BACKBONES["gru"](layers=0),
     lambda: BACKBONES["tcn"](channels=()),
     lambda: BACKBONES["hybrid"](channels=(4, 0)),
     lambda: BACKBONES["hybrid"](kernel=0),

@@ -41,6 +41,7 @@ def test_presets_load_and_survive_a_round_trip(preset, tmp_path):
 def test_every_registered_part_survives_a_round_trip(tmp_path):
     places = {
         "backbone": ("model", "backbone"),
+        "cell": ("model", "backbone", "cell"),
         "activation": ("model", "activation"),
         "head": ("model", "head"),
         "output": ("model", "output"),

@@ -1,9 +1,9 @@
-"""Backbones: LSTM with attention pooling, TCN, and the hybrid TCN-LSTM (thesis 3.2.3), on the streaming contract."""
+"""Backbones on the streaming contract: recurrent, convolutional, and the hybrid of both (thesis 3.2.3)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -11,8 +11,10 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BranchMaker, Slot
 from edp.errors import ConfigError
+from edp.models.cells import CellSpec, GruCell, LstmCell, Stack
+from edp.models.cells.base import check_cell
 from edp.models.convolution import ConvolutionStack, receptive_field
-from edp.models.recurrent import AttentionPooling, Lstm
+from edp.models.pooling import AttentionPooling
 from edp.registry import Registry
 from edp.streaming import Chain, Cost, State, Streaming
 
@@ -41,16 +43,21 @@ class LstmSpec:
 
     Attributes:
         units: hidden units D.
-        layers: stacked LSTM layers.
+        layers: stacked recurrent layers.
         dropout: rate on the hidden states, in training.
+        zoneout: probability that a unit keeps its state over a tick, in training; in evaluation states are blended.
+        cell: options of a registered recurrent layer, of the family of the LSTM.
     """
 
     units: int = 64
     layers: int = 1
     dropout: float = 0.0
+    zoneout: float = 0.0
+    cell: CellSpec = field(default_factory=LstmCell)
 
     def __post_init__(self) -> None:
         _check(self.dropout, units=self.units, layers=self.layers)
+        check_cell("lstm", self.cell, self.zoneout, families=("lstm",))
 
     def slots(self) -> tuple[Slot, ...]:
         """Features derived from the recurrent states."""
@@ -58,7 +65,40 @@ class LstmSpec:
 
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """The recurrent backbone on the scaled features."""
-        net = RecurrentBackbone(None, features, self.units, self.layers, self.dropout, window, blocks)
+        stack = Stack(self.cell, features, self.units, self.layers, self.dropout, self.zoneout)
+        net = RecurrentBackbone(None, stack, self.units, self.dropout, window, blocks)
+        return net, net.width
+
+
+@BACKBONES.register("gru")
+@dataclass(frozen=True, kw_only=True)
+class GruSpec:
+    """GRU with attention pooling over the trailing window (eq. 3.12 to 3.15, 3.33 to 3.35).
+
+    Attributes:
+        units: hidden units D.
+        layers: stacked recurrent layers.
+        dropout: rate on the hidden states, in training.
+        cell: options of a registered recurrent layer, of the family of the GRU.
+    """
+
+    units: int = 64
+    layers: int = 1
+    dropout: float = 0.0
+    cell: CellSpec = field(default_factory=GruCell)
+
+    def __post_init__(self) -> None:
+        _check(self.dropout, units=self.units, layers=self.layers)
+        check_cell("gru", self.cell, 0.0, families=("gru",))
+
+    def slots(self) -> tuple[Slot, ...]:
+        """Features derived from the recurrent states."""
+        return (Slot.FEATURES,)
+
+    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+        """The recurrent backbone on the scaled features."""
+        stack = Stack(self.cell, features, self.units, self.layers, self.dropout)
+        net = RecurrentBackbone(None, stack, self.units, self.dropout, window, blocks)
         return net, net.width
 
 
@@ -100,28 +140,36 @@ class TcnSpec:
 @BACKBONES.register("hybrid")
 @dataclass(frozen=True, kw_only=True)
 class HybridSpec:
-    """Convolutions, then a single-layer LSTM with attention pooling (eq. 3.39, 3.40).
+    """Convolutions, then a recurrent layer, the LSTM of the thesis or another, with attention pooling (eq. 3.39, 3.40).
 
     Attributes:
         channels: width of each convolution level.
         kernel: kernel size.
-        units: hidden units of the LSTM.
+        units: hidden units of the recurrent layer.
+        layers: stacked recurrent layers; the thesis has one.
         dropout: rate after each convolution and on the hidden states, in training.
+        zoneout: probability that a unit keeps its state over a tick, in training; in evaluation states are blended.
+        cell: options of a registered recurrent layer.
     """
 
     channels: tuple[int, ...] = (64,)
     kernel: int = 5
     units: int = 64
+    layers: int = 1
     dropout: float = 0.0
+    zoneout: float = 0.0
+    cell: CellSpec = field(default_factory=LstmCell)
 
     def __post_init__(self) -> None:
         _check(
             self.dropout,
             kernel=self.kernel,
             units=self.units,
+            layers=self.layers,
             levels=len(self.channels),
             channels=min(self.channels, default=0),
         )
+        check_cell("hybrid", self.cell, self.zoneout)
 
     def slots(self) -> tuple[Slot, ...]:
         """Parallel stacks, what works on their channels, and features derived from the recurrent states."""
@@ -130,26 +178,20 @@ class HybridSpec:
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """Convolutions and the recurrent backbone on their channels."""
         encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
-        net = RecurrentBackbone(encoder, width, self.units, 1, self.dropout, window, blocks)
+        stack = Stack(self.cell, width, self.units, self.layers, self.dropout, self.zoneout)
+        net = RecurrentBackbone(encoder, stack, self.units, self.dropout, window, blocks)
         return net, net.width
 
 
 class RecurrentBackbone(Streaming):
-    """``[attention pooling ; h_t ; further features]`` of an LSTM on the input or on an encoder's channels."""
+    """``[attention pooling ; h_t ; further features]`` of recurrent layers on the input or on an encoder's channels."""
 
     def __init__(
-        self,
-        encoder: Streaming | None,
-        width_in: int,
-        units: int,
-        layers: int,
-        dropout: float,
-        window: int,
-        blocks: Blocks,
+        self, encoder: Streaming | None, recurrent: Streaming, units: int, dropout: float, window: int, blocks: Blocks
     ) -> None:
         super().__init__()
         self.encoder = encoder
-        self.lstm = Lstm(width_in, units, layers, dropout)
+        self.recurrent = recurrent
         self.dropout = nn.Dropout(dropout)
         self.pooling = AttentionPooling(units, window)
         extras = in_slot(blocks, Slot.FEATURES)
@@ -162,20 +204,20 @@ class RecurrentBackbone(Streaming):
     def initial_state(self, batch: int, like: Tensor) -> State:
         first = () if self.encoder is None else self.encoder.initial_state(batch, like)
         tail = tuple(part.initial_state(batch, like) for part in self._tail())
-        return first, self.lstm.initial_state(batch, like), tail
+        return first, self.recurrent.initial_state(batch, like), tail
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         first, recurrent, tail = state
         if self.encoder is not None:
             x, first = self.encoder(x, first)
-        h, recurrent = self.lstm(x, recurrent)
+        h, recurrent = self.recurrent(x, recurrent)
         h = self.dropout(h)
         results = [part(h, old) for part, old in zip(self._tail(), tail, strict=True)]
         return torch.cat([y for y, _ in results], dim=-1), (first, recurrent, tuple(new for _, new in results))
 
     def costs(self) -> list[Cost]:
         encoder = [] if self.encoder is None else self.encoder.costs()
-        return encoder + self.lstm.costs() + [cost for part in self._tail() for cost in part.costs()]
+        return encoder + self.recurrent.costs() + [cost for part in self._tail() for cost in part.costs()]
 
 
 def in_slot(blocks: Blocks, slot: Slot) -> list[object]:

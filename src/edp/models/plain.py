@@ -13,6 +13,7 @@ from edp.data.task import TargetMode, Task
 from edp.errors import BundleError, ConfigError
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
+from edp.models.cells import CELLS
 from edp.models.heads import HEADS
 from edp.models.outputs import OUTPUTS
 from edp.models.physics import PHYSICS
@@ -21,6 +22,9 @@ from edp.registry import Registry
 from edp.signals import Kind
 
 Plain = dict[str, Any]
+
+NESTED: Mapping[str, Registry[type]] = {"cell": CELLS}
+"""Options that are registered parts themselves."""
 
 
 def listed(value: Any) -> Any:
@@ -34,7 +38,8 @@ def listed(value: Any) -> Any:
 
 def options(spec: Any) -> Plain:
     """The options of a spec, plain."""
-    return {field.name: listed(getattr(spec, field.name)) for field in fields(spec)}
+    held = {field.name: getattr(spec, field.name) for field in fields(spec)}
+    return {name: tagged(value, NESTED[name]) if name in NESTED else listed(value) for name, value in held.items()}
 
 
 def tagged(spec: Any, registry: Registry[type]) -> Plain:
@@ -48,8 +53,12 @@ def untagged(plain: Mapping[str, Any], registry: Registry[type]) -> Any:
     Raises:
         BundleError: an option that this version does not know.
     """
-    rest = {key: _tupled(value) for key, value in plain.items() if key != "kind"}
     try:
+        rest = {
+            key: untagged(value, NESTED[key]) if key in NESTED else _tupled(value)
+            for key, value in plain.items()
+            if key != "kind"
+        }
         return registry[plain["kind"]](**rest)
     except (TypeError, KeyError) as error:
         raise BundleError(f"{registry.what} {dict(plain)} is not understood by this version: {error}") from error

@@ -1,4 +1,4 @@
-"""The LSTM and attention pooling as streams."""
+"""Attention pooling of hidden states as a stream."""
 
 from __future__ import annotations
 
@@ -11,50 +11,6 @@ from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 UNSEEN = -1e30
 # Query rows per block of the banded softmax: memory stays linear in the sequence length.
 BLOCK = 128
-
-
-class Lstm(Streaming):
-    """Multi-layer LSTM (eq. 2.2 to 2.7, 3.32), PyTorch's gate order and two bias vectors.
-
-    Maps ``(batch, time, width_in)`` to hidden states ``(batch, time, units)``; state ``(h, c)``, each
-    ``(batch, layer, units)``, zero at reset.
-    """
-
-    operations = frozenset({Operation.LSTM})
-
-    def __init__(self, width_in: int, units: int, layers: int, dropout: float) -> None:
-        super().__init__()
-        self.cell = nn.LSTM(width_in, units, layers, batch_first=True, dropout=dropout if layers > 1 else 0.0)
-        with torch.no_grad():
-            for layer in range(layers):
-                # A forget gate open at the start carries gradients through the first epochs.
-                self.cell.get_parameter(f"bias_ih_l{layer}")[units : 2 * units].add_(1.0)
-
-    def initial_state(self, batch: int, like: Tensor) -> State:
-        zeros = like.new_zeros(batch, self.cell.num_layers, self.cell.hidden_size)
-        return zeros, zeros.clone()
-
-    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        h, c = (part.transpose(0, 1).contiguous() for part in state)
-        y, (h, c) = self.cell(x, (h, c))
-        return y, (h.transpose(0, 1), c.transpose(0, 1))
-
-    def costs(self) -> list[Cost]:
-        rows = []
-        width, units = self.cell.input_size, self.cell.hidden_size
-        for layer in range(self.cell.num_layers):
-            macs = 4 * units * (width + units)
-            rows.append(
-                Cost(
-                    f"LSTM layer {layer + 1}, {width}->{units}",
-                    macs + 8 * units,
-                    per_column=macs,
-                    width_in=width,
-                    width_out=units,
-                )
-            )
-            width = units
-        return rows
 
 
 class AttentionPooling(Streaming):

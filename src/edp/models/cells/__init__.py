@@ -1,0 +1,8 @@
+"""Recurrent layers: one file each, entered in `CELLS` by name."""
+
+from edp.models.cells.base import CELLS, CellSpec, Stack
+from edp.models.cells.gru import GruCell
+from edp.models.cells.layer_norm_lstm import LayerNormLstmCell
+from edp.models.cells.lstm import LstmCell
+
+__all__ = ["CELLS", "CellSpec", "GruCell", "LayerNormLstmCell", "LstmCell", "Stack"]
