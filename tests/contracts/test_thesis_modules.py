@@ -1,0 +1,54 @@
+"""The fourteen modules of the thesis's Table 4.5: the settings page names each, and each changes what a network predicts."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edp.config import load_experiment
+from edp.data.scaling import Scaler
+from edp.models.predictor import build_model
+
+PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
+PRINTED = {
+    *("Cyl Gate Diagonal", "Temporal Diff", "Cross Cyl Attn", "GRU Backbone", "LayerNorm LSTM", "Multiscale TCN"),
+    *("Zoneout", "Attention Bridge", "Global Avg Pool", "Squeeze-Excitation", "Physics Residual", "Deeper Head"),
+    *("GLU Head", "STanh Activation"),
+}
+# What must not change before the first update: these start as good as transparent or add no parameters.
+PLAIN = ("model.backbone.units=8", "model.backbone.channels=[8]", "model.head.hidden=8", "model.blocks=[]")
+
+
+def modules():
+    page = PAGE.read_text(encoding="utf-8")
+    section = page.split("### The thesis's modules by name")[1].split("\n## ")[0]
+    return re.findall(r"^\| ([^|`]+?) \| `([^`]+)` \| [^|]+ \|$", section, re.MULTILINE)
+
+
+def predictions(*changes):
+    experiment = load_experiment(preset="quick", overrides=[*PLAIN, *changes])
+    task = experiment.task.resolve(100.0, physics=experiment.model.physics)
+    features = len(task.features.features)
+    scaler = Scaler(np.zeros(features), np.ones(features), np.zeros((1, 3)), np.ones((1, 3)))
+    predictor = build_model(task, experiment.model, scaler, seed=1).eval()
+    x = torch.randn(1, 20, predictor.front.inputs, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        return experiment, predictor.predict(x, predictor.initial_state(1, x))[0]
+
+
+def test_the_page_lists_the_fourteen_modules():
+    assert len(PRINTED) == 14
+    assert {name for name, _ in modules()} == PRINTED
+    assert len(modules()) == 14
+
+
+@pytest.mark.parametrize(("name", "setting"), modules(), ids=lambda value: value if "=" not in value else "")
+def test_each_is_reached_by_its_setting_and_takes_part(name, setting):
+    plain, base = predictions()
+    changed, found = predictions(setting)
+    assert changed.model != plain.model
+    assert changed.training == plain.training
+    assert torch.isfinite(found).all()
+    assert not torch.allclose(found, base, rtol=0, atol=1e-6), name
