@@ -47,6 +47,7 @@ REFUSED = [
         "mode = 'delta' does already",
     ),
     ("velocity_skip", replace(TASK, features=FeatureSet("one", ("v_1",))), with_blocks("velocity_skip"), "v_2 is not"),
+    ("velocity_skip", reads("force"), with_physics("force", "velocity_skip"), "physics base adds the velocity already"),
     ("cross_cylinder_attention", replace(TASK, targets=("v_1",)), with_blocks("cross_cylinder_attention"), "has one"),
     (
         "kinematic",

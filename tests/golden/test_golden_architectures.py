@@ -5,22 +5,23 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from edp.blocks import CylinderGate, MultiScaleTcn, TemporalDifference
+from edp.blocks import AttentionBridge, CylinderGate, MultiScaleTcn, TemporalDifference
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.models.activations import Identity, ScaledTanh
 from edp.models.backbones import HybridSpec
+from edp.models.cells import LayerNormLstmCell, LstmCell
 from edp.models.heads import MlpHead
 from edp.models.predictor import ModelSpec, build_model
 
 W = 50
 
 
-def network(channels, kernel, head, blocks, activation=None):
+def network(channels, kernel, head, blocks, activation=None, cell=None):
     """A hybrid network whose LSTM is as wide as its first level, in double precision."""
     spec = ModelSpec(
-        backbone=HybridSpec(channels=channels, kernel=kernel, units=channels[0]),
+        backbone=HybridSpec(channels=channels, kernel=kernel, units=channels[0], cell=cell or LstmCell()),
         head=head,
         activation=activation or Identity(),
         blocks=blocks,
@@ -45,6 +46,29 @@ GOLDEN = {
     "P4 A_u64": (((64, 32), 7, MlpHead(hidden=32), SCALES), (181_956, 181_572, "8.409", "183.6")),
     "P4 A_u32": (((32, 16), 7, MlpHead(hidden=16), SCALES), (53_604, 53_412, "2.486", "54.4")),
 }
+
+
+BRIDGED = (*SCALES, AttentionBridge(), *DIFFERENCE)
+# The k = 1 rows of phase 5: layer-norm LSTM and bridge; parameters, those left after folding, and the MACs printed.
+PHASE_5 = {
+    "teacher P5": (((128, 64, 32), MlpHead(hidden=32, layers=2), ScaledTanh()), (703_527, 702_628, "26.488")),
+    "P5 A_u64": (((64, 32), MlpHead(hidden=16, layers=2), Identity()), (213_972, 213_588, "6.834")),
+    "P5 A_u32": (((32, 16), MlpHead(hidden=8, layers=2), Identity()), (61_996, 61_804, "2.093")),
+}
+
+
+@pytest.mark.parametrize("name", PHASE_5)
+def test_phase_5_counts_are_those_of_the_thesis(name):
+    """The printed MACs take the matrices of recurrent layer and bridge once, where a window needs them W times."""
+    (channels, head, activation), (parameters, folded, macs) = PHASE_5[name]
+    rows = network(channels, 7, head, BRIDGED, activation, LayerNormLstmCell()).costs()
+    assert sum(row.parameters for row in rows) == parameters
+    assert parameters - sum(row.foldable for row in rows) == folded
+    spans = [row for row in rows if row.part.startswith(("convolution", "residual"))]
+    others = sum(row.per_column for row in rows) - sum(row.per_column for row in spans)
+    scores = 2 * W * 2 * channels[-1]
+    once = others - scores + sum(row.per_prediction for row in rows)
+    assert digits((W * sum(row.per_column for row in spans) + once) / 1e6, macs) == macs
 
 
 def digits(value, printed):

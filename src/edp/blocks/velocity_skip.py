@@ -24,11 +24,16 @@ class VelocitySkip:
     space: ClassVar[dict[str, Any]] = {}
 
     def conflicts(self, model: ModelView, task: TaskView) -> str | None:
-        """Delta mode adds the present value already, and it must be known."""
+        """Delta mode and a physics base add the velocity already, and its present value must be known."""
         if task.mode == "delta":
             return (
                 "velocity_skip adds the present value to the prediction, which mode = 'delta' does already; "
                 "remove the block or set task.mode = 'absolute'"
+            )
+        if model.physics is not None:
+            return (
+                "velocity_skip adds the present value to a prediction to which the physics base adds the velocity "
+                "already; remove the block or model.physics"
             )
         blind = [name for name, column in zip(task.targets, task.present, strict=True) if column is None]
         if blind:
