@@ -5,7 +5,7 @@ import pytest
 from sklearn import metrics as sk
 
 from edp.errors import DataError
-from edp.metrics import COMPOSITE_WEIGHTS, Scores, composite, mean_scores, score, spread
+from edp.metrics import COMPOSITE_WEIGHTS, Scores, composite, interval_scores, mean_scores, score, spread
 
 
 @pytest.fixture
@@ -107,3 +107,13 @@ def test_spread():
     assert spread([2.0])["std"] is None
     with pytest.raises(DataError, match="NaN"):
         spread([1.0, float("nan")])
+
+
+def test_intervals_count_what_lies_between_their_bounds():
+    truth = np.array([0.0, 1.0, 2.0, 3.0])
+    covered, width = interval_scores(np.array([0.0, 1.5, 1.0, 0.0]), np.array([1.0, 2.0, 2.0, 1.0]), truth)
+    assert (covered, width) == (0.5, 0.875)
+    with pytest.raises(DataError, match="4 lower and 3 upper bounds came for 4 true values"):
+        interval_scores(truth, truth[1:], truth)
+    with pytest.raises(DataError, match="the upper bound holds 1 NaN"):
+        interval_scores(truth, np.array([0.0, np.nan, 0.0, 0.0]), truth)
