@@ -7,7 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.sim.jit import compiled
+
 Array = NDArray[np.float64]
+
+
+@compiled
+def read_between(values: Array, positions: Array, out: Array) -> None:
+    """`values` at `positions` (in samples), linear between samples and constant beyond them, into `out`."""
+    last = values.shape[0] - 1
+    for k in range(positions.shape[0]):
+        place = min(max(positions[k], 0.0), float(last))
+        low = int(place)
+        part, high = place - low, min(low + 1, last)
+        for channel in range(values.shape[1]):
+            out[k, channel] = values[low, channel] + part * (values[high, channel] - values[low, channel])
 
 
 @dataclass(frozen=True)
@@ -47,10 +61,9 @@ class Frames:
         What lies before the first sample has its value. A frame taken between samples k and k + 1 is seen at k + 1 at
         the earliest, so that reading between the two looks at no later sample than the one that shows it.
         """
-        at = np.clip(self.positions, 0.0, len(values) - 1.0)
-        low = np.floor(at).astype(np.intp)
-        part = (at - low)[:, None]
-        return np.asarray(values[low] + part * (values[np.minimum(low + 1, len(values) - 1)] - values[low]))
+        taken = np.empty((len(self.positions), values.shape[1]))
+        read_between(np.ascontiguousarray(values), self.positions, taken)
+        return taken
 
     def hold(self, values: Array) -> Array:
         """The newest value that had arrived at each sample, shape ``(sample, channel)``."""

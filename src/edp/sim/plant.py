@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ Array = NDArray[np.float64]
 FINE = 4
 """A step is cut in this many near the ends of the stroke, where cushions and stops are stiff."""
 RESTING_PRESSURE = 10e5
+Clock = tuple[int, float, float, Array]
 LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
 """Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
 
@@ -41,7 +43,7 @@ def run_samples(
     state: Array,
     valves: Array,
     demands: Array,
-    times: tuple[Array, tuple[tuple[int, float, float, Array], tuple[int, float, float, Array]]],
+    times: tuple[Array, tuple[Clock, Clock]],
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     log: Array,
     held: Array,
@@ -76,15 +78,44 @@ def run_samples(
 
 
 @compiled
-def smooth_levers(targets: Array, hand: Array, step_s: float, out: Array) -> None:
-    """Lever targets to lever positions, shapes (samples, 3): 2nd-order low-pass with limited rate, state in `hand`."""
+def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
+    """Lever positions of one sample, shape (3,), from targets: 2nd-order low-pass of limited rate; state in `hand`."""
     omega = 2.0 * np.pi * LEVER_BANDWIDTH_HZ
-    for k in range(targets.shape[0]):
-        for i in range(at.AXES):
-            pull = omega * omega * (targets[k, i] - hand[i, 0]) - 2.0 * omega * hand[i, 1]
-            hand[i, 1] = min(max(hand[i, 1] + step_s * pull, -LEVER_RATE), LEVER_RATE)
-            hand[i, 0] += step_s * hand[i, 1]
-            out[k, i] = hand[i, 0]
+    for i in range(at.AXES):
+        pull = omega * omega * (target[i] - hand[i, 0]) - 2.0 * omega * hand[i, 1]
+        hand[i, 1] = min(max(hand[i, 1] + step_s * pull, -LEVER_RATE), LEVER_RATE)
+        hand[i, 0] += step_s * hand[i, 1]
+        out[i] = hand[i, 0]
+
+
+@compiled
+def shape_commands(
+    levers: Array,
+    hand: Array,
+    step_s: float,
+    past: Array,
+    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
+    demands: Array,
+    held: Array,
+) -> None:
+    """Spool demands of `levers`, shape (samples, 3), behind the `past` ones into `demands`; `past` is then brought up.
+
+    A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held` is scratch.
+    """
+    axes, plant, _, _ = setup
+    count = past.shape[0]
+    for k in range(count):
+        for j in range(at.SPOOLS):
+            demands[k, j] = past[k, j]
+    for k in range(levers.shape[0]):
+        lever = levers[k]
+        if step_s > 0.0:
+            lever = held[: at.AXES]
+            smooth_lever(levers[k], hand, step_s, lever)
+        valve.shape_demand(lever, axes, plant, demands[count + k])
+    for k in range(count):
+        for j in range(at.SPOOLS):
+            past[k, j] = demands[demands.shape[0] - count + k, j]
 
 
 def steps_per_sample(rate_hz: float, step_s: float) -> int:
@@ -160,6 +191,11 @@ class Plant:
         return (*changing, *self._ground[3:])
 
     @property
+    def finite(self) -> bool:
+        """Whether every state is a finite number; what once is not stays so."""
+        return math.isfinite(sum(self.state.tolist()))
+
+    @property
     def clamps(self) -> int:
         """Pressures lifted to the floor so far."""
         return int(self._counts[0])
@@ -170,21 +206,23 @@ class Plant:
         The log has shape (samples, columns of `edp.sim.layout`); row k is the state at the instant at which lever k is
         applied.
         """
-        fresh = np.zeros((len(levers), at.SPOOLS))
-        valve.shape_demands(np.ascontiguousarray(levers, dtype=float), self.axes, self.plant, fresh)
-        demands = np.concatenate((self._demands, fresh))
-        log = np.empty((len(levers), at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
-        setup = (self.axes, self.plant, self.work, self._ground)
-        times = (self._delays, self._clocks)
-        self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
-        self._demands[:] = demands[-self._past :]
-        return log
+        return self._advance(levers, 0.0)
 
     def follow(self, targets: Array) -> Array:
         """Like `run`, with the operator's hand between targets and levers."""
-        levers = np.empty_like(targets)
-        smooth_levers(targets, self.hand, 1.0 / self.rate_hz, levers)
-        return self.run(levers)
+        return self._advance(targets, 1.0 / self.rate_hz)
+
+    def _advance(self, levers: Array, hand_s: float) -> Array:
+        """Run with levers that the hand smooths at steps of `hand_s`; 0 for levers as they are."""
+        setup = (self.axes, self.plant, self.work, self._ground)
+        samples = len(levers)
+        demands = np.empty((samples + self._past, at.SPOOLS))
+        log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
+        levers = np.ascontiguousarray(levers, dtype=float)
+        shape_commands(levers, self.hand, hand_s, self._demands, setup, demands, self._held)
+        times = (self._delays, self._clocks)
+        self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
+        return log
 
 
 def resting_state(strokes: Array, axes: Array, plant: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -86,7 +85,7 @@ class Simulation:
         """
         rows = self.plant.follow(targets) if self.operator.by_hand else self.plant.run(targets)
         self.samples += len(rows)
-        if not math.isfinite(rows[-1].sum()):  # what is not finite stays so
+        if not self.plant.finite:
             scenario = self.scenario
             raise SimulationError(
                 f"simulation '{scenario.label}' diverged before t = {self.samples / scenario.rate_hz:.2f} s "
@@ -195,10 +194,14 @@ def _recording(
     truth = sensors.truth_signals(log)
     extra = {name: channel for name, channel in {**EXTRA_CHANNELS, **GROUND_CHANNELS}.items() if name in truth}
     facts = {key: value for key, value in plain(scenario).items() if key != "name"}
+    values = np.empty((len(log), len(TABLE_A1) + len(extra)), np.float32)
+    values[:, : len(TABLE_A1)] = measured
+    for n, name in enumerate(extra, start=len(TABLE_A1)):
+        values[:, n] = truth[name]
     return Recording(
         name=scenario.label,
         channels=(*TABLE_A1.values(), *extra.values()),
-        values=np.column_stack([measured, *(truth[name] for name in extra)]).astype(np.float32),
+        values=values,
         rate_hz=scenario.rate_hz,
         source=f"sim:{machine.name}",
         meta={**facts, "clamps": clamps, "full_strokes_m": list(machine.cylinders.stroke)},

@@ -173,7 +173,7 @@ class Ground:
 
     def height(self, x: float) -> float:
         """Height (m above the boom foot) at a distance (m) in front of it."""
-        return float(np.interp(x, self.start_m + SPACING_M * np.arange(len(self.heights)), self.heights))
+        return float(terramechanics.height_at(x - self.start_m, self.heights))
 
     def redraw(self, rng: np.random.Generator) -> None:
         """Draw the resistance that is still to be met anew; what the edge is in now goes on from its present value."""

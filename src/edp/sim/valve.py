@@ -18,7 +18,7 @@ SPOOL_DAMPING = 1.0
 
 @compiled
 def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
-    """One row of `shape_demands`."""
+    """Lever positions in [-1, 1], shape (3,), to signed spool demands, shape (6,): primary, then conflux spools."""
     zone, start = plant[at.LEVER_DEAD_ZONE], plant[at.CONFLUX_START]
     for i in range(at.AXES):
         size = min(max((abs(lever[i]) - zone) / (1.0 - zone), 0.0), 1.0)
@@ -27,13 +27,6 @@ def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
         share = axes[i, at.CONFLUX_SHARE_EXTEND] if sign > 0 else axes[i, at.CONFLUX_SHARE_RETRACT]
         out[i] = sign * size
         out[i + 3] = sign * second * share
-
-
-@compiled
-def shape_demands(levers: Array, axes: Array, plant: Array, out: Array) -> None:
-    """Lever positions in [-1, 1], shape (time, 3), to signed spool demands (time, 6): primary, then conflux spools."""
-    for k in range(levers.shape[0]):
-        shape_demand(levers[k], axes, plant, out[k])
 
 
 def _oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.sim import pose
 from edp.sim.plant import Plant
-from edp.sim.soil import Ground
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class View:
+class View(NamedTuple):
     """The plant at one instant; frame and attitude as in `edp.sim.pose`.
 
     Attributes:
@@ -51,16 +49,6 @@ def view_of(plant: Plant) -> View:
     """The present view of a plant."""
     look = np.empty(pose.LOOK_VALUES)
     pose.look_at(plant.state, plant.axes, plant.plant, look)
-    x = float(look[pose.TIP])
-    ground = math.nan if plant.ground is None else height_at(plant.ground, x)
-    tip = float(look[pose.TIP + 1]), float(look[pose.TIP + 2])
-    return View(look[0:3], look[3:6], look[6:9], look[9:12], x, *tip, ground, plant.payload_kg)
-
-
-def height_at(ground: Ground, x: float) -> float:
-    """`Ground.height`, without arrays."""
-    heights = ground.heights
-    place = min(max((x - ground.start_m) / ground.spacing_m, 0.0), len(heights) - 1.000001)
-    k = int(place)
-    left, right = float(heights[k]), float(heights[k + 1])
-    return left + (place - k) * (right - left)
+    x, y, attitude = look[pose.TIP :].tolist()
+    ground = math.nan if plant.ground is None else plant.ground.height(x)
+    return View(look[0:3], look[3:6], look[6:9], look[9:12], x, y, attitude, ground, plant.payload_kg)

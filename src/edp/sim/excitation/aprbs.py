@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from edp.sim.excitation.base import AXES, EXCITATIONS, Array, Excitation, Hold, extend_probability
+from edp.sim.excitation.base import AXES, EXCITATIONS, Array, Excitation, Hold, extend_probability, held
 from edp.sim.excitation.levers import dead_lever
 from edp.sim.machine import Machine
 from edp.sim.view import View
@@ -60,7 +60,7 @@ class Aprbs(Excitation):
             samples = min(samples, max(1, round(self.PIECE_S * self._rate)))
         for hold in self._holds:
             hold.spend(samples)
-        targets = np.tile(self._levels, (samples, 1))
+        targets = held(self._levels, samples)
         if self._chirp >= 0:
             targets[:, self._chirp] = self._sweep(samples, view.strokes[self._chirp])
         else:

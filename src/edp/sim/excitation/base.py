@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,6 +51,13 @@ EXCITATIONS: Registry[type[Excitation]] = Registry("excitation")
 def extend_probability(stroke: float, pull: float = 1.1) -> float:
     """Chance to extend next: more when retracted, so that the mean stroke stays near the middle."""
     return min(max(0.5 + pull * (0.5 - stroke), 0.03), 0.97)
+
+
+def held(levels: Sequence[float] | Array, samples: int) -> Array:
+    """The same levers at every sample, shape (samples, 3)."""
+    targets = np.empty((samples, AXES))
+    targets[:] = levels
+    return targets
 
 
 class Hold:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edp.sim.excitation.base import AXES, EXCITATIONS, Array, AxisStream, Excitation
+from edp.sim.excitation.base import AXES, EXCITATIONS, Array, AxisStream, Excitation, held
 from edp.sim.machine import Machine
 from edp.sim.view import View
 
@@ -25,7 +25,7 @@ class Combined(Excitation):
         samples = min(stream.hold.left for stream in self._streams)
         for stream in self._streams:
             stream.hold.spend(samples)
-        return np.tile([stream.level for stream in self._streams], (samples, 1))
+        return held([stream.level for stream in self._streams], samples)
 
     def redraw(self, unused: int) -> None:
         """Each lever's hold lasts anew."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edp.sim.excitation.base import AXES, EXCITATIONS, Array, Excitation, Hold, extend_probability
+from edp.sim.excitation.base import AXES, EXCITATIONS, Array, Excitation, Hold, extend_probability, held
 from edp.sim.machine import Machine
 from edp.sim.view import View
 
@@ -31,7 +31,7 @@ class Reversals(Excitation):
         if self._hold.left == 0:
             self._next(view)
         samples = self._hold.spend(self._hold.left)
-        return np.tile(self._levels, (samples, 1))
+        return held(self._levels, samples)
 
     def _next(self, view: View) -> None:
         rng = self._rng
