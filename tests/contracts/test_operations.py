@@ -32,6 +32,7 @@ ALLOWED = {
     "native_layer_norm": {Operation.LAYER_NORM},
     "sqrt": {Operation.SQRT},
     "exp": {Operation.EXP},
+    "expm1": {Operation.EXP},
     "sin": {Operation.SINE},
     "cos": {Operation.SINE},
 }
@@ -52,7 +53,7 @@ FREE = {
         "t",
         "transpose",
     ),
-    *("unbind", "unsafe_chunk", "unsafe_split", "unsqueeze", "view", "unfold"),
+    *("unbind", "unsafe_chunk", "unsafe_split", "unsqueeze", "view", "view_as_complex", "view_as_real", "unfold"),
     *(
         "arange",
         "empty",

@@ -6,6 +6,7 @@ import torch
 from edp.errors import ConfigError
 from edp.models.backbones import GruSpec, HybridSpec, LstmSpec
 from edp.models.cells import CELLS
+from edp.models.cells.scan import linear_scan
 from edp.streaming import map_state, parameters_of
 
 KINDS = [(name, rate) for name in CELLS for rate in ((0.0, 0.3) if CELLS[name].zoneout else (0.0,))]
@@ -22,7 +23,8 @@ def kind(request):
 
 
 def make(kind, width=3, units=4, dtype=torch.float64):
-    layer = CELLS[kind[0]]().build(width, units, kind[1]).to(dtype).eval()
+    options = {"states": units} if kind[0] == "diagonal_ssm" else {}
+    layer = CELLS[kind[0]](**options).build(width, units, kind[1]).to(dtype).eval()
     with torch.no_grad():
         for parameter in layer.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
@@ -79,7 +81,35 @@ def gru_by_equations(x, state, held, rate):
     return torch.stack(rows, dim=1), h
 
 
-EQUATIONS = {"lstm": lstm_by_equations, "layer_norm_lstm": lstm_by_equations, "gru": gru_by_equations}
+def min_gru_by_equations(x, h, held, rate):
+    rows = []
+    for t in range(x.shape[1]):
+        gate, candidate = (x[:, t] @ held["gate_and_candidate.weight"].T + held["gate_and_candidate.bias"]).chunk(2, 1)
+        z = torch.sigmoid(gate)
+        h = (1 - z) * h + z * candidate
+        rows.append(h)
+    return torch.stack(rows, dim=1), h
+
+
+def ssm_by_equations(x, state, held, rate):
+    factor = torch.exp(torch.complex(-torch.exp(held["rate"]), held["angle"]))
+    into = torch.view_as_complex(held["into.weight"].unflatten(0, (-1, 2)).transpose(1, 2).contiguous())
+    h, rows = torch.complex(state[..., 0], state[..., 1]), []
+    for t in range(x.shape[1]):
+        h = factor * h + (1 - factor.abs() ** 2).sqrt() * (x[:, t].to(h.dtype) @ into.T)
+        both = torch.stack([h.real, h.imag], dim=-1).flatten(1)
+        value, gate = (both @ held["out.weight"].T + held["out.bias"]).chunk(2, dim=1)
+        rows.append(value * torch.sigmoid(gate))
+    return torch.stack(rows, dim=1), torch.stack([h.real, h.imag], dim=-1)
+
+
+EQUATIONS = {
+    "lstm": lstm_by_equations,
+    "layer_norm_lstm": lstm_by_equations,
+    "gru": gru_by_equations,
+    "min_gru": min_gru_by_equations,
+    "diagonal_ssm": ssm_by_equations,
+}
 
 
 def test_every_layer_has_its_equations():
@@ -152,6 +182,50 @@ def test_a_long_stream_stays_bounded_and_forgets_its_beginning(kind):
     assert torch.isfinite(y).all()
     assert all(leaf.abs().max() < 1e3 for leaf in leaves(state))
     torch.testing.assert_close(y, z, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 3, 16, 17, 50, 129])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.complex128])
+@pytest.mark.parametrize("constant", [False, True])
+def test_the_scan_and_its_gradients_are_those_of_a_loop(ticks, dtype, constant):
+    a = 0.9 * torch.rand(*([3] if constant else [ticks, 2, 3]), dtype=torch.float64).to(dtype)
+    a = a * torch.exp(1j * a.real) if dtype.is_complex else a
+    b, start = torch.randn(ticks, 2, 3, dtype=dtype), torch.randn(2, 3, dtype=dtype)
+    given = [value.clone().requires_grad_() for value in (a, b, start)]
+    h, loop = given[2], []
+    for t in range(ticks):
+        h = (given[0] if constant else given[0][t]) * h + given[1][t]
+        loop.append(h)
+    wanted = torch.stack(loop)
+    weights = torch.randn(wanted.shape, dtype=dtype)
+    slopes = torch.autograd.grad((wanted * weights).sum().abs(), given)
+    found = linear_scan(*given)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-12)
+    for ours, theirs in zip(torch.autograd.grad((found * weights).sum().abs(), given), slopes, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["min_gru", "diagonal_ssm"])
+def test_hours_of_stream_stay_bounded_and_equal_short_steps(name):
+    layer = make((name, 0.0), units=4, dtype=torch.float32)
+    x = torch.randn(1, 720_000, 3)  # two hours at 100 Hz
+    with torch.no_grad():
+        whole, last = layer(x, layer.initial_state(1, x))
+        near, _ = layer(x[:, -5_000:], layer.initial_state(1, x))
+    assert torch.isfinite(last).all()
+    assert whole.abs().max() < 1e2
+    torch.testing.assert_close(near[:, -100:], whole[:, -100:], rtol=0, atol=1e-4)
+
+
+def test_a_state_space_cannot_leave_the_unit_circle():
+    layer = CELLS["diagonal_ssm"](states=5).build(2, 3, 0.0)
+    with torch.no_grad():
+        layer.rate.copy_(torch.tensor([-60.0, -10.0, 0.0, 5.0, 60.0]))
+        factor, scale = layer.factor()
+    size = factor.norm(dim=1)
+    assert (size <= 1.0).all()
+    assert torch.isfinite(scale).all()
+    torch.testing.assert_close(scale[1:, 0], (1 - size[1:].double() ** 2).sqrt().float(), rtol=1e-2, atol=1e-6)
 
 
 def test_costs_name_every_parameter(kind):

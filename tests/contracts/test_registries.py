@@ -70,7 +70,7 @@ def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(p
 
 
 def test_every_file_in_cells_registers_a_recurrent_layer():
-    shared = {"__init__", "base", "lstm_steps"}
+    shared = {"__init__", "base", "lstm_steps", "scan"}
     files = {path.stem for path in Path(edp.models.cells.__path__[0]).glob("*.py")} - shared
     assert files == {CELLS[name].__module__.rpartition(".")[2] for name in CELLS}
 
@@ -141,6 +141,7 @@ BAD = [
     lambda: BACKBONES["lstm"](dropout=1.0),
     lambda: BACKBONES["lstm"](zoneout=1.0),
     lambda: BACKBONES["gru"](layers=0),
+    lambda: CELLS["diagonal_ssm"](states=0),
     lambda: BACKBONES["tcn"](channels=()),
     lambda: BACKBONES["hybrid"](channels=(4, 0)),
     lambda: BACKBONES["hybrid"](kernel=0),
