@@ -446,3 +446,13 @@ def test_baselines_do_not_see_the_physics_columns(truth):
         found = judge(predictor, data, JudgeSpec(baselines=("persistence", "ridge_arx"), history=10), "network")
         scores.append({name: found.scores["models"][name]["overall"] for name in ("persistence", "ridge_arx")})
     assert scores[0] == scores[1]
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: f"{PHYSICS.name_of(spec)}-{spec.pose}")
+def test_a_tick_is_one_graph_without_branches(spec):
+    """What an export needs: every tick runs the same operations, and the traced graph gives the same bits."""
+    base, x = base_and_inputs(spec, (1, 10), 5, ticks=1)
+    state = base.initial_state(1, x)
+    graph = torch.export.export(base, (x, state)).module()
+    _, other = base_and_inputs(spec, (1, 10), 6, ticks=1)
+    assert torch.equal(graph(other, state)[0], base(other, state)[0])
