@@ -1,10 +1,12 @@
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edp.data.augment import AUGMENTATIONS, Jitter, TimeWarp
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
@@ -134,3 +136,79 @@ def test_a_recording_without_a_single_target_is_refused(regime, lead):
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(ConfigError, match="must hold"):
         ChunkSpec(**options)
+
+
+@pytest.mark.parametrize("together", [2, 3, 5])
+def test_windows_drawn_together_end_at_consecutive_samples_and_each_is_seen_once(together):
+    parts = [series(0, 100), series(1, 83)]
+    spec = ChunkSpec(regime="window", length=20, batch=6 * together, consecutive=together)
+    sampler = ChunkSampler(parts, (1, 7), spec, seed=2)
+    firsts = set()
+    for epoch in range(4):
+        batches = list(sampler.epoch(epoch))
+        counts = rows_with_a_loss(batches, parts, (1, 7))
+        assert set(counts.values()) == {1}
+        for batch in batches:
+            ends = batch.inputs[:, -1].reshape(-1, together, 2)
+            assert (np.diff(ends[..., 0], axis=1) == 0).all()
+            assert (np.diff(ends[..., 1], axis=1) == 1).all()
+            assert batch.reset.all()
+        for number, samples in enumerate((100, 83)):
+            rows = sorted(row for owner, row in counts if owner == number)
+            # Groups begin at another row in each epoch; at most a group is left out at each end.
+            assert rows == list(range(rows[0], rows[0] + len(rows)))
+            assert len(rows) > samples - 19 - 7 - 2 * together
+            firsts.add(rows[0])
+        assert len(batches) <= sampler.updates()
+    assert len(firsts) > 1
+
+
+@pytest.mark.parametrize("name", list(AUGMENTATIONS))
+@pytest.mark.parametrize("regime", ["chunk", "window"])
+def test_augmented_epochs_are_functions_of_seed_and_number_and_leave_the_series_alone(name, regime):
+    rng = np.random.default_rng(0)
+    parts = [Series("s", *rng.normal(size=(2, 400, 2)).cumsum(axis=1).astype(np.float32))]
+    kept = parts[0].inputs.copy()
+    spec = ChunkSpec(regime=regime, length=40, batch=3, burn_in=10)
+
+    augmentation = AUGMENTATIONS[name]()
+
+    def epoch(number, seed=1, augmentations=(augmentation,)):
+        batches = list(ChunkSampler(parts, (4,), spec, seed, augmentations).epoch(number))
+        return np.concatenate([batch.inputs for batch in batches]), [batch.valid for batch in batches]
+
+    inputs, valid = epoch(0)
+    np.testing.assert_array_equal(inputs, epoch(0)[0])
+    plain, same = epoch(0, augmentations=())
+    assert plain.shape == inputs.shape
+    assert not np.array_equal(plain, inputs)
+    for mine, theirs in zip(valid, same, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert not np.array_equal(inputs, epoch(0, seed=2)[0])
+    np.testing.assert_array_equal(parts[0].inputs, kept)
+
+
+def test_an_augmented_stretch_goes_on_from_chunk_to_chunk():
+    clock = np.arange(3000, dtype=np.float32)[:, None]
+    spec = ChunkSpec(length=50, batch=2, burn_in=0)
+    batches = list(ChunkSampler([Series("clock", clock, clock)], (3,), spec, 0, (TimeWarp(strength=0.3),)).epoch(0))
+    moved = 0.0
+    for before, after in pairwise(batches):
+        for lane in range(2):
+            if not after.reset[lane] and after.valid[lane].all():
+                step = after.inputs[lane, 0, 0] - before.inputs[lane, -1, 0]
+                assert 0.4 < step < 1.8
+                ahead = after.future[lane, :, 0, 0] - after.inputs[lane, :, 0]
+                assert (ahead > 1.2).all()
+                assert (ahead < 5.4).all()
+                moved = max(moved, np.abs(ahead - 3).max())
+    assert moved > 0.2
+
+
+def test_a_lane_that_has_run_out_gives_nothing_with_augmentations_too():
+    parts = [series(0, 700)]
+    spec = ChunkSpec(length=60, batch=5, burn_in=20)
+    plain = list(ChunkSampler(parts, (2,), spec, 0).epoch(0))
+    noisy = list(ChunkSampler(parts, (2,), spec, 0, (Jitter(),)).epoch(0))
+    assert [batch.targets_seen for batch in plain] == [batch.targets_seen for batch in noisy]
+    assert [batch.reset.tolist() for batch in plain] == [batch.reset.tolist() for batch in noisy]

@@ -176,6 +176,15 @@ def test_a_training_that_diverges_later_hands_over_the_best_weights_and_keeps_it
     assert len((tmp_path / "history.jsonl").read_text().splitlines()) == 2
 
 
+def test_a_start_from_a_regression_is_kept_where_the_first_epoch_diverges(tiny, tiny_bypass, tiny_training):
+    wild = dataclasses.replace(tiny_training, optimizer=AdamW(learning_rate=1e38), schedule=Constant())
+    with pytest.raises(Diverged, match="the weights of the start are kept") as caught:
+        fit(tiny, tiny_bypass, wild)
+    assert caught.value.facts["kept_epoch"] == 0
+    score, _, _ = validation_scores(caught.value.fitted.predictor, tiny.validation, tiny_training, tiny)
+    assert 0 < score < 1
+
+
 def test_weights_that_break_in_the_last_update_of_an_epoch_are_not_kept(tiny, tiny_model, tiny_training, monkeypatch):
     def scores(*parts):
         return math.nan, math.nan, math.nan

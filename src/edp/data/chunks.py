@@ -162,7 +162,7 @@ class ChunkSampler:
                 if step < len(lane):
                     i, start, stop, at = lane[step]
                     if at == start:
-                        held[which] = self._stretch(i, start, stop, number)
+                        held[which] = self._stretch(i, start, stop, self._chance(number, i, start))
                     part, origin = held[which]
                     rows.append(self._cut(part, at - origin, at - start, burn_in))
                     resets.append(at == start)
@@ -180,10 +180,10 @@ class ChunkSampler:
         groups = self.spec.batch // together
         for first in range(0, len(order), groups):
             chosen = order[first : first + groups]
-            rows = []
+            rows, chance = [], self._chance(number, first)
             for i, j in zip(np.searchsorted(ends, chosen, side="right"), chosen, strict=True):
                 start = int(offsets[i] + (j - (ends[i - 1] if i else 0)) * together)
-                part, origin = self._stretch(int(i), start, start + length + together - 1, number)
+                part, origin = self._stretch(int(i), start, start + length + together - 1, chance)
                 rows += [self._cut(part, start + late - origin, 0, length - 1) for late in range(together)]
             yield _stack(rows, [True] * len(rows))
 
@@ -191,15 +191,17 @@ class ChunkSampler:
         """How many groups of consecutive windows a series holds from `offset` on."""
         return max(0, part.samples - self.spec.length + 1 - max(self.horizons) - offset) // self.spec.consecutive
 
-    def _stretch(self, i: int, start: int, stop: int, number: int) -> tuple[Series, int]:
-        """The series to cut ``start:stop`` from in epoch `number`, and the row of series i at which it begins."""
+    def _chance(self, *key: int) -> np.random.Generator | None:
+        """A source of chance of its own for what is augmented: neither the order of lanes nor a stop matters."""
+        return np.random.default_rng([self.seed, *key]) if self.augmentations else None
+
+    def _stretch(self, i: int, start: int, stop: int, rng: np.random.Generator | None) -> tuple[Series, int]:
+        """The series to cut ``start:stop`` from, and the row of series i at which it begins."""
         part = self.series[i]
-        if self.deviation is None:
+        if rng is None or self.deviation is None:
             return part, 0
         stop = min(stop + max(self.horizons), part.samples)
         part = Series(part.name, part.inputs[start:stop], part.targets[start:stop])
-        # Its own source of chance: neither the order of the lanes nor a stop in between matters.
-        rng = np.random.default_rng([self.seed, number, i, start])
         for augmentation in self.augmentations:
             part = augmentation.apply(part, self.deviation, rng)
         return part, start

@@ -172,7 +172,7 @@ class _Loop:
         facts = {
             "epoch": progress.epoch + 1,
             "update": progress.updates,
-            "kept_epoch": progress.best_epoch if kept else None,
+            "kept_epoch": progress.best_epoch if math.isfinite(progress.best_score) else None,
         }
         return Diverged(
             f"{what} is {value} at update {progress.updates} (epoch {facts['epoch']}): the training diverged; {saved}. "
