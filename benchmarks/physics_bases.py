@@ -35,15 +35,15 @@ MACHINE = "M22"
 BASES: dict[str, PhysicsSpec] = {
     "kinematic": KinematicSpec(machine=MACHINE),
     "kinematic, strokes": KinematicSpec(machine=MACHINE, pose="strokes"),
-    "force, literal": ForceSpec(machine=MACHINE, load="none"),
-    "force, gravity": ForceSpec(machine=MACHINE, load="gravity"),
-    "force": ForceSpec(machine=MACHINE),
+    "force, literal": ForceSpec(machine=MACHINE, load="none", fade_s=0.0),
+    "force, gravity": ForceSpec(machine=MACHINE, load="gravity", fade_s=0.0),
+    "force": ForceSpec(machine=MACHINE, fade_s=0.0),
     "force, fading": ForceSpec(machine=MACHINE, fade_s=0.03),
-    "hybrid, literal": HybridPhysicsSpec(machine=MACHINE, load="none"),
-    "hybrid, gravity": HybridPhysicsSpec(machine=MACHINE, load="gravity"),
-    "hybrid": HybridPhysicsSpec(machine=MACHINE),
+    "hybrid, literal": HybridPhysicsSpec(machine=MACHINE, load="none", fade_s=0.0),
+    "hybrid, gravity": HybridPhysicsSpec(machine=MACHINE, load="gravity", fade_s=0.0),
+    "hybrid": HybridPhysicsSpec(machine=MACHINE, fade_s=0.0),
     "hybrid, fading": HybridPhysicsSpec(machine=MACHINE, fade_s=0.03),
-    "hybrid, coupled": HybridPhysicsSpec(machine=MACHINE, coupled=True),
+    "hybrid, coupled": HybridPhysicsSpec(machine=MACHINE, coupled=True, fade_s=0.0),
     "hybrid, coupled, fading": HybridPhysicsSpec(machine=MACHINE, coupled=True, fade_s=0.03),
 }
 WITH_JOINTS = FeatureSet("FG2 and joints", (*FG2.channels, *POSES["angles"]), FG2.derived)

@@ -105,8 +105,8 @@ def _physical() -> dict[str, Structure]:
     """Each physics base beside one backbone: it meets the network at the output only."""
     variants = {
         "kinematic": [{}, {"pose": "strokes"}],
-        "force": [{}, {"load": "none", "machine": "C14"}],
-        "hybrid": [{"fade_s": 0.05}, {"coupled": True, "pose": "strokes"}],
+        "force": [{}, {"load": "none", "fade_s": 0.0, "machine": "C14"}],
+        "hybrid": [{"fade_s": 0.0}, {"coupled": True, "pose": "strokes"}],
     }
     return {
         f"lstm+{name} physics{number or ''}": Structure(SMALL["lstm"][0], physics=PHYSICS[name](**options))
