@@ -87,11 +87,6 @@ def test_all_reasons_are_given_at_once():
         check_combination(task, with_blocks("velocity_skip", "cross_cylinder_attention"))
 
 
-def test_what_does_not_contradict_is_built(structure, predictor_of):
-    predictor = predictor_of(structure)
-    check_combination(predictor.task, predictor.spec)
-
-
 @pytest.mark.parametrize("name", list(BLOCKS))
 def test_the_same_block_twice_is_refused(name):
     backbone = next(
