@@ -2,14 +2,16 @@ import errno
 import hashlib
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from edp.errors import BundleError, StorageError
+from edp.models.outputs import OUTPUTS
 from edp.models.predictor import Predictor, build_model
-from edp.models.running import stream_predictions
+from edp.models.running import stream_intervals, stream_predictions
 from edp.signals import Kind
 from edp.training.bundle import HEADER, SCHEMA, Bundle, load_bundle, make_bundle, save_bundle
 
@@ -53,6 +55,23 @@ def test_every_structure_survives_a_round_trip(structure, predictor_of, tmp_path
     with torch.no_grad():
         found = loaded.predict(x, loaded.initial_state(1, x))[0]
         assert torch.equal(found, predictor.predict(x, predictor.initial_state(1, x))[0])
+
+
+@pytest.mark.parametrize("output", [name for name in OUTPUTS if OUTPUTS[name]().coverages])
+def test_calibrated_intervals_survive_a_round_trip(output, tmp_path, tiny, tiny_model):
+    predictor = network(tiny, replace(tiny_model, output=OUTPUTS[output]()))
+    predictor.output.stretch.uniform_(0.5, 2.0)
+    loaded = load_bundle(save_bundle(make_bundle(predictor, tiny, {}), tmp_path)).predictor
+    wanted, found = (stream_intervals(net, tiny.test)[0] for net in (predictor, loaded))
+    np.testing.assert_array_equal(found, wanted)
+    assert loaded.spec.output == predictor.spec.output
+
+
+def test_a_bundle_from_before_outputs_had_kinds_says_points(folder):
+    header = json.loads((folder / HEADER).read_text())
+    assert header["model"].pop("output") == {"kind": "point"}
+    (folder / HEADER).write_text(json.dumps(header))
+    assert load_bundle(folder).predictor.spec.output == OUTPUTS["point"]()
 
 
 def test_a_run_folder_opens_its_bundle(tmp_path, tiny, tiny_model):

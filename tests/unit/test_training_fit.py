@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from edp.data.augment import AUGMENTATIONS
 from edp.data.chunks import ChunkSpec
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
-from edp.losses import MeanSquared
+from edp.losses import LOSSES, TERMS, AdaptiveWeights, MeanSquared
+from edp.models.outputs import OUTPUTS
 from edp.models.predictor import build_model
 from edp.models.running import stream_predictions
 from edp.runs import RunFolder
@@ -106,6 +108,31 @@ def test_every_optimizer_and_schedule_trains_with_either_regime(schedule, optimi
         made = fit(tiny, tiny_bypass, spec)
         assert made.history[-1]["updates"] == 24
         assert np.isfinite(made.history[-1]["validation_score"])
+
+
+@pytest.mark.parametrize("regime", ["chunk", "window"])
+@pytest.mark.parametrize(("loss", "output"), [(loss, output) for loss in LOSSES for output in LOSSES[loss].outputs])
+def test_every_loss_and_output_trains_with_all_terms_and_augmentations(loss, output, regime, tiny, tiny_bypass):
+    chunks = {
+        "chunk": ChunkSpec(length=32, batch=4, burn_in=20),
+        "window": ChunkSpec(regime="window", length=10, batch=9),
+    }
+    spec = TrainingSpec(
+        chunks=dataclasses.replace(chunks[regime], consecutive=3 if regime == "window" else 1),
+        augmentations=tuple(AUGMENTATIONS[name]() for name in AUGMENTATIONS),
+        loss=LOSSES[loss](),
+        terms=tuple(TERMS[name]() for name in TERMS),
+        weight_power=0.5,
+        horizon_decay=0.9,
+        adaptive=AdaptiveWeights(blend=0.3),
+        average=Stochastic(share=0.5),
+        epochs=2,
+        updates=4,
+        device="cpu",
+    )
+    made = fit(tiny, dataclasses.replace(tiny_bypass, output=OUTPUTS[output]()), spec)
+    assert all(np.isfinite(list(row.values())).all() for row in made.history)
+    assert all(torch.isfinite(value).all() for value in made.predictor.state_dict().values())
 
 
 def test_a_by_pass_starts_better_than_a_network_alone(fitted, tiny, tiny_bypass, tiny_training):
