@@ -11,6 +11,7 @@ from edp.data import events, spectrum
 from edp.data.coverage import CELLS, INTEGRATED, MEASURED, cover, mutual_information
 from edp.data.roles import roles_of
 from edp.data.splits import ByRecording, ByTime, Split, Stretch
+from edp.data.wanted import wanted
 from edp.errors import DataError
 from edp.recording import Recording
 from edp.signals import VOCABULARY, Channel, Kind
@@ -201,3 +202,18 @@ def test_tests_unlike_training_lie_far_away():
     assert distance.test[0] > 3 * distance.train[0]
     own = cover([near], split=ByTime().split([near], 10)).distance
     assert own.test[0] < 1.0
+
+
+def test_figures_are_judged_by_what_is_wanted_of_them():
+    rng = np.random.default_rng(0)
+    meta = {"full_strokes_m": [1.2, 1.2, 1.2]}
+    slow = wanted(cover([machine_like(30_000, meta=meta)]))
+    assert [(w.unit, w.met) for w in slow] == [("%", True)] + [("Hz", False)] * 3
+    noise = {name: np.maximum(sign * rng.normal(size=20_000), 0) for name, sign in (("BmUp", 1), ("BmDwn", -1))}
+    (flat,) = wanted(cover([record(noise)]))
+    assert flat.met
+    assert flat.to_json()["met"] is True
+    assert not wanted(cover([record({"CylVels_1": rng.normal(size=100)})]))[1:]
+    with_split = cover([machine_like(3000)], split=ByTime().split([machine_like(3000)], 10))
+    (far,) = (w for w in wanted(with_split) if not w.at_least)
+    assert far.met == (with_split.distance.beyond <= 0.1)

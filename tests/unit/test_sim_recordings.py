@@ -129,7 +129,7 @@ def test_plan_spreads_the_mix_and_the_seeds():
     assert len({s.seed for s in scenarios}) == 20
     assert scenarios[3].name == f"m22_003_{scenarios[3].excitation}"
     kinds = [s.excitation for s in scenarios]
-    assert [kinds.count(name) for name in plan.DEFAULT_MIX] == [5, 5, 3, 2, 2, 2, 1]
+    assert [kinds.count(name) for name in plan.DEFAULT_MIX] == [4, 5, 3, 3, 2, 2, 1]
     assert scenarios == plan_data_set("M22", 60.0, 20, seed=3)
     assert scenarios != plan_data_set("M22", 60.0, 20, seed=4)
     only = plan_data_set("M22", 1.0, 2, seed=0, mix={"isolated": 2.0})

@@ -66,7 +66,11 @@ def inspect(
             mapped = "" if signal_map is None else f" --map {signal_map}"
             out.print(f"next: edp train {data}{mapped} --out runs/first")
 
-    covers = None if found is None else found.to_json()
+    covers = None
+    if found is not None:
+        from edp.data.wanted import wanted
+
+        covers = {**found.to_json(), "wanted": [figure.to_json() for figure in wanted(found)]}
     emit(as_json, {"errors": errors, "recordings": plain, "coverage": covers, "coverage_absent": why}, show)
     if errors:
         err.print("see the advice beside each error, or ask for a repair with --repair when training")
@@ -106,6 +110,8 @@ def show_report(report: dict[str, Any], channels: bool) -> None:
 
 def show_coverage(found: Coverage) -> None:
     """Print what a data set covers."""
+    from edp.data.wanted import wanted
+
     rows: list[tuple[Any, ...]] = []
     if found.singular:
         lags = max(found.singular)
@@ -129,6 +135,13 @@ def show_coverage(found: Coverage) -> None:
         rows.append(("test farther than 95 % of train", _share(far.beyond), "5 % where both are alike"))
     table(f"coverage: {found.recordings} recording(s), {found.hours:.2f} h", ["", "value", "note"], rows)
     out.print()
+    judged = [
+        (w.name, f"{w.value:.3g} {w.unit}", f"{'>=' if w.at_least else '<='} {w.bound:g} {w.unit}", _verdict(w.met))
+        for w in wanted(found)
+    ]
+    if judged:
+        table("wanted of data to learn a machine from", ["", "here", "wanted", "verdict"], judged)
+        out.print()
     moves = [(a.axis, *(_count(v) for v in (a.reversals, a.crossings)), _share(a.active)) for a in found.activity]
     table("commands", ["axis", "reversals", "dead-band crossings", "time active"], moves)
     out.print()
@@ -146,6 +159,10 @@ def show_coverage(found: Coverage) -> None:
     for note in found.absent:
         out.print(f"  note: {note}")
     out.print()
+
+
+def _verdict(met: bool) -> str:
+    return "met" if met else "not met"
 
 
 def _short(value: float | None) -> str:

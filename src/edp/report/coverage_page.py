@@ -11,16 +11,12 @@ from plotly.offline import get_plotlyjs
 
 from edp.data.coverage import INTEGRATED, Coverage
 from edp.data.spectrum import FLAT_DB
+from edp.data.wanted import BEYOND, OCCUPANCY, wanted
 from edp.report.coverage_plots import coverage_plots
 from edp.report.page import asset, script_json
 from edp.report.tables import Table
 from edp.report.wording import MISSING, listed, number, percent, unbroken, whole
 from edp.storage import write_bytes
-
-FAR = 0.1
-"""Share of the tests beyond 95 % of the training from which the headline says so; 5 % where both are alike."""
-WANTED_OCCUPANCY = 0.9
-"""Share of the cells that a data set should visit."""
 
 
 def build_coverage_page(found: Coverage, output: str | Path, title: str) -> Path:
@@ -57,6 +53,7 @@ def render_coverage(found: Coverage, title: str) -> str:
         "verdict": verdict(found),
         "tiles": tiles(found),
         "plots": plots,
+        "wanted": wanted_table(found),
         "specs": script_json([plot.spec() for plot in plots.values()]),
         "found": found,
         "integrated": found.occupancy is not None and found.occupancy.source == INTEGRATED,
@@ -80,7 +77,7 @@ def headline(found: Coverage) -> str:
         parts.append(f"visits {percent(found.occupancy.share)} {kind}")
     if found.spectrum is not None and any(found.spectrum.flat_to_hz):
         parts.append(f"excites its commands up to {number(min(found.spectrum.flat_to_hz), 1)} Hz")
-    if found.distance is not None and found.distance.beyond > FAR:
+    if found.distance is not None and found.distance.beyond > BEYOND:
         parts.append(f"leaves {percent(found.distance.beyond)} of the tests far from training")
     size = f"{number(found.hours, 1 if found.hours >= 1 else 2)} h of data"
     return f"{size} that {listed(parts)}." if parts else f"{size}."
@@ -95,8 +92,8 @@ def verdict(found: Coverage) -> list[str]:
             f"Commands fall by {FLAT_DB:g} dB before {inputs.used_hz:.2g} Hz, where they lie up to "
             f"{number(max(inputs.drop_db), 0)} dB below their maximum: faster changes teach little here."
         )
-    if found.occupancy is not None and found.occupancy.share < WANTED_OCCUPANCY:
-        lines.append(f"Fewer than {percent(WANTED_OCCUPANCY)} of the cells were visited; the white ones were never.")
+    if found.occupancy is not None and found.occupancy.share < OCCUPANCY:
+        lines.append(f"Fewer than {percent(OCCUPANCY)} of the cells were visited; the white ones were never.")
     if found.constant:
         lines.append(f"{listed(found.constant)} never change{'s' * (len(found.constant) == 1)}.")
     return lines
@@ -123,6 +120,21 @@ def tiles(found: Coverage) -> list[tuple[str, str, str]]:
             (percent(found.distance.beyond).rstrip(" %"), "%", "of the tests farther than 95 % of the training")
         )
     return made
+
+
+def wanted_table(found: Coverage) -> Table | None:
+    """Figures beside what is wanted of them."""
+    rows = tuple(
+        (
+            _first_up(w.name),
+            f"{number(w.value, 2)} {w.unit}",
+            f"{'at least' if w.at_least else 'at most'} {w.bound:g} {w.unit}",
+            "met" if w.met else "not met",
+        )
+        for w in wanted(found)
+    )
+    columns = (("Figure", ""), ("Here", ""), ("Wanted", ""), ("Verdict", ""))
+    return Table("Wanted of data to learn a machine from", columns, rows) if rows else None
 
 
 def activity_table(found: Coverage) -> Table | None:

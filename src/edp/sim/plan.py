@@ -23,13 +23,13 @@ from edp.sim.scenario import START_STROKES, Scenario, SimulationError
 from edp.sim.simulate import simulate
 
 DEFAULT_MIX: Mapping[str, float] = {
-    "combined": 0.24,
-    "isolated": 0.22,
-    "grading": 0.14,
-    "aprbs": 0.12,
-    "dig": 0.12,
+    "isolated": 0.23,
+    "combined": 0.23,
+    "grading": 0.16,
+    "dig": 0.13,
+    "aprbs": 0.10,
     "end_stops": 0.09,
-    "reversals": 0.07,
+    "reversals": 0.06,
 }
 """Share of the recordings by excitation."""
 

@@ -152,9 +152,11 @@ def test_inspect_shows_and_draws_what_the_data_cover(edp, logs, tmp_path):
     assert shown.code == 0
     assert "smallest singular value" in shown.out
     assert "test to train, median" in shown.out
+    assert "not met" in shown.out
     assert page.read_text(encoding="utf-8").lower().startswith("<!doctype html>")
     plain = edp("inspect", logs, "--json").json
     assert plain["coverage"]["recordings"] == len(plain["recordings"])
+    assert not all(figure["met"] for figure in plain["coverage"]["wanted"])
     assert edp("inspect", logs, "--no-coverage", "--json").json["coverage"] is None
     wrong = edp("inspect", logs, "--inputs", "BmUpp")
     assert wrong.code == 1

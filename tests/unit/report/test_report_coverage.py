@@ -40,7 +40,7 @@ def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
     assert list(figures_of(text)) == names == list(coverage_plots(found))
     assert all(f'id="figure-{name}"' in text for name in names)
     assert "Not looked at" not in text
-    for words in ("Reversals", "Both pumps shared", "Power limit", "From test to training", "of 216 cells"):
+    for words in ("Reversals", "Both pumps shared", "Power limit", "From test to training", "of 216 cells", "not met"):
         assert words in text
 
 

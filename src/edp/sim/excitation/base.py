@@ -97,7 +97,7 @@ class AxisStream:
     """One lever: moves of random size, sign and length, with pauses between them.
 
     Its vigour changes every few moves, from careful positioning to full-lever work, so that a data set holds both.
-    The boom is held long, the bucket pulsed: fitted to the lags and spreads of the thesis's signals.
+    The boom is held long, arm and bucket are pulsed: fitted to the lags and spreads of the thesis's signals.
 
     Args:
         rng: source of randomness.
@@ -113,8 +113,8 @@ class AxisStream:
 
     LEVELS = (0.15, 1.0)
     HOLD_S = (0.25, 1.6)
-    PACE = (1.0, 0.5, 0.25)
-    STRENGTH = (0.8, 0.7, 1.2)
+    PACE = (1.0, 0.3, 0.15)
+    STRENGTH = (0.75, 0.75, 1.2)
     VIGOUR = (0.2, 0.9)
     CHANGE = 0.1
 
