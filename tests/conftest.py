@@ -152,7 +152,7 @@ def forms_of(structure: str) -> list[Form]:
 
 
 @cache
-def _build(structure: str, form: Form) -> Predictor:
+def _build(structure: str, form: Form, shake: float) -> Predictor:
     spec = model_of(structure, form[0])
     task = task_of(form, spec)
     shape = (len(form[1]), 2)
@@ -160,10 +160,10 @@ def _build(structure: str, form: Form) -> Predictor:
     scaler = Scaler(rng.normal(size=6), rng.uniform(0.5, 2, 6), rng.normal(size=shape), rng.uniform(0.5, 2, shape))
     predictor = build_model(task, spec, scaler, seed=3)
     # Some parts start at zero or fully open; shaken weights let every path take part.
-    shake = torch.Generator().manual_seed(11)
+    draw = torch.Generator().manual_seed(11)
     with torch.no_grad():
         for parameter in predictor.parameters():
-            parameter.add_(0.2 * torch.randn(parameter.shape, generator=shake))
+            parameter.add_(shake * torch.randn(parameter.shape, generator=draw))
     return predictor
 
 
@@ -172,11 +172,13 @@ def predictor_of() -> Callable[..., Predictor]:
     """Predictors by structure, form and dtype, in evaluation mode; built once, so tests leave them as they are."""
 
     @cache
-    def make(structure: str, form: Form | None = None, dtype: torch.dtype = torch.float64) -> Predictor:
+    def make(
+        structure: str, form: Form | None = None, dtype: torch.dtype = torch.float64, shake: float = 0.2
+    ) -> Predictor:
         # Where a test does not go through all forms, neighbouring structures still take different ones.
         agreed = forms_of(structure)
         chosen = form or agreed[list(STRUCTURES).index(structure) % len(agreed)]
-        return copy.deepcopy(_build(structure, chosen)).to(dtype).eval()
+        return copy.deepcopy(_build(structure, chosen, shake)).to(dtype).eval()
 
     return make
 

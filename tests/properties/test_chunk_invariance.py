@@ -41,8 +41,9 @@ def test_any_split_gives_the_same_stream(structure, predictor_of):
 
 
 def test_a_split_in_single_precision_gives_the_same_stream_up_to_rounding(structure, predictor_of):
-    predictor = predictor_of(structure, dtype=torch.float32)
-    close(in_chunks(predictor, [1, 2, 3, 17, 31]), in_chunks(predictor), 1e-4)
+    # Weights near those of a start: rounding grows with them, and 1e-5 is the contract.
+    predictor = predictor_of(structure, dtype=torch.float32, shake=0.02)
+    close(in_chunks(predictor, [1, 2, 3, 17, 31]), in_chunks(predictor), 1e-5)
 
 
 def test_tick_by_tick_over_more_than_a_pooling_block(predictor_of):
