@@ -21,6 +21,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.models.cells import CELLS
 from edp.models.heads import HEADS, GluHead, MlpHead
+from edp.models.initial import INITIAL_STATES
 from edp.models.outputs import OUTPUTS, Point
 from edp.models.physics import PHYSICS
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination
@@ -40,6 +41,10 @@ SMALL = {
         HybridSpec(channels=(4,), kernel=1, units=4),
         HybridSpec(channels=(4,), kernel=2, units=4, zoneout=0.3),
         *(HybridSpec(channels=(4,), kernel=2, units=4, layers=2, cell=CELLS[name]()) for name in CELLS),
+        *(
+            HybridSpec(channels=(4,), kernel=2, units=3, initial=spec)
+            for spec in (INITIAL_STATES["constant"](), INITIAL_STATES["prefix"](ticks=5, hidden=3))
+        ),
     ],
     "cylinder_gate": [BLOCKS["cylinder_gate"](), BLOCKS["cylinder_gate"](form="linear")],
     "attention_bridge": [BLOCKS["attention_bridge"](heads=2)],

@@ -26,6 +26,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.cells import CELLS
 from edp.models.heads import HEADS
+from edp.models.initial import INITIAL_STATES
 from edp.models.outputs import OUTPUTS
 from edp.models.physics import PHYSICS, PhysicsSpec
 from edp.models.plain import options
@@ -40,6 +41,7 @@ from edp.training.schedules import SCHEDULES
 TAGGED: Mapping[str, Registry[type]] = {
     "backbone": BACKBONES,
     "cell": CELLS,
+    "initial": INITIAL_STATES,
     "head": HEADS,
     "activation": ACTIVATIONS,
     "output": OUTPUTS,

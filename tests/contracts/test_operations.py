@@ -83,7 +83,7 @@ FREE = {
         "reciprocal",
         "rsub",
     ),
-    *("addcmul", "lerp", "sign", "sub"),
+    *("addcmul", "lerp", "sign", "sub", "sum"),
 }
 
 

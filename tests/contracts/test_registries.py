@@ -18,6 +18,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, TcnSpec
 from edp.models.cells import CELLS
 from edp.models.heads import HEADS
+from edp.models.initial import INITIAL_STATES
 from edp.models.outputs import OUTPUTS
 from edp.models.physics import PHYSICS
 from edp.models.plain import tagged, untagged
@@ -30,6 +31,7 @@ from edp.training.schedules import SCHEDULES
 SPECS = [
     BACKBONES,
     CELLS,
+    INITIAL_STATES,
     PHYSICS,
     BLOCKS,
     HEADS,
@@ -63,9 +65,9 @@ def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(p
     assert {block for _, block in fitting} == set(BLOCKS)
     assert {backbone for backbone, _ in fitting} == set(BACKBONES)
     assert len(forms) == len(ACTIVATIONS) * 2 * 2
-    # Plain ones with every recurrent layer, pairs, further options of two blocks, further heads and outputs, and
-    # full slots for each backbone; two forms of each physics base.
-    assert len(structures) == 9 + len(CELLS) + 28 + 2 * 4 + 3 * 4 + 3 * 4 + 4 + 3 * 2
+    # Plain ones with every recurrent layer and initial state, pairs, further options of two blocks, further heads and
+    # outputs, and full slots for each backbone; two forms of each physics base.
+    assert len(structures) == 9 + len(CELLS) + len(INITIAL_STATES) - 1 + 28 + 2 * 4 + 3 * 4 + 3 * 4 + 4 + 3 * 2
     assert {PHYSICS.name_of(s.physics) for s in structures.values() if s.physics} == set(PHYSICS)
 
 
@@ -142,6 +144,7 @@ BAD = [
     lambda: BACKBONES["lstm"](zoneout=1.0),
     lambda: BACKBONES["gru"](layers=0),
     lambda: CELLS["diagonal_ssm"](states=0),
+    lambda: INITIAL_STATES["prefix"](ticks=0),
     lambda: BACKBONES["tcn"](channels=()),
     lambda: BACKBONES["hybrid"](channels=(4, 0)),
     lambda: BACKBONES["hybrid"](kernel=0),

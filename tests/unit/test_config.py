@@ -42,6 +42,7 @@ def test_every_registered_part_survives_a_round_trip(tmp_path):
     places = {
         "backbone": ("model", "backbone"),
         "cell": ("model", "backbone", "cell"),
+        "initial": ("model", "backbone", "initial"),
         "activation": ("model", "activation"),
         "head": ("model", "head"),
         "output": ("model", "output"),

@@ -14,6 +14,7 @@ from edp.errors import ConfigError
 from edp.models.cells import CellSpec, GruCell, LstmCell, Stack
 from edp.models.cells.base import check_cell
 from edp.models.convolution import ConvolutionStack, receptive_field
+from edp.models.initial import InitialSpec, ZeroState
 from edp.models.pooling import AttentionPooling
 from edp.registry import Registry
 from edp.streaming import Chain, Cost, State, Streaming
@@ -47,6 +48,7 @@ class LstmSpec:
         dropout: rate on the hidden states, in training.
         zoneout: probability that a unit keeps its state over a tick, in training; in evaluation states are blended.
         cell: options of a registered recurrent layer, of the family of the LSTM.
+        initial: options of a registered initial state: what the state is after a reset.
     """
 
     units: int = 64
@@ -54,6 +56,7 @@ class LstmSpec:
     dropout: float = 0.0
     zoneout: float = 0.0
     cell: CellSpec = field(default_factory=LstmCell)
+    initial: InitialSpec = field(default_factory=ZeroState)
 
     def __post_init__(self) -> None:
         _check(self.dropout, units=self.units, layers=self.layers)
@@ -66,7 +69,7 @@ class LstmSpec:
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """The recurrent backbone on the scaled features."""
         stack = Stack(self.cell, features, self.units, self.layers, self.dropout, self.zoneout)
-        net = RecurrentBackbone(None, stack, self.units, self.dropout, window, blocks)
+        net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
         return net, net.width
 
 
@@ -80,12 +83,14 @@ class GruSpec:
         layers: stacked recurrent layers.
         dropout: rate on the hidden states, in training.
         cell: options of a registered recurrent layer, of the family of the GRU.
+        initial: options of a registered initial state: what the state is after a reset.
     """
 
     units: int = 64
     layers: int = 1
     dropout: float = 0.0
     cell: CellSpec = field(default_factory=GruCell)
+    initial: InitialSpec = field(default_factory=ZeroState)
 
     def __post_init__(self) -> None:
         _check(self.dropout, units=self.units, layers=self.layers)
@@ -98,7 +103,7 @@ class GruSpec:
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """The recurrent backbone on the scaled features."""
         stack = Stack(self.cell, features, self.units, self.layers, self.dropout)
-        net = RecurrentBackbone(None, stack, self.units, self.dropout, window, blocks)
+        net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
         return net, net.width
 
 
@@ -150,6 +155,7 @@ class HybridSpec:
         dropout: rate after each convolution and on the hidden states, in training.
         zoneout: probability that a unit keeps its state over a tick, in training; in evaluation states are blended.
         cell: options of a registered recurrent layer.
+        initial: options of a registered initial state: what the state is after a reset.
     """
 
     channels: tuple[int, ...] = (64,)
@@ -159,6 +165,7 @@ class HybridSpec:
     dropout: float = 0.0
     zoneout: float = 0.0
     cell: CellSpec = field(default_factory=LstmCell)
+    initial: InitialSpec = field(default_factory=ZeroState)
 
     def __post_init__(self) -> None:
         _check(
@@ -179,7 +186,7 @@ class HybridSpec:
         """Convolutions and the recurrent backbone on their channels."""
         encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
         stack = Stack(self.cell, width, self.units, self.layers, self.dropout, self.zoneout)
-        net = RecurrentBackbone(encoder, stack, self.units, self.dropout, window, blocks)
+        net = RecurrentBackbone(encoder, self.initial.build(stack, width), self.units, self.dropout, window, blocks)
         return net, net.width
 
 

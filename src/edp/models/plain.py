@@ -15,6 +15,7 @@ from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
 from edp.models.cells import CELLS
 from edp.models.heads import HEADS
+from edp.models.initial import INITIAL_STATES
 from edp.models.outputs import OUTPUTS
 from edp.models.physics import PHYSICS
 from edp.models.predictor import ModelSpec
@@ -23,7 +24,7 @@ from edp.signals import Kind
 
 Plain = dict[str, Any]
 
-NESTED: Mapping[str, Registry[type]] = {"cell": CELLS}
+NESTED: Mapping[str, Registry[type]] = {"cell": CELLS, "initial": INITIAL_STATES}
 """Options that are registered parts themselves."""
 
 
