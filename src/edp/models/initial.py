@@ -128,11 +128,11 @@ class LearnedFromPrefix(Streaming):
         inner, total, age = state
         y, inner = self.recurrent(x, inner)
         young = age < self.ticks
-        total = total + torch.where(young, x.sum(dim=1), 0.0)
+        total = total + x.sum(dim=1).masked_fill(~young, 0.0)
         age = (age + x.shape[1]).clamp(max=self.ticks)
         seen = torch.cat([total / self.ticks, x[:, -1]], dim=1)
         correction = self.second(torch.tanh(self.first(seen)))
-        used = torch.where(young & (age >= self.ticks), correction, 0.0)
+        used = correction.masked_fill(~(young & (age >= self.ticks)), 0.0)
         return y, (map_state(torch.add, inner, spread_over(inner, used)), total, age)
 
     def costs(self) -> list[Cost]:
