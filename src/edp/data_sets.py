@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -44,8 +44,13 @@ class SimulationOrder(DataSetSpec):
     truth: str = ""
 
     @staticmethod
-    def of(scenario: str | Path | None = None, **changes: Any) -> SimulationOrder:
+    def of(
+        scenario: str | Path | None = None, note: Callable[[str], None] | None = None, **changes: Any
+    ) -> SimulationOrder:
         """The order of a scenario file, or the default one; `changes` that are not None replace its values.
+
+        What a change makes void in the file goes with it, and `note` is called with a sentence that says so: a layout
+        of MAT files once another format is asked for, a family once a machine is.
 
         Raises:
             ConfigError: a key or value that cannot be; file, key, value and bound are named.
@@ -56,7 +61,16 @@ class SimulationOrder(DataSetSpec):
             values |= {key: value for key, value in files.items() if key != "format"}
             if "format" in files:
                 values["suffix"] = suffix_of(files["format"])
-        values |= {key: value for key, value in changes.items() if value is not None}
+        given = {key: value for key, value in changes.items() if value is not None}
+        if given.get("family") and "machine" in given:
+            raise ConfigError(
+                f"machine = {given['machine']} and family = {given['family']}: a family takes the machine's place; "
+                "give one of the two"
+            )
+        for text in _leave_out(values, given):
+            if note is not None:
+                note(f"{text}; the scenario file's is left out")
+        values |= given
         try:
             order = SimulationOrder(**values)
             order.files()
@@ -79,6 +93,17 @@ class SimulationOrder(DataSetSpec):
                 raise ConfigError(f"layout '{self.layout}' is one of MAT files, not of '{self.suffix}'; ask for mat")
         truth = self.truth or ("apart" if self.layout else "with")
         return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
+
+
+def _leave_out(values: dict[str, Any], given: dict[str, Any]) -> Iterator[str]:
+    """Take out of a file's `values` what those given make void; says what, and why."""
+    suffix = given.get("suffix", ".mat")
+    if suffix != ".mat" and values.get("layout") and "layout" not in given:
+        yield f"layout '{values.pop('layout')}' is one of MAT files, and format {suffix[1:]} was asked for"
+    if "machine" in given and values.get("family"):
+        yield f"family of {values.pop('family')} machines, and machine {given['machine']} was asked for"
+    if not given.get("family", values.get("family", 0)):
+        values.pop("masses", None)
 
 
 def suffix_of(form: str) -> str:

@@ -69,6 +69,15 @@ def test_members_move_and_stay_bounded(index):
     assert np.abs(plant.strokes - before).max() > 0.05
 
 
+def test_members_of_another_range_are_loaded_by_name():
+    light = machine_family(3, 5, 10.0, 12.5)
+    assert [m.name for m in light] == [f"family-5-{i}-10-12p5" for i in range(3)]
+    assert load_machine("family-5-2-10-12p5") == light[2]
+    assert max(m.bodies.mass[0] for m in light) < load_machine("M22").bodies.mass[0]
+    with pytest.raises(ConfigError, match="unknown machine"):
+        load_machine("family-5-2-10")
+
+
 def test_a_data_set_of_a_family_takes_turns():
     plan = over_family(plan_data_set("M22", 1.0, 6, seed=2), 3, seed=2)
     assert {s.machine for s in plan} == {f"family-2-{i}" for i in range(3)}

@@ -1,5 +1,6 @@
 """Data sets described in one file."""
 
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import pytest
 import edp.data_sets
 from edp.data_sets import SimulationOrder, bytes_needed, simulate_data_set
 from edp.errors import ConfigError, StorageError
-from edp.sim import DEFAULT_MIX, DataSetSpec, Scenario, read_scenario_file, simulate_many
+from edp.sim import DEFAULT_MIX, DataSetSpec, Scenario, plan_data_set, read_scenario_file, simulate_many
 from edp.sim.scenario import plain
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "scenarios").glob("*.toml"))
@@ -97,6 +98,9 @@ def test_every_key_arrives_and_options_go_first(tmp_path):
         ("[sensors]\ncan_loss = 2.0", "can_loss = 2.0"),
         ("start_strokes = [0.9]", "start_strokes = .0.9. must be .low, high."),
         ("start_strokes = [0.9, 0.1]", "0 <= low <= high <= 1"),
+        ("family = 2\nmasses = [30, 10]", "family of machines from 30.0 to 10.0 t; the lower must not exceed"),
+        ("family = 2\nmasses = 10", "masses = 10 must be .lightest, heaviest., t"),
+        ("masses = [10, 20]", "are those of a family; say how many machines with family"),
         ("sensor_noise = 1", "sensor_noise = 1 must be true or false"),
         ("[files]\nformat = 'parket'", "no log format for the ending '.parket'; did you mean '.parquet'"),
         ("[files]\nlayot = 'x'", "unknown key 'layot'; did you mean 'layout'"),
@@ -108,6 +112,69 @@ def test_bad_files_are_refused_with_file_key_value_and_bound(tmp_path, text, mes
     with pytest.raises(ConfigError, match=message) as caught:
         SimulationOrder.of(written(tmp_path, text))
     assert "set.toml" in str(caught.value)
+
+
+SOIL = """
+machine = "C14"
+minutes = 1
+recordings = 4
+seed = 3
+[mix]
+dig = 1
+grading = 1
+[materials]
+clay = 1
+[files]
+format = "mat"
+layout = "speedgoat"
+truth = "apart"
+"""
+
+
+def test_another_format_leaves_out_the_layout_of_the_file_and_says_so(tmp_path):
+    path, notes = written(tmp_path, SOIL), []
+    order = SimulationOrder.of(path, notes.append, suffix=".parquet")
+    assert (order.suffix, order.layout, order.truth) == (".parquet", "", "apart")
+    assert len(notes) == 1
+    assert "layout 'speedgoat' is one of MAT files, and format parquet was asked for" in notes[0]
+    assert SimulationOrder.of(path, notes.append, suffix=".mat").layout == "speedgoat"
+    assert len(notes) == 1
+    with pytest.raises(ConfigError, match=r"layout 'simulink' is one of MAT files, not of '.parquet'; ask for mat"):
+        SimulationOrder.of(path, suffix=".parquet", layout="simulink")
+
+
+def test_a_family_takes_the_place_of_the_file_s_machine_and_the_rest_stays(tmp_path):
+    order = SimulationOrder.of(written(tmp_path, SOIL), family=2, masses=(12.0, 20.0))
+    plan = order.scenarios()
+    assert {s.machine for s in plan} == {"family-3-0-12-20", "family-3-1-12-20"}
+    assert {s.excitation for s in plan} == {"dig", "grading"}
+    assert {s.material for s in plan} == {"clay"}
+    for kind in ("dig", "grading"):
+        assert len({s.machine for s in plan if s.excitation == kind}) == 2
+    assert len({s.name for s in plan}) == 4
+    alone, together = (list(simulate_many(plan[:2], workers)) for workers in (1, 2))
+    assert [r.digest for r in alone] == [r.digest for r in together]
+
+
+def test_a_machine_takes_the_place_of_the_file_s_family(tmp_path):
+    path, notes = written(tmp_path, "family = 3\nmasses = [10, 20]"), []
+    assert SimulationOrder.of(path).masses == (10.0, 20.0)
+    order = SimulationOrder.of(path, notes.append, machine="C14")
+    assert (order.family, order.machine) == (0, "C14")
+    assert "family of 3 machines, and machine C14 was asked for" in notes[0]
+    assert SimulationOrder.of(path, family=0).scenarios()[0].machine == "M22"
+    with pytest.raises(ConfigError, match="machine = C14 and family = 2: a family takes the machine's place"):
+        SimulationOrder.of(machine="C14", family=2)
+
+
+def test_soils_of_the_command_line_take_the_place_of_the_file_s(tmp_path):
+    own = tmp_path / "peat.toml"
+    known = resources.files("edp.sim").joinpath("materials").joinpath("clay.toml").read_text()
+    own.write_text(known.replace('name = "clay"', 'name = "peat"'))
+    order = SimulationOrder.of(written(tmp_path, SOIL), materials={str(own): 1.0, "air": 1.0})
+    assert {s.material for s in order.scenarios()} == {str(own), ""}
+    plan = plan_data_set("M22", 1.0, 2, seed=0, mix={"dig": 1}, materials={"gravel": 1})
+    assert {s.material for s in plan} == {"gravel"}
 
 
 def test_an_absent_file_is_refused(tmp_path):

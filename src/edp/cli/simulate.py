@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
 
 if TYPE_CHECKING:
     from edp.data_sets import SimulationOrder
@@ -25,7 +25,17 @@ def simulate(
     minutes: Annotated[float | None, typer.Option(help="Length of all recordings together; default: 60.")] = None,
     recordings: Annotated[int | None, typer.Option(help="How many recordings; default: 30.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same seed gives the same bits; default: 0.")] = None,
-    family: Annotated[int | None, typer.Option(help="So many random machines of 10 to 50 t in place of one.")] = None,
+    family: Annotated[
+        int | None, typer.Option(help="So many random machines, M22 scaled and scattered, in place of one.")
+    ] = None,
+    masses: Annotated[str | None, typer.Option(help="Of --family: range of masses in t; default: 10-50.")] = None,
+    material: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Soil that digging and grading work in: dry_sand, sandy_loam, clay, gravel, or the path of a "
+            "material file (.toml); air for none. Give it again for more soils, in equal shares."
+        ),
+    ] = None,
     form: Annotated[
         str | None, typer.Option("--format", help="Ending of the logs: parquet (default), csv or mat.")
     ] = None,
@@ -44,6 +54,8 @@ def simulate(
 
     Example: `edp simulate data/c14 --scenario examples/scenarios/c14_soil.toml`
 
+    Example: `edp simulate data/many --family 8 --masses 12-30 --material clay`
+
     With --limit, moments of the recordings are branched with fresh randomness of operator, soil and sensors. Of each
     later velocity the least mean absolute error follows that any predictor could reach: one that knows the true state
     and all laws, but neither the operator's future choices nor, in the second column, anything but them.
@@ -51,8 +63,12 @@ def simulate(
     from edp.data_sets import SimulationOrder, suffix_of
 
     given = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
+    tables = {
+        "masses": None if masses is None else _range(masses),
+        "materials": dict.fromkeys(material, 1.0) if material else None,
+    }
     suffix = None if form is None else suffix_of(form)
-    order = SimulationOrder.of(scenario, **given, suffix=suffix, layout=layout, truth=truth)
+    order = SimulationOrder.of(scenario, _note, **given, **tables, suffix=suffix, layout=layout, truth=truth)
     spec = _limit_spec(moments, branches, horizons) if limit else None
     paths = run(folder, order, workers, as_json)
     found = None if spec is None else run_limit(folder, order, spec, workers, as_json)
@@ -131,6 +147,20 @@ def limit_table(found: dict[str, Any]) -> None:
         f"({found['moments']} moments of {found['recordings']} recordings, {found['branches']} futures each)"
     )
     table(title, ["k", *names, "mean", "95 %", "commands known", "persistence"], rows)
+
+
+def _note(text: str) -> None:
+    err.print(f"note: {text}", markup=False)
+
+
+def _range(text: str) -> tuple[float, float]:
+    from edp.errors import ConfigError
+
+    low, dash, high = text.partition("-")
+    try:
+        return float(low), float(high if dash else low)
+    except ValueError as error:
+        raise ConfigError(f"--masses {text}: give the lightest and the heaviest in t, such as 10-50") from error
 
 
 def _limit_spec(moments: int, branches: int, horizons: str) -> LimitSpec:

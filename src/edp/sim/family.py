@@ -32,9 +32,19 @@ BASE_MASS_T = 21.7
 """Operating weight of M22, t."""
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 LIGHTEST_T, HEAVIEST_T = 1.0, 200.0
+MASSES_T = (10.0, 50.0)
+"""Range of masses of a family, unless another is asked for."""
 
 
-def member_mass(seed: int, index: int, low_t: float = 10.0, high_t: float = 50.0) -> float:
+def member_name(seed: int, index: int, masses_t: tuple[float, float] = MASSES_T) -> str:
+    """``family-<seed>-<index>``; where the range is not the usual one, ``-<low>-<high>`` in t, such as ``-10-12p5``."""
+    if tuple(masses_t) == MASSES_T:
+        return f"family-{seed}-{index}"
+    low, high = (f"{mass:.3f}".rstrip("0").rstrip(".").replace(".", "p") for mass in masses_t)
+    return f"family-{seed}-{index}-{low}-{high}"
+
+
+def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]) -> float:
     """Mass (t) of one machine of a family: evenly spread on a logarithmic scale, however many there are.
 
     Raises:

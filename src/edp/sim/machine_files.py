@@ -13,13 +13,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from edp.errors import ConfigError, closest
-from edp.sim.family import member_mass, scaled_machine
+from edp.sim.family import MASSES_T, member_mass, member_name, scaled_machine
 from edp.sim.machine import SECTIONS, Machine
 from edp.sim.machine_checks import check_machine
 
 Section = TypeVar("Section")
-FAMILY = re.compile(r"FAMILY-(\d{1,9})-(\d{1,6})")
-"""A machine of a family, `family-<seed>-<index>`: it needs no file."""
+FAMILY = re.compile(r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?")
+"""A machine of a family, see `member_name`: it needs no file."""
 LISTS = {"Triple": 3, "Ratings": 3, "Rating": 2, "tuple[float, float]": 2}
 """Length of a list by the type of its key."""
 
@@ -31,7 +31,7 @@ def machine_names() -> tuple[str, ...]:
 
 
 def load_machine(name: str) -> Machine:
-    """The machine of this name (upper or lower case; also `family-<seed>-<index>`), or of the TOML file at this path.
+    """The machine of this name (upper or lower case; also a `member_name` of a family), or of this TOML file.
 
     Raises:
         ConfigError: no such machine (the closest name is offered) or file; or the file lacks or misnames a key, or
@@ -64,7 +64,10 @@ def _from_file(path: Path, changed: int) -> Machine:
 def _built_in(name: str) -> Machine:
     member = FAMILY.fullmatch(name)
     if member is not None:
-        return family_member(int(member[1]), int(member[2]))
+        masses = MASSES_T
+        if member[3] is not None:
+            masses = float(member[3].replace("P", ".")), float(member[4].replace("P", "."))
+        return family_member(int(member[1]), int(member[2]), *masses)
     known = machine_names()
     if name not in known:
         raise ConfigError(f"unknown machine '{name}'{closest(name, known)}; or give the path of a .toml file")
@@ -72,22 +75,25 @@ def _built_in(name: str) -> Machine:
     return parse_machine(source.read_text(encoding="utf-8"), source.name)
 
 
-def family_member(seed: int, index: int, low_t: float = 10.0, high_t: float = 50.0) -> Machine:
+def family_member(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]) -> Machine:
     """Machine `index` of the family of `seed`: M22 scaled to a mass from `low_t` to `high_t`, with scatter.
 
-    With the default range it is also `load_machine("family-<seed>-<index>")`.
+    It is also `load_machine(member_name(seed, index, (low_t, high_t)))`, such as "family-0-3" and "family-0-3-10-20".
 
     Raises:
         ConfigError: the range of masses is empty or out of bounds.
     """
     rng = np.random.default_rng([seed, 1 + index])
-    name = f"family-{seed}-{index}"
-    machine = scaled_machine(_built_in("M22"), member_mass(seed, index, low_t, high_t), rng, name)
+    mass = member_mass(seed, index, low_t, high_t)
+    name = member_name(seed, index, (low_t, high_t))
+    machine = scaled_machine(_built_in("M22"), mass, rng, name)
     check_machine(machine, name)
     return machine
 
 
-def machine_family(count: int, seed: int, low_t: float = 10.0, high_t: float = 50.0) -> tuple[Machine, ...]:
+def machine_family(
+    count: int, seed: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]
+) -> tuple[Machine, ...]:
     """`count` machines from `low_t` to `high_t`, each with its own scatter; the same seed gives the same machines."""
     return tuple(family_member(seed, index, low_t, high_t) for index in range(count))
 

@@ -18,6 +18,7 @@ from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.sim import soil
 from edp.sim.excitation import EXCITATIONS
+from edp.sim.family import MASSES_T, member_mass, member_name
 from edp.sim.machine_files import load_machine
 from edp.sim.scenario import START_STROKES, Scenario, SimulationError
 from edp.sim.simulate import simulate
@@ -46,7 +47,8 @@ class DataSetSpec:
         minutes: length of all recordings together.
         recordings: how many recordings, all of one length.
         seed: root of every random choice.
-        family: how many machines of 10 to 50 t take turns in place of `machine`; 0 for none.
+        family: how many random machines take turns in place of `machine`; 0 for none.
+        masses: lightest and heaviest machine of the family, t.
         mix: share of the recordings by excitation.
         materials: share of the recordings of families that work the ground (grading, dig) by soil; ``air`` is none.
             The other families always move in free air.
@@ -65,6 +67,7 @@ class DataSetSpec:
     recordings: int = 30
     seed: int = 0
     family: int = 0
+    masses: tuple[float, float] = MASSES_T
     mix: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_MIX))
     materials: Mapping[str, float] = field(default_factory=dict)
     rate_hz: float = 100.0
@@ -80,6 +83,11 @@ class DataSetSpec:
             )
         if self.family < 0:
             raise ConfigError(f"family = {self.family} machines; must be at least 0")
+        if not self.family and tuple(self.masses) != MASSES_T:
+            raise ConfigError(f"masses = {list(self.masses)} are those of a family; say how many machines with family")
+        member_mass(self.seed, 0, *self.masses)
+        if any(mass != round(mass, 3) for mass in self.masses):
+            raise ConfigError(f"masses = {list(self.masses)} t must be whole kilograms: names of machines hold them")
         for name in self.mix:
             EXCITATIONS[name]
         _check_shares("mix", self.mix)
@@ -114,7 +122,7 @@ class DataSetSpec:
             )
             for i in range(self.recordings)
         )
-        return over_family(plan, self.family, self.seed) if self.family else plan
+        return over_family(plan, self.family, self.seed, self.masses) if self.family else plan
 
     def _soils(self, excitations: Sequence[str]) -> list[str]:
         """The material of each recording; empty for free air. Each family gets all of them in turn."""
@@ -140,18 +148,28 @@ def _check_shares(what: str, shares: Mapping[str, float]) -> None:
 
 
 def plan_data_set(
-    machine: str, minutes: float, recordings: int, seed: int, mix: Mapping[str, float] | None = None
+    machine: str,
+    minutes: float,
+    recordings: int,
+    seed: int,
+    mix: Mapping[str, float] | None = None,
+    materials: Mapping[str, float] | None = None,
 ) -> tuple[Scenario, ...]:
     """The scenarios of a `DataSetSpec`.
 
     Raises:
-        ConfigError: a count or length is not positive, or the mix names an unknown excitation.
+        ConfigError: a count or length is not positive, or mix or materials name what is unknown.
     """
     shares = dict(DEFAULT_MIX if mix is None else mix)
-    return DataSetSpec(machine=machine, minutes=minutes, recordings=recordings, seed=seed, mix=shares).scenarios()
+    spec = DataSetSpec(
+        machine=machine, minutes=minutes, recordings=recordings, seed=seed, mix=shares, materials=materials or {}
+    )
+    return spec.scenarios()
 
 
-def over_family(scenarios: Sequence[Scenario], count: int, seed: int) -> tuple[Scenario, ...]:
+def over_family(
+    scenarios: Sequence[Scenario], count: int, seed: int, masses: tuple[float, float] = MASSES_T
+) -> tuple[Scenario, ...]:
     """The same scenarios on `count` machines of other sizes, which take turns in each excitation; see `machine_family`.
 
     Raises:
@@ -160,7 +178,7 @@ def over_family(scenarios: Sequence[Scenario], count: int, seed: int) -> tuple[S
     if count < 1:
         raise ConfigError(f"family = {count} machines; at least one is needed")
     turns = {place: turn % count for turn, place in enumerate(_by_family([s.excitation for s in scenarios]))}
-    names = [f"family-{seed}-{turns[i]}" for i in range(len(scenarios))]
+    names = [member_name(seed, turns[i], masses) for i in range(len(scenarios))]
     return tuple(replace(s, machine=n, name=_named(s.name, n)) for s, n in zip(scenarios, names, strict=True))
 
 

@@ -69,6 +69,10 @@ def _value(key: str, value: Any, where: str, folder: Path) -> Any:
     elif key == "sensor_noise":
         if not isinstance(value, bool):
             raise ConfigError(f"{where}: sensor_noise = {value!r} must be true or false")
+    elif key == "masses":
+        if not (isinstance(value, list) and len(value) == 2 and all(_number(v) for v in value)):
+            raise ConfigError(f"{where}: masses = {value!r} must be [lightest, heaviest], t")
+        return tuple(map(float, value))
     elif key == "start_strokes":
         if not (isinstance(value, list) and len(value) == 2 and all(_number(v) and 0 <= v <= 1 for v in value)):
             raise ConfigError(f"{where}: start_strokes = {value!r} must be [low, high], shares from 0 to 1")

@@ -146,6 +146,18 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     assert "must be even" in edp(*command, "--limit", "--branches", 3).err
 
 
+def test_soil_family_and_format_of_the_command_line_go_before_the_scenario_file(edp, tmp_path):
+    file = tmp_path / "set.toml"
+    text = 'machine = "C14"\nminutes = 5\nrecordings = 2\n[mix]\ndig = 1\n[materials]\nclay = 1\n'
+    file.write_text(text + '[files]\nformat = "mat"\nlayout = "speedgoat"\n')
+    options = ("--family", 2, "--masses", "12-20", "--material", "gravel", "--format", "parquet", "--workers", 1)
+    made = edp("simulate", tmp_path / "data", "--scenario", file, "--minutes", 0.2, *options, "--json")
+    assert made.json["machine"] == "2 machines"
+    assert "note: layout 'speedgoat' is one of MAT files, and format parquet was asked for" in made.err
+    names = sorted(path.name for path in (tmp_path / "data").glob("*.parquet"))
+    assert names == ["family-0-0-12-20_000_dig_gravel.parquet", "family-0-1-12-20_001_dig_gravel.parquet"]
+
+
 def test_inspect_shows_and_draws_what_the_data_cover(edp, logs, tmp_path):
     page = tmp_path / "coverage.html"
     shown = edp("inspect", logs, "--no-channels", "--split", "time", "--page", page)
