@@ -266,8 +266,9 @@ class _Loop:
     def _close_epoch(self, loss: float, seconds: float) -> dict[str, Any]:
         progress = self.progress
         score, report, validation_loss = self._validate()
-        if not math.isfinite(score):
-            raise self._diverged("the validation score", score)
+        for what, value in (("score", score), ("loss", validation_loss)):
+            if not math.isfinite(value):
+                raise self._diverged(f"the validation {what}", value)
         progress.epoch += 1
         progress.seconds += seconds
         better = score < progress.best_score
