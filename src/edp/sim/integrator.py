@@ -23,7 +23,10 @@ GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
 
 # frozen[...]: numbers of one step; three of a kind stand together, one per cylinder
 LEVERS, GRAVITY_T, PER_HEAD, PER_ROD, SINES, MASS, BYPASS, ANGLES = 0, 3, 6, 9, 12, 15, 21, 23
-FROZEN = 29
+ANCHOR, ANCHOR_COS, ANCHOR_SIN = 29, 32, 35
+FROZEN = 38
+ANCHORED = 0.03
+"""Turn (rad) from its anchor up to which the series of `turned` are exact to rounding."""
 # slopes[cylinder, ...]: Jacobian pieces and elimination factors of one cylinder
 (
     C_HEAD, C_ROD, HEAD_BY_HEAD, ROD_BY_ROD, ACROSS, HEAD_BY_1, HEAD_BY_2, ROD_BY_1, ROD_BY_2,
@@ -39,11 +42,29 @@ FROZEN_W, STROKES_W, OPENED, LU, SLOPE, CONTACT, RATES, RHS, K1, K2, STAGE = ran
 
 
 @inlined
+def anchor(i: int, angle: float, s: Array) -> None:
+    """Take cosine and sine of joint `i` here, for `turned`."""
+    s[ANCHOR + i], s[ANCHOR_COS + i], s[ANCHOR_SIN + i] = angle, math.cos(angle), math.sin(angle)
+
+
+@inlined
+def turned(i: int, angle: float, s: Array) -> tuple[float, float]:
+    """Cosine and sine of joint `i`, by series for the turn since its anchor: within a sample it is small."""
+    if not abs(angle - s[ANCHOR + i]) < ANCHORED:
+        anchor(i, angle, s)
+    x = angle - s[ANCHOR + i]
+    q = x * x
+    c = 1.0 - q * (1.0 / 2.0 - q * (1.0 / 24.0 - q * (1.0 / 720.0)))
+    d = x * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0))))
+    return s[ANCHOR_COS + i] * c - s[ANCHOR_SIN + i] * d, s[ANCHOR_SIN + i] * c + s[ANCHOR_COS + i] * d
+
+
+@inlined
 def freeze_geometry(state: Array, axes: Array, plant: Array, strokes: Array, s: Array) -> None:
     """Strokes, lever arms, volumes, mass matrix, gravity and Coriolis coefficients at the current angles."""
-    c1, s1 = math.cos(state[at.PSI]), math.sin(state[at.PSI])
-    c2, s2 = math.cos(state[at.PSI + 1]), math.sin(state[at.PSI + 1])
-    c3, s3 = math.cos(state[at.PSI + 2]), math.sin(state[at.PSI + 2])
+    c1, s1 = turned(0, state[at.PSI], s)
+    c2, s2 = turned(1, state[at.PSI + 1], s)
+    c3, s3 = turned(2, state[at.PSI + 2], s)
     length, s[LEVERS] = linkage.cylinder_at(0, c1, s1, plant)
     strokes[0] = length - axes[0, at.CLOSED]
     length, s[LEVERS + 1] = linkage.cylinder_at(1, c2, s2, plant)
@@ -233,6 +254,13 @@ def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Ar
     solve(g, axes, work, k2)
     for n in range(at.RATE, at.DISPLACEMENT):
         state[n] += h * (1.5 * k1[n] + 0.5 * k2[n])
+
+
+@inlined
+def begin_sample(state: Array, work: tuple[Array, ...]) -> None:
+    """Anchor the joints, so that no step depends on more than the state at the beginning of its sample."""
+    for i in range(at.AXES):
+        anchor(i, state[at.PSI + i], work[FROZEN_W])
 
 
 @inlined

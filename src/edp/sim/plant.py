@@ -56,7 +56,7 @@ def run_samples(
     """
     first = demands.shape[0] - log.shape[0]
     delays, clocks = times
-    axes, plant, _, ground = setup
+    axes, plant, work, ground = setup
     time_s = clocks[0][0] * clocks[0][1]
     in_soil = ground[0][terramechanics.ACTIVE] > 0.0
     clamps = 0
@@ -67,6 +67,7 @@ def run_samples(
         if in_soil:
             near, touching = earth.look(log[k], time_s, axes, ground)
             fine = fine or touching
+        integrator.begin_sample(state, work)
         steps, step_s, share, filters = clocks[1] if fine else clocks[0]
         for n in range(steps):
             for j in range(at.SPOOLS):

@@ -27,12 +27,12 @@ Ground = tuple[Array, ...]
 Four = tuple[float, float, float, float]
 # numbers[...]: soil and bucket
 (
-    ACTIVE, WIDTH, DENSITY, SWELL, COHESION, ADHESION, METAL, BEKKER, EXPONENT, SHEAR_LENGTH, CONE, STEEPEST, REPOSE,
+    ACTIVE, WIDTH, DENSITY, SWELL, COHESION, ADHESION, BEKKER, EXPONENT, SHEAR_LENGTH, CONE, STEEPEST, REPOSE,
     ROUGHNESS, COURSE_STEP, SAWTOOTH, CAPACITY, FLOOR_COS, FLOOR_SIN, FLOOR_LENGTH, EDGE_AREA, LOAD_X, LOAD_Y,
     BUCKET_MASS, BUCKET_X, BUCKET_Y, BUCKET_INERTIA, PITCH_INERTIA, PITCH_STIFFNESS, PITCH_DAMPING, LIFT_MOMENT,
-    UNLOADING, HEEL_DAMPING, HEAP_LIMIT, BEARING_LIMIT,
-) = range(35)  # fmt: skip
-NUMBERS = 35
+    UNLOADING, HEEL_DAMPING, HEAP_LIMIT, BEARING_LIMIT, METAL_COS, METAL_SIN,
+) = range(36)  # fmt: skip
+NUMBERS = 36
 # contact[...]: what one step needs; Jacobians of tip and heel hold one value per joint
 (ON, DRAG, ACROSS, EDGE, EDGE_X, EDGE_Y, NORMAL, NORMAL_DAMPING, SLIDE, DEPTH, HEEL_DEPTH) = range(11)
 TIP_JX, TIP_JY, HEEL_JX, HEEL_JY, PITCHED, POINTS, DAMPING = 11, 14, 17, 20, 23, 27, 31
@@ -44,6 +44,8 @@ SPACING = 0.05
 STONE_STEP = 0.005
 COURSE = 8192
 LEAST_RAKE, MOST_RAKE = 10, 120
+LEAST_LEAN, MOST_LEAN = 0.17, 2.1
+"""Rake (rad) within which the direction of the cutting force follows it."""
 EDGE_DEPTH = 0.05
 """Depth (m) at which the whole edge is in the ground."""
 HEEL_CONTACT = 0.2
@@ -122,7 +124,8 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
         SWELL: material.swell,
         COHESION: material.cohesion,
         ADHESION: material.adhesion,
-        METAL: math.radians(material.metal_friction_deg),
+        METAL_COS: math.cos(math.radians(material.metal_friction_deg)),
+        METAL_SIN: math.sin(math.radians(material.metal_friction_deg)),
         BEKKER: bearing,
         EXPONENT: material.bekker_exponent,
         SHEAR_LENGTH: material.shear_length,
@@ -205,10 +208,17 @@ def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Ar
     heap = math.sqrt(2.0 * numbers[REPOSE] * memory[at.HEAP] / (loose * numbers[WIDTH]))
     rake = math.atan2(floor[1], floor[0])
     force = inward * factor * cutting_force(depth, rake, 0.5 * loose * GRAVITY * heap, numbers, table)
-    lean = min(max(rake, 0.17), 2.1) + numbers[METAL]
-    back = (1.0 - inward) * factor * cutting_force(depth, math.pi - rake, 0.0, numbers, table)
-    c[DRAG] = force * max(math.sin(lean), 0.3) + inward * stone + PUSHED_BACK * back
-    c[ACROSS] = force * math.cos(lean)
+    back = 0.0
+    if inward < 1.0:
+        back = (1.0 - inward) * factor * cutting_force(depth, math.pi - rake, 0.0, numbers, table)
+    along, rise = floor
+    if rake < LEAST_LEAN or rake > MOST_LEAN:
+        lean = min(max(rake, LEAST_LEAN), MOST_LEAN)
+        along, rise = math.cos(lean), math.sin(lean)
+    # cosine and sine of the angle of the force, rake plus friction on metal
+    c[DRAG] = force * max(rise * numbers[METAL_COS] + along * numbers[METAL_SIN], 0.3) + inward * stone
+    c[DRAG] += PUSHED_BACK * back
+    c[ACROSS] = force * (along * numbers[METAL_COS] - rise * numbers[METAL_SIN])
     c[EDGE] = dig * numbers[CONE] * numbers[EDGE_AREA] * min(depth / EDGE_DEPTH, 1.0)
 
 
@@ -226,7 +236,7 @@ def engage_heel(numbers: Array, memory: Array, c: Array) -> None:
     c[NORMAL_DAMPING] = numbers[HEEL_DAMPING] if normal > 0.0 else 0.0
     sheared = 1.0 - math.exp(-memory[at.SHEAR] / numbers[SHEAR_LENGTH])
     stuck = numbers[ADHESION] * numbers[WIDTH] * HEEL_CONTACT if normal > 0.0 else 0.0
-    c[SLIDE] = (normal * math.tan(numbers[METAL]) + stuck) * sheared
+    c[SLIDE] = (normal * numbers[METAL_SIN] / numbers[METAL_COS] + stuck) * sheared
 
 
 @compiled
