@@ -149,8 +149,9 @@ def test_strokes_give_the_mean_velocity_since_the_tick_before(truth):
     velocity = truth[1][:, at.LOG_VELOCITY : at.LOG_VELOCITY + 3]
     middle = 0.5 * (velocity[1:] + velocity[:-1])
     assert np.array_equal(found[0, 0], np.zeros(3))
-    # Strokes in single precision resolve some 0.1 um, a hundredth of a second later 10 um/s.
-    assert np.sqrt(np.mean((found[1:, 0] - middle) ** 2, axis=0)).max() < 3e-4
+    # The mean of the ends is not the mean of the way between them, and strokes in single precision resolve 0.1 um.
+    error = np.sqrt(np.mean((found[1:, 0] - middle) ** 2, axis=0))
+    assert (error < 0.1 * np.sqrt(np.mean(np.diff(velocity, axis=0) ** 2, axis=0))).all()
 
 
 @pytest.mark.parametrize("load", ["none", "gravity", "all"])
