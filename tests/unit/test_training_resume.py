@@ -11,6 +11,8 @@ from edp.data.augment import AUGMENTATIONS
 from edp.data.chunks import ChunkSpec
 from edp.errors import StorageError
 from edp.losses import LOSSES, TERMS, AdaptiveWeights
+from edp.models.cells import CELLS
+from edp.models.initial import INITIAL_STATES
 from edp.models.outputs import OUTPUTS
 from edp.runs import RunFolder, run_key
 from edp.training.averages import AVERAGES
@@ -74,6 +76,25 @@ def test_optimizers_schedules_with_memory_and_fixed_by_passes_go_on_too(
         fit(tiny, model, spec, (folder, KEY), stop_after(2))
     with RunFolder(tmp_path) as folder:
         assert_same(fit(tiny, model, spec, (folder, KEY)), fit(tiny, model, spec))
+
+
+RECURRENT = {
+    **{name: {"cell": CELLS[name](), "zoneout": 0.2 if CELLS[name].zoneout else 0.0} for name in CELLS},
+    **{f"from {name}": {"initial": INITIAL_STATES[name]()} for name in INITIAL_STATES if name != "zero"},
+}
+
+
+@pytest.mark.parametrize("name", RECURRENT)
+def test_recurrent_layers_learn_and_go_on_to_the_same_bits(name, tmp_path, tiny, tiny_model, tiny_training):
+    model = dataclasses.replace(tiny_model, backbone=dataclasses.replace(tiny_model.backbone, **RECURRENT[name]))
+    spec = dataclasses.replace(tiny_training, epochs=3)
+    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+        fit(tiny, model, spec, (folder, KEY), stop_after(1))
+    with RunFolder(tmp_path) as folder:
+        resumed, whole = fit(tiny, model, spec, (folder, KEY)), fit(tiny, model, spec)
+    assert_same(resumed, whole)
+    losses = [row["train_loss"] for row in whole.history]
+    assert losses[-1] < losses[0]
 
 
 WINDOWS = ChunkSpec(regime="window", length=10, batch=9, consecutive=3)

@@ -126,6 +126,9 @@ class _Loop:
         self.net.to(self.device)
         named = [(name, parameter) for name, parameter in self.net.named_parameters() if parameter.requires_grad]
         self.optimizer = spec.optimizer.build(named)
+        # Walking the tree of modules at every update would cost as much as a layer.
+        self.learned = trainable(self.net)
+        self.all: list[torch.Tensor] = list(self.net.parameters())
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
         self.average = {name: tensor.detach().clone() for name, tensor in self.net.named_parameters()}
         self.best = {name: tensor.clone() for name, tensor in self.average.items()}
@@ -244,7 +247,7 @@ class _Loop:
             raise self._diverged("the training loss", value)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(trainable(self.net), self.spec.clip_norm)
+        torch.nn.utils.clip_grad_norm_(self.learned, self.spec.clip_norm)
         self.optimizer.step()
         self._follow()
         return value, detach_state(state)
@@ -260,8 +263,7 @@ class _Loop:
         step = self.spec.average.step(self.progress.updates, self.updates * self.spec.epochs)
         targets = list(self.average.values())
         with torch.no_grad():
-            current = [parameter.detach() for parameter in self.net.parameters()]
-            torch._foreach_lerp_(targets, current, step)
+            torch._foreach_lerp_(targets, self.all, step)
 
     def _close_epoch(self, loss: float, seconds: float) -> dict[str, Any]:
         progress = self.progress
