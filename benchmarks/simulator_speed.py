@@ -8,6 +8,8 @@ bodies, without cylinders, oil or friction. CPU time is quoted because cores are
 from __future__ import annotations
 
 import importlib.util
+import multiprocessing
+import os
 import statistics
 import subprocess
 import sys
@@ -91,18 +93,22 @@ def start_seconds() -> float:
     return time.perf_counter() - began
 
 
-def ten_hours(seed: int) -> float:
-    """Wall time of 10 h of M22 on two processes."""
-    began = time.perf_counter()
+def ten_hours(seed: int) -> tuple[float, float]:
+    """Wall time of 10 h of M22 on two processes, and the processor time of these two."""
+    began, spent = time.perf_counter(), os.times()
     for _ in simulate_many(plan_data_set("M22", minutes=600.0, recordings=60, seed=seed), workers=2):
         pass
-    return time.perf_counter() - began
+    while multiprocessing.active_children():  # their time counts once they have ended
+        time.sleep(0.05)
+    now = os.times()
+    busy = now.children_user + now.children_system - spent.children_user - spent.children_system
+    return time.perf_counter() - began, busy
 
 
 def main() -> None:
     arguments = parser(__doc__ or "").parse_args()
     quick, seed = arguments.quick, arguments.seed
-    seconds, turns = (60.0, 5) if quick else (200.0, 11)
+    seconds, turns, starts = (50.0, 3, 2) if quick else (200.0, 11, 3)
     works = {
         "ours, free air": ours(seconds, seed, "", "combined"),
         "ours, soil (dig cycles, sandy loam)": ours(seconds, seed, "sandy_loam", "dig"),
@@ -122,8 +128,7 @@ def main() -> None:
     )
     middle = {name: statistics.median(v) for name, v in found.items()}
     air, soil, bare, stiff = middle.values()
-    start_seconds()
-    start = min(start_seconds() for _ in range(3))
+    start = min(start_seconds() for _ in range(starts))
     unit = "simulated s / CPU s"
     verdicts = [
         verdict("full loop in free air against the goal", air, GOAL, ">= 1", unit, quick),
@@ -134,7 +139,10 @@ def main() -> None:
         verdict("second start, one second simulated", start, START_S, "<= 1", "s", quick),
     ]
     if not quick:
-        verdicts.append(verdict("10 h of M22 on two cores", ten_hours(seed), TEN_HOURS_S, "<= 1", "s", quick))
+        wall, busy = ten_hours(seed)
+        found["10 h of M22 on two cores, wall and processor s"] = [wall, busy]
+        print(f"10 h of M22 took two processes {busy:.0f} s of processor time, {wall:.0f} s by the clock")
+        verdicts.append(verdict("10 h of M22 on two cores", wall, TEN_HOURS_S, "<= 1", "s", quick))
     finish("simulator_speed", verdicts, seed, found)
 
 

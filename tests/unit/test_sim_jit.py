@@ -1,6 +1,11 @@
-import numpy as np
+import importlib
+from pathlib import Path
+from types import ModuleType
 
-from edp.sim import jit
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from edp.sim import jit, scenario_file
 
 
 def test_compiles_without_a_writable_cache(monkeypatch, tmp_path):
@@ -32,6 +37,23 @@ def test_cache_folder_is_keyed_to_the_sources(monkeypatch, tmp_path):
     finally:
         monkeypatch.undo()
         jit.cache_folder.cache_clear()
+
+
+def test_compiled_code_uses_nothing_outside_the_files_of_the_fingerprint():
+    known = {path.resolve() for path in jit.fingerprinted()}
+    assert {path.name for path in known} >= {"jit.py", "layout.py", "integrator.py", "plant.py", "terramechanics.py"}
+    assert Path(scenario_file.__file__) not in known
+    for path in known:
+        module = importlib.import_module(f"edp.sim.{path.stem}")
+        for function in vars(module).values():
+            if not isinstance(function, Dispatcher):
+                continue
+            for name in function.py_func.__code__.co_names:
+                used = function.py_func.__globals__.get(name)
+                if isinstance(used, Dispatcher):
+                    used = importlib.import_module(used.py_func.__module__)
+                if isinstance(used, ModuleType) and used.__name__.startswith("edp."):
+                    assert Path(used.__file__).resolve() in known, f"{path.name}: {name}"
 
 
 def test_not_a_number_stays_visible():

@@ -2,7 +2,7 @@
 
 Numba's cache knows a function by its own file, not by the files of the functions it calls: after an edit to one file,
 callers elsewhere would keep running the old code. The cache folder therefore carries a fingerprint of every source
-file of this package.
+file of this package that holds compiled code or the layout of its arrays; edits to other files keep the cache.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 
 import numba
 
+from edp.signals import GROUND_POINTS
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # No "nnan"/"ninf": a diverging state must stay visible as NaN.
@@ -28,11 +30,19 @@ OPTIONS: dict[str, Any] = {
 }
 
 
+def fingerprinted() -> tuple[Path, ...]:
+    """The source files that compiled code comes from: those that import this one, `layout`, and this one."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    own = (Path(__file__).name, "layout.py")
+    return tuple(f for f in files if f.name in own or b"from edp.sim.jit import" in f.read_bytes())
+
+
 @cache
 def cache_folder() -> Path | None:
     """Where compiled code is kept: below NUMBA_CACHE_DIR or the user's cache folder; None where neither is writable."""
     state = hashlib.blake2b(digest_size=8)
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    state.update(str(GROUND_POINTS).encode())
+    for source in fingerprinted():
         state.update(source.name.encode() + b"\0" + source.read_bytes())
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     try:
