@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edp.errors import StorageError
 from edp.storage import replacing
 
-SCHEMA = 1
+SCHEMA = 2
 _FACTS = "facts"
 
 
