@@ -24,6 +24,8 @@ def start(*args):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # Tests may run in the background, where a shell has Ctrl-C ignored; children would inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 
@@ -73,7 +75,7 @@ def test_stopped_and_killed_training_ends_with_the_same_bits(edp, logs, tmp_path
 
 def test_stopped_simulation_keeps_whole_logs_and_goes_on(edp, tmp_path):
     data = tmp_path / "data"
-    command = ("simulate", data, "--minutes", 3, "--recordings", 12, "--workers", 1)
+    command = ("simulate", data, "--minutes", 24, "--recordings", 12, "--workers", 1)
 
     def some():
         return any(data.glob("*.parquet"))
