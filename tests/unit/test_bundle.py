@@ -97,6 +97,12 @@ def test_a_newer_schema_is_refused(folder):
         load_bundle(folder)
 
 
+def test_an_older_schema_is_refused(folder):
+    edit(folder, schema=SCHEMA - 1)
+    with pytest.raises(BundleError, match=rf"schema {SCHEMA - 1}.*train again"):
+        load_bundle(folder)
+
+
 @pytest.mark.parametrize("schema", [None, "1", 0])
 def test_what_is_no_schema_is_refused(schema, folder):
     edit(folder, schema=schema)

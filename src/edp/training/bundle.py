@@ -22,7 +22,7 @@ from edp.models.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, read_json, write_bytes, write_json
 
-SCHEMA = 1
+SCHEMA = 2
 HEADER = "bundle.json"
 
 
@@ -132,9 +132,10 @@ def _check_schema(header: Any, path: Path) -> None:
     schema = header.get("schema") if isinstance(header, dict) else None
     if schema != SCHEMA:
         newer = isinstance(schema, int) and schema > SCHEMA
+        older = isinstance(schema, int) and 0 < schema < SCHEMA
         raise BundleError(
             f"bundle '{path}' has schema {schema}, this version of EDP ({__version__}) reads schema {SCHEMA}; "
-            + ("install a newer EDP" if newer else "the header is not that of a bundle")
+            + ("install a newer EDP" if newer else "train again" if older else "the header is not that of a bundle")
         )
 
 

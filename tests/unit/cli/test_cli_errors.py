@@ -159,7 +159,7 @@ def test_a_bundle_of_a_newer_schema(edp, trained):
     header = trained / "bundle" / "bundle.json"
     held = json.loads(header.read_text())
     header.write_text(json.dumps(held | {"schema": held["schema"] + 1}))
-    refused(edp("footprint", trained), "schema 2", "reads schema 1", "newer EDP")
+    refused(edp("footprint", trained), f"schema {held['schema'] + 1}", f"reads schema {held['schema']}", "newer EDP")
 
 
 def test_damaged_weights(edp, trained):
