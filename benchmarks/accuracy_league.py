@@ -245,14 +245,14 @@ def run(arguments: argparse.Namespace, folder: Path) -> None:
     """The whole league in `folder`."""
     quick, horizons = arguments.quick, arguments.horizons
     data = arguments.data or folder / "data"
-    minutes, recordings = (8.0, 8) if quick else (arguments.minutes, int(arguments.minutes / 3))
+    minutes, recordings = (6.0, 6) if quick else (arguments.minutes, int(arguments.minutes / 3))
     order = SimulationOrder(minutes=minutes, recordings=recordings, seed=arguments.seed)
     simulate_data_set(data, order)
     limits = limits_of(data, order, horizons, quick)
     joints: list[dict[str, float]] = []
     rounds: list[dict[int, dict[str, Any]]] = []
     for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-        league = League(DataSource.of(data), make_folder(folder / "cells"), seed, 3 if quick else LOOKS)
+        league = League(DataSource.of(data), make_folder(folder / "cells"), seed, 2 if quick else LOOKS)
         rounds.append({k: judge_horizon(league, k, arguments, limits[k]) for k in horizons})
         if len(horizons) > 1:
             joints.append(league.cell(OURS, horizons, arguments.budget)["mae"])
@@ -286,7 +286,7 @@ def main() -> None:
     made.set_defaults(rivals=RIVALS, baselines=BASELINES)
     arguments = made.parse_args()
     if arguments.quick:
-        short = {"budget": 2.0, "horizons": [10], "seeds": 1, "converge": False}
+        short = {"budget": 1.0, "horizons": [10], "seeds": 1, "converge": False}
         vars(arguments).update(short | {"rivals": RIVALS[-1:], "baselines": BASELINES[:2]})
     if arguments.work is not None:
         run(arguments, make_folder(arguments.work))
