@@ -73,16 +73,8 @@ def simulate(
     paths = run(folder, order, workers, as_json)
     found = None if spec is None else run_limit(folder, order, spec, workers, as_json)
     made = f"{order.family} machines" if order.family else order.machine
-    facts: dict[str, Any] = {
-        "folder": str(folder),
-        "recordings": len(paths),
-        "minutes": order.minutes,
-        "machine": made,
-        "seed": order.seed,
-    }
-
-    if found is not None:
-        facts["limit"] = found
+    facts: dict[str, Any] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
+    facts |= {"machine": made, "seed": order.seed} | ({} if found is None else {"limit": found})
 
     def show() -> None:
         if found is not None:
