@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
@@ -140,6 +142,13 @@ def task_of(form: Form, model: ModelSpec) -> Task:
     extra = () if model.physics is None else model.physics.channels()
     physics = tuple(name for name in extra if name not in FEATURES.inputs)
     return Task(FEATURES, ("CylVels_1", "CylVels_3"), form[1], form[2], 100.0, physics=physics)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Fill the cache of compiled code before workers start: side by side each would compile its own variant."""
+    if not hasattr(config, "workerinput"):
+        program = "from edp.sim import Scenario, simulate; simulate(Scenario(duration_s=0.5))"
+        subprocess.run([sys.executable, "-c", program], check=True)
 
 
 @cache

@@ -7,6 +7,7 @@ file of this package that holds compiled code or the layout of its arrays; edits
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 from collections.abc import Callable
@@ -77,3 +78,36 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
     finally:
         config.CACHE_DIR = before
     return fast  # type: ignore[no-any-return]
+
+
+class Rehearsal:
+    """Compiles everything once for each cache folder, in one process, in one order.
+
+    What a caller's machine code looks like depends on whether the functions it calls were compiled in the same process
+    or loaded. Processes that fill an empty cache side by side would each run their own variant, and the last bits of
+    their results would differ.
+    """
+
+    def __init__(self) -> None:
+        self._begun = False
+
+    def once(self, play: Callable[[], None]) -> None:
+        """Run `play`, which calls all compiled code, where this cache was not filled before; others wait for it."""
+        if self._begun:
+            return
+        self._begun = True
+        folder = cache_folder()
+        if folder is None:
+            play()
+            return
+        whole = folder / "whole"
+        if whole.exists():
+            return
+        with (folder / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not whole.exists():
+                play()
+                whole.touch()
+
+
+rehearsal = Rehearsal()

@@ -13,6 +13,7 @@ from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim import layout as at
 from edp.sim import pose, sensors, soil
 from edp.sim.excitation import EXCITATIONS
+from edp.sim.jit import rehearsal
 from edp.sim.machine import Machine
 from edp.sim.parameters import pack
 from edp.sim.plant import Plant
@@ -32,6 +33,7 @@ class Simulation:
     """
 
     def __init__(self, scenario: Scenario) -> None:
+        rehearsal.once(_rehearse)
         self.scenario = scenario
         machine = scenario.load()
         start, hand = (np.random.default_rng(s) for s in _seeds(scenario)[:2])
@@ -206,3 +208,9 @@ def _recording(
         source=f"sim:{machine.name}",
         meta={**facts, "clamps": clamps, "full_strokes_m": list(machine.cylinders.stroke)},
     )
+
+
+def _rehearse() -> None:
+    """Call all compiled code: in free air and in soil, open and closed loops, light and full sensors."""
+    simulate(Scenario(excitation="combined", duration_s=0.5))
+    simulate(Scenario(machine="C14", excitation="dig", material="clay", duration_s=0.5))
