@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
+from edp.report.templates import template
 from edp.sim import Machine, linkage, load_machine
 from edp.sim import layout as at
 from edp.sim.parameters import pack
@@ -182,11 +182,8 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
     Raises:
         StorageError: the page cannot be written.
     """
-    environment = Environment(
-        loader=PackageLoader("edp.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
     seconds = len(scene.angles) / FRAMES_PER_S
-    page = environment.get_template("animation.html.jinja").render(
+    page = template("animation.html.jinja").render(
         name=scene.name,
         machine=f"{scene.machine.name}, {scene.machine.description}",
         stretch=f"{scene.start_s:g} to {scene.start_s + seconds:g} s",

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
@@ -15,6 +14,7 @@ from edp.data.wanted import BEYOND, OCCUPANCY, wanted
 from edp.report.coverage_plots import coverage_plots
 from edp.report.page import asset, script_json
 from edp.report.tables import Table
+from edp.report.templates import template
 from edp.report.wording import MISSING, listed, number, percent, unbroken, whole
 from edp.storage import write_bytes
 
@@ -37,13 +37,6 @@ def build_coverage_page(found: Coverage, output: str | Path, title: str) -> Path
 
 def render_coverage(found: Coverage, title: str) -> str:
     """The page's text."""
-    environment = Environment(
-        loader=PackageLoader("edp.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     plots = coverage_plots(found)
     context: dict[str, Any] = {
         "title": title,
@@ -66,7 +59,7 @@ def render_coverage(found: Coverage, title: str) -> str:
         "script": Markup(asset("page.js")),
         "plotly": Markup(get_plotlyjs()),
     }
-    return environment.get_template("coverage.html.jinja").render(**context)
+    return template("coverage.html.jinja").render(**context)
 
 
 def headline(found: Coverage) -> str:

@@ -7,13 +7,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from edp.report import facts as run
 from edp.report import tables
 from edp.report.plots import DOTS_AT_MOST, plots_of
+from edp.report.templates import template
 from edp.report.wording import moment, unbroken
 from edp.storage import write_bytes
 
@@ -47,14 +47,7 @@ def build_report(
 
 def render(facts: run.Facts, title: str | None = None) -> str:
     """The page's text."""
-    environment = Environment(
-        loader=PackageLoader("edp.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("page.html.jinja").render(**context(facts, title))
+    return template("page.html.jinja").render(**context(facts, title))
 
 
 def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
