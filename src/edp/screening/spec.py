@@ -1,0 +1,87 @@
+"""What a screening is asked: targets, horizon, reach of the lags, sizes of the samples, thresholds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from edp.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForestSpec:
+    """The random forest whose permutation importance is measured on held-out recordings.
+
+    Attributes:
+        trees: number of trees.
+        samples: rows that it is fitted on, evenly spread over the training recordings.
+        tests: held-out rows on which channels are permuted.
+        repeats: permutations of each group.
+        leaf: least number of rows in a leaf.
+        share: share of the channels that a node may choose from.
+        held_out: share of the recordings (or pieces) held out.
+    """
+
+    trees: int = 30
+    samples: int = 12_000
+    tests: int = 6_000
+    repeats: int = 5
+    leaf: int = 5
+    share: float = 1 / 3
+    held_out: float = 0.34
+
+    def __post_init__(self) -> None:
+        for name in ("trees", "samples", "tests", "repeats", "leaf"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"screening.forest.{name} = {getattr(self, name)}; it must be at least 1")
+        for name in ("share", "held_out"):
+            if not 0.0 < getattr(self, name) <= (1.0 if name == "share" else 0.8):
+                raise ConfigError(f"screening.forest.{name} = {getattr(self, name)}; a share above 0, held_out <= 0.8")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreeningSpec:
+    """Options of a screening; lags and horizons are samples.
+
+    Attributes:
+        targets: channels to be predicted; empty takes the cylinder velocities of Table A.1, else every velocity.
+        candidates: channels to judge; empty takes all of the recordings. Targets are always among them.
+        trusted: channels known to be measured on the machine, besides the targets and the names of Table A.1. Of a
+            channel and its copy, the trusted one is taken for the original.
+        horizon: how far ahead the model will predict.
+        max_lag: lags from -max_lag to max_lag are searched.
+        pieces: least number of stretches to compare; recordings are cut where there are fewer.
+        neighbours: k of the nearest-neighbour estimate of mutual information.
+        information_samples: rows for that estimate, evenly spread over the data.
+        collinear: rank correlation from which channels form a cluster.
+        copy: correlation at the best lag from which one channel is a copy of another.
+        level: chance of a false alarm of each test of significance, shared among the channels.
+        forest: the forest.
+        seed: of everything drawn.
+    """
+
+    targets: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()
+    trusted: tuple[str, ...] = ()
+    horizon: int = 10
+    max_lag: int = 100
+    pieces: int = 8
+    neighbours: int = 3
+    information_samples: int = 4_000
+    collinear: float = 0.9
+    copy: float = 0.99
+    level: float = 0.01
+    forest: ForestSpec = field(default_factory=ForestSpec)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        least = {"horizon": 0, "max_lag": 1, "pieces": 4, "neighbours": 1, "information_samples": 100, "seed": 0}
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise ConfigError(f"screening.{name} = {getattr(self, name)}; it must be at least {low}")
+        for name in ("collinear", "copy", "level"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ConfigError(f"screening.{name} = {getattr(self, name)}; it must lie between 0 and 1")
+        if self.horizon > self.max_lag:
+            raise ConfigError(
+                f"screening.horizon = {self.horizon} is beyond max_lag = {self.max_lag}; raise max_lag to see it"
+            )
