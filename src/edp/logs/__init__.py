@@ -6,7 +6,7 @@ from edp.logs.inspection import inspect_log
 from edp.logs.mat_layouts import LAYOUTS
 from edp.logs.quality import ChannelFacts, Finding, QualityReport, inspect
 from edp.logs.raw import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
-from edp.logs.read import find_recordings, read_data_set, read_recording, read_truth
+from edp.logs.read import find_recordings, read_data_set, read_parts, read_recording, read_truth
 from edp.logs.repair import Repair, split_at_gaps
 from edp.logs.write import truth_path, write_recording
 
@@ -32,6 +32,7 @@ __all__ = [
     "open_log",
     "parquet",
     "read_data_set",
+    "read_parts",
     "read_recording",
     "read_truth",
     "split_at_gaps",

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from edp.errors import DataError, closest
+from edp.logs.assemble import assemble
 from edp.logs.detect import open_log
 from edp.logs.quality import Finding, QualityReport, inspect
 from edp.logs.raw import RawLog
-from edp.logs.read import assemble
 from edp.logs.repair import Repair
 from edp.logs.resolve import Wanted, resolve
 from edp.logs.timebase import Clock, judge
@@ -93,7 +93,7 @@ def _unit_clashes(raw: RawLog, signal_map: SignalMap) -> list[Finding]:
     """Units of the map that differ from the file's."""
     found = []
     for entry in signal_map.channels:
-        stated = raw.signals[entry.column].unit if entry.column in raw.signals else None
+        stated = raw.signal(entry.column).unit if entry.column in raw else None
         if stated and entry.unit and stated != entry.unit:
             what = f"the map says {entry.unit}, the file says {stated}; the map's unit is used"
             found.append(Finding("warning", entry.name, what, 1, "", "check which is right"))

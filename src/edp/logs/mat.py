@@ -50,7 +50,7 @@ class MatFormat:
                 )
             variables = {signal_map.variable: variables[signal_map.variable]}
             if signal_map.variable == TRUTH and own.truth:
-                own = replace(own, channels=own.truth)
+                own = replace(own, channels=own.truth, digest=own.truth_digest)
         found = collect(variables)
         if not found.signals:
             raise DataError(
@@ -168,4 +168,4 @@ def _raw_log(path: Path, found: Found, own: OwnFacts, signal_map: SignalMap) -> 
         )
     if own.channels:
         signals = {name: signals[name] for name in own.channels if name in signals}
-    return RawLog(path, signals, found.scalars, own.rate_hz, own.name, own.source, own.meta)
+    return RawLog(path, signals, found.scalars, **own.for_log())

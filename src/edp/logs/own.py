@@ -23,6 +23,18 @@ class OwnFacts:
     meta: Mapping[str, Any] = field(default_factory=dict)
     channels: Mapping[str, Channel] = field(default_factory=dict)
     truth: Mapping[str, Channel] = field(default_factory=dict)
+    digest: str | None = None
+    truth_digest: str | None = None
+
+    def for_log(self) -> dict[str, Any]:
+        """What a `RawLog` takes of it."""
+        return {
+            "rate_hz": self.rate_hz,
+            "name": self.name,
+            "source": self.source,
+            "meta": self.meta,
+            "digest": self.digest,
+        }
 
 
 def facts_text(recording: Recording, truth: Recording | None = None) -> str:
@@ -33,8 +45,11 @@ def facts_text(recording: Recording, truth: Recording | None = None) -> str:
         "source": recording.source,
         "meta": dict(recording.meta),
         "channels": _listed(recording.channels),
+        "digest": recording.digest,
     }
-    return json.dumps(facts if truth is None else facts | {"truth": _listed(truth.channels)})
+    if truth is not None:
+        facts |= {"truth": _listed(truth.channels), "truth_digest": truth.digest}
+    return json.dumps(facts)
 
 
 def _listed(channels: Sequence[Channel]) -> list[dict[str, str]]:
@@ -56,7 +71,9 @@ def own_facts(text: str, where: str) -> OwnFacts:
             {str(e["name"]): Channel(str(e["name"]), Kind(e["kind"]), str(e["description"])) for e in entries}
             for entries in (facts["channels"], facts.get("truth", []))
         )
-        return OwnFacts(rate, str(facts["name"]), str(facts["source"]), dict(facts["meta"]), channels, truth)
+        # Files of earlier versions state no digest.
+        digests = (facts.get("digest"), facts.get("truth_digest"))
+        return OwnFacts(rate, str(facts["name"]), str(facts["source"]), dict(facts["meta"]), channels, truth, *digests)
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{where}: the facts that EDP wrote into it are damaged ({type(error).__name__}: {error}); "

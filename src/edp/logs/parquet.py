@@ -52,7 +52,7 @@ class ParquetFormat:
         if time_name is not None:
             time = _stamps(parquet, schema.field(time_name), path, signal_map)
         signals = {field.name: _signal(parquet, field, path, rows, time) for field in fields if field.name != time_name}
-        return RawLog(path, signals, rate_hz=own.rate_hz, name=own.name, source=own.source, meta=own.meta)
+        return RawLog(path, signals, **own.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write float32 columns in groups of rows; there is no time column: row k is at k / rate_hz."""

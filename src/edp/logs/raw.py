@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,6 +17,29 @@ from edp.signals import TABLE_A1, TIME_UNITS, VOCABULARY, Kind, SignalMap
 
 Column = NDArray[np.float64]
 
+PIECE_ROWS = 1 << 16
+"""Rows that a table reads at a time: what bounds the memory that a log of any length takes."""
+
+
+class Table(Protocol):
+    """Columns of one file that share their rows, read together in one go through the file."""
+
+    def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+        """Rows ``start <= row < stop`` of the named columns, in pieces of some rows, in order.
+
+        Yields:
+            one array of numbers a name, all of the same length, shape ``(rows of the piece,)``.
+
+        Raises:
+            DataError: a column is damaged or holds text.
+        """
+
+
+def load_column(table: Table, name: str, samples: int) -> Column:
+    """One whole column of a table, shape ``(samples,)``."""
+    parts = [columns[0] for columns in table.pieces([name], 0, samples)]
+    return np.concatenate(parts).astype(np.float64, copy=False) if parts else np.empty(0)
+
 
 @dataclass(frozen=True, eq=False)
 class RawSignal:
@@ -30,6 +53,8 @@ class RawSignal:
         unit: the unit the file gives, None when it says nothing.
         kind: the kind the file gives (only files that EDP wrote do).
         description: the file's description.
+        table: the table that it is a column of, where several columns are best read together.
+        key: its name in the table.
     """
 
     name: str
@@ -39,6 +64,8 @@ class RawSignal:
     unit: str | None = None
     kind: Kind | None = None
     description: str = ""
+    table: Table | None = None
+    key: str = ""
 
     @property
     def values(self) -> Column:
@@ -58,6 +85,9 @@ class RawLog:
         name: the recording's name as the file states it.
         source: where the recording came from as the file states it.
         meta: facts the file carries.
+        aliases: further names of columns, each with its name in `signals` (the whole path of a signal).
+        repeated: names that several columns have, with the names in `signals` that tell them apart.
+        digest: of the values that EDP wrote (`Recording.digest`), where the file states it.
     """
 
     path: Path
@@ -67,19 +97,36 @@ class RawLog:
     name: str | None = None
     source: str = ""
     meta: Mapping[str, Any] = field(default_factory=dict)
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    repeated: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    digest: str | None = None
+
+    def __contains__(self, name: str) -> bool:
+        """Whether the file has a column of this name or alias."""
+        return name in self.signals or name in self.aliases
 
     def signal(self, name: str) -> RawSignal:
         """The named column.
 
         Raises:
-            DataError: no such column; the closest name is offered.
+            DataError: no such column, or several; the names to choose from are offered.
         """
-        if name not in self.signals:
+        name = self.aliases.get(name, name)
+        if name in self.signals:
+            return self.signals[name]
+        if name in self.repeated:
             raise DataError(
-                f"'{self.path}' has no column '{name}'{closest(name, [*self.signals, *self.scalars])}; "
-                "name an existing column in the signal map"
+                f"'{self.path}' has {len(self.repeated[name])} columns named '{name}': "
+                f"{self._told_apart(name)}; name the wanted one in the signal map"
             )
-        return self.signals[name]
+        raise DataError(
+            f"'{self.path}' has no column '{name}'{closest(name, [*self.signals, *self.scalars])}; "
+            "name an existing column in the signal map"
+        )
+
+    def _told_apart(self, name: str) -> str:
+        found = [self.signals[full] for full in self.repeated[name]]
+        return ", ".join(signal.name + (f" [{signal.unit}]" if signal.unit else "") for signal in found[:8])
 
 
 TRUTH_PLACES = ("with", "apart", "without")

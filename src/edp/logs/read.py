@@ -2,35 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.logs.assemble import assemble, parts, prepare
 from edp.logs.detect import format_for, known_suffixes, open_log
-from edp.logs.raw import TRUTH, RawLog, RawSignal, is_truth
-from edp.logs.repair import Repair, mend_gaps, mend_stamps, mend_values
+from edp.logs.raw import TRUTH, RawLog, is_truth
+from edp.logs.repair import Repair
 from edp.logs.resolve import Wanted, resolve
-from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
 from edp.logs.write import truth_path
 from edp.recording import Recording
 from edp.signals import SignalMap
 
 RATE_TOLERANCE = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class _Timeline:
-    """The clock of one time column, the rows it keeps, and how the grid samples it."""
-
-    clock: Clock
-    order: Rows | None
-    rows: Rows | None
-    missing: NDArray[np.bool_]
 
 
 def read_recording(
@@ -59,131 +47,46 @@ def read_recording(
         DataError: the file, a column, a unit, a time stamp or a value cannot be used; the message says what to change.
     """
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
+    raw, wanted = _opened(path, signal_map)
+    return assemble(raw, wanted, signal_map, repair, (name, rows))[0]
+
+
+def read_parts(
+    path: str | Path,
+    signal_map: SignalMap | None = None,
+    *,
+    samples: int = 1 << 18,
+    repair: Repair | None = None,
+) -> Iterator[Recording]:
+    """Read a log in consecutive parts, for logs whose channels do not fit into memory together.
+
+    Args:
+        path: as in `read_recording`.
+        signal_map: as in `read_recording`.
+        samples: of a part; the last one is shorter.
+        repair: as in `read_recording`; a part that begins with a missing value holds the last good one before it.
+
+    Yields:
+        recordings that, one after the other, hold the values of `read_recording`; named ``NAME[start:stop]``.
+
+    Raises:
+        DataError: as `read_recording`; defects of time before the first part, those of values when their part comes.
+    """
+    if samples < 1:
+        raise DataError(f"parts of {samples} samples asked for; give at least 1")
+    signal_map, repair = signal_map or SignalMap(), repair or Repair()
+    raw, wanted = _opened(path, signal_map)
+    yield from parts(prepare(raw, wanted, signal_map, repair), samples, raw.name or raw.path.stem)
+
+
+def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[Wanted]]:
+    """The file and the wanted channels, all of which it has."""
     raw = open_log(path, signal_map)
     wanted, problems = resolve(raw, signal_map)
     if problems:
         more = f" (and {len(problems) - 1} more problem(s) of this kind)" if len(problems) > 1 else ""
         raise type(problems[0])(f"{problems[0]}{more}")
-    return assemble(raw, wanted, signal_map, repair, (name, rows))[0]
-
-
-def assemble(
-    raw: RawLog,
-    wanted: Sequence[Wanted],
-    signal_map: SignalMap,
-    repair: Repair,
-    naming: tuple[str | None, tuple[int, int | None] | None] = (None, None),
-) -> tuple[Recording, list[Clock]]:
-    """Bring the wanted channels to one grid; also returns the clocks of the file's time columns."""
-    name, rows = naming
-    where = f"'{raw.path}'"
-    timelines, grid, made = _timelines(raw, wanted, signal_map, repair)
-    values = np.empty((grid.count, len(wanted)), dtype=np.float32)
-    missing = np.zeros(grid.count, dtype=np.bool_)
-    for place, entry in enumerate(wanted):
-        if entry.signal is None:
-            values[:, place] = entry.constant
-            continue
-        line = timelines[_clock_key(entry.signal)]
-        column = entry.signal.values
-        if line.order is not None:
-            column = column[line.order]
-        values[:, place] = entry.convert(column if line.rows is None else column[line.rows])
-        missing |= line.missing
-    if repair.gaps != "hold":
-        values[missing] = np.nan
-    part = _rows(rows, grid.count, where)
-    values, missing = values[part], missing[part]
-    keep, gap_facts = mend_gaps(missing, grid.rate_hz, repair, where)
-    values, missing = values[keep], missing[keep]
-    names = [entry.channel.name for entry in wanted]
-    made += gap_facts + mend_values(values, missing, names, grid.rate_hz, repair, where)
-    clocks = [line.clock for line in timelines.values()]
-    meta: dict[str, Any] = dict(raw.meta)
-    if made:
-        meta["repairs"] = [*meta.get("repairs", []), *made]
-    if any(line.rows is not None for line in timelines.values()):
-        meta["resampled_from_hz"] = max(clock.rate_hz for clock in clocks)
-    recording = Recording(
-        name=name or raw.name or raw.path.stem,
-        channels=tuple(entry.channel for entry in wanted),
-        values=values,
-        rate_hz=grid.rate_hz,
-        source=raw.source or str(raw.path),
-        meta=meta,
-    )
-    return recording, clocks
-
-
-def _clock_key(signal: RawSignal) -> int:
-    return 0 if signal.time_s is None else id(signal.time_s)
-
-
-def _timelines(
-    raw: RawLog, wanted: Sequence[Wanted], signal_map: SignalMap, repair: Repair
-) -> tuple[dict[int, _Timeline], Grid, list[dict[str, Any]]]:
-    if signal_map.rate_hz is not None and not 0 < signal_map.rate_hz < np.inf:
-        raise DataError(f"signal map: rate_hz is {signal_map.rate_hz}; it must be a positive number")
-    signals = [entry.signal for entry in wanted if entry.signal is not None]
-    if not signals:
-        raise DataError(f"'{raw.path}': no channel is read from the file; map at least one to a column")
-    judged: dict[int, tuple[Clock, Rows | None]] = {}
-    made: list[dict[str, Any]] = []
-    for signal in signals:
-        key = _clock_key(signal)
-        if key in judged:
-            _check_length(raw, signal, judged[key], signals[0])
-            continue
-        stated = _stated_clock(raw, signal, signal_map)
-        if stated is not None:
-            judged[key] = (stated, None)
-            continue
-        if signal.time_s is None:
-            known = ", ".join(list(raw.signals)[:12])
-            raise DataError(
-                f"'{raw.path}' has no time column that fits '{signal.name}' (columns: {known}); "
-                "set 'time' in the signal map to its name, or set 'sample_time_s'"
-            )
-        where = f"'{raw.path}', time of '{signal.name}'"
-        clock, order, mended = mend_stamps(signal.time_s, repair, where)
-        judged[key] = (clock, order)
-        made += mended
-    grid = common_grid([clock for clock, _ in judged.values()], signal_map.rate_hz, f"'{raw.path}'")
-    lines = {key: _Timeline(clock, order, *hold_rows(clock, grid)) for key, (clock, order) in judged.items()}
-    return lines, grid, made
-
-
-def _stated_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Clock | None:
-    """The clock of rows that are uniform because the map or the file says so."""
-    rate = None
-    if signal_map.sample_time_s is not None:
-        if not signal_map.sample_time_s > 0:
-            raise DataError(f"signal map: sample_time_s is {signal_map.sample_time_s}; it must be positive")
-        rate = 1.0 / signal_map.sample_time_s
-    elif raw.rate_hz is not None:
-        rate = float(raw.rate_hz)
-    if rate is None:
-        return None
-    if signal.samples < 1:
-        raise DataError(f"'{raw.path}': column '{signal.name}' holds no rows")
-    return uniform_clock(signal.samples, rate)
-
-
-def _check_length(raw: RawLog, signal: RawSignal, judged: tuple[Clock, Rows | None], first: RawSignal) -> None:
-    if signal.time_s is None and signal.samples != len(judged[0].stamps):
-        raise DataError(
-            f"'{raw.path}': column '{signal.name}' has {signal.samples} rows, '{first.name}' has {first.samples}; "
-            "map columns of one length, or give each its own time"
-        )
-
-
-def _rows(rows: tuple[int, int | None] | None, count: int, where: str) -> slice:
-    if rows is None:
-        return slice(None)
-    start, stop = rows[0], count if rows[1] is None else rows[1]
-    if not 0 <= start < stop <= count:
-        raise DataError(f"{where}: rows {start}:{stop} asked for, but 0 <= start < stop <= {count} must hold")
-    return slice(start, stop)
+    return raw, wanted
 
 
 def read_truth(path: str | Path) -> Recording | None:

@@ -105,9 +105,17 @@ def mend_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tupl
 
 
 def mend_values(
-    values: NDArray[np.float32], missing: Mask, names: Sequence[str], rate_hz: float, repair: Repair, where: str
+    values: NDArray[np.float32],
+    missing: Mask,
+    names: Sequence[str],
+    rate_hz: float,
+    repair: Repair,
+    where: str,
+    first_row: int = 0,
 ) -> list[dict[str, Any]]:
     """Check for NaN and infinity outside gaps, shape ``(time, channel)``, and hold them in place where allowed.
+
+    `first_row` is the row of the recording that `values` begin with.
 
     Raises:
         DataError: there are some and `repair` does not allow them, or a channel starts with one.
@@ -121,7 +129,7 @@ def mend_values(
         rows = np.flatnonzero(own)
         if not len(rows) or repair.nan == "keep":
             continue
-        first = int(rows[0])
+        first = first_row + int(rows[0])
         if repair.nan == "refuse":
             raise DataError(
                 f"{where}: channel '{name}' has {len(rows)} missing or infinite value(s), first in row {first} "
@@ -130,7 +138,7 @@ def mend_values(
         if bad[0]:
             raise DataError(
                 f"{where}: channel '{name}' starts with a missing value, nothing earlier can be held; "
-                f"start the rows at {int(np.argmin(bad))} or later"
+                f"start the rows at {first_row + int(np.argmin(bad))} or later"
             )
         source = np.maximum.accumulate(np.where(bad, 0, np.arange(len(bad))))
         values[own, column] = values[source[own], column]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,11 @@ class Wanted:
     scale: float = 1.0
     constant: float = float("nan")
 
-    def convert(self, values: NDArray[np.float64]) -> NDArray[np.float32]:
+    def convert(self, values: NDArray[Any]) -> NDArray[np.float32]:
         """File values to SI, float32."""
+        if values.dtype == np.float32 and self.scale == 1.0 and self.unit.factor == 1.0 and not self.unit.offset:
+            return values
+        values = values.astype(np.float64, copy=False)
         if self.scale != 1.0 or self.unit.factor != 1.0:
             values = values * (self.scale * self.unit.factor)
         if self.unit.offset:
@@ -57,7 +61,8 @@ def _vocabulary_entries(raw: RawLog) -> list[ChannelMap]:
     stated = [signal for signal in raw.signals.values() if signal.kind is not None]
     if stated:
         return [ChannelMap(s.name, s.name, kind=s.kind, description=s.description) for s in stated]
-    return [ChannelMap(name, name) for name in VOCABULARY if name in raw.signals]
+    # A name that occurs twice is refused when its column is looked up, with the names that tell them apart.
+    return [ChannelMap(name, name) for name in VOCABULARY if name in raw or name in raw.repeated]
 
 
 def _nothing_known(raw: RawLog) -> DataError:
@@ -71,7 +76,7 @@ def _nothing_known(raw: RawLog) -> DataError:
 def _one(raw: RawLog, entry: ChannelMap) -> Wanted:
     channel = entry.channel()
     where = f"'{raw.path}', column '{entry.column}'"
-    present = entry.column in raw.signals
+    present = entry.column in raw
     if not present and entry.column in raw.scalars:
         unit = unit_for(entry.unit, channel.kind, where)
         value = raw.scalars[entry.column] * entry.scale * unit.factor + unit.offset

@@ -1,0 +1,295 @@
+"""From the columns of a file to rows of a recording: clocks, one grid, repairs, values piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+from edp.logs.raw import RawLog, RawSignal, Table
+from edp.logs.repair import Mask, Repair, mend_gaps, mend_stamps, mend_values
+from edp.logs.resolve import Wanted
+from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
+from edp.recording import FloatArray, Recording
+from edp.signals import SignalMap
+
+
+@dataclass(frozen=True, eq=False)
+class _Timeline:
+    """The clock of one time column, the rows it keeps, and how the grid samples it."""
+
+    clock: Clock
+    order: Rows | None
+    rows: Rows | None
+    missing: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """A log brought to one grid, its values still in the file.
+
+    Attributes:
+        raw: the file.
+        wanted: the channels, in order.
+        repair: what may be mended.
+        lines: how each time column is sampled.
+        rate_hz: of the grid.
+        ticks: the ticks of the grid that the recording keeps.
+        missing: which of them lie in a gap, shape ``(time,)``.
+        made: the repairs made to time.
+        whole: the ticks are all that the file holds.
+    """
+
+    raw: RawLog
+    wanted: Sequence[Wanted]
+    repair: Repair
+    lines: dict[int, _Timeline]
+    rate_hz: float
+    ticks: slice
+    missing: Mask
+    made: list[dict[str, Any]] = field(default_factory=list)
+    whole: bool = True
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of the recording."""
+        return len(self.missing)
+
+    @property
+    def clocks(self) -> list[Clock]:
+        """The clocks of the file's time columns."""
+        return [line.clock for line in self.lines.values()]
+
+    @property
+    def resampled(self) -> bool:
+        """Whether a tick may take another row than its own."""
+        return any(line.rows is not None for line in self.lines.values())
+
+    @property
+    def untouched(self) -> bool:
+        """Whether the recording is the whole file as it is: every channel, every row, nothing mended."""
+        names = [entry.channel.name for entry in self.wanted]
+        kept = self.repair == Repair() and self.whole and not self.resampled
+        return kept and names == [signal.name for signal in self.raw.signals.values()]
+
+    def recording(self, start: int, stop: int, name: str | None, before: FloatArray | None = None) -> Recording:
+        """The samples ``start <= t < stop``.
+
+        Args:
+            start: the first.
+            stop: behind the last.
+            name: the recording's name; None: as the file says.
+            before: the last good value of each channel before `start`, shape ``(channel,)``, to hold.
+
+        Raises:
+            DataError: a column cannot be read, or holds missing values that may not be mended.
+        """
+        values, made = self._mended(start, stop, before)
+        meta: dict[str, Any] = dict(self.raw.meta)
+        if self.made or made:
+            meta["repairs"] = [*meta.get("repairs", []), *self.made, *made]
+        if self.resampled:
+            meta["resampled_from_hz"] = max(clock.rate_hz for clock in self.clocks)
+        return Recording(
+            name=name or self.raw.name or self.raw.path.stem,
+            channels=tuple(entry.channel for entry in self.wanted),
+            values=values,
+            rate_hz=self.rate_hz,
+            source=self.raw.source or str(self.raw.path),
+            meta=meta,
+        )
+
+    def _mended(self, start: int, stop: int, before: FloatArray | None) -> tuple[FloatArray, list[dict[str, Any]]]:
+        first = self.ticks.start + start
+        values = self._values(first, self.ticks.start + stop)
+        missing = self.missing[start:stop]
+        if self.repair.gaps != "hold":
+            values[missing] = np.nan
+        if before is not None:
+            values, missing = np.vstack([before[None], values]), np.append(False, missing)
+        names = [entry.channel.name for entry in self.wanted]
+        offset = start if before is None else start - 1
+        made = mend_values(values, missing, names, self.rate_hz, self.repair, f"'{self.raw.path}'", offset)
+        return (values if before is None else values[1:]), made
+
+    def _values(self, first: int, last: int) -> FloatArray:
+        """Ticks ``first <= k < last`` of the grid, float32, shape ``(time, channel)``."""
+        values = np.empty((last - first, len(self.wanted)), dtype=np.float32)
+        tables: dict[int, tuple[Table, list[int]]] = {}
+        for place, entry in enumerate(self.wanted):
+            if entry.signal is None:
+                values[:, place] = entry.constant
+                continue
+            line = self.lines[_clock_key(entry.signal)]
+            if entry.signal.table is not None and line.order is None:
+                tables.setdefault(id(entry.signal.table), (entry.signal.table, []))[1].append(place)
+                continue
+            column = entry.signal.values
+            if line.order is not None:
+                column = column[line.order]
+            values[:, place] = entry.convert(column[slice(first, last) if line.rows is None else line.rows[first:last]])
+        for table, places in tables.values():
+            self._fill(values, table, places, first)
+        return values
+
+    def _fill(self, values: FloatArray, table: Table, places: list[int], first: int) -> None:
+        """The columns of one table, piece by piece."""
+        chosen = [(place, entry, entry.signal) for place in places if (entry := self.wanted[place]).signal is not None]
+        keys = [signal.key for _, _, signal in chosen]
+        ticks = slice(first, first + len(values))
+        rows = self.lines[_clock_key(chosen[0][2])].rows
+        taken = np.arange(ticks.start, ticks.stop) if rows is None else rows[ticks]
+        at, tick = int(taken[0]), 0
+        for columns in table.pieces(keys, at, int(taken[-1]) + 1):
+            end = at + len(columns[0])
+            stop = int(np.searchsorted(taken, end))
+            part = taken[tick:stop] - at
+            plain = len(part) == end - at and rows is None
+            for (place, entry, _), column in zip(chosen, columns):
+                values[tick:stop, place] = entry.convert(column if plain else column[part])
+            at, tick = end, stop
+        if tick != len(values):
+            raise DataError(
+                f"'{self.raw.path}' ends after {at} rows, {int(taken[-1]) + 1} were announced (truncated or damaged); "
+                "copy or export it again"
+            )
+
+
+def prepare(
+    raw: RawLog,
+    wanted: Sequence[Wanted],
+    signal_map: SignalMap,
+    repair: Repair,
+    rows: tuple[int, int | None] | None = None,
+) -> Assembly:
+    """Bring the times of the wanted channels to one grid; no value is read yet.
+
+    Raises:
+        DataError: times that cannot be used or may not be mended; rows outside the log.
+    """
+    where = f"'{raw.path}'"
+    lines, grid, made = _timelines(raw, wanted, signal_map, repair)
+    missing = np.zeros(grid.count, dtype=np.bool_)
+    for line in lines.values():
+        missing |= line.missing
+    part = _rows(rows, grid.count, where)
+    keep, gap_facts = mend_gaps(missing[part], grid.rate_hz, repair, where)
+    first = part.start + (keep.start or 0)
+    last = part.start + (len(missing[part]) if keep.stop is None else keep.stop)
+    whole = (first, last) == (0, grid.count)
+    return Assembly(
+        raw, wanted, repair, lines, grid.rate_hz, slice(first, last), missing[first:last], made + gap_facts, whole
+    )
+
+
+def assemble(
+    raw: RawLog,
+    wanted: Sequence[Wanted],
+    signal_map: SignalMap,
+    repair: Repair,
+    naming: tuple[str | None, tuple[int, int | None] | None] = (None, None),
+) -> tuple[Recording, list[Clock]]:
+    """Bring the wanted channels to one grid; also returns the clocks of the file's time columns."""
+    name, rows = naming
+    made = prepare(raw, wanted, signal_map, repair, rows)
+    recording = made.recording(0, made.samples, name)
+    if made.untouched and raw.digest is not None and recording.digest != raw.digest:
+        raise DataError(
+            f"'{raw.path}': the values are not the ones that EDP wrote; the file is damaged, or was changed by another "
+            "program: copy it again, or where the change is wanted, remove EDP's facts from it (edp_info)"
+        )
+    return recording, made.clocks
+
+
+def parts(made: Assembly, samples: int, name: str) -> Iterator[Recording]:
+    """The recording in consecutive parts of `samples` (the last one shorter), each named by its samples."""
+    before: FloatArray | None = None
+    for start in range(0, made.samples, samples):
+        stop = min(start + samples, made.samples)
+        part = made.recording(start, stop, f"{name}[{start}:{stop}]", before)
+        before = _last_good(part.values, before)
+        yield part
+
+
+def _last_good(values: FloatArray, before: FloatArray | None) -> FloatArray:
+    last = np.full(values.shape[1], np.nan, dtype=np.float32) if before is None else before.copy()
+    for place, column in enumerate(values.T):
+        good = np.flatnonzero(np.isfinite(column))
+        if len(good):
+            last[place] = column[good[-1]]
+    return last
+
+
+def _clock_key(signal: RawSignal) -> int:
+    return 0 if signal.time_s is None else id(signal.time_s)
+
+
+def _timelines(
+    raw: RawLog, wanted: Sequence[Wanted], signal_map: SignalMap, repair: Repair
+) -> tuple[dict[int, _Timeline], Grid, list[dict[str, Any]]]:
+    if signal_map.rate_hz is not None and not 0 < signal_map.rate_hz < np.inf:
+        raise DataError(f"signal map: rate_hz is {signal_map.rate_hz}; it must be a positive number")
+    signals = [entry.signal for entry in wanted if entry.signal is not None]
+    if not signals:
+        raise DataError(f"'{raw.path}': no channel is read from the file; map at least one to a column")
+    judged: dict[int, tuple[Clock, Rows | None]] = {}
+    made: list[dict[str, Any]] = []
+    for signal in signals:
+        key = _clock_key(signal)
+        if key in judged:
+            _check_length(raw, signal, judged[key], signals[0])
+            continue
+        stated = _stated_clock(raw, signal, signal_map)
+        if stated is not None:
+            judged[key] = (stated, None)
+            continue
+        if signal.time_s is None:
+            known = ", ".join(list(raw.signals)[:12])
+            raise DataError(
+                f"'{raw.path}' has no time column that fits '{signal.name}' (columns: {known}); "
+                "set 'time' in the signal map to its name, or set 'sample_time_s'"
+            )
+        where = f"'{raw.path}', time of '{signal.name}'"
+        clock, order, mended = mend_stamps(signal.time_s, repair, where)
+        judged[key] = (clock, order)
+        made += mended
+    grid = common_grid([clock for clock, _ in judged.values()], signal_map.rate_hz, f"'{raw.path}'")
+    lines = {key: _Timeline(clock, order, *hold_rows(clock, grid)) for key, (clock, order) in judged.items()}
+    return lines, grid, made
+
+
+def _stated_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Clock | None:
+    """The clock of rows that are uniform because the map or the file says so."""
+    rate = None
+    if signal_map.sample_time_s is not None:
+        if not signal_map.sample_time_s > 0:
+            raise DataError(f"signal map: sample_time_s is {signal_map.sample_time_s}; it must be positive")
+        rate = 1.0 / signal_map.sample_time_s
+    elif raw.rate_hz is not None:
+        rate = float(raw.rate_hz)
+    if rate is None:
+        return None
+    if signal.samples < 1:
+        raise DataError(f"'{raw.path}': column '{signal.name}' holds no rows")
+    return uniform_clock(signal.samples, rate)
+
+
+def _check_length(raw: RawLog, signal: RawSignal, judged: tuple[Clock, Rows | None], first: RawSignal) -> None:
+    if signal.time_s is None and signal.samples != len(judged[0].stamps):
+        raise DataError(
+            f"'{raw.path}': column '{signal.name}' has {signal.samples} rows, '{first.name}' has {first.samples}; "
+            "map columns of one length, or give each its own time"
+        )
+
+
+def _rows(rows: tuple[int, int | None] | None, count: int, where: str) -> slice:
+    if rows is None:
+        return slice(0, count)
+    start, stop = rows[0], count if rows[1] is None else rows[1]
+    if not 0 <= start < stop <= count:
+        raise DataError(f"{where}: rows {start}:{stop} asked for, but 0 <= start < stop <= {count} must hold")
+    return slice(start, stop)
