@@ -1,0 +1,123 @@
+"""What the other channels, now and before, tell of a channel: one ridge regression for every choice of channels."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+Array = NDArray[np.float64]
+KNEES = (0.5, 0.8)
+"""Quantiles at which each channel has a hinge, so that laws with a dead zone or a threshold can be told."""
+RIDGE = 1e-6
+"""Penalty over the mean squared size of a term."""
+BLOCK = 8192
+
+
+@dataclass(frozen=True, eq=False)
+class OthersModel:
+    """Sums that settle the regression of any channels on all others.
+
+    The terms of a channel are its values at the lags and its hinges ``max(x - knee, 0)`` at the present tick, all
+    centred and brought to deviation 1.
+
+    Attributes:
+        lags: ticks back, 0 among them.
+        knees: shape ``(knee, channel)``.
+        mean, deviation: of the terms, shape ``(term,)``.
+        gram: sums of products of the terms over rows, shape ``(term, term)``, over the count.
+        owner: channel of each term, shape ``(term,)``.
+    """
+
+    lags: tuple[int, ...]
+    knees: Array
+    mean: Array
+    deviation: Array
+    gram: Array
+    owner: NDArray[np.int64]
+
+    @staticmethod
+    def fit(parts: Sequence[NDArray[np.float32]], lags: Sequence[int], rows: int) -> OthersModel:
+        """From stretches of inputs, each ``(time, channel)``, thinned evenly to about `rows` rows."""
+        total = sum(len(part) for part in parts)
+        every = max(1, total // rows)
+        channels = parts[0].shape[1]
+        thinned = np.concatenate([part[::every] for part in parts])
+        knees = np.quantile(thinned, KNEES, axis=0).astype(np.float64)
+        count, sums, products = 0, 0.0, 0.0
+        size = np.maximum(thinned.std(axis=0, dtype=np.float64), 1e-30)
+        shift = thinned.mean(axis=0, dtype=np.float64)
+        pick = np.tile(np.arange(channels), len(lags) + len(KNEES))
+        for part in parts:
+            terms = _terms(part, lags, knees, np.arange(0, len(part), every))
+            # Near 0 and 1 first, so that sums of squares lose no digits.
+            terms = (terms - shift[pick]) / size[pick]
+            count, sums, products = count + len(terms), sums + terms.sum(axis=0), products + terms.T @ terms
+        mean = np.asarray(sums / count)
+        gram = np.asarray(products / count) - np.outer(mean, mean)
+        spread = np.sqrt(np.maximum(np.diag(gram), 0.0))
+        # A term that never moves has no say and no surprise.
+        flat = spread < 1e-9
+        spread[flat] = 1.0
+        gram = gram / np.outer(spread, spread)
+        gram[flat, :] = gram[:, flat] = 0.0
+        return OthersModel(
+            tuple(lags), knees, shift[pick] + size[pick] * mean, size[pick] * spread, gram, pick.astype(np.int64)
+        )
+
+    def expect(
+        self, groups: Sequence[Sequence[int]], parts: Sequence[NDArray[np.float32]]
+    ) -> tuple[list[list[NDArray[np.float32]]], list[float]]:
+        """What the channels outside of each group tell of its members, and how much of their variance that is.
+
+        Args:
+            groups: channels that are told together, none of them from another of them.
+            parts: inputs, each ``(time, channel)``.
+
+        Returns:
+            For each group and part ``(time, member)``; and for each group the share of variance on the rows of the
+            fit, mean over its members.
+        """
+        settled = [self._weights(group) for group in groups]
+        weights = np.concatenate([found for found, _ in settled], axis=1)
+        wanted = [self._present(column) for group in groups for column in group]
+        told: list[NDArray[np.float32]] = []
+        for part in parts:
+            values = np.empty((len(part), len(wanted)), np.float32)
+            for start in range(0, len(part), BLOCK):
+                rows = np.arange(start, min(start + BLOCK, len(part)))
+                terms = (_terms(part, self.lags, self.knees, rows) - self.mean) / self.deviation
+                values[rows] = self.mean[wanted] + self.deviation[wanted] * (terms @ weights)
+            told.append(values)
+        edges = np.cumsum([0, *(len(group) for group in groups)])
+        spans = [slice(a, b) for a, b in itertools.pairwise(edges)]
+        return [[values[:, span] for values in told] for span in spans], [share for _, share in settled]
+
+    def _weights(self, group: Sequence[int]) -> tuple[Array, float]:
+        """Weights of all terms, shape ``(term, member)``, zero for the group's own; and the share of variance told."""
+        wanted = np.array([self._present(column) for column in group])
+        weights = np.zeros((len(self.owner), len(group)))
+        known = np.flatnonzero(~np.isin(self.owner, group))
+        if len(known) == 0:
+            return weights, 0.0
+        inner, cross = self.gram[np.ix_(known, known)], self.gram[np.ix_(known, wanted)]
+        found = linalg.solve(inner + RIDGE * len(known) * np.eye(len(known)), cross, assume_a="pos")
+        weights[known] = found
+        told = 2 * np.sum(found * cross, axis=0) - np.sum(found * (inner @ found), axis=0)
+        return weights, float(np.clip(told, 0.0, 1.0).mean())
+
+    def _present(self, column: int) -> int:
+        """Term that is the channel itself at the present tick."""
+        channels = len(self.owner) // (len(self.lags) + len(KNEES))
+        return self.lags.index(0) * channels + column
+
+
+def _terms(part: NDArray[np.float32], lags: Sequence[int], knees: Array, rows: NDArray[np.int64]) -> Array:
+    """Terms at `rows`, shape ``(row, term)``; before the start the first row holds."""
+    lagged = [part[np.maximum(rows - lag, 0)].astype(np.float64) for lag in lags]
+    hinges = [np.maximum(part[rows].astype(np.float64) - knee, 0.0) for knee in knees]
+    return np.concatenate([*lagged, *hinges], axis=1)

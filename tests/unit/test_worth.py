@@ -1,0 +1,123 @@
+"""What channels are worth to a trained predictor: exact on laws that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.blocks import LinearBypass
+from edp.data.features import FeatureSet
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError, DataError
+from edp.evaluation.conditional import OthersModel
+from edp.evaluation.worth import WorthSpec, _donors, channel_worths
+from edp.signals import Channel, Kind
+from edp.training import fit
+
+NAMES = ("speed", "lever", "twice", "noise", "second")
+SPEC = WorthSpec(repeats=2, groups=(("lever", "twice"),), skip=20)
+
+
+def drive(seed, samples=900):
+    """The speed follows lever and second lever; `twice` is a law of the lever, and noise is noise."""
+    rng = np.random.default_rng(seed)
+    lever, second = (np.repeat(rng.normal(size=samples // 20 + 1), 20)[:samples] for _ in range(2))
+    speed = np.zeros(samples)
+    for t in range(3, samples):
+        speed[t] = 0.9 * speed[t - 1] + 0.03 * lever[t - 3] + 0.01 * second[t - 3]
+    inputs = np.column_stack([speed, lever, 2 * lever + 1, rng.normal(size=samples), second]).astype(np.float32)
+    return Series(f"drive {seed}", inputs, inputs[:, :1].copy())
+
+
+@pytest.fixture(scope="module")
+def data():
+    task = Task(FeatureSet("law", NAMES), ("speed",), (3,), TargetMode.DELTA, 100.0)
+    kinds = (Kind.VELOCITY, *[Kind.GENERIC] * 4)
+    return Prepared(
+        task, [drive(1), drive(2)], [drive(3)], [drive(4), drive(5), drive(6, 700)],
+        tuple(Channel(name, kind) for name, kind in zip(NAMES, kinds, strict=True)),
+        kinds, (Kind.VELOCITY,), ("",), "0" * 32,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def predictor(data, tiny_model, tiny_training):
+    model = replace(tiny_model, blocks=(LinearBypass(taps=5),))
+    return fit(data, model, replace(tiny_training, epochs=2, updates=20)).predictor
+
+
+@pytest.fixture(scope="module")
+def worths(predictor, data):
+    seen = []
+    found = channel_worths(predictor, data, SPEC, lambda name, done, total: seen.append((name, done, total)))
+    assert seen == [(", ".join(row.members), n, 6) for n, row in enumerate(found.rows[::2])]
+    return found
+
+
+def test_worths_follow_the_law(worths):
+    rows = {row.members: row for row in worths.rows if row.target == "mean"}
+    base = worths.error["3"]["mean"]
+    lever, twice, both = rows[("lever",)], rows[("twice",)], rows[("lever", "twice")]
+    # A law gives the one from the other: alone they have nothing of their own, together nearly all.
+    assert lever.told > 0.999
+    assert twice.told > 0.999
+    assert both.told < 0.9
+    assert max(lever.renewed.mean, twice.renewed.mean) < 0.05 * both.renewed.mean
+    assert both.renewed.low > base
+    assert both.exchanged.mean > rows[("second",)].exchanged.mean > 0
+    assert rows[("second",)].renewed.low > 0
+    assert abs(rows[("noise",)].exchanged.mean) < 0.05 * both.exchanged.mean
+    assert [row.members for row in worths.ranked(3)[:2]] == [("speed",), ("lever", "twice")]
+    assert worths.units == {"mean": "mm/s", "speed": "mm/s"}
+    for row in worths.rows:
+        assert row.exchanged.low <= row.exchanged.mean <= row.exchanged.high
+
+
+def test_the_same_seed_gives_the_same_worths(worths, predictor, data):
+    assert channel_worths(predictor, data, SPEC) == worths
+    assert channel_worths(predictor, data, replace(SPEC, seed=1)) != worths
+
+
+def test_one_recording_is_exchanged_with_itself_far_off(predictor, data):
+    found = channel_worths(predictor, replace(data, test=data.test[:1]), WorthSpec(repeats=1, skip=20))
+    rows = {row.members: row for row in found.rows if row.target == "mean"}
+    assert rows[("second",)].renewed.mean > 0
+    rng = np.random.default_rng(0)
+    assert all(225 <= _donors(data.test[:1], rng)[0].start <= 675 for _ in range(50))
+    for _ in range(50):
+        assert all(donor.recording != i for i, donor in enumerate(_donors(data.test, rng)))
+
+
+def test_hinges_tell_a_threshold():
+    rng = np.random.default_rng(0)
+    values = rng.uniform(0, 1, (4000, 3)).astype(np.float32)
+    values[:, 1] = np.maximum(values[:, 0] - 0.5, 0) * 3
+    model = OthersModel.fit([values[:3000], values[3000:]], (0, 1), 10_000)
+    (told, _), shares = model.expect([[1], [2]], [values])
+    assert shares[0] > 0.99
+    assert shares[1] < 0.05
+    assert np.corrcoef(told[0][:, 0], values[:, 1])[0, 1] > 0.995
+
+
+def test_still_channels_and_lone_channels():
+    values = np.column_stack([np.full(500, 7.0), np.arange(500)]).astype(np.float32)
+    model = OthersModel.fit([values], (0, 2), 500)
+    (still, moving), shares = model.expect([[0], [1]], [values])
+    assert np.allclose(still[0], 7.0)
+    assert np.allclose(moving[0], values[:, 1].mean())
+    assert shares == [0.0, 0.0]
+    (all_of_them,), _ = model.expect([[0, 1]], [values])
+    assert np.allclose(all_of_them[0], values.mean(axis=0))
+
+
+def test_mistakes_are_told(predictor, data):
+    with pytest.raises(ConfigError, match=r"names 'levr', which is no input.*lever"):
+        channel_worths(predictor, data, WorthSpec(groups=(("levr", "noise"),)))
+    with pytest.raises(DataError, match="longest has 900 samples, the first 2000 are start-up"):
+        channel_worths(predictor, data, WorthSpec(skip=2000))
+    with pytest.raises(ConfigError, match="repeats = 0"):
+        WorthSpec(repeats=0)
+    with pytest.raises(ConfigError, match="nothing from the future"):
+        WorthSpec(lags=(0, -1))
