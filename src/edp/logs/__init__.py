@@ -1,6 +1,6 @@
 """Recordings in and out: readers and writers, units, time stamps, repairs and quality reports."""
 
-from edp.logs import csv, mat, parquet
+from edp.logs import csv, mat, mdf, parquet
 from edp.logs.detect import format_for, known_suffixes, open_log
 from edp.logs.inspection import inspect_log
 from edp.logs.mat_layouts import LAYOUTS
@@ -29,6 +29,7 @@ __all__ = [
     "inspect_log",
     "known_suffixes",
     "mat",
+    "mdf",
     "open_log",
     "parquet",
     "read_data_set",

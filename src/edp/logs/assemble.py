@@ -17,6 +17,8 @@ from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform
 from edp.recording import FloatArray, Recording
 from edp.signals import SignalMap
 
+_CACHED_ROWS = 4096
+
 
 @dataclass(frozen=True, eq=False)
 class _Timeline:
@@ -149,14 +151,24 @@ class Assembly:
             stop = int(np.searchsorted(taken, end))
             part = taken[tick:stop] - at
             plain = len(part) == end - at and rows is None
-            for (place, entry, _), column in zip(chosen, columns):
-                values[tick:stop, place] = entry.convert(column if plain else column[part])
+            converted = [
+                entry.convert(column if plain else column[part]) for (_, entry, _), column in zip(chosen, columns)
+            ]
+            _interleave(values[tick:stop], [place for place, _, _ in chosen], converted)
             at, tick = end, stop
         if tick != len(values):
             raise DataError(
                 f"'{self.raw.path}' ends after {at} rows, {int(taken[-1]) + 1} were announced (truncated or damaged); "
                 "copy or export it again"
             )
+
+
+def _interleave(values: FloatArray, places: list[int], columns: list[FloatArray]) -> None:
+    """Write columns into rows, some rows at a time: a whole column at once would leave the cache at each step."""
+    for start in range(0, len(values), _CACHED_ROWS):
+        block = values[start : start + _CACHED_ROWS]
+        for place, column in zip(places, columns):
+            block[:, place] = column[start : start + _CACHED_ROWS]
 
 
 def prepare(

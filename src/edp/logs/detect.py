@@ -11,9 +11,7 @@ from edp.signals import SignalMap
 _HEAD = 4096
 _EXPORT = {
     ".mldatx": "open it in the Simulation Data Inspector and export MAT, CSV or Parquet",
-    ".mf4": "export it as MAT or CSV with your measurement tool",
-    ".mdf": "export it as MAT or CSV with your measurement tool",
-    ".dat": "export it as MAT or CSV with your measurement tool",
+    ".dat": "save it as MDF 4 (.mf4), MAT or CSV with your measurement tool",
     ".mcap": "convert the wanted topics to CSV or Parquet",
     ".bag": "convert the wanted topics to CSV or Parquet",
     ".db3": "convert the wanted topics to CSV or Parquet",

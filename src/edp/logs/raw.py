@@ -49,7 +49,7 @@ class RawSignal:
         name: the file's own name.
         load: returns the values, float64, shape ``(time,)``; called when needed so that columns pass one by one.
         samples: number of values.
-        time_s: its time stamps in seconds, shape ``(time,)``; columns of one table share the same array.
+        time: its time stamps in seconds, shape ``(time,)``, or what reads them; columns of one table share the same.
         unit: the unit the file gives, None when it says nothing.
         kind: the kind the file gives (only files that EDP wrote do).
         description: the file's description.
@@ -60,7 +60,7 @@ class RawSignal:
     name: str
     load: Callable[[], Column]
     samples: int
-    time_s: Column | None = None
+    time: Column | Callable[[], Column] | None = None
     unit: str | None = None
     kind: Kind | None = None
     description: str = ""
@@ -71,6 +71,11 @@ class RawSignal:
     def values(self) -> Column:
         """The values, read now; not kept."""
         return self.load()
+
+    @property
+    def time_s(self) -> Column | None:
+        """The time stamps in seconds, shape ``(time,)``; columns of one table give the same array."""
+        return self.time() if callable(self.time) else self.time
 
 
 @dataclass(frozen=True)

@@ -121,10 +121,11 @@ def mend_values(
         DataError: there are some and `repair` does not allow them, or a channel starts with one.
     """
     made: list[dict[str, Any]] = []
+    sound = np.asarray(np.isfinite(values).all(axis=0))
     for column, name in enumerate(names):
-        bad = ~np.isfinite(values[:, column])
-        if not bad.any():
+        if sound[column]:
             continue
+        bad = ~np.isfinite(values[:, column])
         own = bad & ~missing if repair.gaps in ("keep", "refuse") else bad
         rows = np.flatnonzero(own)
         if not len(rows) or repair.nan == "keep":

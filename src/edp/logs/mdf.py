@@ -1,0 +1,238 @@
+"""ASAM MDF 4: measurement files of CAN loggers and calibration tools, read and written through asammdf.
+
+Channels are selected group by group and brought to the grid by `edp.logs.timebase`; asammdf's own union of time stamps
+is not used.
+"""
+
+from __future__ import annotations
+
+import logging
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+from edp.logs.mdf_check import check_blocks
+from edp.logs.names import told_apart
+from edp.logs.own import OwnFacts, facts_text, own_facts
+from edp.logs.raw import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
+from edp.logs.units import normalise_unit
+from edp.recording import Recording
+from edp.signals import SignalMap
+
+_MAGIC = (b"MDF     ", b"UnFinMF ")
+_FACTS = "edp_info.json"
+_PIECE_BYTES = 1 << 25
+_NUMBERS = range(6)
+"""Data types of whole numbers and floats; above are texts, bytes, dates and pictures."""
+_PLAIN_TYPES = (0, 2, 3, 6)
+"""Channel types: fixed length, master, virtual master, virtual."""
+_TIME = 1
+
+
+class MdfFormat:
+    """ASAM MDF 4."""
+
+    name = "mdf"
+    suffixes: tuple[str, ...] = (".mf4", ".mdf")
+    content = "MDF"
+    parts = False
+
+    def claims(self, head: bytes) -> bool:
+        """Begins with MDF's file identification."""
+        return head.startswith(_MAGIC)
+
+    def read(self, path: Path, signal_map: SignalMap) -> RawLog:
+        """Read names, units and groups; values and times are read when asked for."""
+        asammdf = _library()
+        check_blocks(path)
+        with _damage(path):
+            stream = path.open("rb")
+            try:
+                # A stream keeps the library from reading a whole group when a part of it is asked for.
+                log = asammdf.MDF(
+                    stream, process_bus_logging=False, use_display_names=False, raise_on_multiple_occurrences=False
+                )
+            except BaseException:
+                stream.close()
+                raise
+            file = _File(path, log)
+            weakref.finalize(file, _close, log, stream)
+            own = file.facts()
+            found = [signal for number in range(len(log.groups)) for signal in file.group(number, own, signal_map)]
+        if not found:
+            raise DataError(f"'{path}' holds no channels of numbers; {_advice(log)}")
+        signals, aliases, repeated = told_apart(found)
+        if own.channels:
+            signals = {name: signals[name] for name in own.channels if name in signals}
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
+
+    def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
+        """Write one channel group of float32 with the time in s, packed, and EDP's facts as an attachment."""
+        asammdf = _library()
+        time = np.arange(recording.samples) / recording.rate_hz
+        signals = [
+            asammdf.Signal(
+                samples=np.ascontiguousarray(recording.values[:, place]),
+                timestamps=time,
+                name=channel.name,
+                unit=channel.unit,
+                comment=channel.description,
+            )
+            for place, channel in enumerate(recording.channels)
+        ]
+        with asammdf.MDF(version="4.10") as log, path.open("wb+") as stream:
+            log.append(signals, acq_name=recording.name, comment="EDP", common_timebase=True)
+            log.attach(facts_text(recording).encode(), file_name=_FACTS, mime="application/json")
+            log.save(stream, compression=2)
+
+
+FORMATS.register("mdf")(MdfFormat())
+
+
+class _File:
+    """An open file."""
+
+    def __init__(self, path: Path, log: Any) -> None:
+        self.path = path
+        self.log = log
+
+    def facts(self) -> OwnFacts:
+        for number, attachment in enumerate(self.log.attachments):
+            if attachment.file_name == _FACTS:
+                data = self.log.extract_attachment(index=number)[0]
+                return own_facts(bytes(data).decode(errors="replace"), f"'{self.path}', attachment '{_FACTS}'")
+        return OwnFacts()
+
+    def group(self, number: int, own: OwnFacts, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
+        """The channels of one group that hold numbers, each with the group's name."""
+        group = self.log.groups[number]
+        samples = int(group.channel_group.cycles_nr)
+        master = self.log.masters_db.get(number)
+        timed = master is not None and group.channels[master].sync_type == _TIME
+        stamps = None
+        if timed and own.rate_hz is None and signal_map.sample_time_s is None:
+            stamps = cache(partial(self.stamps, number))
+        table = _Table(self, number)
+        found = []
+        for place, channel in enumerate(group.channels):
+            usable = channel.data_type in _NUMBERS and channel.channel_type in _PLAIN_TYPES
+            if place == master or not usable or group.channel_dependencies[place] or not samples:
+                continue
+            known = own.channels.get(channel.name)
+            unit = channel.unit or (channel.conversion.unit if channel.conversion else "")
+            key = str(place)
+            signal = RawSignal(
+                channel.name,
+                partial(load_column, table, key, samples),
+                samples,
+                stamps,
+                unit=normalise_unit(unit) or (known.unit if known else None),
+                kind=known.kind if known else None,
+                description=known.description if known else "",
+                table=table,
+                key=key,
+            )
+            found.append((self.name_of(number), signal))
+        return found
+
+    def name_of(self, number: int) -> str:
+        head = self.log.groups[number].channel_group
+        source = head.acq_source.name if head.acq_source else ""
+        return str(head.acq_name or source or f"group_{number}")
+
+    def stamps(self, number: int) -> Column:
+        with _damage(self.path):
+            return np.array(self.log.get_master(number), dtype=np.float64)
+
+
+class _Table:
+    """One channel group."""
+
+    def __init__(self, file: _File, number: int) -> None:
+        self.file = file
+        self.number = number
+
+    def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+        """See `edp.logs.raw.Table`."""
+        head = self.file.log.groups[self.number].channel_group
+        rows = max(PIECE_ROWS, _PIECE_BYTES // max(int(head.samples_byte_nr), 1))
+        chosen = [(None, self.number, int(name)) for name in names]
+        for first in range(start, stop, rows):
+            count = min(rows, stop - first)
+            with _damage(self.file.path):
+                selected = self.file.log.select(
+                    chosen,
+                    record_offset=first,
+                    record_count=count,
+                    copy_master=False,
+                    ignore_value2text_conversions=True,
+                )
+                columns = [_valid(signal) for signal in selected]
+            for signal, column in zip(selected, columns):
+                if column.dtype.kind not in "fiub" or column.ndim != 1:
+                    raise DataError(f"'{self.file.path}': column '{signal.name}' holds no plain numbers; map another")
+                if len(column) != count:
+                    raise DataError(
+                        f"'{self.file.path}': column '{signal.name}' ends after {first + len(column)} rows, {stop} "
+                        "were announced (truncated); copy or export it again"
+                    )
+            yield columns
+
+
+def _valid(signal: Any) -> NDArray[Any]:
+    """The values, NaN where the file marks them as invalid."""
+    values = np.asarray(signal.samples)
+    if signal.invalidation_bits is None:
+        return values
+    invalid = np.asarray(signal.invalidation_bits, dtype=np.bool_)
+    return np.where(invalid, np.nan, values) if invalid.any() else values
+
+
+def _close(log: Any, stream: Any) -> None:
+    log.close()
+    stream.close()
+
+
+def _advice(log: Any) -> str:
+    names = {channel.name for group in log.groups for channel in group.channels}
+    if any(name.startswith(("CAN_DataFrame", "LIN_Frame", "FLX_Frame", "ETH_Frame")) for name in names):
+        return "it logs raw bus frames: decode them with their database (DBC, ARXML) and save the signals"
+    return f"channels: {', '.join(sorted(names)[:12]) or 'none'}"
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """The library meets damaged bytes with any exception there is; every one means the same to the user."""
+    logger = logging.getLogger("asammdf")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    except (DataError, MemoryError):
+        raise
+    except Exception as error:
+        raise DataError(
+            f"'{path}' cannot be read as MDF ({type(error).__name__}: {error}); it may be truncated or damaged: copy "
+            "or export it again"
+        ) from error
+    finally:
+        logger.setLevel(level)
+
+
+def _library() -> ModuleType:
+    try:
+        import asammdf
+    except ImportError as error:
+        raise DataError(
+            "MDF files need the package asammdf, which is not installed; run pip install "
+            "'excavator-dynamics-predictor[mdf]', or export the file as MAT or CSV with your measurement tool"
+        ) from error
+    return asammdf

@@ -1,0 +1,41 @@
+"""Names of columns where a file has groups, topics or variables: short where that is clear, else with the place."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+from edp.logs.raw import RawSignal
+
+Named = tuple[dict[str, RawSignal], dict[str, str], dict[str, list[str]]]
+
+
+def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
+    """Columns by name.
+
+    Args:
+        found: each column under its short name, with the place (group, topic) in which it lies.
+
+    Returns:
+        columns under their short names where those occur once, else as ``place.name``, numbered where even that
+        occurs twice; the long names of the former; and the short names of the latter with their long ones.
+    """
+    counts = Counter(signal.name for _, signal in found)
+    often = {name for name, count in counts.items() if count > 1}
+    signals: dict[str, RawSignal] = {}
+    aliases: dict[str, str] = {}
+    repeated: dict[str, list[str]] = {}
+    for place, signal in found:
+        full = f"{place}.{signal.name}"
+        if signal.name not in often:
+            signals[signal.name] = signal
+            aliases[full] = signal.name
+            continue
+        number = 1
+        while full in signals:
+            number += 1
+            full = f"{place}.{signal.name}#{number}"
+        signals[full] = replace(signal, name=full)
+        repeated.setdefault(signal.name, []).append(full)
+    return signals, aliases, repeated
