@@ -1,6 +1,6 @@
 """Recordings in and out: readers and writers, units, time stamps, repairs and quality reports."""
 
-from edp.logs import csv, mat, mdf, parquet
+from edp.logs import csv, mat, mdf, parquet, rosbag
 from edp.logs.detect import format_for, known_suffixes, open_log
 from edp.logs.inspection import inspect_log
 from edp.logs.mat_layouts import LAYOUTS
@@ -36,6 +36,7 @@ __all__ = [
     "read_parts",
     "read_recording",
     "read_truth",
+    "rosbag",
     "split_at_gaps",
     "truth_path",
     "write_recording",

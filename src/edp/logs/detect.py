@@ -9,12 +9,24 @@ from edp.logs.raw import FORMATS, LogFormat, RawLog
 from edp.signals import SignalMap
 
 _HEAD = 4096
+BAG_MARK = "metadata.yaml"
+"""The file that makes a folder a ROS 2 bag."""
 _EXPORT = {
-    ".mldatx": "open it in the Simulation Data Inspector and export MAT, CSV or Parquet",
+    ".mldatx": (
+        "only MATLAB reads MLDATX: open it in the Simulation Data Inspector, press Export and choose a MAT, Parquet or "
+        "CSV file, or in MATLAB: Simulink.sdi.load('run.mldatx'); "
+        "Simulink.sdi.exportRun(Simulink.sdi.getAllRunIDs, to='file', filename='run.mat')"
+    ),
+    ".part": "the download is not finished; wait for it or load it again",
+    ".crdownload": "the download is not finished; wait for it or load it again",
+    ".download": "the download is not finished; wait for it or load it again",
+    ".partial": "the download is not finished; wait for it or load it again",
+    ".zip": "unpack it and give the files in it",
+    ".mf4z": "unpack it (it is a ZIP archive) and give the file in it",
+    ".gz": "unpack it and give the file in it",
+    ".7z": "unpack it and give the files in it",
+    ".active": "the bag was not closed (its recorder was killed): run 'rosbag reindex' and rename it to .bag",
     ".dat": "save it as MDF 4 (.mf4), MAT or CSV with your measurement tool",
-    ".mcap": "convert the wanted topics to CSV or Parquet",
-    ".bag": "convert the wanted topics to CSV or Parquet",
-    ".db3": "convert the wanted topics to CSV or Parquet",
     ".txt": "rename it to .csv if it holds a table",
     ".xlsx": "save the sheet as CSV",
     ".xls": "save the sheet as CSV",
@@ -23,7 +35,13 @@ _OTHERS = {
     b"PK\x03\x04": "a ZIP archive (xlsx, mldatx and the like)",
     b"\x1f\x8b": "gzip-compressed data",
     b"\x89HDF\r\n\x1a\n": "HDF5 that is not a MAT v7.3 file",
-    b"SQLite format 3": "an SQLite database",
+    b"PARE": "an encrypted Parquet file (decrypt it with its keys first)",
+    b"version https://git-lfs": "a pointer of Git LFS instead of the data (run 'git lfs pull')",
+    b"<!DOCTYPE": "a web page instead of the data (a login or an error page was saved)",
+    b"<!doctype": "a web page instead of the data (a login or an error page was saved)",
+    b"<html": "a web page instead of the data (a login or an error page was saved)",
+    b"Salted__": "encrypted data (decrypt it first)",
+    b"-----BEGIN PGP": "encrypted data (decrypt it first)",
 }
 
 
@@ -37,7 +55,11 @@ def format_for(path: Path) -> LogFormat:
 
     Raises:
         DataError: no format has this ending; says which are known and how to export the common others.
+
+    A folder with a ``metadata.yaml`` is a ROS 2 bag.
     """
+    if (path / BAG_MARK).is_file():
+        return FORMATS["rosbag2"]
     suffix = path.suffix.lower()
     for part in FORMATS.values():
         if suffix in part.suffixes:
@@ -54,6 +76,8 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
     """
     source = Path(path)
     named = format_for(source)
+    if source.is_dir():
+        return named.read(source, signal_map)
     try:
         with source.open("rb") as stream:
             head = stream.read(_HEAD)
@@ -62,12 +86,16 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
         raise DataError(f"cannot read '{source}': {reason}; check the path and its permissions") from error
     if not head:
         raise DataError(f"'{source}' is empty (0 bytes); copy or export it again")
-    if not named.claims(head):
+    if not any(head):
+        raise DataError(f"'{source}' begins with zeros only; it is half downloaded or damaged: copy it again")
+    if not named.claims(head) or any(head.startswith(magic) for magic in _OTHERS):
         raise DataError(f"'{source}' is named {source.suffix} but holds {_content(head)}; rename it or export it again")
     return named.read(source, signal_map)
 
 
 def _content(head: bytes) -> str:
+    if head.startswith(b"PK\x03\x04") and len(head) > 6 and head[6] & 1:
+        return "a password-protected ZIP archive (unpack it with its password first)"
     for magic, text in _OTHERS.items():
         if head.startswith(magic):
             return text

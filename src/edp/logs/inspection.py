@@ -24,7 +24,7 @@ def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> Qualit
     """Find what is wrong with a log: its columns, units, time stamps and values.
 
     Args:
-        path: a CSV, Parquet or MAT file.
+        path: a log of any known format.
         signal_map: as in `read_recording`.
 
     Raises:

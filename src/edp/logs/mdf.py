@@ -112,7 +112,7 @@ class _File:
         return OwnFacts()
 
     def group(self, number: int, own: OwnFacts, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
-        """The channels of one group that hold numbers, each with the group's name."""
+        """The channels of one group that hold numbers, each with its full name."""
         group = self.log.groups[number]
         samples = int(group.channel_group.cycles_nr)
         master = self.log.masters_db.get(number)
@@ -140,7 +140,7 @@ class _File:
                 table=table,
                 key=key,
             )
-            found.append((self.name_of(number), signal))
+            found.append((f"{self.name_of(number)}.{channel.name}", signal))
         return found
 
     def name_of(self, number: int) -> str:

@@ -15,19 +15,19 @@ def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
     """Columns by name.
 
     Args:
-        found: each column under its short name, with the place (group, topic) in which it lies.
+        found: the full name of each column (with group or topic), and the column under its short name.
 
     Returns:
-        columns under their short names where those occur once, else as ``place.name``, numbered where even that
-        occurs twice; the long names of the former; and the short names of the latter with their long ones.
+        columns under their short names where those occur once, else under the full ones, numbered where even those
+        occur twice; the full names of the former; and the short names of the latter with their full ones.
     """
     counts = Counter(signal.name for _, signal in found)
     often = {name for name, count in counts.items() if count > 1}
     signals: dict[str, RawSignal] = {}
     aliases: dict[str, str] = {}
     repeated: dict[str, list[str]] = {}
-    for place, signal in found:
-        full = f"{place}.{signal.name}"
+    for name, signal in found:
+        full = name
         if signal.name not in often:
             signals[signal.name] = signal
             aliases[full] = signal.name
@@ -35,7 +35,7 @@ def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
         number = 1
         while full in signals:
             number += 1
-            full = f"{place}.{signal.name}#{number}"
+            full = f"{name}#{number}"
         signals[full] = replace(signal, name=full)
         repeated.setdefault(signal.name, []).append(full)
     return signals, aliases, repeated

@@ -10,7 +10,7 @@ import numpy as np
 
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
-from edp.logs.detect import format_for, known_suffixes, open_log
+from edp.logs.detect import BAG_MARK, format_for, known_suffixes, open_log
 from edp.logs.raw import TRUTH, RawLog, is_truth
 from edp.logs.repair import Repair
 from edp.logs.resolve import Wanted, resolve
@@ -32,7 +32,7 @@ def read_recording(
     """Read a log file as a uniformly sampled recording in SI units.
 
     Args:
-        path: a CSV, Parquet or MAT file.
+        path: a log of any known format (`edp.logs.known_suffixes`), or the folder of a ROS 2 bag.
         signal_map: which columns become which channels; an empty map takes the vocabulary's names with the units
             that the file states (SI where it states none).
         name: the recording's name; default: as the file says, else the file's stem.
@@ -110,22 +110,25 @@ def read_truth(path: str | Path) -> Recording | None:
 def find_recordings(path: str | Path) -> tuple[Path, ...]:
     """The log files at a path: the file itself, or all files with a known ending in a folder and below, sorted.
 
-    In a folder, files that hold the truth of the log beside them (``NAME.truth.SUFFIX``) are passed over.
+    In a folder, files that hold the truth of the log beside them (``NAME.truth.SUFFIX``) are passed over. A folder that
+    is a ROS 2 bag counts as one log.
 
     Raises:
         DataError: the path does not exist, or holds no log file.
     """
     source = Path(path)
-    if source.is_file():
+    if source.is_file() or (source / BAG_MARK).is_file():
         return (source,)
     if not source.exists():
         raise DataError(f"'{source}' does not exist; give a log file or a folder of log files")
     known = known_suffixes()
-    found = [
+    bags = {entry.parent for entry in source.rglob(BAG_MARK)}
+    files = [
         entry
-        for entry in sorted(source.rglob("*"))
+        for entry in source.rglob("*")
         if entry.suffix.lower() in known and not entry.name.startswith(".") and entry.is_file() and not _is_truth(entry)
     ]
+    found = sorted([*bags, *(file for file in files if file.parent not in bags)])
     if not found:
         raise DataError(f"'{source}' holds no log files; known endings: {', '.join(known)}")
     return tuple(found)
