@@ -25,8 +25,11 @@ from edp.data.spectrum import LAGS
 from edp.data.splits import SPLITS
 from edp.data_sets import SimulationOrder, simulate_data_set
 from edp.errors import DataError, StorageError
+from edp.evaluation.conditional import collinear
 from edp.evaluation.footprint import Budget, Footprint, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
+from edp.evaluation.worth import Worths, WorthSpec
+from edp.evaluation.worth import channel_worths as measure_worths
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination, describe
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
@@ -178,18 +181,7 @@ def evaluate(
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
     """
     folder = Path(run)
-    bundle = load_bundle(folder)
-    if not (folder / "provenance.json").is_file():
-        raise StorageError(f"'{folder}' is not a run folder: it has no provenance.json; give the folder of edp train")
-    provenance = read_json(folder / "provenance.json")
-    experiment = load_experiment(folder / "config.toml", preset=None)
-    torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
-    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment)
-    if data.digest != provenance["data"]["digest"]:
-        raise DataError(
-            f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "
-            "split would not be the same: train again, or judge other recordings with --data"
-        )
+    bundle, experiment, provenance, data = _trained(folder)
     target, judged = folder, [data.digest]
     if source is not None:
         recordings = source.read()
@@ -208,6 +200,54 @@ def evaluate(
     if source is None:
         save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
     return target
+
+
+def _trained(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepared]:
+    """Bundle, settings, provenance and data of a run, the data checked to be what it was trained on."""
+    bundle = load_bundle(folder)
+    if not (folder / "provenance.json").is_file():
+        raise StorageError(f"'{folder}' is not a run folder: it has no provenance.json; give the folder of edp train")
+    provenance = read_json(folder / "provenance.json")
+    experiment = load_experiment(folder / "config.toml", preset=None)
+    torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
+    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment)
+    if data.digest != provenance["data"]["digest"]:
+        raise DataError(
+            f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "
+            "split would not be the same: train again, or judge other recordings with --data"
+        )
+    return bundle, experiment, provenance, data
+
+
+def channel_worths(
+    run: str | Path,
+    source: DataSource | None = None,
+    spec: WorthSpec | None = None,
+    on_group: Callable[[str, int, int], None] | None = None,
+) -> tuple[Worths, Path]:
+    """What each input channel is worth to the network of a run, on its held-out recordings or on other ones.
+
+    Args:
+        run: run folder.
+        source: other recordings; all of them are judged.
+        spec: how channels are taken away; without it, collinear channels are also taken away together.
+        on_group: called with the channels, how many groups are done and of how many.
+
+    Returns:
+        The figures, and the file ``worth.json`` with them: in the run folder, or in the folder in it for `source`.
+    """
+    folder = Path(run)
+    bundle, _, _, data = _trained(folder)
+    target = folder
+    if source is not None:
+        data = replace(data, test=[bundle.task.series(recording) for recording in source.read()])
+        target = make_folder(folder / f"on_{source.path.stem}")
+    if spec is None:
+        groups = collinear([part.inputs for part in data.train])
+        spec = WorthSpec(groups=tuple(tuple(data.task.inputs[i] for i in group) for group in groups))
+    found = measure_worths(bundle.predictor, data, spec, on_group)
+    write_json(target / "worth.json", {"schema": 1} | found.to_json())
+    return found, target / "worth.json"
 
 
 def _kept(folder: Path, key: str) -> dict[str, Any] | None:
@@ -257,6 +297,7 @@ __all__ = [
     "DataSource",
     "SimulationOrder",
     "build_report",
+    "channel_worths",
     "coverage",
     "evaluate",
     "footprint_of",

@@ -11,7 +11,7 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
-from edp.evaluation.conditional import OthersModel
+from edp.evaluation.conditional import OthersModel, collinear
 from edp.evaluation.worth import WorthSpec, _donors, channel_worths
 from edp.signals import Channel, Kind
 from edp.training import fit
@@ -121,3 +121,12 @@ def test_mistakes_are_told(predictor, data):
         WorthSpec(repeats=0)
     with pytest.raises(ConfigError, match="nothing from the future"):
         WorthSpec(lags=(0, -1))
+
+
+def test_collinear_channels_form_groups():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 2000))
+    values = np.column_stack([a, b, np.exp(a), np.zeros(2000), -b + 0.1 * a]).astype(np.float32)
+    assert collinear([values[:900], values[900:]]) == [[0, 2], [1, 4]]
+    assert collinear([values[:, :1]]) == []
+    assert collinear([values], least=0.999) == [[0, 2]]

@@ -12,6 +12,7 @@ from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, tabl
 from edp.cli.train import MapOption, RepairOption, source_of
 
 if TYPE_CHECKING:
+    from edp.evaluation.worth import Worths
     from edp.sources import DataSource
 
 
@@ -23,6 +24,9 @@ def evaluate(
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    worth: Annotated[
+        bool, typer.Option(help="Also take each channel away from the model, and say how much the error grows.")
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Score a trained model on held-out recordings beside honest baselines.
@@ -32,13 +36,17 @@ def evaluate(
     names = None if baselines is None else [n for n in baselines.split(",") if n and n != "none"]
     source = None if data is None else source_of(data, signal_map, repair)
     folder, scores = run_evaluation(run, source, names, as_json)
+    worths = run_worths(run, source, as_json) if worth else None
 
     def show() -> None:
         score_table(scores)
         out.print(f"scores in {folder / 'scores.json'}")
+        if worths is not None:
+            worth_table(worths)
+            out.print(f"worth of the channels in {folder / 'worth.json'}")
         out.print(f"next: edp report {folder}")
 
-    emit(as_json, {"folder": str(folder), **scores}, show)
+    emit(as_json, {"folder": str(folder), **scores} | ({} if worths is None else {"worth": worths.to_json()}), show)
 
 
 def run_evaluation(
@@ -58,6 +66,37 @@ def run_evaluation(
 
         folder = judge_run(run, source, names, on_step)
     return folder, read_json(folder / "scores.json")
+
+
+def run_worths(run: Path, source: DataSource | None = None, quiet: bool = False) -> Worths:
+    """Take channels away with a progress display."""
+    from edp.workflow import channel_worths
+
+    steps, began = Steps(quiet), time.monotonic()
+    with progress(quiet) as shown:
+        bar = shown.add_task("worth", total=1.0, note="")
+
+        def on_group(name: str, done: int, groups: int) -> None:
+            left = (time.monotonic() - began) / done * (groups - done) if done else 0.0
+            shown.update(bar, completed=done / groups, note=f"{done}/{groups}, {name}")
+            tail = f", {duration(left)} left" if done else ""
+            steps.say(f"worth: {done}/{groups} taken away, now {name}{tail}")
+
+        found, _ = channel_worths(run, source, on_group=on_group)
+    return found
+
+
+def worth_table(worths: Worths) -> None:
+    """Print a table a horizon: what the error grows by without each channel, most first."""
+    unit = worths.units["mean"]
+    for horizon, error in worths.error.items():
+        rows = []
+        for row in worths.ranked(int(horizon)):
+            bounds = f"{row.renewed.low:.3g} to {row.renewed.high:.3g}"
+            figures = [f"{row.renewed.mean:.3g}", bounds, f"{row.exchanged.mean:.3g}", f"{row.told:.0%}"]
+            rows.append([", ".join(row.members), *figures])
+        title = f"growth of the error at k = {horizon} (MAE {error['mean']:.4g} {unit}) without the channel, {unit}"
+        table(title, ["channel", "its own", "95 %", "with all it shares", "told by others"], rows)
 
 
 def score_table(scores: dict[str, Any]) -> None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, stats
+from scipy.cluster import hierarchy
 
 Array = NDArray[np.float64]
 KNEES = (0.5, 0.8)
@@ -114,6 +115,27 @@ class OthersModel:
         """Term that is the channel itself at the present tick."""
         channels = len(self.owner) // (len(self.lags) + len(KNEES))
         return self.lags.index(0) * channels + column
+
+
+def collinear(parts: Sequence[NDArray[np.float32]], least: float = 0.9, rows: int = 20_000) -> list[list[int]]:
+    """Groups of channels, two or more, of which every two have at least this absolute rank correlation.
+
+    Args:
+        parts: stretches, each ``(time, channel)``.
+        least: bound.
+        rows: about how many rows are looked at, evenly spread.
+    """
+    every = max(1, sum(len(part) for part in parts) // rows)
+    values = np.concatenate([part[::every] for part in parts]).astype(np.float64)
+    moving = np.flatnonzero(values.std(axis=0) > 0)
+    if len(moving) < 2:
+        return []
+    ranks = stats.rankdata(values[:, moving], axis=0)
+    apart = 1.0 - np.abs(np.corrcoef(ranks, rowvar=False))
+    tree = hierarchy.linkage(np.clip(apart[np.triu_indices(len(moving), 1)], 0.0, None), "complete")
+    label = hierarchy.fcluster(tree, 1.0 - least, "distance")
+    groups = [moving[label == number].tolist() for number in np.unique(label)]
+    return sorted(group for group in groups if len(group) > 1)
 
 
 def _terms(part: NDArray[np.float32], lags: Sequence[int], knees: Array, rows: NDArray[np.int64]) -> Array:

@@ -10,6 +10,8 @@ from edp import __version__
 from edp.cli import app, demo
 from edp.cli import train as train_command
 from edp.cli.console import duration
+from edp.signals import TABLE_A1
+from edp.storage import read_json
 
 COMMANDS = [command.name for command in app.registered_commands]
 EXPECTED = ["demo", "simulate", "inspect", "animate", "train", "evaluate", "footprint", "report"]
@@ -120,6 +122,19 @@ def test_other_recordings_can_be_judged(edp, logs, trained):
     found = edp("evaluate", trained, "--data", logs / "drive_1.parquet", "--baselines", "persistence", "--json").json
     assert found["folder"] == str(trained / "on_drive_1")
     assert (trained / "on_drive_1" / "scores.json").is_file()
+
+
+def test_the_worth_of_channels_is_told(edp, logs, trained):
+    few = ("--baselines", "persistence", "--worth")
+    found = edp("evaluate", trained, *few, "--json").json
+    assert found["worth"] == {k: v for k, v in read_json(trained / "worth.json").items() if k != "schema"}
+    assert {tuple(row["members"]) for row in found["worth"]["rows"]} >= {(name,) for name in TABLE_A1}
+    told = edp("evaluate", trained, *few)
+    assert "worth: 0/24 taken away" in told.err
+    assert "without the channel" in told.out
+    other = edp("evaluate", trained, *few, "--data", logs / "drive_1.parquet", "--json").json
+    assert (trained / "on_drive_1" / "worth.json").is_file()
+    assert other["worth"]["recordings"] == ["drive_1"]
 
 
 @pytest.mark.parametrize(
