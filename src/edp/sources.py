@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from edp.config import build, load_data_set, load_signal_map, plain_tree
 from edp.errors import ConfigError, DataError
-from edp.logs import QualityReport, find_recordings, inspect_log, read_data_set, read_recording
+from edp.logs import DataQuality, compare, find_recordings, look_into, read_data_set, read_recording, unique_names
 from edp.logs.repair import Repair
 from edp.recording import Recording
 from edp.signals import SignalMap
@@ -68,9 +69,25 @@ class DataSource:
         _check_listed(recordings, self.path)
         return recordings
 
-    def inspect(self) -> list[QualityReport]:
-        """What is in each log and what is wrong with it; nothing is mended or refused."""
-        return [inspect_log(log.path, log.signal_map) for log in self.logs()]
+    def inspect(self, on_log: Callable[[Path, int, int], None] | None = None) -> DataQuality:
+        """What is in each log, what is wrong with it, and which repeat each other; nothing is mended or refused.
+
+        Args:
+            on_log: called with the path of each log before it is read, its number from 1, and how many there are.
+
+        Raises:
+            DataError: a file that cannot be read at all.
+        """
+        logs = self.logs()
+        seen = []
+        for i, log in enumerate(logs):
+            if on_log is not None:
+                on_log(log.path, i + 1, len(logs))
+            seen.append(look_into(log.path, log.signal_map, log.name, log.rows))
+        names = unique_names([report.name for report, _ in seen], [log.path for log in logs])
+        reports = [replace(report, name=name) for (report, _), name in zip(seen, names)]
+        sketches = [replace(sketch, name=name) for (_, sketch), name in zip(seen, names) if sketch is not None]
+        return compare(reports, sketches)
 
 
 @dataclass(frozen=True)

@@ -196,14 +196,16 @@ def test_odd_channels_are_named(name, values, says, kind):
 
 
 def test_ordinary_channels_give_no_findings():
+    swing = 0.6 + 0.3 * np.sin(np.arange(400) * 0.02) + 0.01 * NOISE
     for name, scale in (("CylPressures_1", 2e7), ("BmUp", 3e6), ("CylVels_1", 0.4), ("CylAcc_1", 8.0)):
-        assert quality(name, NOISE * scale).findings == ()
-    idle = np.concatenate([np.zeros(300), NOISE * 2e6, np.zeros(300)])
+        assert quality(name, swing * scale).findings == ()
+    idle = np.concatenate([np.zeros(300), swing * 2e6, np.zeros(300)])
     assert quality("BmUp", idle).findings == ()
 
 
 def test_stuck_run_is_a_note():
-    values = np.concatenate([NOISE, np.full(250, 0.5), NOISE])
+    swing = 0.5 * np.cos(np.arange(400) * np.pi / 400)
+    values = np.concatenate([swing, np.full(250, -0.4), -swing])
     (finding,) = quality("CylVels_1", values).findings
     assert (finding.severity, finding.where) == ("note", "row 400 (t = 4 s)")
     assert "longest 2.5 s" in finding.what

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, emit, err, out, table
+from edp.cli.console import JsonFlag, Steps, emit, err, out, progress, table
+from edp.cli.quality import LogDisplay, show_between, show_report, verdict_text
 from edp.cli.train import MapOption
 from edp.errors import EdpError
 
@@ -23,14 +24,14 @@ def inspect(
     signal_map: MapOption = None,
     channels: Annotated[bool, typer.Option(help="Show a row for each channel.")] = True,
     covered: Annotated[bool, typer.Option("--coverage/--no-coverage", help="Show what the data cover.")] = True,
-    page: Annotated[Path | None, typer.Option(help="Also write the coverage as an offline HTML page.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Also write quality and coverage as an offline HTML page.")] = None,
     split: Annotated[
         str, typer.Option(help="Also say how far tests lie from training: recordings, blocks, time.")
     ] = "",
     inputs: Annotated[str, typer.Option(help="Channels that command, where names and kinds do not tell: a,b.")] = "",
     as_json: JsonFlag = False,
 ) -> None:
-    """Report rate, gaps, missing values, constant channels and doubtful units of recordings; nothing is changed.
+    """Report the quality of recordings: time, gaps, noise, steps, clipping, units, repeats; nothing is changed.
 
     Then what the data cover: how rich the inputs are, poses, joint histograms, events.
     Ends with exit code 3 where a log has an error that training would refuse.
@@ -40,8 +41,9 @@ def inspect(
     from edp.sources import DataSource
 
     source = DataSource.of(data, signal_map)
-    plain = [report.to_json() for report in source.inspect()]
-    errors = sum(finding["severity"] == "error" for report in plain for finding in report["findings"])
+    with progress(as_json) as shown:
+        quality = source.inspect(LogDisplay(shown, Steps(as_json)).on_log)
+    errors = quality.errors
     asked = page is not None or bool(split or inputs)
     found, why = None, "" if covered or asked else "not asked for"
     if not errors and (covered or asked):
@@ -49,19 +51,19 @@ def inspect(
     if found is not None and page is not None:
         from edp.report import build_coverage_page
 
-        build_coverage_page(found, page, data.resolve().stem)
+        build_coverage_page(found, page, data.resolve().stem, quality)
 
     def show() -> None:
-        for report in plain:
+        for report in quality.reports:
             show_report(report, channels)
+        show_between(quality)
         if found is not None:
             show_coverage(found)
         elif why and covered:
             out.print(f"coverage: {why}")
         if found is not None and page is not None:
             out.print(f"page: {page.resolve()}")
-        verdict = f"{errors} error(s) that training would refuse" if errors else "no errors"
-        out.print(f"{len(plain)} recording(s), {verdict}")
+        out.print(verdict_text(quality))
         if not errors:
             mapped = "" if signal_map is None else f" --map {signal_map}"
             out.print(f"next: edp train {data}{mapped} --out runs/first")
@@ -71,7 +73,7 @@ def inspect(
         from edp.data.wanted import wanted
 
         covers = {**found.to_json(), "wanted": [figure.to_json() for figure in wanted(found)]}
-    emit(as_json, {"errors": errors, "recordings": plain, "coverage": covers, "coverage_absent": why}, show)
+    emit(as_json, {**quality.to_json(), "coverage": covers, "coverage_absent": why}, show)
     if errors:
         err.print("see the advice beside each error, or ask for a repair with --repair when training")
         raise typer.Exit(FAULTY)
@@ -87,25 +89,6 @@ def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bo
         if asked:
             raise
         return None, str(error)
-
-
-def show_report(report: dict[str, Any], channels: bool) -> None:
-    """Print one recording's facts and findings."""
-    rate = report["rate_hz"]
-    head = f"{report['name']}: {report['duration_s']:.1f} s, {rate:g} Hz, {report['samples']:,} samples"
-    if channels:
-        rows = [
-            (c["name"], c["kind"], c["unit"], *(_short(c[key]) for key in ("min", "max", "mean", "std")), c["missing"])
-            for c in report["channels"]
-        ]
-        table(head, ["channel", "kind", "unit", "min", "max", "mean", "std", "missing"], rows)
-    else:
-        out.print(head)
-    for finding in report["findings"]:
-        where = f" {finding['channel']}:" if finding["channel"] else ""
-        place = f" ({finding['where']})" if finding["where"] else ""
-        out.print(f"  {finding['severity']}:{where} {finding['what']}{place}. {finding['advice']}")
-    out.print()
 
 
 def show_coverage(found: Coverage) -> None:
@@ -163,10 +146,6 @@ def show_coverage(found: Coverage) -> None:
 
 def _verdict(met: bool) -> str:
     return "met" if met else "not met"
-
-
-def _short(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
 
 
 def _share(value: float | None) -> str:

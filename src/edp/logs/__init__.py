@@ -1,13 +1,16 @@
 """Recordings in and out: readers and writers, units, time stamps, repairs and quality reports."""
 
 from edp.logs import csv, mat, mdf, parquet, rosbag
+from edp.logs.between import DataQuality, compare
+from edp.logs.checks import Finding
 from edp.logs.detect import format_for, known_suffixes, open_log
-from edp.logs.inspection import inspect_log
+from edp.logs.inspection import inspect_log, look_into
 from edp.logs.mat_layouts import LAYOUTS
-from edp.logs.quality import ChannelFacts, Finding, QualityReport, inspect
+from edp.logs.quality import ChannelFacts, ClockFacts, QualityReport, inspect
 from edp.logs.raw import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
-from edp.logs.read import find_recordings, read_data_set, read_parts, read_recording, read_truth
+from edp.logs.read import find_recordings, read_data_set, read_parts, read_recording, read_truth, unique_names
 from edp.logs.repair import Repair, split_at_gaps
+from edp.logs.repeats import Repeat, Sketch, find_repeats, sketch
 from edp.logs.write import truth_path, write_recording
 
 __all__ = [
@@ -15,19 +18,26 @@ __all__ = [
     "LAYOUTS",
     "TRUTH_PLACES",
     "ChannelFacts",
+    "ClockFacts",
+    "DataQuality",
     "Finding",
     "LogFormat",
     "QualityReport",
     "RawLog",
     "RawSignal",
     "Repair",
+    "Repeat",
+    "Sketch",
     "WriteOptions",
+    "compare",
     "csv",
     "find_recordings",
+    "find_repeats",
     "format_for",
     "inspect",
     "inspect_log",
     "known_suffixes",
+    "look_into",
     "mat",
     "mdf",
     "open_log",
@@ -37,7 +47,9 @@ __all__ = [
     "read_recording",
     "read_truth",
     "rosbag",
+    "sketch",
     "split_at_gaps",
     "truth_path",
+    "unique_names",
     "write_recording",
 ]

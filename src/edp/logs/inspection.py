@@ -8,10 +8,12 @@ import numpy as np
 
 from edp.errors import DataError, closest
 from edp.logs.assemble import assemble
+from edp.logs.checks import Finding
 from edp.logs.detect import open_log
-from edp.logs.quality import Finding, QualityReport, inspect
+from edp.logs.quality import ClockFacts, QualityReport, inspect
 from edp.logs.raw import RawLog
 from edp.logs.repair import Repair
+from edp.logs.repeats import Sketch, sketch
 from edp.logs.resolve import Wanted, resolve
 from edp.logs.timebase import Clock, judge
 from edp.recording import Recording
@@ -30,6 +32,26 @@ def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> Qualit
     Raises:
         DataError: only where the file itself cannot be read (missing, damaged, of another format).
     """
+    return look_into(path, signal_map)[0]
+
+
+def look_into(
+    path: str | Path,
+    signal_map: SignalMap | None = None,
+    name: str | None = None,
+    rows: tuple[int, int | None] | None = None,
+) -> tuple[QualityReport, Sketch | None]:
+    """As `inspect_log`, with a sketch to compare recordings by; None where no sample could be read.
+
+    Args:
+        path: a log file of a known format.
+        signal_map: as in `read_recording`.
+        name: as in `read_recording`.
+        rows: as in `read_recording`.
+
+    Raises:
+        DataError: as `inspect_log`.
+    """
     signal_map = signal_map or SignalMap()
     raw = open_log(path, signal_map)
     wanted, problems = resolve(raw, signal_map)
@@ -41,15 +63,15 @@ def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> Qualit
     findings += more
     try:
         clocks = _clocks(raw, usable, signal_map)
-        recording, _ = assemble(raw, usable, signal_map, _LENIENT)
+        recording, _ = assemble(raw, usable, signal_map, _LENIENT, (name, rows))
     except DataError as error:
         findings.append(Finding("error", None, str(error)))
-        empty = Recording(raw.path.stem, (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
-        return inspect(empty, tuple(findings), float("nan"))
-    for name, clock in clocks:
-        findings += _time_findings(name, clock)
-    jitter = max((clock.jitter for _, clock in clocks), default=0.0)
-    return inspect(recording, tuple(findings), jitter)
+        empty = Recording(name or raw.path.stem, (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
+        return inspect(empty, tuple(findings)), None
+    for signal, clock in clocks:
+        findings += _time_findings(signal, clock)
+    facts = tuple(_clock_facts(signal, clock) for signal, clock in clocks)
+    return inspect(recording, tuple(findings), facts), sketch(recording)
 
 
 def _clocks(raw: RawLog, wanted: list[Wanted], signal_map: SignalMap) -> list[tuple[str, Clock]]:
@@ -62,6 +84,13 @@ def _clocks(raw: RawLog, wanted: list[Wanted], signal_map: SignalMap) -> list[tu
         if signal is not None and signal.time_s is not None and id(signal.time_s) not in seen:
             seen[id(signal.time_s)] = (signal.name, judge(signal.time_s, f"'{raw.path}', time of '{signal.name}'"))
     return list(seen.values())
+
+
+def _clock_facts(name: str, clock: Clock) -> ClockFacts:
+    at = clock.stamps
+    longest = float((at[clock.gaps + 1] - at[clock.gaps]).max()) if len(clock.gaps) else 0.0
+    counts = len(clock.duplicates), len(clock.falling)
+    return ClockFacts(name, clock.rate_hz, clock.jitter, len(clock.gaps), longest, *counts)
 
 
 def _readable(wanted: list[Wanted]) -> tuple[list[Wanted], list[Finding]]:

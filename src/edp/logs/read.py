@@ -163,7 +163,7 @@ def read_data_set(
         recordings = _without_partial_truth(recordings)
     _check_same(recordings, files)
     rate = recordings[0].rate_hz
-    names = _unique_names([recording.name for recording in recordings], files)
+    names = unique_names([recording.name for recording in recordings], files)
     return [replace(recording, name=name, rate_hz=rate) for recording, name in zip(recordings, names)]
 
 
@@ -199,7 +199,7 @@ def _check_same(recordings: Sequence[Recording], files: Sequence[Path]) -> None:
             )
 
 
-def _unique_names(names: Sequence[str], files: Sequence[Path]) -> list[str]:
+def unique_names(names: Sequence[str], files: Sequence[Path]) -> list[str]:
     """Names as they are where unique, else with the folder in front, else numbered."""
     better = [f"{file.parent.name}/{name}" if names.count(name) > 1 else name for name, file in zip(names, files)]
     seen: dict[str, int] = {}

@@ -11,31 +11,34 @@ from plotly.offline import get_plotlyjs
 from edp.data.coverage import INTEGRATED, Coverage
 from edp.data.spectrum import FLAT_DB
 from edp.data.wanted import BEYOND, OCCUPANCY, wanted
+from edp.logs import DataQuality
 from edp.report.coverage_plots import coverage_plots
 from edp.report.page import asset, script_json
+from edp.report.quality import quality_tables
 from edp.report.tables import Table
 from edp.report.templates import template
 from edp.report.wording import MISSING, listed, number, percent, unbroken, whole
 from edp.storage import write_bytes
 
 
-def build_coverage_page(found: Coverage, output: str | Path, title: str) -> Path:
+def build_coverage_page(found: Coverage, output: str | Path, title: str, quality: DataQuality | None = None) -> Path:
     """Write what a data set covers as one HTML file that opens with no network.
 
     Args:
         found: what it covers.
         output: where to write.
         title: name of the data set.
+        quality: how good its recordings are.
 
     Raises:
         StorageError: the page cannot be written.
     """
     target = Path(output)
-    write_bytes(target, render_coverage(found, title).encode())
+    write_bytes(target, render_coverage(found, title, quality).encode())
     return target
 
 
-def render_coverage(found: Coverage, title: str) -> str:
+def render_coverage(found: Coverage, title: str, quality: DataQuality | None = None) -> str:
     """The page's text."""
     plots = coverage_plots(found)
     context: dict[str, Any] = {
@@ -49,6 +52,7 @@ def render_coverage(found: Coverage, title: str) -> str:
         "wanted": wanted_table(found),
         "specs": script_json([plot.spec() for plot in plots.values()]),
         "found": found,
+        "quality": {} if quality is None else quality_tables(quality),
         "integrated": found.occupancy is not None and found.occupancy.source == INTEGRATED,
         "activity": activity_table(found),
         "together": together_table(found),

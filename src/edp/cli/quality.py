@@ -1,0 +1,94 @@
+"""How a shell shows the quality of recordings; `edp inspect` and `edp screen` share it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edp.cli.console import Steps, out, table
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from edp.logs import DataQuality, Finding, QualityReport
+
+VERDICT_TEXTS = {
+    "good": "good: use them as they are",
+    "check": "check: read the warnings before training",
+    "unusable": "unusable as they are: training would refuse them",
+}
+
+
+class LogDisplay:
+    """Shows which log is read."""
+
+    def __init__(self, shown: Progress, steps: Steps) -> None:
+        self.shown, self.steps = shown, steps
+        self.bar = shown.add_task("read", total=1.0, note="")
+
+    def on_log(self, path: Path, number: int, count: int) -> None:
+        """Show one log."""
+        self.shown.update(self.bar, completed=(number - 1) / count, note=f"{path.name}, {number} of {count}")
+        self.steps.say(f"read: {path.name}, {number} of {count}")
+
+
+def show_report(report: QualityReport, channels: bool) -> None:
+    """Print one recording's facts and findings."""
+    out.print(
+        f"[bold]{_plain(report.name)}[/]: {report.duration_s:.1f} s, {report.rate_hz:g} Hz, {report.samples:,} samples"
+        f", verdict: {report.verdict}"
+    )
+    for clock in report.clocks:
+        gaps = f"{clock.gaps} gap(s), longest {clock.longest_gap_s:g} s" if clock.gaps else "no gaps"
+        out.print(
+            f"  time of '{_plain(clock.name)}': {clock.rate_hz:g} Hz, jitter {clock.jitter:.2g} of a step, {gaps}"
+        )
+    if channels and report.channels:
+        rows = [(c.name, c.unit, *map(_short, (c.min, c.max, c.mean, c.std)), c.missing) for c in report.channels]
+        table("", ["channel", "unit", "min", "max", "mean", "std", "missing"], rows)
+        out.print()
+        table(
+            "", ["channel", "unit", "step", "noise", "SNR, dB", "new, Hz", "stuck, s", "at ends", "verdict"],
+            [
+                (c.name, c.unit, _short(c.step), _short(c.noise, 3), _short(c.snr_db, 3), f"{c.new_hz:.4g}",
+                 f"{c.stuck_s:.3g}", f"{100 * c.at_ends:.1f} %", c.verdict)
+                for c in report.channels
+            ],
+        )  # fmt: skip
+    for finding in report.findings:
+        show_finding(finding)
+    out.print()
+
+
+def show_finding(finding: Finding) -> None:
+    """Print one finding with its advice."""
+    where = f" {finding.channel}:" if finding.channel else ""
+    place = f" ({finding.where})" if finding.where else ""
+    advice = f". {finding.advice}" if finding.advice else ""
+    out.print(_plain(f"  {finding.severity}:{where} {finding.what}{place}{advice}"))
+
+
+def show_between(quality: DataQuality) -> None:
+    """Print what shows between recordings."""
+    for finding in quality.findings:
+        show_finding(finding)
+    if quality.findings:
+        out.print()
+
+
+def verdict_text(quality: DataQuality) -> str:
+    """The last line: how many recordings, errors and repeats, and what to do."""
+    count, errors = len(quality.reports), quality.errors
+    parts = [f"{count} recording(s)", f"{errors} error(s) that training would refuse" if errors else "no errors"]
+    if quality.repeats:
+        parts.append(f"{len(quality.repeats)} repeat(s) of a session")
+    return f"{', '.join(parts)}; {VERDICT_TEXTS[quality.verdict]}"
+
+
+def _short(value: float | None, digits: int = 4) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
+
+
+def _plain(text: str) -> str:
+    return text.replace("[", r"\[")

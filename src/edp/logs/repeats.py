@@ -1,0 +1,328 @@
+"""The same session in two recordings: whole or in part, shifted, resampled, rescaled, or under other channel names.
+
+Each recording leaves a sketch at 10 Hz. Of every 12.8 s of it the first cosine coefficients, scaled to length one, are
+a fingerprint that neither offset, scale nor rate changes. Fingerprints that agree vote for a lag between two
+recordings; the lag is then checked over the whole overlap, in every channel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from edp.recording import Recording
+
+SKETCH_HZ = 10.0
+WINDOW = 128
+_HOP = 32
+_COEFFICIENTS = 12
+_NEAR = 0.15
+_NEIGHBOURS = 4
+_MOVES = 0.1
+_CHANNELS = 3
+_OWN, _OWN_UNNAMED = 2, 16
+_SAME = 0.98
+_LEAST_WINDOWS = 2
+_LEAST_SHARE = 0.5
+_SHIFTS = np.linspace(-0.5, 0.5, 5)
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """A recording at a low rate.
+
+    Attributes:
+        name: of the recording.
+        channels: names, in the order of the columns.
+        values: means over 0.1 s, each channel over its deviation about its mean, shape ``(block, channel)``.
+        hz: blocks per second; `SKETCH_HZ`, or the recording's own rate where that is lower.
+        digest: of the samples, whatever the channels are called.
+    """
+
+    name: str
+    channels: tuple[str, ...]
+    values: Floats
+    hz: float
+    digest: str
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """Two recordings that hold the same session.
+
+    Attributes:
+        first: one recording.
+        second: the other.
+        seconds: how much of it they share.
+        share: of the shorter recording.
+        first_from_s: where the shared part begins in the first.
+        second_from_s: where it begins in the second.
+        channels: how many channels agree.
+        compared: how many channels that move there could be compared.
+        correlation: median over windows and channels that agree.
+        renamed: channels that agree under another name, as (first, second).
+        identical: every sample is the same.
+    """
+
+    first: str
+    second: str
+    seconds: float
+    share: float
+    first_from_s: float
+    second_from_s: float
+    channels: int
+    compared: int
+    correlation: float
+    renamed: tuple[tuple[str, str], ...]
+    identical: bool
+
+    @property
+    def what(self) -> str:
+        """The finding in words."""
+        if self.identical:
+            return f"'{self.second}' holds the same samples as '{self.first}'"
+        names = f", {len(self.renamed)} under other names" if self.renamed else ""
+        return (
+            f"'{self.second}' from {self.second_from_s:.1f} s repeats {self.seconds:.0f} s of '{self.first}' from "
+            f"{self.first_from_s:.1f} s ({100 * self.share:.0f} % of the shorter one; correlation "
+            f"{self.correlation:.4f}, {self.channels} of {self.compared} channels{names})"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {**asdict(self), "renamed": [list(pair) for pair in self.renamed], "what": self.what}
+
+
+def sketch(recording: Recording, name: str | None = None) -> Sketch:
+    """The sketch of a recording; missing values count as the mean of their channel."""
+    rate = recording.rate_hz
+    hz = min(SKETCH_HZ, rate)
+    blocks = max(int(recording.samples * hz / rate), 1)
+    starts = np.minimum(np.ceil(np.arange(blocks) * rate / hz - 1e-9).astype(np.intp), recording.samples - 1)
+    made = np.empty((blocks, len(recording.channels)), dtype=np.float32)
+    counts = np.diff(np.append(starts, recording.samples))
+    for place in range(len(recording.channels)):
+        values = recording.values[:, place].astype(np.float64)
+        good = np.isfinite(values)
+        mean = float(values[good].mean()) if good.any() else 0.0
+        values = np.where(good, values - mean, 0.0)
+        coarse = np.add.reduceat(values, starts) / np.maximum(counts, 1)
+        std = float(coarse.std())
+        made[:, place] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
+    digest = hashlib.blake2b(np.ascontiguousarray(recording.values).tobytes(), digest_size=16).hexdigest()
+    return Sketch(name or recording.name, recording.channel_names, made, hz, digest)
+
+
+def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
+    """Pairs of recordings that hold the same session, the longest shared stretch first.
+
+    Recordings shorter than 12.8 s are compared by their samples alone. A pair counts where at least two windows agree
+    (correlation above 0.98 in at least half of the channels that move), at one lag.
+    """
+    found = {pair: _identical(*(sketches[i] for i in pair)) for pair in _equal_pairs(sketches)}
+    for pair, lag in _candidates(sketches).items():
+        if pair not in found:
+            repeat = _checked(sketches[pair[0]], sketches[pair[1]], lag)
+            if repeat is not None:
+                found[pair] = repeat
+    return tuple(sorted(found.values(), key=lambda repeat: -repeat.seconds))
+
+
+def _equal_pairs(sketches: Sequence[Sketch]) -> list[tuple[int, int]]:
+    """Each recording with the first that has the same samples."""
+    seen: dict[str, int] = {}
+    pairs = [(seen.setdefault(entry.digest, i), i) for i, entry in enumerate(sketches)]
+    return [(first, second) for first, second in pairs if first != second]
+
+
+def _identical(a: Sketch, b: Sketch) -> Repeat:
+    count = len(a.channels)
+    renamed = tuple((x, y) for x, y in zip(a.channels, b.channels, strict=True) if x != y)
+    return Repeat(a.name, b.name, len(a.values) / a.hz, 1.0, 0.0, 0.0, count, count, 1.0, renamed, True)
+
+
+def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
+    """The lag, in blocks, that most fingerprints of a pair of recordings vote for."""
+    long = [i for i, entry in enumerate(sketches) if len(entry.values) >= WINDOW + _HOP]
+    if len(long) < 2:
+        return {}
+    prints: list[Floats] = []
+    labels: list[NDArray[np.int64]] = []
+    chosen = _telling(sketches)
+    for i in long:
+        for place in chosen[i]:
+            marks, places = _fingerprints(sketches[i].values[:, place])
+            prints.append(marks)
+            labels.append(np.stack([np.full(len(places), i), places], axis=1))
+    marks, owners = np.concatenate(prints), np.concatenate(labels)
+    probes = np.flatnonzero(owners[:, 1] % _HOP == 0)
+    if not len(probes):
+        return {}
+    near, which = cKDTree(marks[probes]).query(marks, k=_NEIGHBOURS, distance_upper_bound=_NEAR)
+    asked, rank = np.nonzero(np.isfinite(near))
+    mine, theirs = owners[asked], owners[probes[which[asked, rank]]]
+    other = mine[:, 0] != theirs[:, 0]
+    return _voted(mine[other], theirs[other])
+
+
+def _voted(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> dict[tuple[int, int], int]:
+    swap = mine[:, 0] > theirs[:, 0]
+    a, b = np.where(swap[:, None], theirs, mine), np.where(swap[:, None], mine, theirs)
+    votes, counts = np.unique(np.stack([a[:, 0], b[:, 0], b[:, 1] - a[:, 1]], axis=1), axis=0, return_counts=True)
+    best: dict[tuple[int, int], tuple[int, int]] = {}
+    for (i, j, lag), count in zip(votes.tolist(), counts.tolist()):
+        if count >= _LEAST_WINDOWS and count > best.get((i, j), (0, 0))[0]:
+            best[i, j] = (count, lag)
+    return {pair: lag for pair, (_, lag) in best.items()}
+
+
+def _telling(sketches: Sequence[Sketch]) -> list[list[int]]:
+    """Columns of each recording to take fingerprints of.
+
+    First the names that move most often over all recordings, so that the same are taken of each; then the recording's
+    own liveliest: more of them where recordings share no name, so that renamed channels meet too.
+    """
+    names = [set(entry.channels) for entry in sketches]
+    own_count = _OWN if all(mine & names[0] for mine in names) else _OWN_UNNAMED
+    lively = [_lively(entry) for entry in sketches]
+    total: dict[str, float] = {}
+    for entry, shares in zip(sketches, lively):
+        for name, share in zip(entry.channels, shares):
+            total[name] = total.get(name, 0.0) + share
+    made = []
+    for entry, shares in zip(sketches, lively):
+        places = range(len(entry.channels))
+        common = sorted(places, key=lambda place: (-total[entry.channels[place]], entry.channels[place]))
+        own = sorted(places, key=lambda place: -shares[place])
+        made.append(list(dict.fromkeys([*common[:_CHANNELS], *own[:own_count]])))
+    return made
+
+
+def _lively(entry: Sketch) -> list[float]:
+    """Share of the time in which each channel is well off its last value, shape ``(channel,)``."""
+    moved = np.abs(np.diff(entry.values, axis=0)) > _MOVES / 2
+    return [float(share) for share in moved.mean(axis=0)] if len(moved) else [0.0] * len(entry.channels)
+
+
+def _fingerprints(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Fingerprints of every window in which the channel moves, shape ``(window, 12)``, and where they begin."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW)
+    phase = np.pi * (np.arange(WINDOW) + 0.5) / WINDOW
+    basis = np.cos(np.outer(phase, np.arange(1, _COEFFICIENTS + 1))) * np.sqrt(2.0 / WINDOW)
+    marks = windows @ basis.astype(np.float32)
+    size = np.linalg.norm(marks, axis=1)
+    # The channel's own deviation is one.
+    kept = np.flatnonzero(size > _MOVES * WINDOW**0.5)
+    return marks[kept] / size[kept, None], kept
+
+
+def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
+    """The repeat at a lag (block k of `a` is block k + `lag` of `b`), or None where the recordings do not agree."""
+    if abs(a.hz - b.hz) > 1e-6:
+        return None
+    start = max(0, -lag)
+    stop = min(len(a.values), len(b.values) - lag)
+    count = (stop - start - 1) // WINDOW
+    if count < 1:
+        return None
+    start += max(1 - (start + lag), 0)  # a fraction of a block is read before the first
+    count = (stop - start - 1) // WINDOW
+    pairs = _pairs(a, b, slice(start, stop), lag)
+    if count < 1 or not pairs:
+        return None
+    mine = _windows(a.values[start : start + count * WINDOW, [i for i, _ in pairs]])
+    columns = b.values[:, [j for _, j in pairs]]
+    rows = np.arange(start + lag, start + lag + count * WINDOW)
+    best: tuple[float, NDArray[np.float64]] | None = None
+    for shift in _SHIFTS:
+        theirs = _windows((1 - abs(shift)) * columns[rows] + abs(shift) * columns[rows + int(np.sign(shift))])
+        alike = _alike(mine, theirs)
+        score = float(np.nanmedian(alike)) if np.isfinite(alike).any() else -1.0
+        if best is None or score > best[0]:
+            best = (score, alike)
+    return None if best is None else _judged(a, b, lag, start, pairs, best[1])
+
+
+def _judged(
+    a: Sketch, b: Sketch, lag: int, start: int, pairs: list[tuple[int, int]], alike: NDArray[np.float64]
+) -> Repeat | None:
+    """A repeat from the correlations by window and channel, shape ``(window, channel)``, NaN where neither moves."""
+    moves = np.isfinite(alike)
+    agree = np.where(moves, alike, 0.0) > _SAME
+    moving = moves.sum(axis=1)
+    same = (moving > 0) & (agree.sum(axis=1) >= np.maximum(_LEAST_SHARE * moving, 1))
+    if same.sum() < _LEAST_WINDOWS:
+        return None
+    hit = np.flatnonzero(same)
+    compared = moves[hit].any(axis=0)
+    kept = agree[hit].sum(axis=0) >= 0.5 * np.maximum(moves[hit].sum(axis=0), 1)
+    if kept.sum() < max(_LEAST_SHARE * compared.sum(), 1):
+        return None
+    begins = start + int(hit[0]) * WINDOW
+    ends = start + (int(hit[-1]) + 1) * WINDOW
+    if int(hit[0]) == 0 or not moving[: int(hit[0])].any():
+        begins = max(0, -lag)
+    stop = min(len(a.values), len(b.values) - lag)
+    if stop - ends < WINDOW:
+        ends = stop
+    apart = int((moving[hit[0] : hit[-1] + 1] > 0).sum()) - len(hit)
+    shared = ends - begins - apart * WINDOW
+    renamed = tuple(
+        (a.channels[i], b.channels[j]) for (i, j), held in zip(pairs, kept) if held and a.channels[i] != b.channels[j]
+    )
+    return Repeat(
+        a.name,
+        b.name,
+        shared / a.hz,
+        min(1.0, shared / min(len(a.values), len(b.values))),
+        begins / a.hz,
+        (begins + lag) / b.hz,
+        int((kept & compared).sum()),
+        int(compared.sum()),
+        float(np.median(alike[hit][agree[hit]])),
+        renamed,
+        False,
+    )
+
+
+def _pairs(a: Sketch, b: Sketch, rows: slice, lag: int) -> list[tuple[int, int]]:
+    """Columns of the same name, or where no name is shared, those that agree best at the lag, each once."""
+    shared = [(i, b.channels.index(name)) for i, name in enumerate(a.channels) if name in b.channels]
+    if shared:
+        return shared
+    mine, theirs = a.values[rows], b.values[rows.start + lag : rows.stop + lag]
+    sizes = np.outer(mine.std(axis=0), theirs.std(axis=0))
+    products = (mine - mine.mean(axis=0)).T @ (theirs - theirs.mean(axis=0)) / len(mine)
+    alike = np.where(sizes > 1e-6, products / np.maximum(sizes, 1e-6), -1.0)
+    pairs = []
+    for _ in range(min(alike.shape)):
+        i, j = (int(k) for k in np.unravel_index(int(np.argmax(alike)), alike.shape))
+        if alike[i, j] < _SAME - 0.03:
+            break
+        pairs.append((i, j))
+        alike[i, :], alike[:, j] = -1.0, -1.0
+    return pairs
+
+
+def _windows(values: Floats) -> NDArray[np.float64]:
+    """Shape ``(window, sample, channel)``, each window about its mean."""
+    made = values.reshape(-1, WINDOW, values.shape[1]).astype(np.float64)
+    return made - made.mean(axis=1, keepdims=True)
+
+
+def _alike(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correlation by window and channel, shape ``(window, channel)``; NaN where neither moves."""
+    sizes = np.sqrt((mine**2).mean(axis=1)), np.sqrt((theirs**2).mean(axis=1))
+    moves = np.maximum(*sizes) > _MOVES
+    products = (mine * theirs).mean(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        alike = products / np.maximum(sizes[0] * sizes[1], 1e-12)
+    return np.where(moves, alike, np.nan)
