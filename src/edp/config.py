@@ -71,6 +71,8 @@ class FeatureSettings:
     channels: tuple[str, ...] = ()
     derived: tuple[Derived, ...] = ()
     hidden: tuple[str, ...] = ()
+    starting: tuple[str, ...] = ()
+    starting_ticks: int = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +99,7 @@ class TaskSettings:
         """The task for recordings of `rate_hz` with these channels, with what a physics base reads beside them."""
         chosen = self.features
         if isinstance(chosen, FeatureSettings):
-            features = FeatureSet(chosen.name, chosen.channels, chosen.derived, chosen.hidden)
+            features = FeatureSet(**{field.name: getattr(chosen, field.name) for field in fields(chosen)})
         elif chosen == "all":
             features = FeatureSet("all", tuple(channels))
         elif chosen in FEATURE_SETS:

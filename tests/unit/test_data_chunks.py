@@ -58,6 +58,23 @@ def test_chunks_give_each_sample_one_loss_but_for_the_burn_in_at_the_start(case)
         assert seen == list(range(seen[0], n - max(horizons)))
 
 
+@pytest.mark.parametrize(("samples", "lanes"), [(300, 8), (5000, 4)])
+def test_streams_start_anew_as_often_as_asked_and_short_data_fill_all_lanes(samples, lanes):
+    parts = [series(0, samples)]
+    spec = ChunkSpec(length=40, batch=lanes, burn_in=5, carried=2)
+    batches = list(ChunkSampler(parts, [0], spec, seed=1).epoch(0))
+    counts = rows_with_a_loss(batches, parts, [0])
+    assert {row for _, row in counts} >= set(range(45, samples))
+    assert batches[0].reset.all()
+    assert batches[0].valid.any(axis=1).all()  # no lane idles
+    for before, after in pairwise(batches):
+        assert not (before.reset & after.reset & after.valid.any(axis=1) & before.valid.all(axis=1)).any()
+    ages = np.zeros(lanes)
+    for batch in batches:
+        ages = np.where(batch.reset, 1, ages + 1)
+        assert ages.max() <= 2
+
+
 @settings(max_examples=25, deadline=None)
 @given(case=CASES)
 def test_lanes_are_unbroken_between_resets_and_losses_wait_for_the_burn_in(case):

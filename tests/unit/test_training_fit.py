@@ -266,3 +266,48 @@ def test_zero_threads_means_all_cores():
 def test_a_missing_device_is_named(tiny, tiny_model, tiny_training):
     with pytest.raises(ConfigError, match="no CUDA device is present"):
         fit(tiny, tiny_model, dataclasses.replace(tiny_training, device="cuda"))
+
+
+def test_a_refit_trains_on_all_stretches_for_the_epochs_that_were_best(tiny, tiny_model, tiny_training):
+    spec = dataclasses.replace(tiny_training, epochs=2)
+    first = fit(tiny, tiny_model, spec)
+    best = max(row["epoch"] for row in first.history if row["best"])
+    events = []
+    again = fit(tiny, tiny_model, dataclasses.replace(spec, refit=True), on_event=events.append)
+    assert again.history == [dict(row, seconds=again.history[i]["seconds"]) for i, row in enumerate(first.history)]
+    assert {event.epochs for event in events if event.refit} == {best}
+    assert all(event.row is None for event in events if event.refit)
+    # The same as a training on all stretches with the scaler of the first; the tiny task gets better with each epoch.
+    assert best == spec.epochs
+    joined = dataclasses.replace(tiny, train=[*tiny.train, *tiny.validation])
+    object.__setattr__(joined, "scaler", tiny.scaler)
+    for mine, theirs in zip(
+        again.predictor.parameters(), fit(joined, tiny_model, spec).predictor.parameters(), strict=True
+    ):
+        assert torch.equal(mine, theirs)
+    for mine, theirs in zip(again.predictor.parameters(), first.predictor.parameters(), strict=True):
+        assert not torch.equal(mine, theirs)
+
+
+def test_a_refit_keeps_the_calibration_of_the_first_training(tiny, tiny_model, tiny_training):
+    model = dataclasses.replace(tiny_model, output=OUTPUTS["laplace"]())
+    spec = dataclasses.replace(tiny_training, epochs=2, loss=LOSSES["heteroscedastic"]())
+    first, again = fit(tiny, model, spec), fit(tiny, model, dataclasses.replace(spec, refit=True))
+    held, kept = first.predictor.output.state_dict(), again.predictor.output.state_dict()
+    assert held
+    assert all(torch.equal(held[name], kept[name]) for name in held)
+
+
+def test_a_refit_that_diverges_leaves_the_first_training(tiny, tiny_model, tiny_training):
+    broken = dataclasses.replace(tiny.validation[0], targets=tiny.validation[0].targets.copy())
+    spec = dataclasses.replace(tiny_training, epochs=2, refit=True)
+    first = fit(tiny, tiny_model, dataclasses.replace(spec, refit=False))
+
+    def on_event(event):
+        if event.epoch == spec.epochs and event.row is not None:
+            broken.targets[50:] = np.inf  # from now on the validation stretch, which the refit trains on, is bad
+
+    with pytest.raises(Diverged, match="this was the refit; the weights of the first training are kept") as end:
+        fit(dataclasses.replace(tiny, validation=[broken]), tiny_model, spec, on_event=on_event)
+    for mine, theirs in zip(end.value.fitted.predictor.parameters(), first.predictor.parameters(), strict=True):
+        assert torch.equal(mine, theirs)

@@ -228,3 +228,17 @@ def test_run_keys_depend_on_settings_and_data_and_not_on_their_order():
     key = run_key({"a": 1, "b": [2]}, "d")
     assert key == run_key({"b": [2], "a": 1}, "d")
     assert len({key, run_key({"a": 1, "b": [3]}, "d"), run_key({"a": 1, "b": [2]}, "e")}) == 3
+
+
+@pytest.mark.parametrize("stop", [(False, 2), (True, 1)])
+def test_a_stopped_refit_goes_on_to_the_same_bits(stop, tmp_path, tiny, tiny_model, tiny_training):
+    spec = dataclasses.replace(tiny_training, epochs=3, refit=True)
+
+    def on_event(event):
+        if (event.refit, event.update) == (stop[0], event.updates) and event.epoch == stop[1]:
+            raise Stop
+
+    with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+        fit(tiny, tiny_model, spec, (folder, KEY), on_event)
+    with RunFolder(tmp_path) as folder:
+        assert_same(fit(tiny, tiny_model, spec, (folder, KEY)), fit(tiny, tiny_model, spec))

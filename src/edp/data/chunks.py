@@ -26,6 +26,8 @@ class ChunkSpec:
         burn_in: samples after a reset that give no loss (chunk regime).
         consecutive: windows that end at consecutive samples and are drawn together, for terms of the loss that
             compare neighbours (window regime).
+        carried: chunks that a stream is carried on before it starts anew (chunk regime); where the data do not fill
+            all lanes they are walked again, cut elsewhere. 0: at least 8, and at most an even share of a lane.
 
     Raises:
         ConfigError: a value out of range.
@@ -36,6 +38,7 @@ class ChunkSpec:
     batch: int = 16
     burn_in: int = 50
     consecutive: int = 1
+    carried: int = 0
 
     def __post_init__(self) -> None:
         if self.regime not in ("chunk", "window"):
@@ -49,6 +52,16 @@ class ChunkSpec:
             raise ConfigError(
                 f"chunks: consecutive = {self.consecutive}, batch = {self.batch}; consecutive of at least 1 and a "
                 "batch that is a multiple of it must hold"
+            )
+        if self.carried < 0 or (self.carried and self.regime == "window"):
+            raise ConfigError(
+                f"chunks: carried = {self.carried} with regime = '{self.regime}'; at least 0, and 0 for windows, which "
+                "all start anew, must hold"
+            )
+        if self.carried and self.carried * self.length <= self.burn_in:
+            raise ConfigError(
+                f"chunks: carried = {self.carried} chunks of {self.length} ticks are no longer than burn_in = "
+                f"{self.burn_in}, so no tick would have a loss; make one of them longer"
             )
         if self.consecutive > 1 and self.regime == "chunk":
             raise ConfigError(
@@ -129,17 +142,10 @@ class ChunkSampler:
         length, lanes = self.spec.length, self.spec.batch
         total = sum(part.samples for part in self.series)
         # At least a few chunks per piece, so that burn-in stays a small share; at most an even share of a lane.
-        piece = max(8, -(-total // (lanes * length * 4))) * length
-        pieces = []
-        for i in rng.permutation(len(self.series)):
-            samples = self.series[i].samples
-            start = int(rng.integers(0, min(length, max(1, samples // 8))))
-            while start < samples - self.spec.burn_in - max(self.horizons):
-                rest = -(-(samples - start) // length) * length
-                size = min(piece, rest)
-                pieces.append((int(i), start, start + size))
-                # The next piece overlaps by the burn-in, so that every sample gets a loss.
-                start += size - self.spec.burn_in if size < rest else size
+        piece = (self.spec.carried or max(8, -(-total // (lanes * length * 4)))) * length
+        pieces = list(self._pieces(rng, piece))
+        while self.spec.carried and len(pieces) < lanes:  # Short data are walked again, cut elsewhere.
+            pieces += self._pieces(rng, piece)
         queue = [pieces[i] for i in rng.permutation(len(pieces))]
         plan: list[list[tuple[int, int, int]]] = [[] for _ in range(lanes)]
         load = np.zeros(lanes, dtype=np.int64)
@@ -148,6 +154,19 @@ class ChunkSampler:
             plan[lane].append(entry)
             load[lane] += entry[2] - entry[1]
         return [[lane[i] for i in rng.permutation(len(lane))] for lane in plan]
+
+    def _pieces(self, rng: np.random.Generator, piece: int) -> Iterator[tuple[int, int, int]]:
+        """All series cut into pieces of `piece` ticks."""
+        length = self.spec.length
+        for i in rng.permutation(len(self.series)):
+            samples = self.series[i].samples
+            start = int(rng.integers(0, min(length, max(1, samples // 8))))
+            while start < samples - self.spec.burn_in - max(self.horizons):
+                rest = -(-(samples - start) // length) * length
+                size = min(piece, rest)
+                yield int(i), start, start + size
+                # The next piece overlaps by the burn-in, so that every sample gets a loss.
+                start += size - self.spec.burn_in if size < rest else size
 
     def _lanes(self, rng: np.random.Generator, number: int) -> Iterator[Batch]:
         length, burn_in = self.spec.length, self.spec.burn_in

@@ -13,6 +13,9 @@ from edp.recording import FloatArray, Recording
 from edp.registry import Registry
 from edp.signals import TABLE_A1, VOCABULARY, Kind
 
+STARTING = "starting"
+"""The feature that tells a network whether channels of the start are read at this tick."""
+
 Derivation = Callable[[Any, Any, float], Any]
 """(value now, value one tick before, rate in Hz) to the derived value; the same code serves arrays and tensors."""
 
@@ -53,35 +56,49 @@ class FeatureSet:
         channels: logged channels, in order; these are the inputs of a bundle, in SI units.
         derived: channels computed inside the predictor, appended in order.
         hidden: logged channels that only serve as sources of derived ones; inputs, but not features.
+        starting: logged channels that are read in the first ticks after a reset only, so that a free run starts from
+            a measured state; with them comes the feature `STARTING`, 1 while they are read and 0 from then on.
+        starting_ticks: how many ticks they are read.
     """
 
     name: str
     channels: tuple[str, ...]
     derived: tuple[Derived, ...] = ()
     hidden: tuple[str, ...] = ()
+    starting: tuple[str, ...] = ()
+    starting_ticks: int = 5
 
     def __post_init__(self) -> None:
-        names = [*self.channels, *self.hidden, *(d.name for d in self.derived)]
+        names = [*self.channels, *self.starting, *self.hidden, *(d.name for d in self.derived)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ConfigError(f"feature set '{self.name}' names {', '.join(twice)} twice; keep one entry each")
         if not self.channels and not self.derived:
             raise ConfigError(f"feature set '{self.name}' is empty; give it at least one channel")
+        if self.starting_ticks < 1:
+            raise ConfigError(
+                f"feature set '{self.name}': starting_ticks = {self.starting_ticks}; at least 1 must hold"
+            )
         for entry in self.derived:
-            if entry.source not in self.inputs:
+            if entry.source not in self.channels + self.hidden:
                 raise ConfigError(
-                    f"feature set '{self.name}': derived '{entry.name}' reads '{entry.source}', which is not an input; "
-                    "add it to channels, or to hidden if the network should not see it"
+                    f"feature set '{self.name}': derived '{entry.name}' reads '{entry.source}', which is not an input "
+                    "at every tick; add it to channels, or to hidden if the network should not see it"
                 )
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Logged channels that must be fed at each tick."""
-        return self.channels + self.hidden
+        """Logged channels that are fed at each tick; those of `starting` count in the first ticks only."""
+        return self.channels + self.hidden + self.starting
 
     @property
     def features(self) -> tuple[str, ...]:
-        """What the network sees: channels, then derived ones."""
+        """What the network sees: channels, derived ones, then those of the start."""
+        return self.lasting + self.starting + ((STARTING,) if self.starting else ())
+
+    @property
+    def lasting(self) -> tuple[str, ...]:
+        """Features that are known at every tick."""
         return self.channels + tuple(entry.name for entry in self.derived)
 
 

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from edp.data.features import kind_of
+from edp.data.features import STARTING, kind_of
 from edp.data.scaling import Scaler, fit_scaler
 from edp.data.series import Series
 from edp.data.splits import SplitSpec, Stretch
@@ -78,7 +78,9 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
         validation=series(parts.validation),
         test=series(parts.test),
         inputs=tuple(first.channels[first.index(name)] for name in task.inputs),
-        feature_kinds=tuple(kind_of(name, first, task.derived) for name in task.features.features),
+        feature_kinds=tuple(
+            Kind.GENERIC if name == STARTING else kind_of(name, first, task.derived) for name in task.features.features
+        ),
         target_kinds=task.kinds(first),
         descriptions=tuple(_description(first, name) for name in task.targets),
         digest=state.hexdigest(),

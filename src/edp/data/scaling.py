@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.features import derive
+from edp.data.features import STARTING, derive
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.signals import KINDS, Kind
@@ -38,11 +38,14 @@ class Scaler:
 
 
 def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
-    """Features of a whole stretch, ``(time, feature)``: logged channels, then derived ones."""
+    """Features of a whole stretch, ``(time, feature)``, those of the start as if they were read at every tick."""
     inputs = task.features.inputs
     columns = [series.inputs[:, i] for i in range(len(task.features.channels))]
     for entry in task.features.derived:
         columns.append(derive(entry, series.inputs[:, inputs.index(entry.source)], task.rate_hz))
+    if task.features.starting:
+        columns += [series.inputs[:, inputs.index(name)] for name in task.features.starting]
+        columns.append(np.ones(series.samples, dtype=np.float32))
     return np.stack(columns, axis=1)
 
 
@@ -61,7 +64,8 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
         facts = KINDS[kind]
         if std[i] <= CONSTANT * facts.nominal:
             scale[i] = facts.nominal
-            constant.append(task.features.features[i])
+            if task.features.features[i] != STARTING:
+                constant.append(task.features.features[i])
         elif facts.bounded:
             offset[i], scale[i] = (low[i] + high[i]) / 2, (high[i] - low[i]) / 2
     target_offset = np.zeros((len(task.horizons), len(task.targets)))

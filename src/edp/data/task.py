@@ -57,13 +57,13 @@ class Task:
             raise ConfigError(
                 f"task: horizons = {list(self.horizons)}; samples >= 0, increasing, each once, at least one"
             )
-        blind = [name for name in self.targets if name not in self.features.features]
+        blind = [name for name in self.targets if name not in self.features.lasting]
         if self.mode is TargetMode.DELTA and blind:
             raise ConfigError(
                 f"task: mode = 'delta' predicts the change from the present value, but {', '.join(blind)} is not a "
-                f"feature{closest(blind[0], self.features.features)}; add it to the features or set mode = 'absolute'"
+                f"feature{closest(blind[0], self.features.lasting)}; add it to the features or set mode = 'absolute'"
             )
-        seen = [name for name in self.targets if name in self.features.features]
+        seen = [name for name in self.targets if name in self.features.lasting]
         if 0 in self.horizons and seen:
             raise ConfigError(
                 f"task: horizon 0 asks for the present value of {', '.join(seen)}, which is also a feature; "
@@ -96,7 +96,7 @@ class Task:
     @property
     def present(self) -> tuple[int | None, ...]:
         """For each target the feature column that holds its present value, None where it is not measured."""
-        names = self.features.features
+        names = self.features.lasting
         return tuple(names.index(target) if target in names else None for target in self.targets)
 
     def kinds(self, recording: Recording | None = None) -> tuple[Kind, ...]:

@@ -95,6 +95,8 @@ def judge(
         predictions[name] = [baseline.predict(series) for series in known["test"]]
         names[name], times[name] = baseline.label, time.perf_counter() - began
     skip = predictor.spec.window if spec.skip is None else spec.skip
+    if data.task.features.starting:  # While the start is read there is nothing to predict.
+        skip = max(skip, data.task.features.starting_ticks)
     ruler = _Ruler(data, skip)
     models = {
         name: {"label": names[name], "seconds": times[name], **ruler.measure(predicted)}
@@ -109,11 +111,17 @@ def judge(
 
 def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     """The baselines' task: present values only where an input measures them, or a feature derived from one."""
-    inputs = (*data.task.features.inputs, *_derived_targets(data))
+    inputs = (*_lasting(data), *_derived_targets(data))
     present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
     longest = min(series.samples for series in [*data.train, *data.test]) - data.task.reach - 1
     history = max(1, min(spec.history, longest // 2))
     return BaselineTask(horizons=data.task.horizons, present=present, history=history, seed=spec.seed)
+
+
+def _lasting(data: Prepared) -> tuple[str, ...]:
+    """What baselines read: neither channels of the start nor what only a physics base reads; both come last."""
+    features = data.task.features
+    return features.inputs[: len(features.inputs) - len(features.starting)]
 
 
 def _derived_targets(data: Prepared) -> list[str]:
@@ -124,10 +132,9 @@ def _derived_targets(data: Prepared) -> list[str]:
 def _with_derived_targets(data: Prepared, parts: Sequence[Series]) -> list[Series]:
     """Inputs as the baselines read them: where the network knows a target's present value, so must they."""
     names = _derived_targets(data)
-    if not names and not data.task.physics:
+    own = len(_lasting(data))
+    if not names and own == len(data.task.inputs):
         return list(parts)
-    # Baselines do not read what only a physics base reads.
-    own = len(data.task.features.inputs)
     columns = [data.task.features.features.index(name) for name in names]
     return [
         replace(

@@ -17,6 +17,7 @@ class FrontEnd(Streaming):
     Maps inputs ``(batch, time, input)`` in SI units to physical features ``(batch, time, feature)``; `scale` gives
     the standardised ones. State: the previous tick's inputs and whether there was one; at the first tick after a
     reset every derived value is 0. Inputs of the physics base follow those of the features and are passed over.
+    Channels of the start have their mean from `starting_ticks` on, whatever is fed; the state then counts the ticks.
     """
 
     offset: Tensor
@@ -29,6 +30,9 @@ class FrontEnd(Streaming):
         self.inputs = len(task.inputs)
         self.sources = len(inputs)
         self.rate_hz = task.rate_hz
+        self.starting = [inputs.index(name) for name in task.features.starting]
+        self.starting_ticks = task.features.starting_ticks if self.starting else 1
+        self.lasting = len(task.features.lasting)
         self.derived = [(DERIVATIONS[entry.how], inputs.index(entry.source)) for entry in task.features.derived]
         self.register_buffer("offset", torch.tensor(scaler.feature_offset, dtype=torch.get_default_dtype()))
         self.register_buffer("width", torch.tensor(scaler.feature_scale, dtype=torch.get_default_dtype()))
@@ -37,14 +41,22 @@ class FrontEnd(Streaming):
         return like.new_zeros(batch, 1, self.sources), like.new_zeros(batch, 1, 1)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        previous, seen = state
+        previous, age = state
         x = x[..., : self.sources]
-        first = torch.where(seen > 0.5, previous, x[:, :1])
+        first = torch.where(age > 0.5, previous, x[:, :1])
         before = torch.cat([first, x[:, :-1]], dim=1)
         columns = [x[..., : self.logged]]
         for how, source in self.derived:
             columns.append(how(x[..., source], before[..., source], self.rate_hz).unsqueeze(-1))
-        return torch.cat(columns, dim=-1), (x[:, -1:], torch.ones_like(seen))
+        if self.starting:
+            columns += self._start(x[..., self.starting], age)
+        return torch.cat(columns, dim=-1), (x[:, -1:], (age + x.shape[1]).clamp(max=self.starting_ticks))
+
+    def _start(self, x: Tensor, age: Tensor) -> list[Tensor]:
+        """Channels of the start ``(batch, time, channel)``, and whether they are read at a tick."""
+        read = age + torch.arange(x.shape[1], device=x.device).view(1, -1, 1) < self.starting_ticks
+        mean = self.offset[self.lasting : self.lasting + len(self.starting)]
+        return [torch.where(read, x, mean), read.to(x)]
 
     def scale(self, features: Tensor) -> Tensor:
         """Standardised features."""

@@ -105,6 +105,8 @@ def task_to_plain(task: Task) -> Plain:
             "channels": list(features.channels),
             "hidden": list(features.hidden),
             "derived": [options(entry) for entry in features.derived],
+            "starting": list(features.starting),
+            "starting_ticks": features.starting_ticks,
         },
         "targets": list(task.targets),
         "horizons": list(task.horizons),
@@ -125,7 +127,12 @@ def task_from_plain(plain: Mapping[str, Any]) -> Task:
     try:
         held = plain["features"]
         features = FeatureSet(
-            held["name"], tuple(held["channels"]), tuple(map(_derived, held["derived"])), tuple(held["hidden"])
+            name=held["name"],
+            channels=tuple(held["channels"]),
+            derived=tuple(map(_derived, held["derived"])),
+            hidden=tuple(held["hidden"]),
+            starting=tuple(held.get("starting", ())),
+            starting_ticks=held.get("starting_ticks", 5),
         )
         return Task(
             features=features,

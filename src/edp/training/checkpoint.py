@@ -17,6 +17,7 @@ from edp.storage import write_bytes
 from edp.training.schedules import ScheduleState
 
 FILE = "checkpoint.safetensors"
+REFIT = "refit.safetensors"
 
 
 @dataclass
@@ -43,7 +44,7 @@ class Weights:
 
 
 def save_checkpoint(
-    folder: Path, key: str, progress: Progress, weights: Weights, optimizer: torch.optim.Optimizer
+    path: Path, key: str, progress: Progress, weights: Weights, optimizer: torch.optim.Optimizer
 ) -> None:
     """Write the checkpoint atomically; an earlier one stays until the new one is whole."""
     tensors = {"running": weights.running.detach().cpu().contiguous()}
@@ -53,16 +54,15 @@ def save_checkpoint(
     structure = {"state": _strip(state["state"], "optimizer", tensors), "param_groups": state["param_groups"]}
     header = {"key": key, "progress": asdict(progress), "optimizer": structure}
     data = save(tensors, metadata={"edp": json.dumps(header)})
-    write_bytes(folder / FILE, data)
+    write_bytes(path, data)
 
 
-def load_checkpoint(folder: Path, key: str) -> tuple[Progress, Weights, dict[str, Any]] | None:
+def load_checkpoint(path: Path, key: str) -> tuple[Progress, Weights, dict[str, Any]] | None:
     """Progress, weights and optimiser state of the run `key`, or None where there is no checkpoint yet.
 
     Raises:
         StorageError: the file is damaged or belongs to another run.
     """
-    path = folder / FILE
     if not path.exists():
         return None
     try:

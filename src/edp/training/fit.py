@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from edp.errors import ConfigError, DataError, EdpError
 from edp.models.predictor import ModelSpec, Predictor, build_model, trainable
 from edp.runs import RunFolder
 from edp.streaming import State, detach_state, reset_where
-from edp.training.checkpoint import Progress, Weights, load_checkpoint, save_checkpoint
+from edp.training.checkpoint import FILE, REFIT, Progress, Weights, load_checkpoint, save_checkpoint
 from edp.training.objective import Objective
 from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, check_training
@@ -39,6 +39,7 @@ class Event:
     targets_per_s: float
     seconds_left: float
     row: dict[str, Any] | None = None
+    refit: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,17 @@ def fit(
         Diverged: the loss is not finite any more; it carries the best weights before that.
     """
     torch.set_num_threads(thread_count(spec))
-    return _Loop(data, model, spec, run).fit(on_event or (lambda event: None))
+    tell = on_event or (lambda event: None)
+    fitted = _Loop(data, model, spec, run).fit(tell)
+    best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
+    if not spec.refit or not best:
+        return fitted
+    try:
+        again = _Loop(data, model, spec, run, fitted.history[:best]).fit(tell)
+    except Diverged as end:
+        raise Diverged(str(end), fitted, end.facts) from end
+    again.predictor.output.load_state_dict(fitted.predictor.output.state_dict())
+    return replace(again, history=fitted.history, seconds=fitted.seconds + again.seconds)
 
 
 def thread_count(spec: TrainingSpec) -> int:
@@ -106,13 +117,27 @@ def thread_count(spec: TrainingSpec) -> int:
 
 
 class _Loop:
-    """One training: the net, its average, the optimiser, and where it stands."""
+    """One training: the net, its average, the optimiser, and where it stands.
 
-    def __init__(self, data: Prepared, model: ModelSpec, spec: TrainingSpec, run: tuple[RunFolder, str] | None) -> None:
-        self.data, self.spec, self.run = data, spec, run
+    Where `refitted` holds the rows of an earlier training, all stretches train, for as many epochs as there are rows;
+    what the earlier one validated stands for what cannot be validated any more.
+    """
+
+    def __init__(
+        self,
+        data: Prepared,
+        model: ModelSpec,
+        spec: TrainingSpec,
+        run: tuple[RunFolder, str] | None,
+        refitted: list[dict[str, Any]] | None = None,
+    ) -> None:
+        self.data, self.spec, self.run, self.refitted = data, spec, run, refitted
+        self.epochs = spec.epochs if refitted is None else len(refitted)
+        self.file = run[0].path / (FILE if refitted is None else REFIT) if run else None
         self.device = _device(spec.device)
         check_training(data.task, model, spec)
-        self.sampler = ChunkSampler(data.train, data.task.horizons, spec.chunks, spec.seed, spec.augmentations)
+        known = data.train if refitted is None else [*data.train, *data.validation]
+        self.sampler = ChunkSampler(known, data.task.horizons, spec.chunks, spec.seed, spec.augmentations)
         for part in data.validation:
             if part.samples <= spec.chunks.burn_in + data.task.reach:
                 raise DataError(
@@ -135,14 +160,16 @@ class _Loop:
         self.progress = Progress()
         self.objective = Objective(spec, self.net.code)
         self.updates = spec.updates or max(1, self.sampler.updates())
-        if started:  # The regression is a candidate itself: training must improve on it to be kept.
+        if (
+            started and refitted is None
+        ):  # The regression is a candidate itself: training must improve on it to be kept.
             self.progress.best_score = self._validate()[0]
 
     def fit(self, on_event: Callable[[Event], None]) -> Fitted:
         self._resume()
         self.resumed_at, self.rate = self.progress.epoch, 0.0
         seen, busy = 0, 0.0
-        while self.progress.epoch < self.spec.epochs and not self._stalled():
+        while self.progress.epoch < self.epochs and not self._stalled():
             began = time.perf_counter()
             loss, targets = self._epoch(on_event)
             busy += time.perf_counter() - began
@@ -157,14 +184,16 @@ class _Loop:
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.best[name])
-        if self.net.spec.output.calibrated:
+        if self.net.spec.output.calibrated and self.refitted is None:
             calibrate(self.net, self.data.validation, self.spec)
         return Fitted(self.net.eval(), self.progress.history, self.progress.seconds, self.rate, self.resumed_at)
 
     def _diverged(self, what: str, value: float) -> Diverged:
         progress = self.progress
         kept = [row for row in progress.history if row["epoch"] == progress.best_epoch]
-        if kept:
+        if self.refitted is not None:
+            saved = "this was the refit; the weights of the first training are kept"
+        elif kept:
             saved = (
                 f"the weights of epoch {progress.best_epoch} (validation MAE {kept[0]['validation_mae']:.4g}) are kept"
             )
@@ -185,7 +214,7 @@ class _Loop:
         )
 
     def _resume(self) -> None:
-        held = load_checkpoint(self.run[0].path, self.run[1]) if self.run else None
+        held = load_checkpoint(self.file, self.run[1]) if self.run and self.file else None
         if held is None:
             return
         self.progress, weights, optimizer = held
@@ -199,7 +228,7 @@ class _Loop:
 
     def _stalled(self) -> bool:
         waited = self.progress.epoch - self.progress.best_epoch
-        return 0 < self.spec.patience <= waited and self.spec.average.may_stop()
+        return self.refitted is None and 0 < self.spec.patience <= waited and self.spec.average.may_stop()
 
     def _batches(self) -> Iterator[Batch]:
         """Exactly `updates` batches; the order depends on the seed and the epoch alone."""
@@ -265,36 +294,52 @@ class _Loop:
         with torch.no_grad():
             torch._foreach_lerp_(targets, self.all, step)
 
-    def _close_epoch(self, loss: float, seconds: float) -> dict[str, Any]:
+    def _close_epoch(self, loss: float, seconds: float) -> dict[str, Any] | None:
+        """Validate and choose after an epoch, and keep where the training stands; the row of its history."""
+        progress = self.progress
+        row = None
+        if self.refitted is None:
+            row = self._judge_epoch(loss)
+        else:
+            score = self.refitted[progress.epoch]["validation_score"]
+            progress.best_score, progress.best_epoch = score, progress.epoch + 1
+            self.best = {name: tensor.clone() for name, tensor in self.average.items()}
+            self.spec.schedule.observe(score, progress.schedule)
+        progress.epoch += 1
+        progress.seconds += seconds
+        if row is not None:
+            row["seconds"] = round(progress.seconds, 3)
+            progress.history.append(row)
+        if self.run and self.file:
+            weights = Weights(dict(self.net.named_parameters()), self.average, self.best, self.objective.running)
+            save_checkpoint(self.file, self.run[1], progress, weights, self.optimizer)
+            if row is not None:
+                self.run[0].write_history(progress.history)
+        return row
+
+    def _judge_epoch(self, loss: float) -> dict[str, Any]:
+        """Validate the averaged weights and keep them where they are the best so far."""
         progress = self.progress
         score, report, validation_loss = self._validate()
         for what, value in (("score", score), ("loss", validation_loss)):
             if not math.isfinite(value):
                 raise self._diverged(f"the validation {what}", value)
-        progress.epoch += 1
-        progress.seconds += seconds
         better = score < progress.best_score
         if better:
-            progress.best_score, progress.best_epoch = score, progress.epoch
+            progress.best_score, progress.best_epoch = score, progress.epoch + 1
             self.best = {name: tensor.clone() for name, tensor in self.average.items()}
         self.spec.schedule.observe(score, progress.schedule)
-        row = {
-            "epoch": progress.epoch,
+        return {
+            "epoch": progress.epoch + 1,
             "updates": progress.updates,
             "train_loss": loss,
             "validation_loss": validation_loss,
             "validation_score": score,
             "validation_mae": report,
             "learning_rate": self.optimizer.param_groups[0]["lr"],
-            "seconds": round(progress.seconds, 3),
+            "seconds": 0.0,
             "best": better,
         }
-        progress.history.append(row)
-        if self.run:
-            weights = Weights(dict(self.net.named_parameters()), self.average, self.best, self.objective.running)
-            save_checkpoint(self.run[0].path, self.run[1], progress, weights, self.optimizer)
-            self.run[0].write_history(progress.history)
-        return row
 
     def _validate(self) -> tuple[float, float, float]:
         """Standardised and reported mean absolute error of the averaged weights, and their loss."""
@@ -311,8 +356,17 @@ class _Loop:
 
     def _event(self, epoch: int, update: int, rate: float, seconds: float, row: dict[str, Any] | None) -> Event:
         done = (epoch - 1) * self.updates + update
-        left = max(0, self.spec.epochs * self.updates - done)
-        return Event(epoch, self.spec.epochs, update, self.updates, rate, left * seconds / max(1, update), row)
+        left = max(0, self.epochs * self.updates - done)
+        return Event(
+            epoch,
+            self.epochs,
+            update,
+            self.updates,
+            rate,
+            left * seconds / max(1, update),
+            row,
+            self.refitted is not None,
+        )
 
 
 def _device(name: str) -> torch.device:

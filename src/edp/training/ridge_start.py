@@ -76,4 +76,4 @@ def _columns(task: Task) -> list[int]:
     features = task.features
     new = {entry.name for entry in features.derived if entry.source in features.hidden}
     wanted = {*features.channels, *new, *task.targets}
-    return [column for column, name in enumerate(features.features) if name in wanted]
+    return [column for column, name in enumerate(features.lasting) if name in wanted]

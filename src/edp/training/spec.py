@@ -34,6 +34,8 @@ class TrainingSpec:
         epochs: the longest training.
         updates: updates per epoch; 0 for one pass over the data.
         patience: epochs without a better validation score before an early stop; 0 never stops early.
+        refit: train anew on training and validation stretches together, for as many epochs as were best before; for
+            short data. The choice of the epoch, and the calibration of intervals, stay those of the first training.
         clip_norm: largest global gradient norm.
         seed: root of every random choice.
         threads: CPU threads, 0 for all cores; more than one pays for wide networks on an idle machine only, and
@@ -57,6 +59,7 @@ class TrainingSpec:
     epochs: int = 20
     updates: int = 0
     patience: int = 8
+    refit: bool = False
     clip_norm: float = 1.0
     seed: int = 0
     threads: int = 1
