@@ -15,6 +15,7 @@ import tomli_w
 
 from edp.blocks import BLOCKS
 from edp.data.augment import AUGMENTATIONS
+from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS, Derived, FeatureSet
 from edp.data.splits import SPLITS, ByRecording, SplitSpec
 from edp.data.task import TargetMode, Task
@@ -80,7 +81,8 @@ class TaskSettings:
     """The task before the data's rate is known.
 
     Attributes:
-        features: ``FG1``, ``FG2``, ``all`` (every channel of the recordings), or a table.
+        features: ``FG1``, ``FG2``, ``all`` (every channel of the recordings), or a table. The path of a feature-set
+            file stands for its table; in a settings file it is relative to that file.
         targets: names of the predicted channels.
         horizons: look-ahead in samples.
         mode: ``delta`` or ``absolute``.
@@ -175,10 +177,10 @@ def load_experiment(
             raise ConfigError(f"there is no preset '{preset}'{closest(preset, PRESETS)}")
         table = tomllib.loads(resources.files("edp").joinpath(f"presets/{preset}.toml").read_text(encoding="utf-8"))
     if path is not None:
-        table = merged(table, read_toml(path))
+        table = merged(table, _with_set_file(read_toml(path), Path(path).parent))
         where = f"'{path}'"
     for text in overrides:
-        table = merged(table, _override(text))
+        table = merged(table, _with_set_file(_override(text), Path()))
     where += " with --set" if overrides else ""
     return build(Experiment, table, where)
 
@@ -259,6 +261,17 @@ def merged(base: Table, change: Mapping[str, Any]) -> Table:
         )
         result[key] = merged(old, value) if same and isinstance(old, dict) else value
     return result
+
+
+def _with_set_file(table: Table, folder: Path) -> Table:
+    """`table` with the feature set that its ``task.features`` names by a file, so that a run folder keeps all of it."""
+    task = table.get("task")
+    if not isinstance(task, dict) or not is_set_file(task.get("features")):
+        return table
+    path = folder / task["features"]
+    features = read_set_table(path)
+    build(FeatureSettings, features, f"'{path}'")
+    return {**table, "task": {**task, "features": features}}
 
 
 def _override(text: str) -> Table:

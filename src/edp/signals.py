@@ -250,6 +250,8 @@ class SignalMap:
         header: False for a file without a header row; `columns` then names its columns.
         columns: column names of a headerless file.
         variable: the variable of a MAT file that holds the signals, when there are several.
+        others: also take every column of numbers that `channels` does not name, under its own name; the vocabulary
+            or else the file's unit tells its kind.
     """
 
     channels: tuple[ChannelMap, ...] = ()
@@ -262,6 +264,7 @@ class SignalMap:
     variable: str | None = None
     delimiter: str | None = None
     decimal: str = "."
+    others: bool = False
 
     def __post_init__(self) -> None:
         names = [entry.name for entry in self.channels]

@@ -255,3 +255,34 @@ def test_find_recordings_says_what_it_looks_for(tmp_path):
     for name in ("b.csv", "a.parquet", ".hidden.csv", "readme.md"):
         (tmp_path / name).write_text("x")
     assert [path.name for path in find_recordings(tmp_path)] == ["a.parquet", "b.csv"]
+
+
+def test_a_map_may_take_all_other_columns(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = "\n".join(f"{k / 100},{k},{k / 10},ok,{k % 7},{k % 5},{k % 3}" for k in range(50))
+    path.write_text(f"time,u [bar],CylVels_1 [mm/s],state,torque [Nm],share [%],q [l/min]\n{rows}\n")
+    whole = read_recording(path, SignalMap(others=True))
+    kinds = {channel.name: channel.kind for channel in whole.channels}
+    assert kinds == {
+        "u": Kind.PRESSURE,
+        "CylVels_1": Kind.VELOCITY,
+        "torque": Kind.GENERIC,
+        "share": Kind.RATIO,
+        "q": Kind.FLOW,
+    }
+    assert whole.column("u")[1] == pytest.approx(1e5)
+    assert whole.column("CylVels_1")[10] == pytest.approx(1e-3)
+    mapped = read_recording(path, SignalMap((ChannelMap("pilot", "u", kind=Kind.PILOT_PRESSURE),), others=True))
+    assert mapped.channel_names == ("pilot", "CylVels_1", "torque", "share", "q")
+
+
+def test_a_folder_read_whole_keeps_what_all_logs_hold(tmp_path):
+    for name, columns in (("a", "u,v,w"), ("b", "v,u,x")):
+        rows = "\n".join(f"{k / 100},{k},{k % 7},{k % 5}" for k in range(50))
+        (tmp_path / f"{name}.csv").write_text(f"time,{columns}\n{rows}\n")
+    found = read_data_set(tmp_path, SignalMap(others=True))
+    assert [recording.channel_names for recording in found] == [("u", "v"), ("u", "v")]
+    assert found[1].column("u")[8] == 1
+    with pytest.raises(DataError, match="no channel is in all of the 2 recordings"):
+        (tmp_path / "b.csv").write_text("time,x\n0,1\n0.01,2\n0.02,3\n")
+        read_data_set(tmp_path, SignalMap(others=True))

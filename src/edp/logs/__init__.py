@@ -8,7 +8,15 @@ from edp.logs.inspection import inspect_log, look_into
 from edp.logs.mat_layouts import LAYOUTS
 from edp.logs.quality import ChannelFacts, ClockFacts, QualityReport, inspect
 from edp.logs.raw import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
-from edp.logs.read import find_recordings, read_data_set, read_parts, read_recording, read_truth, unique_names
+from edp.logs.read import (
+    common_channels,
+    find_recordings,
+    read_data_set,
+    read_parts,
+    read_recording,
+    read_truth,
+    unique_names,
+)
 from edp.logs.repair import Repair, split_at_gaps
 from edp.logs.repeats import Repeat, Sketch, find_repeats, sketch
 from edp.logs.write import truth_path, write_recording
@@ -29,6 +37,7 @@ __all__ = [
     "Repeat",
     "Sketch",
     "WriteOptions",
+    "common_channels",
     "compare",
     "csv",
     "find_recordings",

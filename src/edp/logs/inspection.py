@@ -56,7 +56,7 @@ def look_into(
     raw = open_log(path, signal_map)
     wanted, problems = resolve(raw, signal_map)
     findings = [Finding("error", None, str(problem)) for problem in problems]
-    if not signal_map.channels:
+    if not signal_map.channels and not signal_map.others:
         findings += _near_misses(raw)
     findings += _unit_clashes(raw, signal_map)
     usable, more = _readable(wanted)

@@ -152,7 +152,8 @@ def read_data_set(
 
     Raises:
         DataError: as `read_recording`, and for mixed rates or channel sets. Truth of a simulation that only some of
-            them hold is left out instead, unless the map asks for it.
+            them hold is left out instead, unless the map asks for it; and so is any channel that only some hold where
+            the map takes `others`.
     """
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     files = list(dict.fromkeys(file for path in given for file in find_recordings(path)))
@@ -161,6 +162,8 @@ def read_data_set(
     recordings = [read_recording(file, signal_map, repair=repair) for file in files]
     if signal_map is None or not signal_map.channels:
         recordings = _without_partial_truth(recordings)
+    if signal_map is not None and signal_map.others:
+        recordings = common_channels(recordings)
     _check_same(recordings, files)
     rate = recordings[0].rate_hz
     names = unique_names([recording.name for recording in recordings], files)
@@ -178,6 +181,30 @@ def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
         channels = tuple(recording.channels[i] for i in kept)
         made.append(replace(recording, channels=channels, values=np.ascontiguousarray(recording.values[:, kept])))
     return made
+
+
+def common_channels(recordings: Sequence[Recording]) -> list[Recording]:
+    """Recordings less the channels that not all of them hold, in the order of the first.
+
+    Raises:
+        DataError: no channel is in all of them.
+    """
+    first = recordings[0].channel_names
+    names = [name for name in first if all(name in recording.channel_names for recording in recordings)]
+    if not names:
+        raise DataError(
+            f"no channel is in all of the {len(recordings)} recordings; bring them to one set of names in maps"
+        )
+    if all(recording.channel_names == first for recording in recordings):
+        return list(recordings)
+    return [
+        replace(
+            recording,
+            channels=tuple(recording.channels[recording.index(name)] for name in names),
+            values=np.ascontiguousarray(recording.select(names)),
+        )
+        for recording in recordings
+    ]
 
 
 def _check_same(recordings: Sequence[Recording], files: Sequence[Path]) -> None:

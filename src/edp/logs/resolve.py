@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, EdpError, closest
 from edp.logs.raw import RawLog, RawSignal
-from edp.logs.units import unit_for
-from edp.signals import VOCABULARY, Channel, ChannelMap, SignalMap, Unit
+from edp.logs.units import normalise_unit, unit_for
+from edp.signals import UNITS, VOCABULARY, Channel, ChannelMap, Kind, SignalMap, Unit
+
+_LOOKED_ROWS = 1000
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,12 @@ def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[Wanted], list[EdpE
     """The wanted channels in order, and what is wrong with the map or the file for those that cannot be had."""
     wanted: list[Wanted] = []
     problems: list[EdpError] = []
-    if not signal_map.channels:
+    if not signal_map.channels and not signal_map.others:
         entries = _vocabulary_entries(raw)
         if not entries:
             problems.append(_nothing_known(raw))
     else:
-        entries = list(signal_map.channels)
+        entries = [*signal_map.channels, *(_other_entries(raw, signal_map) if signal_map.others else ())]
     for entry in entries:
         try:
             wanted.append(_one(raw, entry))
@@ -63,6 +65,38 @@ def _vocabulary_entries(raw: RawLog) -> list[ChannelMap]:
         return [ChannelMap(s.name, s.name, kind=s.kind, description=s.description) for s in stated]
     # A name that occurs twice is refused when its column is looked up, with the names that tell them apart.
     return [ChannelMap(name, name) for name in VOCABULARY if name in raw or name in raw.repeated]
+
+
+def _other_entries(raw: RawLog, signal_map: SignalMap) -> list[ChannelMap]:
+    """Every column of numbers that the map does not name, under its own name."""
+    columns = {raw.aliases.get(entry.column, entry.column) for entry in signal_map.channels}
+    names = {entry.name for entry in signal_map.channels}
+    found = []
+    for name, signal in raw.signals.items():
+        if name in columns or name in names or not _holds_numbers(signal):
+            continue
+        known = VOCABULARY.get(name)
+        kind = signal.kind or (known.kind if known is not None else _kind_of_unit(signal.unit))
+        found.append(ChannelMap(name, name, kind=kind, description=signal.description))
+    return found
+
+
+def _holds_numbers(signal: RawSignal) -> bool:
+    """Whether the first rows are numbers; text farther down is an error when the column is read."""
+    try:
+        if signal.table is None:
+            signal.load()
+        else:
+            next(iter(signal.table.pieces([signal.key], 0, min(signal.samples, _LOOKED_ROWS))), None)
+    except DataError:
+        return False
+    return True
+
+
+def _kind_of_unit(stated: str | None) -> Kind:
+    """The first kind that a unit measures; generic where it says nothing."""
+    unit = UNITS.get(normalise_unit(stated) or "1")
+    return Kind.GENERIC if unit is None or Kind.GENERIC in unit.kinds else unit.kinds[0]
 
 
 def _nothing_known(raw: RawLog) -> DataError:

@@ -1,0 +1,77 @@
+"""Feature sets as TOML files: what `edp screen` writes, what a user may write, and what `task.features` may name."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from edp.data.features import FeatureSet
+from edp.errors import ConfigError, StorageError
+
+SUFFIX = ".toml"
+
+
+def is_set_file(features: object) -> bool:
+    """Whether a setting `task.features` names a file."""
+    return isinstance(features, str) and features.endswith(SUFFIX)
+
+
+def read_set_table(path: str | Path) -> dict[str, Any]:
+    """The table of a feature-set file, whole: what it leaves out is empty, its name is the file's where none is given.
+
+    The names of its keys and the values are checked where the settings are.
+
+    Raises:
+        StorageError: the file cannot be read.
+        ConfigError: it is not TOML.
+    """
+    source = Path(path)
+    try:
+        with source.open("rb") as stream:
+            table = tomllib.load(stream)
+    except OSError as error:
+        raise StorageError(
+            f"cannot read the feature set '{source}': {error.strerror or error}; task.features is a name (FG1, FG2, "
+            "all), a table, or the path of a feature-set file, which in a settings file is relative to that file"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"the feature set '{source}' is not valid TOML: {error}") from error
+    return {"name": source.stem, "channels": [], "derived": [], "hidden": []} | table
+
+
+def set_text(
+    features: FeatureSet, head: Sequence[str] = (), why: Mapping[str, str] | None = None, tail: Sequence[str] = ()
+) -> str:
+    """A feature set as TOML that `read_set_table` reads back.
+
+    Args:
+        features: the set.
+        head: lines of comment on top.
+        why: a comment for each channel that has one.
+        tail: lines of comment at the end.
+    """
+    why = why or {}
+    lines = [*(_comment(line) for line in head), f"name = {_text(features.name)}", "", "channels = ["]
+    width = max((len(_text(name)) for name in features.channels), default=0) + 1
+    for name in features.channels:
+        entry = f"{_text(name)},"
+        lines.append(f"    {entry:<{width}}  {_comment(why[name])}" if name in why else f"    {entry}")
+    lines += ["]", f"hidden = [{', '.join(_text(name) for name in features.hidden)}]"]
+    for derived in features.derived:
+        facts = {"name": derived.name, "source": derived.source, "how": derived.how, "kind": str(derived.kind)}
+        lines += ["", "[[derived]]", *(f"{key} = {_text(value)}" for key, value in facts.items())]
+    lines += ["", *(_comment(line) for line in tail)] if tail else []
+    return "\n".join(lines) + "\n"
+
+
+def _text(value: str) -> str:
+    """A basic string of TOML; JSON's escapes are among TOML's, but for the delete character."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+
+
+def _comment(line: str) -> str:
+    """A line of comment; control characters, which TOML forbids there, become spaces."""
+    return ("# " + "".join(c if c.isprintable() else " " for c in line)).rstrip()
