@@ -1,4 +1,4 @@
-"""Our default on public measured recordings, beside persistence, linear floors and published free-run scores.
+"""Our default on public measured recordings, beside persistence and linear floors, k steps ahead.
 
 Each set is a data-set file and a settings file in ``examples/real``; no code knows any of them. The same commands, with
 the same preset, work on anyone's recordings:
@@ -12,7 +12,6 @@ The recordings are no part of the repository: their folder is given by --shared 
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 import tempfile
@@ -97,51 +96,33 @@ def show_floors(rows: Sequence[Row], quick: bool) -> None:
     table(headings, lines)
 
 
-def free_run(entry: dict[str, Any], scores: dict[str, Any]) -> dict[str, float]:
-    """Our free-run errors by name, in the unit of the published ones."""
-    found = {}
-    for model, name in (("network", "OURS"), ("ridge_arx", "ridge on past inputs, here")):
-        if entry.get("integrated"):
-            value = float(scores["models"][model]["integrated"][entry["target"]]["rmse"])
-        else:
-            value = rmse(scores, model, entry["target"], 0)
-        found[name] = value * entry.get("factor", 1.0)
-    return found
-
-
-def show_league(entry: dict[str, Any], ours: dict[str, float], scores: dict[str, Any], quick: bool) -> None:
-    """Print the published league with our errors in their place."""
-    skip, rate = scores["task"]["skip"], scores["task"]["rate_hz"]
-    print(f"\nFree run: {entry['title']}" + (" (quick: hardly trained)" if quick else ""))
-    both = [*entry["published"].items(), *ours.items()]
-    both.sort(key=lambda pair: pair[1] if math.isfinite(pair[1]) else math.inf)
-    table(["method", "test RMSE"], both)
-    print(f"Source: {entry['source']}; {entry['note']}.")
-    print(f"Ours knows no initial state: {skip} first ticks ({skip / rate:g} s) warm up and are not scored.")
-
-
 def run(quick: bool, seed: int) -> tuple[list[Row], dict[str, Any]]:
     """Train and judge every set; rows of the k-step table and what else is kept."""
     listed = read_toml(EXAMPLES / "leagues.toml")
     changes = [f"training.seed={seed}", *(QUICK if quick else ())]
     rows: list[Row] = []
-    kept: dict[str, Any] = {"seconds": {}, "free_run": {}}
+    kept: dict[str, Any] = {"seconds": {}}
     with tempfile.TemporaryDirectory() as folder:
-        for kind in ("floors", "leagues"):
-            for entry in listed[kind]:
-                if quick and entry["data"] not in QUICK_SETS:
-                    continue
-                print(f"{entry['settings']} ...", file=sys.stderr, flush=True)
-                out = Path(folder) / Path(entry["settings"]).stem
-                scores, seconds = scores_of(entry["data"], entry["settings"], out, changes)
-                kept["seconds"][entry["settings"]] = round(seconds, 1)
-                if kind == "floors":
-                    rows += floor_rows(entry, scores)
-                else:
-                    ours = free_run(entry, scores)
-                    show_league(entry, ours, scores, quick)
-                    kept["free_run"][entry["title"]] = {**ours, "skip": scores["task"]["skip"]}
+        for entry in listed["floors"]:
+            if quick and entry["data"] not in QUICK_SETS:
+                continue
+            print(f"{entry['settings']} ...", file=sys.stderr, flush=True)
+            out = Path(folder) / Path(entry["settings"]).stem
+            scores, seconds = scores_of(entry["data"], entry["settings"], out, changes)
+            kept["seconds"][entry["settings"]] = round(seconds, 1)
+            rows += floor_rows(entry, scores)
     return rows, kept
+
+
+def shared_folder(given: Path | None) -> Path | None:
+    """The folder of the recordings, made known to data-set files; None, and a line says so, where there is none."""
+    shared = given or Path(os.environ.get(VARIABLE) or ROOT.parent / "shared" / "data")
+    if not shared.is_dir():
+        print(f"skipped: there is no folder of real recordings '{shared}'; give --shared or set {VARIABLE}")
+        print(json.dumps({"skipped": True, "why": "no real recordings"}))
+        return None
+    os.environ[VARIABLE] = str(shared.resolve())
+    return shared
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -149,12 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser(__doc__ or "")
     options.add_argument("--shared", type=Path, default=None, help=f"folder of the recordings (else ${VARIABLE})")
     given = options.parse_args(arguments)
-    shared = given.shared or Path(os.environ.get(VARIABLE) or ROOT.parent / "shared" / "data")
-    if not shared.is_dir():
-        print(f"skipped: there is no folder of real recordings '{shared}'; give --shared or set {VARIABLE}")
-        print(json.dumps({"skipped": True, "why": "no real recordings"}))
+    if shared_folder(given.shared) is None:
         return
-    os.environ[VARIABLE] = str(shared.resolve())
     rows, kept = run(given.quick, given.seed)
     show_floors(rows, given.quick)
     kept["rows"] = [vars(row) for row in rows]

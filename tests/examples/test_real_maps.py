@@ -16,19 +16,33 @@ LISTED = read_toml(REAL / "leagues.toml")
 ENTRIES = [*LISTED["floors"], *LISTED["leagues"]]
 
 
+def script(name):
+    """A benchmark script as a module."""
+    spec = importlib.util.spec_from_file_location(f"bench_{name}", ROOT / "benchmarks" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
 @pytest.fixture(scope="module")
-def bench():
-    """The benchmark script as a module."""
+def scripts():
     folder = str(ROOT / "benchmarks")
     sys.path.insert(0, folder)
     try:
-        spec = importlib.util.spec_from_file_location("bench_real_recordings", ROOT / "benchmarks/real_recordings.py")
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[spec.name] = module
-        spec.loader.exec_module(module)
-        yield module
+        yield {name: script(name) for name in ("real_recordings", "published_leagues")}
     finally:
         sys.path.remove(folder)
+
+
+@pytest.fixture(scope="module")
+def bench(scripts):
+    return scripts["real_recordings"]
+
+
+@pytest.fixture(scope="module")
+def leagues(scripts):
+    return scripts["published_leagues"]
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=[entry["settings"] for entry in ENTRIES])
@@ -45,7 +59,8 @@ def test_maps_and_settings_agree(entry):
         assert all(linear > 0 and persistence > 0 for _, _, persistence, linear in entry["rows"])
     else:
         assert task.horizons == (0,)
-        assert not set(task.targets) & set(task.features.features)
+        assert not set(task.targets) & set(task.features.lasting)
+        assert set(entry["rivals"]) <= set(entry["published"])
         assert entry["target"] in task.targets
 
 
@@ -56,12 +71,9 @@ def test_every_file_is_listed():
 
 def test_sets_share_one_preset():
     for path in REAL.glob("*_settings.toml"):
-        settings = read_toml(path)
-        # A free run has no measured output for the linear map to start from; nothing else may differ.
-        assert settings.pop("model", {"blocks": []}) == {"blocks": []}
-        assert set(settings) <= {"task", "split"}, f"{path.name} changes more than the task and the split"
         free_run = path.name.endswith("_freerun_settings.toml")
-        assert free_run or "model" not in read_toml(path)
+        # A league is a contest: each has settings of its own. What is held against floors differs in the task alone.
+        assert free_run or set(read_toml(path)) <= {"task", "split"}, f"{path.name} changes more than task and split"
 
 
 def test_an_unset_variable_is_named(monkeypatch):
@@ -70,35 +82,65 @@ def test_an_unset_variable_is_named(monkeypatch):
         DataSource.of(REAL / "faster.toml").read()
 
 
-def test_without_recordings_it_says_so_and_succeeds(bench, tmp_path, capsys):
-    bench.main(["--shared", str(tmp_path / "nowhere")])
+@pytest.mark.parametrize("name", ["real_recordings", "published_leagues"])
+def test_without_recordings_it_says_so_and_succeeds(name, scripts, tmp_path, capsys):
+    scripts[name].main(["--shared", str(tmp_path / "nowhere")])
     lines = capsys.readouterr().out.strip().splitlines()
     assert lines[0].startswith("skipped:")
     assert json.loads(lines[-1])["skipped"] is True
 
 
-def test_rows_verdicts_and_league(bench, capsys):
-    def model(error: float) -> dict:
-        return {"overall": {"1": {"y": {"rmse": error}}, "0": {"y": {"rmse": error}}}}
+def model(error: float) -> dict:
+    return {"overall": {"1": {"y": {"rmse": error}}, "0": {"y": {"rmse": error}}}}
 
-    scores = {
-        "task": {"skip": 4, "rate_hz": 2.0},
-        "models": {"network": model(0.5), "ridge_arx": model(0.8), "persistence": model(2.0)},
-    }
+
+SCORES = {
+    "task": {"skip": 4, "rate_hz": 2.0},
+    "models": {"network": model(0.5), "ridge_arx": model(0.8), "persistence": model(2.0)},
+}
+
+
+def test_rows_and_verdicts(bench):
     entry = {"title": "made up", "rows": [["y", 1, 2.1, 0.4]]}
-    rows = list(bench.floor_rows(entry, scores))
+    rows = list(bench.floor_rows(entry, SCORES))
     assert (rows[0].ours, rows[0].ridge, rows[0].persistence, rows[0].floor_linear) == (0.5, 0.8, 2.0, 0.4)
     (found,) = bench.verdicts_of(rows, quick=True)
     assert not found.met
     assert found.ratio == pytest.approx(1.25)
     bench.show_floors(rows, quick=True)
-    league = {"title": "made up", "target": "y", "published": {"A": 0.1, "B": 900.0}, "factor": 1e3, "source": "s"}
-    ours = bench.free_run(league, scores)
-    assert ours == {"OURS": 500.0, "ridge on past inputs, here": 800.0}
-    bench.show_league({**league, "note": "n"}, ours, scores, quick=True)
+
+
+def test_a_league_puts_the_median_of_ours_in_its_place(leagues, monkeypatch, capsys):
+    errors = {"training.seed=0": 0.9, "training.seed=1": 0.5, "training.seed=2": 0.4}
+
+    def scores_of(data, settings, out, changes):
+        return {**SCORES, "models": {**SCORES["models"], "network": model(errors[changes[0]])}}, 1.0
+
+    monkeypatch.setattr(leagues, "scores_of", scores_of)
+    entry = {
+        "title": "made up",
+        "data": "d",
+        "settings": "s",
+        "target": "y",
+        "factor": 1e3,
+        "unit": "mm",
+        "published": {"A": 0.1, "B": 900.0},
+        "rivals": ["A", "B"],
+        "source": "s",
+        "note": "n",
+    }
+    found = leagues.measure(entry, range(3), quick=False)
+    assert found["median"] == 500.0
+    assert found[leagues.RIDGE] == 800.0
+    assert [(v.ours, v.rival, v.met) for v in leagues.verdicts_of(entry, found, False)] == [
+        (500.0, 0.1, False),
+        (500.0, 900.0, True),
+    ]
+    leagues.show(entry, found, quick=True)
     printed = capsys.readouterr().out
     assert printed.index("A  ") < printed.index("OURS") < printed.index("B  ")
-    assert "4 first ticks (2 s)" in printed
+    assert "Ours by seed: 900, 500, 400" in printed
+    assert "first 4 ticks (2 s)" in printed
 
 
 def test_real_recordings_train_through_their_maps(bench, tmp_path, monkeypatch):
@@ -114,6 +156,8 @@ def test_real_recordings_train_through_their_maps(bench, tmp_path, monkeypatch):
     (tmp_path / "cascaded_tanks/dataBenchmark.csv").write_text(text)
     monkeypatch.setenv("EDP_SHARED_DATA", str(tmp_path))
     changes = ["training.epochs=1", "training.updates=2"]
+    free, _ = bench.scores_of("tanks.toml", "tanks_freerun_settings.toml", tmp_path / "free", changes)
+    assert np.isfinite(bench.rmse(free, "network", "y", 0))
     scores, _ = bench.scores_of("tanks.toml", "tanks_settings.toml", tmp_path / "run", changes)
     for horizon in (1, 5, 10):
         assert bench.rmse(scores, "network", "y", horizon) < bench.rmse(scores, "persistence", "y", horizon)

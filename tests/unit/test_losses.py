@@ -13,6 +13,7 @@ from edp.losses import (
     Correlation,
     Course,
     Derivative,
+    Drift,
     Focal,
     Heteroscedastic,
     Huber,
@@ -192,6 +193,24 @@ def test_derivative_is_the_mean_square_of_the_errors_first_differences():
         (e[b, t + 1] - e[b, t]) ** 2 for b in range(SHAPE[0]) for t in range(SHAPE[1] - 1) if valid[b, t : t + 2].all()
     ]
     assert Derivative().evaluate(made).item() == pytest.approx(np.mean(squares), rel=1e-12)
+
+
+def test_drift_is_the_mean_square_of_the_running_sum_over_the_root_of_its_ticks():
+    (p, y, _), valid, made = course()
+    parts = []
+    for b in range(SHAPE[0]):
+        error = (p - y)[b][valid[b]]
+        parts += list(np.cumsum(error, axis=0) ** 2 / np.arange(1, len(error) + 1)[:, None, None])
+    assert Drift().evaluate(made).item() == pytest.approx(np.mean(parts), rel=1e-12)
+
+
+def test_drift_grows_with_the_length_of_a_constant_error():
+    def of(ticks):
+        zeros = torch.zeros(1, ticks, 1, 1).double()
+        return Drift().evaluate(Course(zeros + 0.1, zeros, zeros, torch.ones(1, ticks, dtype=torch.bool))).item()
+
+    assert of(1) == pytest.approx(0.01)
+    assert of(99) == pytest.approx(0.01 * 50)
 
 
 def test_correlation_is_one_minus_that_of_numpy():

@@ -3,6 +3,7 @@
 from edp.losses.base import LOSSES, Answer, LossSpec, Penalty, masked_loss
 from edp.losses.correlation import Correlation
 from edp.losses.derivative import Derivative
+from edp.losses.drift import Drift
 from edp.losses.focal import Focal
 from edp.losses.heteroscedastic import Heteroscedastic
 from edp.losses.huber import Huber
@@ -20,6 +21,7 @@ __all__ = [
     "Correlation",
     "Course",
     "Derivative",
+    "Drift",
     "Focal",
     "Heteroscedastic",
     "Huber",
