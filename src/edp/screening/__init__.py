@@ -14,6 +14,7 @@ from edp.screening.result import (
     Stability,
     Value,
 )
+from edp.screening.screen import screen
 from edp.screening.spec import ForestSpec, ScreeningSpec
 
 __all__ = [
@@ -31,4 +32,5 @@ __all__ = [
     "ScreeningSpec",
     "Stability",
     "Value",
+    "screen",
 ]

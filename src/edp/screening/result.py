@@ -29,6 +29,8 @@ class FlagKind(StrEnum):
     DUPLICATE = "duplicate"
     ARTEFACT = "per-file artefact"
     NOISE = "no relation"
+    REDUNDANT = "redundant"
+    MISSING = "missing values"
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class LagCurve:
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """One metric of a channel and a target in each piece of the data.
+    """One metric of a channel at t and a target at t + horizon, in each piece of the data.
 
     Attributes:
         metric: ``pearson``, ``spearman``, ``kendall``, ``information`` or ``lag``.
@@ -112,7 +114,7 @@ class Stability:
         values: shape ``(piece,)``; NaN where the channel is constant in a piece.
         mean, deviation: over the pieces.
         agreement: share of the pieces with the sign of the mean (1 for information).
-        chance: what the metric is without any relation: mean over pieces paired with others' targets.
+        chance: mean absolute value between a piece's channel and another piece's target, where nothing can relate.
     """
 
     metric: str
@@ -132,8 +134,9 @@ class Importance:
     Attributes:
         members: channels permuted together.
         target: name, or ``all`` for the mean of the targets.
-        increase: mean increase of the mean squared error, as a share of the target's variance.
-        low, high: 95 % interval over permutations and held-out pieces.
+        increase: mean increase of the mean squared error of the target's change up to the horizon, as a share of
+            that change's variance.
+        low, high: 95 % interval over the held-out pieces.
         share: the group's part of all positive increases.
     """
 

@@ -52,6 +52,8 @@ class ScreeningSpec:
         pieces: least number of stretches to compare; recordings are cut where there are fewer.
         neighbours: k of the nearest-neighbour estimate of mutual information.
         information_samples: rows for that estimate, evenly spread over the data.
+        rank_samples: the same for Kendall's tau.
+        piece_samples: rows of each piece for the metrics that are compared among pieces.
         collinear: rank correlation from which channels form a cluster.
         copy: correlation at the best lag from which one channel is a copy of another.
         level: chance of a false alarm of each test of significance, shared among the channels.
@@ -67,6 +69,8 @@ class ScreeningSpec:
     pieces: int = 8
     neighbours: int = 3
     information_samples: int = 4_000
+    rank_samples: int = 20_000
+    piece_samples: int = 1_000
     collinear: float = 0.9
     copy: float = 0.99
     level: float = 0.01
@@ -74,7 +78,8 @@ class ScreeningSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least = {"horizon": 0, "max_lag": 1, "pieces": 4, "neighbours": 1, "information_samples": 100, "seed": 0}
+        least = {"horizon": 0, "max_lag": 10, "pieces": 4, "neighbours": 1, "seed": 0}
+        least |= dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), 100)
         for name, low in least.items():
             if getattr(self, name) < low:
                 raise ConfigError(f"screening.{name} = {getattr(self, name)}; it must be at least {low}")

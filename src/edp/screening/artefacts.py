@@ -1,0 +1,101 @@
+"""Channels whose relation to anything is made by how the recordings were cut: they tell the file, not the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from edp.screening.compiled import spread
+from edp.screening.lagged import Lagged
+from edp.screening.ranks import ranks_of
+from edp.screening.result import Array, Flag, FlagKind
+from edp.screening.table import Table
+
+CLOCK = 0.98
+"""Rank correlation with time, in every piece, from which a channel only tells the time."""
+STRONG = 0.6
+"""Correlation that a relation must have in every piece before a change of its sign counts."""
+EXACT = 0.97
+"""The same before a change of its gain counts."""
+GAIN = 1.5
+"""Ratio of the largest to the smallest gain."""
+
+
+def dead_flags(table: Table) -> list[Flag]:
+    """Channels that never change, or change between recordings only; and those with missing values."""
+    flags = [
+        Flag(name, FlagKind.MISSING, value=1.0, evidence=f"{count} values are missing or infinite")
+        for name, count in table.missing.items()
+    ]
+    for i in np.flatnonzero(~table.live):
+        if table.between[i] > 0.5 and np.ptp(table.sums[0][:, i]) > 1e-6 * max(1e-30, float(np.abs(table.mean[i]))):
+            text = "constant within each recording, but not the same in all: it tells the file, not the machine"
+            flags.append(Flag(table.names[i], FlagKind.ARTEFACT, value=1.0, evidence=text))
+        else:
+            flags.append(Flag(table.names[i], FlagKind.CONSTANT, value=1.0, evidence="never changes"))
+    return flags
+
+
+def clock_flags(table: Table, live: Sequence[int]) -> list[Flag]:
+    """Channels that rise or fall throughout every recording."""
+
+    def of_channel(i: int) -> float:
+        found = []
+        for piece in table.pieces:
+            values = max(piece.stretches, key=len)[:, i]
+            values = values[:: max(1, len(values) // 2_000)]
+            if values.max() > values.min():
+                found.append(abs(float(np.corrcoef(ranks_of(values), np.arange(len(values)))[0, 1])))
+        return min(found) if len(found) > len(table.pieces) // 2 else 0.0
+
+    values = spread(of_channel, live)
+    return [
+        Flag(
+            table.names[i],
+            FlagKind.ARTEFACT,
+            value=value,
+            evidence=f"rises or falls throughout every recording (rank correlation with time {value:.3f} or more): it "
+            "tells the time since the start",
+        )
+        for i, value in zip(live, values)
+        if value >= CLOCK
+    ]
+
+
+def changing_flags(names: Sequence[str], lagged: Lagged, judged: Sequence[int]) -> list[Flag]:
+    """Channels that follow another one closely in every piece, but not with the same sign or gain."""
+    squares = lagged.squares().astype(np.float64)
+    usable = np.asarray((squares > 0).all(axis=0))
+
+    def of_channel(i: int) -> Flag | None:
+        if not usable[i]:
+            return None
+        scale = np.sqrt(squares[:, None, i, None] * squares[:, None, :])
+        found: Array = np.divide(lagged.sums[:, :, i], scale, out=np.zeros(lagged.sums[:, :, i].shape), where=scale > 0)
+        found[:, :, ~usable] = 0.0
+        found[:, :, i] = 0.0
+        least: Array = np.abs(found).min(axis=0)
+        lag, j = (int(k) for k in np.unravel_index(int(least.argmax()), least.shape))
+        values = found[:, lag, j]
+        turned = min(int(np.sum(values > 0)), int(np.sum(values < 0)))
+        gains = np.abs(values) * np.sqrt(squares[:, i] / squares[:, j])
+        changed = float(gains.max() / gains.min()) if least[lag, j] >= EXACT else 1.0
+        if least[lag, j] < STRONG or (turned == 0 and changed < GAIN):
+            return None
+        what = (
+            f"its sign differs in {turned} of {len(values)} pieces"
+            if turned
+            else f"its gain differs by a factor of {changed:.1f} among pieces"
+        )
+        text = f"follows {names[j]} in every piece (correlation {least[lag, j]:.2f} or more), but {what}"
+        return Flag(names[i], FlagKind.ARTEFACT, names[j], lag - lagged.reach, float(least[lag, j]), text)
+
+    return [flag for flag in spread(of_channel, judged) if flag is not None]
+
+
+def lonely(values: Array, chance: float) -> int | None:
+    """The only piece in which a correlation is strong, given one value a piece; None where there is no such."""
+    order = np.argsort(-np.abs(values))
+    first, second = float(abs(values[order[0]])), float(abs(values[order[1]]))
+    return int(order[0]) if first > max(0.3, 4 * second, 3 * chance) else None

@@ -1,0 +1,51 @@
+"""Compiled loops that let other threads run, and the threads that call them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import numba
+from threadpoolctl import threadpool_limits
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def compiled(function: Function) -> Function:
+    """Compile with Numba, without the interpreter's lock; the machine code is cached where a folder is writable."""
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    try:
+        fast: Any = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder that can be written
+        fast = numba.njit(**options)(function)
+    return fast  # type: ignore[no-any-return]
+
+
+def threads() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def spread(
+    work: Callable[[Item], Result], items: Iterable[Item], on_share: Callable[[float], None] | None = None
+) -> list[Result]:
+    """`work` on every item by all processors, results in order; `on_share` hears the share that is done.
+
+    The threads of the linear algebra library are held to one meanwhile: they would wait for each other.
+    """
+    todo = list(items)
+    results: list[Result] = []
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(threads()) as pool:
+        try:
+            for done, result in enumerate(pool.map(work, todo), start=1):
+                results.append(result)
+                if on_share is not None:
+                    on_share(done / len(todo))
+        except BaseException:  # Ctrl-C too: do not wait for what has not begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return results

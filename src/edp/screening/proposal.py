@@ -1,0 +1,234 @@
+"""From figures to a feature set: what is kept, what is dropped, in which order and why; and the memory needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.screening.artefacts import lonely
+from edp.screening.result import Choice, Cluster, Flag, FlagKind, Importance, LagCurve, Proposal, Value
+from edp.screening.stability import Relations
+from edp.screening.table import Table
+
+NEGLIGIBLE = 0.002
+"""Share of the remaining error that a channel must take away, held out, to be kept for that alone."""
+CLEAR = 0.2
+"""Correlation from which a lag counts for the window."""
+STEP = 5
+"""Windows are rounded up to so many samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the verdicts rest on; arrays of `relations` are over `live`.
+
+    Attributes:
+        table: the data.
+        live: columns of the table that change.
+        relations: tests of live channels against targets.
+        pieces: correlation of each piece at the best lag with the best target, ``(piece, live channel)``.
+        curves: lag curves.
+        importance: of the forest, all entries.
+        values: of linear models.
+        clusters: collinear channels.
+        history: held-out error by window, and the shortest that suffices.
+    """
+
+    table: Table
+    live: NDArray[np.int64]
+    relations: Relations
+    pieces: NDArray[np.float64]
+    curves: Sequence[LagCurve]
+    importance: Sequence[Importance]
+    values: Sequence[Value]
+    clusters: Sequence[Cluster]
+    history: tuple[int, Mapping[int, float]]
+
+    def gain(self, name: str) -> tuple[float, float]:
+        """Largest linear value of a channel over the targets, and the lower end of its interval; NaN if not judged."""
+        found = [value for value in self.values if value.channel == name]
+        if not found:
+            return math.nan, math.nan
+        best = max(found, key=lambda value: value.gain)
+        return best.gain, best.low
+
+    def importance_of(self, name: str) -> Importance | None:
+        """The entry over all targets of the group that holds a channel."""
+        found = (entry for entry in self.importance if entry.target == "all" and name in entry.members)
+        return next(found, None)
+
+
+def noise_flags(evidence: Evidence, judged: Sequence[str]) -> list[Flag]:
+    """Channels that neither relate to a target nor help a forest or a linear model, held out."""
+    flags = []
+    for place, column in enumerate(evidence.live):
+        name = evidence.table.names[column]
+        if name not in judged or evidence.relations.related[place].any():
+            continue
+        gain, low = evidence.gain(name)
+        entry = evidence.importance_of(name)
+        if (low > 0 and gain > NEGLIGIBLE) or (entry is not None and entry.low > 0 and entry.increase > NEGLIGIBLE):
+            continue
+        flags.append(_noise(evidence, place, name))
+    return flags
+
+
+def _noise(evidence: Evidence, place: int, name: str) -> Flag:
+    relations = evidence.relations
+    target = int(np.abs(relations.linear[place]).argmax())
+    value = float(abs(relations.linear[place, target]))
+    chance = float(relations.linear_chance[place, target])
+    only = lonely(evidence.pieces[:, place], chance)
+    if only is not None:
+        text = (
+            f"goes with a target in {evidence.table.pieces[only].name} only "
+            f"(correlation {evidence.pieces[only, place]:.2f}), in no other piece"
+        )
+        return Flag(name, FlagKind.ARTEFACT, value=abs(float(evidence.pieces[only, place])), evidence=text)
+    between = float(evidence.table.between[evidence.live[place]])
+    found = f"correlation with a target at most {value:.3f} (between unrelated pieces up to {chance:.3f})"
+    if between > 0.5:
+        text = f"{100 * between:.0f} % of its variance lies between recordings; within them {found}"
+        return Flag(name, FlagKind.ARTEFACT, value=between, evidence=text)
+    information = float(np.nan_to_num(relations.information[place]).max())
+    text = f"{found}; mutual information above chance {information:.3f} nat; no help to a forest or a linear model"
+    return Flag(name, FlagKind.NOISE, value=value, evidence=text)
+
+
+def redundant_flags(evidence: Evidence, judged: Sequence[str]) -> list[Flag]:
+    """Members of a cluster, other than its representative, that add nothing beside it."""
+    flags = []
+    for cluster in evidence.clusters:
+        for name in cluster.members:
+            gain, low = evidence.gain(name)
+            if name == cluster.representative or name not in judged or not (low <= 0 or gain < NEGLIGIBLE):
+                continue
+            text = (
+                f"goes with {cluster.representative} (rank correlation {cluster.least:.2f} or more within the cluster) "
+                f"and takes away only {100 * gain:.2f} % of the error that is left"
+            )
+            flags.append(Flag(name, FlagKind.REDUNDANT, cluster.representative, value=cluster.least, evidence=text))
+    return flags
+
+
+def propose(
+    evidence: Evidence, names: Sequence[str], targets: Sequence[str], horizon: int, flags: Sequence[Flag]
+) -> Proposal:
+    """Rank all candidates and suggest a window.
+
+    Args:
+        evidence: figures.
+        names: candidates, those with missing values too.
+        targets: names; inputs as well unless the horizon is 0.
+        horizon: samples ahead.
+        flags: whoever has one is dropped.
+    """
+    by_channel: dict[str, list[Flag]] = {}
+    for flag in flags:
+        by_channel.setdefault(flag.channel, []).append(flag)
+    scores = _scores(evidence)
+    rows = []
+    for name in names:
+        own = tuple(by_channel.get(name, ()))
+        barred = horizon == 0 and name in targets
+        keep = (name in targets and not barred) or (not own and not barred)
+        rows.append((not keep, -scores.get(name, 0.0), name, own, barred))
+    choices = tuple(
+        Choice(name, not dropped, rank, -score, _reason(evidence, name, name in targets, own, barred), own)
+        for rank, (dropped, score, name, own, barred) in enumerate(sorted(rows, key=lambda row: row[:3]), start=1)
+    )
+    kept = {choice.channel for choice in choices if choice.keep}
+    window, reason = _window(evidence, kept, targets, horizon)
+    return Proposal(choices, window, reason, _notes(evidence, flags, horizon))
+
+
+def _scores(evidence: Evidence) -> dict[str, float]:
+    """Half the importance, a quarter each of correlation and information, each relative to the largest; 0 to 1."""
+    linear = np.abs(evidence.relations.linear).max(axis=1)
+    information = np.nan_to_num(evidence.relations.information).max(axis=1)
+    names = [evidence.table.names[column] for column in evidence.live]
+    entries = [evidence.importance_of(name) for name in names]
+    weight = np.array([max(e.increase, 0.0) / len(e.members) if e is not None else 0.0 for e in entries])
+    parts = [
+        share * np.maximum(values, 0.0) / max(float(values.max()), 1e-30)
+        for share, values in ((0.5, np.sqrt(weight)), (0.25, linear), (0.25, information))
+    ]
+    return dict(zip(names, np.clip(sum(parts), 0.0, 1.0).tolist()))
+
+
+def _reason(evidence: Evidence, name: str, target: bool, flags: tuple[Flag, ...], barred: bool) -> str:
+    if barred:
+        return "is what is to be predicted; at horizon 0 its present value is no input"
+    if flags:
+        text = "; ".join(f"{flag.kind}: {flag.evidence}" for flag in flags)
+        return f"a target, kept for its past, but {text}" if target else text
+    place = int(np.flatnonzero(evidence.live == evidence.table.names.index(name))[0])
+    relations = evidence.relations
+    best = int(np.abs(relations.linear[place]).argmax())
+    goal = evidence.table.names[evidence.table.targets[best]]
+    parts = []
+    if target:
+        parts.append("a target: its own past")
+    else:
+        parts.append(f"correlation {relations.linear[place, best]:.2f} with {goal}")
+    informed = int(np.nan_to_num(relations.information[place]).argmax())
+    goal = evidence.table.names[evidence.table.targets[informed]]
+    parts.append(f"{max(float(np.nan_to_num(relations.information[place, informed])), 0.0):.2f} nat on {goal}")
+    entry, (gain, _) = evidence.importance_of(name), evidence.gain(name)
+    if entry is not None:
+        group = "" if len(entry.members) == 1 else f" with {len(entry.members) - 1} collinear"
+        parts.append(f"forest importance {100 * entry.increase:.1f} % of the variance{group}")
+    if math.isfinite(gain):
+        parts.append(f"its past takes away {100 * gain:.1f} % of the error that the others leave")
+    return "; ".join(parts)
+
+
+def _window(evidence: Evidence, kept: set[str], targets: Sequence[str], horizon: int) -> tuple[int, str]:
+    """The longer of two: from the present back to the earliest cause, and what a linear prediction makes use of."""
+    leads = [
+        curve
+        for curve in evidence.curves
+        if curve.channel in kept
+        and curve.channel not in targets
+        and curve.certain
+        and not curve.at_edge
+        and abs(curve.value) >= CLEAR
+        and curve.best < 0
+    ]
+    needed, errors = evidence.history
+    by_lag, text = 1, "no channel that is kept leads a target clearly"
+    if leads:
+        first = min(leads, key=lambda curve: curve.best)
+        by_lag = -first.best
+        text = f"the longest clear lead is {by_lag} samples ({first.channel} before {first.target})"
+    window = STEP * math.ceil(max(by_lag, needed) / STEP)
+    longest = max(errors)
+    text += (
+        f"; a linear prediction {horizon} samples ahead leaves {100 * errors[needed]:.1f} % of the change with "
+        f"{needed} samples of history and {100 * errors[longest]:.1f} % with {longest}"
+    )
+    return window, text
+
+
+def _notes(evidence: Evidence, flags: Sequence[Flag], horizon: int) -> tuple[str, ...]:
+    notes = []
+    table = evidence.table
+    if len(table.pieces) < 8:
+        notes.append(
+            f"only {len(table.pieces)} pieces were compared: figures of stability are rough; give more recordings"
+        )
+    edge = sorted({c.channel for c in evidence.curves if c.certain and c.at_edge and abs(c.value) >= CLEAR})
+    if edge:
+        notes.append(f"the best lag of {', '.join(edge)} is the end of the search; raise max_lag")
+    leaks = [flag.channel for flag in flags if flag.kind == FlagKind.LEAK]
+    if leaks:
+        notes.append(
+            f"{len(leaks)} channels know the future: a model fed with them does well in tests and fails on the machine"
+        )
+    if horizon == 0:
+        notes.append("horizon 0: targets are no inputs")
+    return tuple(notes)
