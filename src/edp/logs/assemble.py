@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.logs.limits import check_memory
 from edp.logs.raw import RawLog, RawSignal, Table
 from edp.logs.repair import Mask, Repair, mend_gaps, mend_stamps, mend_values
 from edp.logs.resolve import Wanted
@@ -18,6 +19,8 @@ from edp.recording import FloatArray, Recording
 from edp.signals import SignalMap
 
 _CACHED_ROWS = 4096
+_TICK_BYTES = 25
+"""What the time rule takes a tick: its time, its row and whether it is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,7 @@ class Assembly:
         ticks: the ticks of the grid that the recording keeps.
         missing: which of them lie in a gap, shape ``(time,)``.
         made: the repairs made to time.
-        whole: the ticks are all that the file holds.
+        untouched: every row of every channel is taken as it is in the file, by its own rate and map.
     """
 
     raw: RawLog
@@ -54,7 +57,7 @@ class Assembly:
     ticks: slice
     missing: Mask
     made: list[dict[str, Any]] = field(default_factory=list)
-    whole: bool = True
+    untouched: bool = False
 
     @property
     def samples(self) -> int:
@@ -70,13 +73,6 @@ class Assembly:
     def resampled(self) -> bool:
         """Whether a tick may take another row than its own."""
         return any(line.rows is not None for line in self.lines.values())
-
-    @property
-    def untouched(self) -> bool:
-        """Whether the recording is the whole file as it is: every channel, every row, nothing mended."""
-        names = [entry.channel.name for entry in self.wanted]
-        kept = self.repair == Repair() and self.whole and not self.resampled
-        return kept and names == [signal.name for signal in self.raw.signals.values()]
 
     def recording(self, start: int, stop: int, name: str | None, before: FloatArray | None = None) -> Recording:
         """The samples ``start <= t < stop``.
@@ -120,6 +116,12 @@ class Assembly:
 
     def _values(self, first: int, last: int) -> FloatArray:
         """Ticks ``first <= k < last`` of the grid, float32, shape ``(time, channel)``."""
+        check_memory(
+            self.raw.path,
+            4 * (last - first) * len(self.wanted),
+            f"{last - first} samples of {len(self.wanted)} channels",
+            "read some rows, fewer channels, or in parts (edp.logs.read_parts)",
+        )
         values = np.empty((last - first, len(self.wanted)), dtype=np.float32)
         tables: dict[int, tuple[Table, list[int]]] = {}
         for place, entry in enumerate(self.wanted):
@@ -192,9 +194,10 @@ def prepare(
     keep, gap_facts = mend_gaps(missing[part], grid.rate_hz, repair, where)
     first = part.start + (keep.start or 0)
     last = part.start + (len(missing[part]) if keep.stop is None else keep.stop)
-    whole = (first, last) == (0, grid.count)
+    own_way = not signal_map.channels and signal_map.rate_hz is None and signal_map.sample_time_s is None
+    untouched = own_way and repair == Repair() and (first, last) == (0, grid.count)
     return Assembly(
-        raw, wanted, repair, lines, grid.rate_hz, slice(first, last), missing[first:last], made + gap_facts, whole
+        raw, wanted, repair, lines, grid.rate_hz, slice(first, last), missing[first:last], made + gap_facts, untouched
     )
 
 
@@ -270,6 +273,12 @@ def _timelines(
         judged[key] = (clock, order)
         made += mended
     grid = common_grid([clock for clock, _ in judged.values()], signal_map.rate_hz, f"'{raw.path}'")
+    check_memory(
+        raw.path,
+        _TICK_BYTES * grid.count * (1 + sum(not clock.uniform for clock, _ in judged.values())),
+        f"{grid.count} samples from {grid.start_s:g} s on at {grid.rate_hz:g} Hz",
+        "check the time column for a stamp that is far off, or set a lower rate_hz in the signal map",
+    )
     lines = {key: _Timeline(clock, order, *hold_rows(clock, grid)) for key, (clock, order) in judged.items()}
     return lines, grid, made
 

@@ -216,8 +216,12 @@ def _damage(path: Path) -> Iterator[None]:
     logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
-    except (DataError, MemoryError):
+    except DataError:
         raise
+    except MemoryError as error:
+        raise DataError(
+            f"'{path}' announces more data than this machine has memory for; it may be damaged: copy or export it again"
+        ) from error
     except Exception as error:
         raise DataError(
             f"'{path}' cannot be read as MDF ({type(error).__name__}: {error}); it may be truncated or damaged: copy "

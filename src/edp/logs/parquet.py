@@ -109,7 +109,8 @@ def _values(parquet: pq.ParquetFile, name: str, path: Path) -> Column:
 
 
 def _signal(parquet: pq.ParquetFile, field: pa.Field, path: Path, rows: int, time: Column | None) -> RawSignal:
-    facts = {key.decode(): value.decode(errors="replace") for key, value in (field.metadata or {}).items()}
+    known = (field.metadata or {}).items()
+    facts = {key.decode(errors="replace"): value.decode(errors="replace") for key, value in known}
     kind = facts.get("kind")
     return RawSignal(
         field.name,

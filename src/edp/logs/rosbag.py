@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.logs.mcap_check import check_records
 from edp.logs.names import told_apart
 from edp.logs.own import OwnFacts, own_facts
 from edp.logs.raw import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
@@ -289,6 +290,9 @@ def _reader(path: Path) -> Any:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
+    for file in path.glob("*.mcap") if path.is_dir() else [path]:
+        if file.suffix.lower() == ".mcap":
+            check_records(file)
     return Reader1(path) if path.suffix.lower() == ".bag" and path.is_file() else Reader2(path)
 
 
@@ -306,10 +310,14 @@ def damage(path: Path) -> Iterator[None]:
             f"'{path}': bags and MCAP files need the package rosbags, which is not installed; run pip install "
             "'excavator-dynamics-predictor[ros]', or convert the wanted topics to CSV or Parquet"
         ) from error
-    except (DataError, OSError, MemoryError) as error:
-        if isinstance(error, DataError) and str(path) not in str(error):
-            raise DataError(f"'{path}' holds {error}; it may be damaged: copy or record it again") from error
-        raise
+    except DataError as error:
+        if str(path) in str(error):
+            raise
+        raise DataError(f"'{path}' holds {error}; it may be damaged: copy or record it again") from error
+    except MemoryError as error:
+        raise DataError(
+            f"'{path}' announces more data than this machine has memory for; it may be damaged: copy or record it again"
+        ) from error
     except Exception as error:
         text = str(error) or type(error).__name__
         raise DataError(f"'{path}' cannot be read: {text}{_advice(text)}") from error

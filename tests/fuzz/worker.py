@@ -1,0 +1,118 @@
+"""Reads damaged copies of one log, one after the other, in a process with bounded memory and time a file.
+
+Usage: ``python worker.py FOLDER CASE FIRST COUNT``. The last line is JSON: how many were read, refused, and what went
+wrong. The damaged copy in work lies in FOLDER, so that a crash leaves its cause behind.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import logging
+import resource
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from edp.errors import EdpError
+from edp.logs import read_recording
+from edp.recording import Recording
+
+MEMORY_BYTES = 6 << 30
+SECONDS = 20
+
+
+def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
+    """One of the ways in which files are damaged: flipped bytes, cut off, zeros at the end, parts lost, wild sizes."""
+    data = bytearray(whole)
+    size = len(data)
+    way = int(rng.integers(8))
+    if way <= 1:
+        for place in rng.integers(0, size, int(rng.integers(1, 9))):
+            data[place] ^= int(rng.integers(1, 256))
+    elif way == 2:
+        # Where formats keep their structure: near the ends.
+        for place in rng.integers(0, min(size, 2048), int(rng.integers(1, 5))):
+            data[place if rng.integers(2) else size - 1 - place] ^= 1 << int(rng.integers(8))
+    elif way == 3:
+        del data[int(rng.integers(1, size)) :]
+    elif way == 4:
+        start = int(rng.integers(0, size))
+        data[start:] = bytes(size - start)
+    elif way == 5:
+        start = int(rng.integers(0, size))
+        part = data[start : start + int(rng.integers(1, 512))]
+        if rng.integers(2):
+            del data[start : start + len(part)]
+        else:
+            data[start:start] = part
+    elif way == 6:
+        wide = int(rng.choice([1, 2, 4, 8]))
+        place = int(rng.integers(0, max(size - wide, 1)))
+        wild = [b"\xff" * wide, b"\0" * wide, (b"\xff" * wide)[:-1] + b"\x7f", rng.bytes(wide)]
+        data[place : place + wide] = wild[int(rng.integers(len(wild)))]
+    else:
+        start, stop = sorted(rng.integers(0, size, 2).tolist())
+        part = min(stop - start, 256)
+        data[start : start + part] = data[stop - part : stop]
+    return bytes(data)
+
+
+def same_where_stated(read: Recording, original: Recording) -> bool:
+    """Whether a log that states to be EDP's holds EDP's values."""
+    return read.source != original.source or read.digest == original.digest
+
+
+class _TooSlow(Exception):
+    pass
+
+
+def _alarm(*_: object) -> None:
+    raise _TooSlow
+
+
+def main() -> None:
+    folder, case = Path(sys.argv[1]), sys.argv[2]
+    first, count = int(sys.argv[3]), int(sys.argv[4])
+    faulthandler.enable()
+    logging.disable(logging.CRITICAL)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    signal.signal(signal.SIGALRM, _alarm)
+    path = folder / case
+    whole = path.read_bytes()
+    original = read_recording(path)
+    target = folder / f"damaged_{case}"
+    found = {"read": 0, "refused": 0, "slowest_s": 0.0, "faults": []}
+    for number in range(first, first + count):
+        rng = np.random.default_rng([number, *case.encode()])
+        target.write_bytes(damaged(whole, rng))
+        start = time.monotonic()
+        fault = ""
+        signal.alarm(SECONDS)
+        try:
+            read = read_recording(target)
+            found["read"] += 1
+            if not same_where_stated(read, original):
+                fault = "wrong numbers"
+        except EdpError as error:
+            found["refused"] += 1
+            if target.name not in str(error):
+                fault = f"message without the file: {error}"
+        except _TooSlow:
+            fault = f"longer than {SECONDS} s"
+        except BaseException as error:
+            fault = f"{type(error).__name__}: {error}"
+        finally:
+            signal.alarm(0)
+        found["slowest_s"] = max(found["slowest_s"], time.monotonic() - start)
+        if fault:
+            found["faults"].append([number, fault[:300]])
+    found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
