@@ -231,7 +231,7 @@ def test_files_that_cannot_be_read_say_why(tmp_path):
     with pytest.raises(DataError, match="only ROS 2 messages in MCAP are read"):
         read_recording(mcap)
     mcap.write_bytes(whole[:-500])
-    with pytest.raises(DataError, match="truncated or damaged"):
+    with pytest.raises(DataError, match="truncated, half downloaded, or its recorder was killed"):
         read_recording(mcap)
     other = tmp_path / "other.db3"
     with sqlite3.connect(other) as base:

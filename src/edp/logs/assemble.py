@@ -123,14 +123,15 @@ class Assembly:
             "read some rows, fewer channels, or in parts (edp.logs.read_parts)",
         )
         values = np.empty((last - first, len(self.wanted)), dtype=np.float32)
-        tables: dict[int, tuple[Table, list[int]]] = {}
+        tables: dict[tuple[int, int], tuple[Table, list[int]]] = {}
         for place, entry in enumerate(self.wanted):
             if entry.signal is None:
                 values[:, place] = entry.constant
                 continue
-            line = self.lines[_clock_key(entry.signal)]
-            if entry.signal.table is not None and line.order is None:
-                tables.setdefault(id(entry.signal.table), (entry.signal.table, []))[1].append(place)
+            clock = _clock_key(entry.signal)
+            line, table = self.lines[clock], entry.signal.table
+            if table is not None and line.order is None:
+                tables.setdefault((id(table), clock), (table, []))[1].append(place)
                 continue
             column = entry.signal.values
             if line.order is not None:
@@ -141,7 +142,7 @@ class Assembly:
         return values
 
     def _fill(self, values: FloatArray, table: Table, places: list[int], first: int) -> None:
-        """The columns of one table, piece by piece."""
+        """Columns of one table and one clock, piece by piece."""
         chosen = [(place, entry, entry.signal) for place in places if (entry := self.wanted[place]).signal is not None]
         keys = [signal.key for _, _, signal in chosen]
         ticks = slice(first, first + len(values))
@@ -296,6 +297,9 @@ def _stated_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Cloc
         return None
     if signal.samples < 1:
         raise DataError(f"'{raw.path}': column '{signal.name}' holds no rows")
+    check_memory(
+        raw.path, _TICK_BYTES * signal.samples, f"{signal.samples} rows", "the file may be damaged: copy it again"
+    )
     return uniform_clock(signal.samples, rate)
 
 

@@ -128,8 +128,8 @@ class _Bag:
         with damage(self.path):
             for connection, log_ns, raw in self.reader.messages([c for topic in topics for c in topic.connections]):
                 collected[connection.topic].add(log_ns, raw)
-        for name, topic in by_name.items():
-            topic.take(*collected[name].columns(), paths[name])
+            for name, topic in by_name.items():
+                topic.take(*collected[name].columns(), paths[name])
 
 
 class _Collected:
