@@ -1,5 +1,6 @@
 """``edp footprint`` on the thesis's settings prints the counts that the thesis prints (Tables B.1, 4.8, 4.9)."""
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -8,11 +9,15 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
+from edp.config import load_experiment
+from edp.losses import TERMS
+from edp.models.predictor import ModelSpec, describe
 
 FOLDER = Path(__file__).parents[2] / "examples" / "thesis"
 # Parameters as stored; MACs of a window in M to three digits as printed; MACs per tick in k to four digits.
 PRINTED = {
     "table_b1": (1_376_775, "62.88", "1379"),
+    "table_b1_training": (1_376_775, "62.88", "1379"),
     "k10_teacher": (1_197_319, "45.198", "1206"),
     "k10_student_u64": (84_292, "3.257", "86.6"),
     "k10_student_u32": (24_228, "0.958", "25.4"),
@@ -50,3 +55,27 @@ def test_counts(name, monkeypatch, capsys):
     if name in FOLDED:
         assert counts["parameters_folded"] == FOLDED[name]
     assert counts["window"] == 50
+
+
+def test_the_training_of_table_b1_is_what_is_printed_there():
+    made = load_experiment(FOLDER / "table_b1_training.toml", "thesis")
+    preset, training = load_experiment(FOLDER / "table_b1.toml", "thesis"), made.training
+    assert dataclasses.replace(made.model.backbone, dropout=preset.model.backbone.dropout) == preset.model.backbone
+    assert (made.model.head, made.model.activation, made.model.blocks) == (
+        *(preset.model.head, preset.model.activation, preset.model.blocks),
+    )
+    assert [(TERMS.name_of(term), term.weight) for term in training.terms] == [
+        ("smoothness", 0.05),
+        ("derivative", 0.1),
+    ]
+    assert training.augmentations[0].std == 0.02
+    assert (training.weight_power, training.clip_norm, training.patience, training.epochs) == (2.0, 1.0, 8, 25)
+    assert (training.loss.delta, training.optimizer.learning_rate, training.optimizer.weight_decay) == (1.5, 3e-4, 5e-4)
+    assert (training.chunks.regime, training.chunks.length, training.chunks.batch) == ("window", 50, 32)
+    assert 3e-4 * training.schedule.floor == pytest.approx(1e-7, rel=0.02)
+
+
+def test_a_label_names_what_is_not_plain():
+    b1 = load_experiment(FOLDER / "table_b1.toml", "thesis").model
+    assert describe(b1) == "hybrid + multi_scale_tcn + cylinder_gate + stanh activation"
+    assert describe(ModelSpec()) == "hybrid"

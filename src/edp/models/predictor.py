@@ -12,11 +12,11 @@ from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import ConfigError
 from edp.losses import Answer
-from edp.models.activations import ActivationSpec, Identity
+from edp.models.activations import ACTIVATIONS, ActivationSpec, Identity
 from edp.models.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.models.frontend import FrontEnd, TargetCode
-from edp.models.heads import HeadSpec, MlpHead
-from edp.models.outputs import OutputSpec, Point
+from edp.models.heads import HEADS, HeadSpec, MlpHead
+from edp.models.outputs import OUTPUTS, OutputSpec, Point
 from edp.models.physics import PHYSICS, PhysicsBase, PhysicsSpec
 from edp.streaming import Cost, State, Streaming, parameters_of
 
@@ -190,6 +190,16 @@ def trainable(module: nn.Module) -> list[nn.Parameter]:
 
 
 def describe(spec: ModelSpec) -> str:
-    """A short label for tables, for example ``hybrid + temporal_difference``."""
+    """A short label for tables, for example ``hybrid + temporal_difference``; plain heads, outputs are not named."""
     physics = [] if spec.physics is None else [f"{PHYSICS.name_of(spec.physics)} physics"]
-    return " + ".join([BACKBONES.name_of(spec.backbone), *(BLOCKS.name_of(block) for block in spec.blocks), *physics])
+    ends = [
+        f"{registry.name_of(part)} {what}"
+        for registry, part, what, plain in (
+            (HEADS, spec.head, "head", MlpHead),
+            (ACTIVATIONS, spec.activation, "activation", Identity),
+            (OUTPUTS, spec.output, "output", Point),
+        )
+        if not isinstance(part, plain)
+    ]
+    blocks = [BLOCKS.name_of(block) for block in spec.blocks]
+    return " + ".join([BACKBONES.name_of(spec.backbone), *blocks, *ends, *physics])
