@@ -30,6 +30,8 @@ MATERIAL = 0.15
 """Correlation of the rest of a copy with anything, above which it is more than noise."""
 RELATED = 0.7
 """Least correlation of a noisy copy with its original."""
+EXPLAINED = 0.01
+"""Share of a channel's variance left by the presents and pasts of others, below which it is made of them."""
 SLACK = 1
 """Samples by which an exact copy may be off and still count as simultaneous."""
 _FAR = 30
@@ -186,7 +188,37 @@ def _copy_flag(names: Sequence[str], pair: Pair, trusted: bool) -> Flag:
     if abs(pair.lag) <= SLACK:
         return Flag(name, FlagKind.DUPLICATE, source, pair.lag, value, f"equals {source} (correlation {value:.4f})")
     text = f"is {source} {pair.lag} samples later (correlation {value:.4f}), and what is left of it relates to nothing"
+    if not trusted:
+        text += f"; or {source} knows its future: see which of the two is measured, and name it as trusted"
     return Flag(name, FlagKind.COPY, source, pair.lag, value, text)
+
+
+def explained_flags(
+    names: Sequence[str], correlations: Array, judged: Sequence[int], base: Sequence[int]
+) -> list[Flag]:
+    """Channels that the presents and pasts of others make up, one after the other, so that something remains.
+
+    Args:
+        names: channels.
+        correlations: ``[reach + lag, i, j]``, over all pieces.
+        judged: columns in the order in which they may go.
+        base: columns that explain; those of `judged` are among them until they go.
+    """
+    reach = len(correlations) // 2
+    strength = np.abs(correlations).max(axis=0)
+    remaining = list(base)
+    flags = []
+    for channel in judged:
+        others = sorted((k for k in remaining if k != channel), key=lambda k: -strength[channel, k])
+        near = others[:_PARTNERS]
+        taps = [(k, a) for k in others for a in (_NEAR_PAST if k in near else _SPARSE_PAST) if a <= reach]
+        if not taps or (left := unexplained(correlations, channel, taps)[1]) > EXPLAINED:
+            continue
+        text = f"the presents and pasts of {names[near[0]]} and others make up all but {100 * left:.2g} % of it"
+        value = 1.0 - left
+        flags.append(Flag(names[channel], FlagKind.REDUNDANT, names[near[0]], value=value, evidence=text))
+        remaining.remove(channel)
+    return flags
 
 
 def innovations(correlations: Array, order: int = 20) -> Array:

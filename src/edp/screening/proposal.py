@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.screening.artefacts import lonely
+from edp.screening.copies import explained_flags
 from edp.screening.result import Choice, Cluster, Flag, FlagKind, Importance, LagCurve, Proposal, Value
 from edp.screening.stability import Relations
 from edp.screening.table import Table
@@ -29,6 +30,7 @@ class Evidence:
     Attributes:
         table: the data.
         live: columns of the table that change.
+        correlations: of live channels, ``[reach + lag, i, j]``, over all pieces.
         relations: tests of live channels against targets.
         pieces: correlation of each piece at the best lag with the best target, ``(piece, live channel)``.
         curves: lag curves.
@@ -40,6 +42,7 @@ class Evidence:
 
     table: Table
     live: NDArray[np.int64]
+    correlations: NDArray[np.float64]
     relations: Relations
     pieces: NDArray[np.float64]
     curves: Sequence[LagCurve]
@@ -69,9 +72,8 @@ def noise_flags(evidence: Evidence, judged: Sequence[str]) -> list[Flag]:
         name = evidence.table.names[column]
         if name not in judged or evidence.relations.related[place].any():
             continue
-        gain, low = evidence.gain(name)
         entry = evidence.importance_of(name)
-        if (low > 0 and gain > NEGLIGIBLE) or (entry is not None and entry.low > 0 and entry.increase > NEGLIGIBLE):
+        if _adds(evidence, name) or (entry is not None and entry.low > 0 and entry.increase > NEGLIGIBLE):
             continue
         flags.append(_noise(evidence, place, name))
     return flags
@@ -99,14 +101,38 @@ def _noise(evidence: Evidence, place: int, name: str) -> Flag:
     return Flag(name, FlagKind.NOISE, value=value, evidence=text)
 
 
-def redundant_flags(evidence: Evidence, judged: Sequence[str]) -> list[Flag]:
-    """Members of a cluster, other than its representative, that add nothing beside it."""
+def redundant_flags(evidence: Evidence, judged: Sequence[str], free: Sequence[str]) -> list[Flag]:
+    """Channels that add nothing beside others: members of a cluster, and what the pasts of others make up.
+
+    Args:
+        evidence: figures.
+        judged: channels that may go.
+        free: all channels without a flag, `judged` among them.
+    """
+    idle = {name for name in judged if not _adds(evidence, name)}
+    flags = _cluster_flags(evidence, idle)
+    idle -= {flag.channel for flag in flags}
+    names = [evidence.table.names[column] for column in evidence.live]
+    scores = _scores(evidence)
+    order = [names.index(name) for name in sorted(idle, key=lambda name: (scores[name], name))]
+    gone = {flag.channel for flag in flags}
+    base = [k for k, name in enumerate(names) if name in free and name not in gone]
+    return flags + explained_flags(names, evidence.correlations, order, base)
+
+
+def _adds(evidence: Evidence, name: str) -> bool:
+    """Whether the past of a channel takes away some of the error that the others leave, held out."""
+    gain, low = evidence.gain(name)
+    return low > 0 and gain > NEGLIGIBLE
+
+
+def _cluster_flags(evidence: Evidence, idle: set[str]) -> list[Flag]:
     flags = []
     for cluster in evidence.clusters:
         for name in cluster.members:
-            gain, low = evidence.gain(name)
-            if name == cluster.representative or name not in judged or not (low <= 0 or gain < NEGLIGIBLE):
+            if name == cluster.representative or name not in idle:
                 continue
+            gain = evidence.gain(name)[0]
             text = (
                 f"goes with {cluster.representative} (rank correlation {cluster.least:.2f} or more within the cluster) "
                 f"and takes away only {100 * gain:.2f} % of the error that is left"

@@ -132,10 +132,15 @@ def _widened(table: Table, matrix: Array) -> Array:
     return full
 
 
+def trusted_names(table: Table, spec: ScreeningSpec) -> set[str]:
+    """Channels known to be measured on the machine: targets, the names of Table A.1, and those that the user names."""
+    return {*(table.names[i] for i in table.targets), *spec.trusted, *TABLE_A1}
+
+
 def _structural_flags(table: Table, lagged: Lagged, spec: ScreeningSpec) -> list[Flag]:
     """What is wrong with channels whatever the targets: dead, clocks, per-file artefacts, leaks, copies."""
     names = [table.names[i] for i in lagged.live]
-    trust = {*(table.names[i] for i in table.targets), *spec.trusted, *TABLE_A1}
+    trust = trusted_names(table, spec)
     trusted = [k for k, name in enumerate(names) if name in trust]
     targets = np.searchsorted(lagged.live, table.targets).tolist()
     flags = artefacts.dead_flags(table)
@@ -184,7 +189,8 @@ def _evidence(
         history = values.window_needed(lagged, among, targets.tolist(), spec.horizon, held)
     clusters = _clusters(table, spearman, columns, groups, relations.linear[np.searchsorted(lagged.live, columns)])
     pieces = _at_best(lagged, targets, relations)
-    return Evidence(table, lagged.live, relations, pieces, curves, importance, worth, clusters, history)
+    correlations = lagged.pooled()
+    return Evidence(table, lagged.live, correlations, relations, pieces, curves, importance, worth, clusters, history)
 
 
 def _clusters(
@@ -233,8 +239,9 @@ def _concluded(
     targets = tuple(table.names[i] for i in table.targets)
     free = {name for name in table.names if name not in targets} - {flag.channel for flag in flags}
     flags = flags + noise_flags(evidence, sorted(free))
-    free -= {flag.channel for flag in flags}
-    flags = flags + redundant_flags(evidence, sorted(free))
+    free = set(table.names) - {flag.channel for flag in flags}
+    trust = trusted_names(table, spec)
+    flags = flags + redundant_flags(evidence, sorted(free - trust), sorted(free))
     return Screening(
         tuple(recording.name for recording in recordings),
         tuple(piece.name for piece in table.pieces),
