@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import struct
 import tempfile
+import zlib
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
@@ -22,6 +25,20 @@ def make(rows=300):
     rng = np.random.default_rng(1)
     channels = tuple(TABLE_A1[name] for name in ("BmUp", "CylVels_1"))
     return Recording("R", channels, rng.standard_normal((rows, 2)).astype(np.float32), 100.0)
+
+
+def attempt(path):
+    """The recording, or why there is none."""
+    try:
+        return read_recording(path), ""
+    except DataError as error:
+        return None, str(error)
+
+
+def same_columns(one, other):
+    """Bit by bit; a text file, or one that lost EDP's facts, has the vocabulary's order."""
+    names = sorted(other.channel_names)
+    return sorted(one.channel_names) == names and one.select(names).tobytes() == other.select(names).tobytes()
 
 
 def text(tmp_path, content, name="a.csv"):
@@ -224,3 +241,98 @@ def test_rows_out_of_range(tmp_path):
     assert read_recording(path, rows=(10, None)).samples == 290
     with pytest.raises(DataError, match=r"rows 0:301 asked for, but 0 <= start < stop <= 300"):
         read_recording(path, rows=(0, 301))
+
+
+@pytest.mark.parametrize("version", ["5", "7.3"])
+def test_a_mat_file_that_unpacks_to_more_than_memory_is_refused_unread(tmp_path, version):
+    """A zip bomb: some kilobytes that announce gigabytes."""
+    path = tmp_path / "bomb.mat"
+    if version == "5":
+        zeros = zlib.compress(struct.pack("<II", 14, 0xFFFFFFF0) + bytes(1 << 20))
+        element = struct.pack("<II", 15, len(zeros)) + zeros
+        path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + element * 20)
+    else:
+        with h5py.File(path, "w", userblock_size=512) as file:
+            file.create_dataset("x", shape=(1, 1 << 44), dtype="f8", chunks=(1, 1 << 10), compression="gzip")
+            file["x"].attrs["MATLAB_class"] = np.bytes_(b"double")
+        with path.open("rb+") as stream:
+            stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(DataError, match=r"variables of this MAT file would take .* of memory.*made to exhaust memory"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "message"),
+    [
+        ("a.mat", b"PK\x03\x04\x14\x00\x01\x00" + bytes(60), "a password-protected ZIP archive"),
+        ("a.csv", b"<!DOCTYPE html><html><body>Sign in</body></html>", "a web page instead of the data"),
+        ("a.csv", b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n", "run 'git lfs pull'"),
+        ("a.parquet", b"Salted__" + bytes(60), r"encrypted data \(decrypt it first\)"),
+        ("a.mf4", bytes(5000), "begins with zeros only; it is half downloaded"),
+        ("a.mcap", b"\x89MCAP0\r\n" + bytes(500), "has no end"),
+        ("a.bag", b"#ROSBAG V2.0\n" + bytes(500), "cannot be read"),
+        ("a.db3", b"SQLite format 3\0" + bytes(500), "cannot be read"),
+        ("a.mf4.crdownload", b"MDF", "the download is not finished"),
+        ("a.bag.active", b"#ROSBAG", "rosbag reindex"),
+        ("a.mldatx", b"PK", "press Export and choose a MAT, Parquet or CSV file"),
+    ],
+)
+def test_what_is_not_a_log_is_named(tmp_path, name, head, message):
+    (tmp_path / name).write_bytes(head)
+    with pytest.raises(DataError, match=message):
+        read_recording(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_an_empty_file_of_each_format(tmp_path, suffix):
+    (tmp_path / f"a{suffix}").write_bytes(b"")
+    with pytest.raises(DataError, match="is empty"):
+        read_recording(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_half_downloaded_file_of_each_format(tmp_path, suffix):
+    """Browsers write what they have, others the whole length with zeros where the rest will be."""
+    whole = write_recording(make(3000), tmp_path / f"a{suffix}").read_bytes()
+    half = len(whole) // 2
+    for data in (whole[:half], whole[:half] + bytes(len(whole) - half)):
+        (tmp_path / f"a{suffix}").write_bytes(data)
+        read, message = attempt(tmp_path / f"a{suffix}")
+        if read is None:
+            assert f"a{suffix}" in message
+            continue
+        # Lines of text that are whole are a shorter log.
+        assert suffix == ".csv"
+        assert read.samples < 3000
+        assert same_columns(read.rows(0, read.samples - 1), make(3000).rows(0, read.samples - 1))
+
+
+@pytest.mark.parametrize("suffix", [suffix for suffix in SUFFIXES if suffix != ".csv"])
+def test_numbers_changed_behind_our_back_are_never_read_silently(tmp_path, suffix):
+    """EDP's own files state the digest of their values, whatever the container checks."""
+    recording = make(400)
+    whole = bytearray(write_recording(recording, tmp_path / f"a{suffix}").read_bytes())
+    for place in np.random.default_rng(5).integers(len(whole) // 4, len(whole), 40):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0x10
+        (tmp_path / f"a{suffix}").write_bytes(damaged)
+        read, message = attempt(tmp_path / f"a{suffix}")
+        assert f"a{suffix}" in message if read is None else same_columns(read, recording)
+
+
+def test_text_block_by_block_is_read_as_the_whole(tmp_path, monkeypatch):
+    recording = make(5000)
+    path = write_recording(recording, tmp_path / "a.csv")
+    monkeypatch.setattr("edp.logs.csv_table.WHOLE_BYTES", 0)
+    monkeypatch.setattr("edp.logs.csv_table._BLOCK_BYTES", 4096)
+    assert same_columns(read_recording(path), recording)
+    assert same_columns(read_recording(path, rows=(1234, 1300)), recording.rows(1234, 1300))
+    with path.open("a") as stream:
+        stream.write("50.00,1,2\n50.01,oops,2\n")
+    with pytest.raises(DataError, match=r"column 'BmUp' holds text 'oops' in line 5003"):
+        read_recording(path)
+    with path.open("a") as stream:
+        stream.write("50.00,1\n")
+    with pytest.raises(DataError, match="has 2 cells, the header has 3"):
+        read_recording(path)

@@ -5,38 +5,24 @@ from __future__ import annotations
 import csv as text_csv
 import io
 import re
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as arrow_csv
 
 from edp.errors import DataError
-from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, time_factor
+from edp.logs.csv_table import CsvTable, Layout, is_number
+from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, load_column, time_factor
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
 from edp.signals import TIME_UNITS, UNITS, SignalMap
 
 _HEAD_BYTES = 1 << 18
 _DELIMITERS = (",", ";", "\t", "|")
-_NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "-nan", "-nan(ind)", "1.#QNAN"]
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")
 _BLOCK_ROWS = 65536
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """How a text file is laid out: its columns with units, and where its numbers begin."""
-
-    names: tuple[str, ...]
-    units: tuple[str | None, ...]
-    numeric: tuple[bool, ...]
-    delimiter: str
-    decimal: str
-    skip_rows: int
-    encoding: str
 
 
 class CsvFormat:
@@ -57,24 +43,20 @@ class CsvFormat:
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read a text file; empty cells are missing values."""
         layout = _layout(path, signal_map)
-        table = _table(path, layout)
+        table = CsvTable(path, layout)
         names = [name for name in layout.names if name]
         time_name = find_time(names, signal_map, path)
-        time = None
-        if time_name is not None:
-            place = layout.names.index(time_name)
-            time = _stamps(table.column(place), path, time_name, layout, signal_map)
+        time = None if time_name is None else _stamps(table, layout.names.index(time_name), signal_map)
         signals: dict[str, RawSignal] = {}
         for place, name in enumerate(layout.names):
             if not name or name == time_name:
                 continue
-            column = table.column(place)
             if name in signals:
-                signals[name] = _ambiguous(path, name, table.num_rows, time)
+                signals[name] = _ambiguous(path, name, table.rows, time)
                 continue
-            signals[name] = RawSignal(
-                name, _loader(column, path, name, layout), table.num_rows, time, unit=layout.units[place]
-            )
+            key = str(place)
+            load = partial(load_column, table, key, table.rows)
+            signals[name] = RawSignal(name, load, table.rows, time, unit=layout.units[place], table=table, key=key)
         return RawLog(path, signals)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
@@ -96,7 +78,7 @@ class CsvFormat:
 FORMATS.register("csv")(CsvFormat())
 
 
-def _layout(path: Path, signal_map: SignalMap) -> _Layout:
+def _layout(path: Path, signal_map: SignalMap) -> Layout:
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     encoding = _encoding(head)
@@ -121,8 +103,8 @@ def _layout(path: Path, signal_map: SignalMap) -> _Layout:
         body = rows[more:]
     else:
         names, units = _stated_columns(path, rows, signal_map)
-    numeric = tuple(all(_is_number(row[i], decimal) for row in body if i < len(row)) for i in range(len(names)))
-    return _Layout(names, units, numeric, delimiter, decimal, skip, encoding)
+    numeric = tuple(all(is_number(row[i], decimal) for row in body if i < len(row)) for i in range(len(names)))
+    return Layout(names, units, numeric, delimiter, decimal, skip, encoding)
 
 
 def _encoding(head: bytes) -> str:
@@ -153,22 +135,11 @@ def _has_decimal_commas(rows: list[list[str]]) -> bool:
     )
 
 
-def _is_number(cell: str, decimal: str = ".") -> bool:
-    text = cell.strip()
-    if text in _NULLS:
-        return True
-    try:
-        float(text.replace(decimal, ".") if decimal != "." else text)
-    except ValueError:
-        return False
-    return True
-
-
 def _header(path: Path, rows: list[list[str]], decimal: str) -> tuple[tuple[str, ...], tuple[str | None, ...], int]:
     """Names, units and the number of header rows (2 with a row of units)."""
     cells = [cell.strip() for cell in rows[0]]
     filled = [cell for cell in cells if cell]
-    if not filled or all(_is_number(cell, decimal) for cell in filled):
+    if not filled or all(is_number(cell, decimal) for cell in filled):
         raise DataError(
             f"'{path}': the first row holds numbers, not names ({', '.join(cells[:4])}); "
             "set header = false in the signal map and list its columns"
@@ -198,7 +169,7 @@ def _is_unit_row(row: list[str], decimal: str) -> bool:
     filled = [cell for cell in cells if cell]
     words = [cell for cell in filled if cell != "1"]
     known = [normalise_unit(cell) in UNITS or normalise_unit(cell) in TIME_UNITS for cell in words]
-    return any(known) and not any(_is_number(cell, decimal) for cell in words)
+    return any(known) and not any(is_number(cell, decimal) for cell in words)
 
 
 def _stated_columns(
@@ -213,62 +184,6 @@ def _stated_columns(
     return tuple(signal_map.columns), (None,) * width
 
 
-def _table(path: Path, layout: _Layout) -> pa.Table:
-    """All columns, numbers where they are numbers, text otherwise."""
-    keys = [f"c{i}" for i in range(len(layout.names))]
-    types = {key: pa.float64() if number else pa.string() for key, number in zip(keys, layout.numeric)}
-    ragged: list[Any] = []
-
-    def note(row: Any) -> str:
-        ragged.append(row)
-        return "skip"
-
-    encoding = "utf-8" if layout.encoding == "utf-8-sig" else layout.encoding
-    read = arrow_csv.ReadOptions(
-        use_threads=False, column_names=keys, skip_rows=layout.skip_rows, encoding=encoding, block_size=1 << 24
-    )
-    parse = arrow_csv.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=note)
-    for _ in range(len(keys) + 1):
-        convert = arrow_csv.ConvertOptions(column_types=types, null_values=_NULLS, decimal_point=layout.decimal)
-        ragged.clear()
-        try:
-            table = arrow_csv.read_csv(path, read_options=read, parse_options=parse, convert_options=convert)
-        except (pa.ArrowException, OSError, ValueError) as error:
-            column = re.search(r"CSV column #(\d+)", str(error))
-            if column is None or types[keys[int(column[1])]] == pa.string():
-                raise DataError(f"'{path}' cannot be read as CSV: {error}") from error
-            # Text further down a column of numbers: keep it as text, so that only a map that needs it is refused.
-            types[keys[int(column[1])]] = pa.string()
-            continue
-        if ragged:
-            bad = ragged[0]
-            raise DataError(
-                f"'{path}': line {bad.number} has {bad.actual_columns} cells, the header has {bad.expected_columns} "
-                f"('{bad.text[:60]}'); the file may be cut off: export it again or delete the line"
-            )
-        return table
-    raise DataError(f"'{path}' cannot be read as CSV")
-
-
-def _loader(column: pa.ChunkedArray, path: Path, name: str, layout: _Layout) -> Any:
-    def load() -> Column:
-        if pa.types.is_string(column.type):
-            _refuse_text(column, path, name, layout)
-        return np.asarray(column.to_numpy(), dtype=np.float64)
-
-    return load
-
-
-def _refuse_text(column: pa.ChunkedArray, path: Path, name: str, layout: _Layout) -> None:
-    for row, cell in enumerate(column.to_pylist()):
-        if not _is_number(cell or "", layout.decimal):
-            raise DataError(
-                f"'{path}': column '{name}' holds text '{cell[:40]}' in line {row + layout.skip_rows + 1}; "
-                "expected a number or an empty cell"
-            )
-    raise DataError(f"'{path}': column '{name}' holds numbers that cannot be read; check the decimal sign in the map")
-
-
 def _ambiguous(path: Path, name: str, samples: int, time: Column | None) -> RawSignal:
     def load() -> Column:
         raise DataError(f"'{path}' has two columns named '{name}'; rename one of them")
@@ -276,15 +191,18 @@ def _ambiguous(path: Path, name: str, samples: int, time: Column | None) -> RawS
     return RawSignal(name, load, samples, time)
 
 
-def _stamps(column: pa.ChunkedArray, path: Path, name: str, layout: _Layout, signal_map: SignalMap) -> Column:
-    unit = layout.units[layout.names.index(name)]
-    if not pa.types.is_string(column.type):
-        return _loader(column, path, name, layout)() * time_factor(name, unit, signal_map)
-    cells = [(cell or "NaT").strip().removesuffix("Z") for cell in column.to_pylist()]
+def _stamps(table: CsvTable, place: int, signal_map: SignalMap) -> Column:
+    layout = table.layout
+    name, unit = layout.names[place], layout.units[place]
+    if table.types[table.keys[place]] != pa.string():
+        return load_column(table, str(place), table.rows) * time_factor(name, unit, signal_map)
+    cells = [(cell or "NaT").strip().removesuffix("Z") for cell in table.texts(place)]
     try:
         dates = np.array(cells, dtype="datetime64[ns]")
     except ValueError:
-        _refuse_text(column, path, name, layout)
+        table.refuse_text(place)
         raise
+    if not len(dates):
+        return np.empty(0)
     stamps = (dates - dates[0]) / np.timedelta64(1, "s")
     return np.asarray(stamps, dtype=np.float64)

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.io
 
 from edp.errors import DataError, closest
+from edp.logs.mat_check import check_size
 from edp.logs.mat_layouts import INFO, LAYOUTS
 from edp.logs.mat_objects import Found, collect
 from edp.logs.matlab import matio
@@ -115,6 +116,8 @@ def _load(path: Path) -> dict[str, Any]:
         head = stream.read(128)
     if any(magic.startswith(head[: len(magic)]) for magic in _MAGIC) and len(head) < 128:
         raise DataError(f"'{path}' is a MAT file that ends inside its header (truncated); copy or export it again")
+    if not _is_v4(head):
+        check_size(path)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
