@@ -12,7 +12,7 @@ from scipy import linalg, stats
 from scipy.cluster import hierarchy
 
 Array = NDArray[np.float64]
-KNEES = (0.5, 0.8)
+KNEES = (0.5, 0.7, 0.8, 0.9, 0.96)
 """Quantiles at which each channel has a hinge, so that laws with a dead zone or a threshold can be told."""
 RIDGE = 1e-6
 """Penalty over the mean squared size of a term."""

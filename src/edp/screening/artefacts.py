@@ -10,7 +10,7 @@ from edp.screening.compiled import spread
 from edp.screening.lagged import Lagged
 from edp.screening.ranks import ranks_of
 from edp.screening.result import Array, Flag, FlagKind
-from edp.screening.table import Table
+from edp.screening.table import Table, chunks
 
 CLOCK = 0.98
 """Rank correlation with time, in every piece, from which a channel only tells the time."""
@@ -20,6 +20,8 @@ EXACT = 0.97
 """The same before a change of its gain counts."""
 GAIN = 1.5
 """Ratio of the largest to the smallest gain."""
+STEADY = 1.25
+"""Largest ratio of gains (90 % to 10 %) that count as one gain."""
 
 
 def dead_flags(table: Table) -> list[Flag]:
@@ -92,6 +94,58 @@ def changing_flags(names: Sequence[str], lagged: Lagged, judged: Sequence[int]) 
         return Flag(names[i], FlagKind.ARTEFACT, names[j], lag - lagged.reach, float(least[lag, j]), text)
 
     return [flag for flag in spread(of_channel, judged) if flag is not None]
+
+
+def turned_flags(table: Table, live: Sequence[int], judged: Sequence[int]) -> list[Flag]:
+    """Channels that show another one with the same gain in many recordings, but not with the same sign.
+
+    Pieces may join recordings with different signs, so every stretch is looked at for itself, at lag 0. Natural
+    relations change their gain where they change their sign; a plug turned round, or a set-up script, does not.
+
+    Args:
+        table: the data.
+        live: its columns that change.
+        judged: places in `live` of the channels that may be flagged; the others are what they are held against.
+    """
+    found = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
+    relations, slopes = np.array([r for r, _ in found]), np.array([s for _, s in found])
+    strong = np.abs(relations) >= STRONG
+    counts = strong.sum(axis=0)
+    turned = np.minimum((strong & (relations > 0)).sum(axis=0), (strong & (relations < 0)).sum(axis=0))
+    enough = (counts >= max(4, len(found) // 4)) & (turned >= np.maximum(2, 0.2 * counts))
+    flags, open_ones = [], set(judged)
+    for i in judged:
+        # Of two channels that are both in question, it cannot be told which one turns.
+        sources = [int(j) for j in np.flatnonzero(enough[i]) if int(j) not in open_ones]
+        sources.sort(key=lambda j: -float(np.abs(relations[strong[:, i, j], i, j]).mean()))
+        for j in sources:
+            gains = np.abs(slopes[strong[:, i, j], i, j])
+            low, high = np.quantile(gains, (0.1, 0.9))
+            if high > STEADY * low:
+                continue
+            text = (
+                f"shows {table.names[live[j]]} with one gain in {counts[i, j]} of {len(found)} stretches, but with the "
+                f"other sign in {turned[i, j]} of them"
+            )
+            value = float(np.abs(relations[strong[:, i, j], i, j]).mean())
+            flags.append(Flag(table.names[live[i]], FlagKind.ARTEFACT, table.names[live[j]], 0, value, text))
+            break
+    return flags
+
+
+def _moments(stretches: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Correlations ``[i, j]`` and slopes of i on j, ``(channel, channel)``; 0 where one of them stands still."""
+    count = sum(len(stretch) for stretch in stretches)
+    mean = sum(stretch.sum(axis=0, dtype=np.float64) for stretch in stretches) / count
+    products = np.zeros((len(mean), len(mean)))
+    for part in chunks(stretches):
+        part -= mean
+        products += part.T @ part
+    square = np.diag(products)
+    moving = square > 1e-12 * count * np.maximum(mean * mean, 1e-30)
+    both = np.outer(moving, moving)
+    relation = np.divide(products, np.sqrt(np.outer(square, square)), out=np.zeros_like(products), where=both)
+    return relation, np.divide(products, square[None, :], out=np.zeros_like(products), where=both)
 
 
 def lonely(values: Array, chance: float) -> int | None:

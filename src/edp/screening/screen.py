@@ -151,6 +151,7 @@ def _structural_flags(table: Table, lagged: Lagged, spec: ScreeningSpec) -> list
 
     flags += artefacts.clock_flags(table, [int(lagged.live[k]) for k in open_ones()])
     flags += artefacts.changing_flags(names, lagged, open_ones())
+    flags += artefacts.turned_flags(table, [int(k) for k in lagged.live], open_ones())
     correlations = lagged.pooled()
     known = sorted(set(range(len(names))) - set(open_ones()))
     flags += copies.find_leaks(names, correlations, trusted, targets, known)
