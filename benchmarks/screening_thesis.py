@@ -84,45 +84,83 @@ class Figures:
         return float("nan")
 
 
+@dataclass(frozen=True)
+class Lag:
+    """Where a channel goes best with its cylinder's velocity.
+
+    Attributes:
+        channel: name.
+        best: lag of the largest size of the correlation on either side, with its 95 % interval `low` to `high`.
+        value: correlation there.
+        certain: it is no chance.
+        leading: lag of the largest correlation (eq. 2.13) among those at which the channel leads or is simultaneous,
+            in the direction in which it drives the piston: what retracts it (retract pilots, rod pressures) counts
+            with the opposite sign.
+        led: correlation there, in that direction.
+        open: the largest one is at an end of the leading side, so no peak.
+    """
+
+    channel: str
+    best: int
+    low: float
+    high: float
+    value: float
+    certain: bool
+    leading: int
+    led: float
+    open: bool
+
+
+def lag_of(found: Screening, channel: str, target: str) -> Lag:
+    """One row of the table of lags."""
+    curve = found.curve(channel, target)
+    retracts = channel.removesuffix("Conf") in {pair[1] for pair in PILOTS} or channel[-1] in "567"
+    side = (curve.lags <= 0) & (curve.lags >= -3 * SEEN)
+    driven = curve.correlation[side] * (-1.0 if retracts else 1.0)
+    peak = int(np.argmax(driven))
+    return Lag(channel, curve.best, curve.low, curve.high, curve.value, curve.certain, int(curve.lags[side][peak]),
+               float(driven[peak]), peak in (0, len(driven) - 1))  # fmt: skip
+
+
 def lag_rows(found: Screening) -> list[dict[str, Any]]:
     """Lags of each group's channels against their own cylinder, beside Table 4.2."""
     rows = []
     for group, (low, high) in TABLE_4_2.items():
-        curves = [found.curve(name, TARGETS[axis]) for axis in range(3) for name in members(group, axis)
-                  if name in found.channels]  # fmt: skip
-        known = [curve for curve in curves if np.isfinite(curve.value)]
-        sure = [curve for curve in known if curve.certain and not curve.at_edge]
-        within = [curve for curve in sure if low <= curve.best <= high]
+        lags = [lag_of(found, name, TARGETS[axis]) for axis in range(3) for name in members(group, axis)
+                if np.isfinite(found.curve(name, TARGETS[axis]).value)]  # fmt: skip
+        peaks = [lag for lag in lags if not lag.open]
         rows.append({
             "group": group,
             "thesis": [low, high],
-            "ours": [min((c.best for c in sure), default=None), max((c.best for c in sure), default=None)],
-            "each": {c.channel: {"lag": c.best, "correlation": c.value, "low": c.low, "high": c.high,
-                                 "certain": c.certain} for c in known},
-            "certain": len(sure),
-            "of": len(curves),
-            "within": len(within) / len(curves),
+            "leading": [min((lag.leading for lag in peaks), default=None), max((lag.leading for lag in peaks),
+                        default=None)],
+            "either side": [min(lag.best for lag in lags), max(lag.best for lag in lags)],
+            "peaks": len(peaks),
+            "of": len(lags),
+            "within": sum(low <= lag.leading <= high for lag in peaks) / len(lags),
+            "each": [asdict(lag) for lag in lags],
         })  # fmt: skip
     return rows
 
 
 def show_lags(rows: Sequence[dict[str, Any]]) -> None:
     """Print our lags beside Table 4.2, then each channel's own."""
-    print("\nLag of the largest correlation with the own cylinder's velocity, samples (negative: the channel leads)")
-    cells = []
-    for row in rows:
-        low, high = row["ours"]
-        ours = "-" if low is None else f"{low} to {high}"
-        cells.append([row["group"], f"{row['thesis'][0]} to {row['thesis'][1]}", ours, f"{row['certain']}/{row['of']}",
-                      f"{row['within']:.0%}"])  # fmt: skip
-    table(["group", "Table 4.2", "ours", "certain", "in the thesis's range"], cells)
+    print("\nLags at which channels go best with their own cylinder's velocity, samples (negative: the channel leads)")
+    cells = [
+        [row["group"], "{} to {}".format(*row["thesis"]), "{} to {}".format(*row["leading"]),
+         f"{row['peaks']}/{row['of']}", f"{row['within']:.0%}", "{} to {}".format(*row["either side"])]
+        for row in rows
+    ]  # fmt: skip
+    table(
+        ["group", "Table 4.2", "ours, leading side", "with a peak", "in the thesis's range", "ours, either side"], cells
+    )
     print()
     every = [
-        [name, one["lag"], f"{one['correlation']:+.2f}", f"{one['low']:.0f} to {one['high']:.0f}",
-         "yes" if one["certain"] else "no"]
-        for row in rows for name, one in row["each"].items()
+        [one["channel"], "none" if one["open"] else one["leading"], f"{one['led']:+.2f}", one["best"],
+         f"{one['value']:+.2f}", f"{one['low']:.0f} to {one['high']:.0f}", "yes" if one["certain"] else "no"]
+        for row in rows for one in row["each"]
     ]  # fmt: skip
-    table(["channel", "lag", "correlation", "95 %", "certain"], every)
+    table(["channel", "leading", "correlation", "either side", "correlation", "95 %", "certain"], every)
 
 
 def show_pattern(figures: Figures, metric: str, title: str) -> None:
@@ -205,18 +243,18 @@ def of_the_lags(found: Screening, rows: Sequence[dict[str, Any]]) -> list[Statem
     """What the thesis says of Table 4.2."""
     statements = [
         Statement(f"lags of the {row['group']}", f"{row['thesis'][0]} to {row['thesis'][1]}",
-                  ", ".join(f"{one['lag']}" for one in row["each"].values()), row["within"])
+                  ", ".join("no peak" if one["open"] else f"{one['leading']}" for one in row["each"]), row["within"])
         for row in rows
     ]  # fmt: skip
-    mean = {row["group"]: np.mean([one["lag"] for one in row["each"].values()]) for row in rows}
-    first = sorted(mean, key=lambda group: mean[group])[:2]
+    peaks = {row["group"]: [one["leading"] for one in row["each"] if not one["open"]] for row in rows}
+    first = sorted(peaks, key=lambda group: float(np.mean(peaks[group] or [0])))[:2]
     statements.append(
         Statement("which groups lead most", "pilots and conflux", " and ".join(first),
                   float(all("pilot" in group for group in first)))
     )  # fmt: skip
-    longest = -min(one["lag"] for row in rows for one in row["each"].values() if one["certain"])
+    longest = -min(lag for lags in peaks.values() for lag in lags)
     statements.append(
-        Statement("longest certain lag", f"about {SEEN} samples", f"{longest} samples", float(longest <= 1.25 * SEEN))
+        Statement("longest lead", f"about {SEEN} samples", f"{longest} samples", float(longest <= 1.25 * SEEN))
     )
     window = found.proposal.window
     statements.append(
