@@ -213,28 +213,38 @@ def chosen_rivals(league: League, arguments: argparse.Namespace) -> list[Contend
     ]
 
 
-def judge_horizon(
+def equal_time(
     league: League, horizon: int, rivals: list[Contender], arguments: argparse.Namespace, limit: float
 ) -> dict[str, Any]:
-    """All contenders at one horizon, their table printed."""
-    key = str(horizon)
-    ours = league.cell(OURS, [horizon], arguments.budget)
-    found: dict[str, Any] = {
-        "ours": ours,
+    """All contenders at one horizon after the same processor time."""
+    return {
+        "ours": league.cell(OURS, [horizon], arguments.budget),
         "baselines": league.baselines(horizon, arguments.baselines),
         "limit": limit,
         "rivals": {rival.family: league.cell(rival, [horizon], arguments.budget) for rival in rivals},
     }
-    rows = [("ours", ours), *((f"{family} (window)", cell) for family, cell in found["rivals"].items())]
-    if horizon in arguments.converge:
-        teacher = next(rival for rival in rivals if rival.family == TEACHER)
-        grown = league.cell(teacher, [horizon], arguments.cap, patience=12)
-        found["converged"] = grown
-        found["ours_tenth"] = league.cell(OURS, [horizon], round(grown["cpu_s"] / 10))
-        found["ours_long"] = league.cell(OURS, [horizon], arguments.cap)
-        rows += [(f"{TEACHER}, converged", grown), ("ours, a tenth of its time", found["ours_tenth"])]
+
+
+def at_convergence(
+    league: League, horizon: int, rivals: list[Contender], arguments: argparse.Namespace
+) -> dict[str, Any]:
+    """The teacher until it gets no better, ours in a tenth of that time, and ours as long as the cap."""
+    teacher = next(rival for rival in rivals if rival.family == TEACHER)
+    grown = league.cell(teacher, [horizon], arguments.cap, patience=12)
+    return {
+        "converged": grown,
+        "ours_tenth": league.cell(OURS, [horizon], round(grown["cpu_s"] / 10)),
+        "ours_long": league.cell(OURS, [horizon], arguments.cap),
+    }
+
+
+def show_horizon(horizon: int, found: dict[str, Any]) -> None:
+    """Print the table of a horizon."""
+    key, ridge, limit = str(horizon), found["baselines"]["ridge_arx"], found["limit"]
+    rows = [("ours", found["ours"]), *((f"{family} (window)", cell) for family, cell in found["rivals"].items())]
+    if "converged" in found:
+        rows += [(f"{TEACHER}, converged", found["converged"]), ("ours, a tenth of its time", found["ours_tenth"])]
         rows += [("ours, long", found["ours_long"])]
-    ridge = found["baselines"]["ridge_arx"]
     print(f"\nk = {horizon}: held-out mean absolute error, mm/s; the limit is {limit:.3g}")
     lines = [
         [name, cell["mae"][key], cell["cpu_s"], cell["parameters"], closed(cell["mae"][key], ridge, limit)]
@@ -242,7 +252,6 @@ def judge_horizon(
     ]
     lines += [[name, mae, "-", "-", closed(mae, ridge, limit)] for name, mae in found["baselines"].items()]
     table(["model", "MAE", "processor s", "parameters", "gap closed"], sorted(lines, key=lambda line: line[1]))
-    return found
 
 
 def closed(mae: float, ridge: float, limit: float) -> float:
@@ -302,10 +311,16 @@ def run(arguments: argparse.Namespace, folder: Path) -> None:
     for seed in range(arguments.seed, arguments.seed + arguments.seeds):
         league = League(DataSource.of(data), make_folder(folder / "cells"), seed, 2 if quick else LOOKS)
         rivals = chosen_rivals(league, arguments)
-        rounds.append({k: judge_horizon(league, k, rivals, arguments, limits[k]) for k in horizons})
+        found = {k: equal_time(league, k, rivals, arguments, limits[k]) for k in horizons}
         if len(horizons) > 1:
             joints.append(league.cell(OURS, sorted(horizons), arguments.budget)["mae"])
+        for horizon in (k for k in arguments.converge if k in horizons):
+            found[horizon] |= at_convergence(league, horizon, rivals, arguments)
+        for horizon, cells in found.items():
+            show_horizon(horizon, cells)
+        if joints:
             print("one net for all horizons:", joints[-1])
+        rounds.append(found)
     each = [
         list(verdicts_of(found, joint, quick))
         for found, joint in zip(rounds, joints or [None] * len(rounds), strict=True)
