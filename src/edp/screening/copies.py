@@ -1,12 +1,12 @@
 """Channels that add nothing since they are copies of another, and channels that know the future.
 
 A *copy* is a channel that equals another one, delayed, scaled and with noise of its own: what is left of it is related
-to nothing, so that whoever has the past of the original gains nothing. A *leak of the future* is a channel that the
-presents and pasts of the trusted channels leave unexplained, but that the future of one of them explains: shifted,
-smoothed to both sides, differenced across the present. No sensor shows that.
+to nothing in a linear way, so that whoever has the past of the original gains nothing. A *leak of the future* is a
+channel that the presents and pasts of the trusted channels leave unexplained, but that the future of one of them
+explains: shifted, smoothed to both sides, differenced across the present. No sensor shows that.
 
-A channel that *causes* a trusted one through dynamics that can be inverted without loss looks the same; who has one
-(a lever before its valve) names it as trusted.
+A channel that *causes* a trusted one through dynamics that can be inverted without loss and without noise looks the
+same; who has one names it as trusted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,11 @@ from edp.screening.result import Array, Flag, FlagKind
 
 LEAKING = 0.5
 """Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak."""
+DIFFERENCING = 2.5
+"""Sum of the absolute weights of the future, from which it is differences of the future that explain: so do leaks that
+are derivatives, but also causes, whose effect is turned back. Shifts and means have a sum of 2 or less."""
+EXACT_SHARE = 0.95
+"""Share that differences must take away to count as a leak: noise of sensors keeps a cause from being found so well."""
 TELLING = 1e-4
 """Less left unexplained by pasts than this share of the variance: nothing to learn from the future."""
 MATERIAL = 0.15
@@ -94,8 +99,8 @@ def _leak(
     past: list[Tap],
     future: list[Tap],
     left: tuple[float, float],
-) -> Flag:
-    """Name the channel whose future explains most on its own, and how far ahead."""
+) -> Flag | None:
+    """Name the channel whose future explains most on its own, and how far ahead; None where it may be a cause."""
     gains = {}
     for source in dict.fromkeys(k for k, _ in future):
         alone = unexplained(correlations, channel, past, [tap for tap in future if tap[0] == source])
@@ -107,6 +112,9 @@ def _leak(
     weights = np.linalg.solve(joint, gram(correlations, taps, [(channel, 0)])[:, 0])[len(past) :]
     ahead = -taps[len(past) + int(np.abs(weights).argmax())][1]
     share = 1.0 - left[1] / left[0]
+    differences = float(np.abs(weights).sum()) > DIFFERENCING
+    if differences and share < EXACT_SHARE:
+        return None
     return Flag(
         names[channel],
         FlagKind.LEAK,
@@ -114,7 +122,8 @@ def _leak(
         -ahead,
         share,
         f"the pasts of the other channels leave {left[0]:.3g} of its variance; {names[source]} up to {ahead} samples "
-        f"later takes away {100 * share:.0f} % of that: it knows what has not happened yet",
+        f"later takes away {100 * share:.0f} % of that: it knows what has not happened yet"
+        + (f" (or it causes {names[source]}: then name it as trusted)" if differences else ""),
     )
 
 
