@@ -2,8 +2,9 @@
 
 Decoys (`decoys.py`) are noise, delayed copies, leaks of the future and artefacts of single files, 20 each, beside the
 24 channels of Table A.1. What matters is asked of the simulator (`m22_truth.py`), never of the screening. Then the
-network of a preset is trained on the proposal, on all channels, on all but the flagged leaks, on FG1, FG2 and on random
-sets of the proposal's size, with equal settings, and judged on held-out recordings. Last, each channel is taken away
+network of a preset is trained on the proposal, on FG1, FG2, on what the simulator says is needed, on all channels, on
+all but the flagged leaks, and on random sets of the proposal's size, with equal settings, and judged on held-out
+recordings. Last, each channel is taken away
 from the network that was trained on FG1.
 
 A set that holds leaks has errors that no machine will ever see, because there the future is not known.
@@ -101,7 +102,7 @@ def on_disk(recordings: Sequence[Recording], folder: Path) -> DataSource:
     return DataSource(folder, SignalMap(channels=entries))
 
 
-def tried(source: DataSource, found: Screening, folder: Path, quick: bool, seed: int) -> Trials:
+def tried(source: DataSource, found: Screening, truth: Sequence[Cause], folder: Path, quick: bool, seed: int) -> Trials:
     """Train and judge the network on every set."""
     changes = [f"training.seed={seed}", f"split.seed={seed}", "split.test_share=0.25"]
     changes += ["training.epochs=2", "training.updates=15"] if quick else ["training.epochs=6", "training.updates=250"]
@@ -113,6 +114,7 @@ def tried(source: DataSource, found: Screening, folder: Path, quick: bool, seed:
         "proposed, with pressure differences": with_differences(proposed, first, "proposed with differences"),
         "FG1": "FG1",
         "FG2": "FG2",
+        "needed causes": FeatureSettings(name="needed causes", channels=tuple(c.name for c in truth if c.needed)),
         "all less flagged leaks": FeatureSettings(
             name="no leaks", channels=tuple(name for name in first.channel_names if name not in flagged)
         ),
@@ -127,7 +129,7 @@ def tried(source: DataSource, found: Screening, folder: Path, quick: bool, seed:
             told[0] = name
             print(f"training {done + 1}/{total}: {name}", flush=True)
 
-    spec = TrialSpec(random=1 if quick else 3, draw=seed, seeds=(seed,))
+    spec = TrialSpec(random=1 if quick else 3, draw=seed, barred=tuple(sorted(flagged)), seeds=(seed,))
     return try_feature_sets(source, load_experiment(None, "quick", changes), sets, folder, spec, tell)
 
 
@@ -192,7 +194,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.data or Path(temporary)
         source = on_disk(first, folder / "logs")
-        trials = tried(source, first_screening, folder / "trials", quick, seed)
+        trials = tried(source, first_screening, truth, folder / "trials", quick, seed)
         show_trials(trials)
         worths = show_worths(folder / "trials" / f"FG1_seed{seed}", truth, quick)
     errors = {trial.name: trial.error["10"] for trial in trials.trials}

@@ -38,13 +38,15 @@ class TrialSpec:
     """Which trainings are made beside those of the given sets.
 
     Attributes:
-        random: sets drawn at random from all channels, of the size of the first given set.
+        random: sets drawn at random from the channels, of the size of the first given set.
         draw: seed of the draw.
+        barred: channels that random sets must not hold; leaks of the future, with which any set looks good.
         seeds: a training for each set with each of these seeds.
     """
 
     random: int = 3
     draw: int = 0
+    barred: tuple[str, ...] = ()
     seeds: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
@@ -217,7 +219,7 @@ def _drawn(
     """Sets of random channels, as many as the first set has; in delta mode the targets are always among them."""
     size = len(_inputs(next(iter(chosen.values())), first))
     always = experiment.task.targets if experiment.task.mode is TargetMode.DELTA else ()
-    free = [name for name in first.channel_names if name not in always]
+    free = [name for name in first.channel_names if name not in {*always, *spec.barred}]
     rng = np.random.default_rng(spec.draw)
     drawn: dict[str, str | FeatureSettings] = {}
     for number in range(1, spec.random + 1):
