@@ -1,0 +1,162 @@
+"""One training of a search: a plain order in, a plain record out, so that any process on any machine can do it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+from edp.config import Experiment, Table, build, plain_tree
+from edp.data.prepared import Prepared, prepare
+from edp.data.splits import ByRecording
+from edp.errors import ConfigError, DataError
+from edp.evaluation.footprint import footprint
+from edp.evaluation.judge import JudgeSpec, judge
+from edp.recording import Recording
+from edp.sources import DataSource
+from edp.training import fit
+
+SCORES = ("mae", "rmse", "p95", "p99", "composite")
+
+
+@dataclass(frozen=True)
+class Order:
+    """A training to be done and judged; equal orders give equal records.
+
+    Attributes:
+        settings: the whole experiment as plain tables; its split is not used.
+        source: what `DataSource.to_plain` gave.
+        train: names of the sessions that train.
+        judged: names of the sessions that judge; none of them trains or chooses anything.
+        seed: root of every random choice of the training.
+        updates: training steps; there is no early stop, so that no session that judges has a say.
+    """
+
+    settings: Table
+    source: Mapping[str, Any]
+    train: tuple[str, ...]
+    judged: tuple[str, ...]
+    seed: int
+    updates: int
+
+    def __post_init__(self) -> None:
+        both = sorted(set(self.train) & set(self.judged))
+        if both:
+            raise ConfigError(f"order: {', '.join(both)} would train and judge; each session must do one of the two")
+        if not self.train or not self.judged:
+            raise ConfigError(
+                f"order: {len(self.train)} sessions train, {len(self.judged)} judge; at least one of each must hold"
+            )
+        if self.updates < 1:
+            raise ConfigError(f"order: updates = {self.updates}; at least 1 must hold")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, from which `from_json` makes the same order."""
+        return {
+            "settings": self.settings,
+            "source": dict(self.source),
+            "train": list(self.train),
+            "judged": list(self.judged),
+            "seed": self.seed,
+            "updates": self.updates,
+        }
+
+    @staticmethod
+    def from_json(plain: Mapping[str, Any]) -> Order:
+        """The order that `to_json` gave."""
+        return Order(
+            plain["settings"],
+            plain["source"],
+            tuple(plain["train"]),
+            tuple(plain["judged"]),
+            plain["seed"],
+            plain["updates"],
+        )
+
+
+def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Train and judge an order given as plain values.
+
+    Returns:
+        ``sessions``: for each judging session its scores at each horizon, report units, mean over targets;
+        ``scores``: their means over sessions; ``parameters``, ``macs_tick``; ``seconds``; ``train_loss``.
+
+    Raises:
+        ConfigError: settings that contradict one another or the data.
+        DataError: a session is missing or cannot be read.
+        Diverged: the loss was not finite any more.
+    """
+    order = Order.from_json(plain)
+    began = time.perf_counter()
+    experiment = experiment_of(order)
+    data = _prepared(order, experiment)
+    fitted = fit(data, experiment.model, experiment.training)
+    spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
+    found = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
+    sessions = {
+        name: {k: {score: held["mean"][score] for score in SCORES} for k, held in horizons.items()}
+        for name, horizons in found.items()
+    }
+    counted = footprint(fitted.predictor)
+    return {
+        "sessions": sessions,
+        "scores": mean_scores(sessions),
+        "parameters": counted.parameters,
+        "macs_tick": counted.macs_tick,
+        "train_loss": fitted.history[-1]["train_loss"],
+        "seconds": round(time.perf_counter() - began, 3),
+    }
+
+
+def experiment_of(order: Order) -> Experiment:
+    """The experiment that an order trains: one long epoch, so that schedules run to their end and nothing is chosen."""
+    made = build(Experiment, order.settings, "of a search")
+    training = replace(made.training, epochs=1, updates=order.updates, patience=0, refit=False, seed=order.seed)
+    return replace(made, training=training)
+
+
+def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
+    """Mean of each score over sessions and horizons."""
+    rows = [scores for horizons in sessions.values() for scores in horizons.values()]
+    return {name: sum(row[name] for row in rows) / len(rows) for name in SCORES}
+
+
+def _prepared(order: Order, experiment: Experiment) -> Prepared:
+    recordings = {recording.name: recording for recording in _recordings(_frozen(order.source))}
+    missing = [name for name in (*order.train, *order.judged) if name not in recordings]
+    if missing:
+        raise DataError(
+            f"'{order.source['path']}' has no session {', '.join(missing)}; the data changed since the search began: "
+            "restore them, or begin another search"
+        )
+    chosen = [recordings[name] for name in (*order.train, *order.judged)]
+    # A training needs a part that validates; with one epoch it decides nothing, so it is one of those that train.
+    split = ByRecording(validation=order.train[:1], test=order.judged)
+    first = chosen[0]
+    task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
+    if len(order.train) == 1:
+        raise DataError("a search needs two training sessions or more; give more recordings or fewer folds")
+    data = prepare(chosen, task, split, experiment.model.window)
+    return replace(data, train=[*data.validation, *data.train])
+
+
+def _frozen(source: Mapping[str, Any]) -> str:
+    return json.dumps(source, sort_keys=True)
+
+
+@lru_cache(maxsize=1)
+def _recordings(source: str) -> Sequence[Recording]:
+    """The recordings of a source, kept by the process that trains on them again and again."""
+    return DataSource.from_plain(json.loads(source)).read()
+
+
+def settings_of(experiment: Experiment) -> Table:
+    """An experiment as plain tables, without what an order decides itself, so that equal orders have equal keys."""
+    made: Table = plain_tree(experiment)
+    del made["split"], made["judge"]["baselines"]
+    for name in ("epochs", "updates", "patience", "refit", "seed"):
+        del made["training"][name]
+    return made

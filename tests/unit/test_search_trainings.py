@@ -1,0 +1,107 @@
+"""One training of a search: plain order in, plain record out."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from edp.config import load_experiment
+from edp.errors import ConfigError, DataError
+from edp.logs import write_recording
+from edp.recording import Recording
+from edp.search.trainings import SCORES, Order, experiment_of, settings_of, train_order
+from edp.signals import Channel, Kind
+from edp.sources import DataSource
+
+CHANGES = (
+    'task.features={name="tiny", channels=["lever", "speed"]}',
+    'task.targets=["speed"]',
+    "task.horizons=[1, 3]",
+    'model.backbone={kind="lstm", units=4}',
+    "model.blocks=[]",
+    "model.window=5",
+    "training.chunks={length=20, batch=4, burn_in=5}",
+)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sessions")
+    for number in range(5):
+        rng = np.random.default_rng(number)
+        lever = np.repeat(rng.normal(size=20), 15)
+        speed = np.zeros(300)
+        for t in range(1, 300):
+            speed[t] = 0.9 * speed[t - 1] + 0.01 * lever[t - 1]
+        channels = (Channel("lever", Kind.GENERIC), Channel("speed", Kind.VELOCITY))
+        values = np.column_stack([lever, speed]).astype(np.float32)
+        write_recording(Recording(f"s{number}", channels, values, 100.0), folder / f"s{number}.parquet")
+    return DataSource.of(folder)
+
+
+@pytest.fixture(scope="module")
+def order(source):
+    settings = settings_of(load_experiment(None, "quick", CHANGES))
+    return Order(settings, source.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
+
+
+@pytest.fixture(scope="module")
+def record(order):
+    return train_order(order.to_json())
+
+
+def test_an_order_goes_through_json_and_equal_orders_give_equal_records(order, record):
+    plain = json.loads(json.dumps(order.to_json()))
+    assert Order.from_json(plain) == order
+    again = train_order(plain)
+    assert {**again, "seconds": 0} == {**record, "seconds": 0}
+    assert json.loads(json.dumps(record)) == record
+
+
+def test_a_record_has_every_judging_session_and_their_means(record):
+    assert set(record["sessions"]) == {"s3", "s4"}
+    assert set(record["sessions"]["s3"]) == {"1", "3"}
+    for name in SCORES:
+        values = [record["sessions"][s][k][name] for s in ("s3", "s4") for k in ("1", "3")]
+        assert record["scores"][name] == pytest.approx(np.mean(values))
+    assert record["parameters"] > 0
+    assert record["train_loss"] > 0
+
+
+def test_another_seed_and_another_fold_give_other_records(order, record):
+    other = train_order(dataclasses.replace(order, seed=2).to_json())
+    assert other["scores"] != record["scores"]
+    fold = train_order(dataclasses.replace(order, train=("s0", "s1", "s4"), judged=("s3",)).to_json())
+    assert set(fold["sessions"]) == {"s3"}
+    assert fold["sessions"]["s3"] != record["sessions"]["s3"]
+
+
+def test_sessions_that_judge_have_no_say_in_training(order, record):
+    fewer = train_order(dataclasses.replace(order, judged=("s3",)).to_json())
+    assert fewer["sessions"]["s3"] == record["sessions"]["s3"]
+
+
+def test_nothing_is_chosen_in_a_training(order):
+    made = experiment_of(order)
+    assert (made.training.epochs, made.training.updates, made.training.patience) == (1, 12, 0)
+
+
+def test_settings_that_an_order_decides_are_not_part_of_its_key():
+    one = load_experiment(None, "quick", [*CHANGES, "training.epochs=3", "training.seed=5", "judge.baselines=[]"])
+    other = load_experiment(None, "quick", [*CHANGES, "training.epochs=9", "training.updates=7"])
+    assert settings_of(one) == settings_of(other)
+    assert settings_of(one) != settings_of(load_experiment(None, "quick", [*CHANGES, "training.clip_norm=2.0"]))
+
+
+def test_orders_that_cannot_be_are_refused(order):
+    with pytest.raises(ConfigError, match="s2 would train and judge"):
+        dataclasses.replace(order, judged=("s2", "s4"))
+    with pytest.raises(ConfigError, match="3 sessions train, 0 judge"):
+        dataclasses.replace(order, judged=())
+    with pytest.raises(ConfigError, match="updates = 0"):
+        dataclasses.replace(order, updates=0)
+    with pytest.raises(DataError, match="has no session s9; the data changed"):
+        train_order(dataclasses.replace(order, judged=("s9",)).to_json())
+    with pytest.raises(DataError, match="two training sessions or more"):
+        train_order(dataclasses.replace(order, train=("s0",)).to_json())
