@@ -1,7 +1,7 @@
-"""Reads damaged copies of one log, one after the other, in a process with bounded memory and time a file.
+"""Reads damaged copies of logs, one after the other, in a process with bounded memory and time a file.
 
-Usage: ``python worker.py FOLDER CASE FIRST COUNT``. The last line is JSON: how many were read, refused, and what went
-wrong. The damaged copy in work lies in FOLDER, so that a crash leaves its cause behind.
+Usage: ``python worker.py FOLDER CASE[,CASE] FIRST COUNT``. The last line is JSON: how many were read, refused, and what
+went wrong. The damaged copy in work lies in FOLDER, so that a crash leaves its cause behind.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -74,21 +75,14 @@ def _alarm(*_: object) -> None:
     raise _TooSlow
 
 
-def main() -> None:
-    folder, case = Path(sys.argv[1]), sys.argv[2]
-    first, count = int(sys.argv[3]), int(sys.argv[4])
-    faulthandler.enable()
-    logging.disable(logging.CRITICAL)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
-    signal.signal(signal.SIGALRM, _alarm)
-    path = folder / case
+def read_damaged(folder: Path, case: str, first: int, count: int) -> dict[str, Any]:
+    """Read damaged copies of one log; what was found."""
+    path, target = folder / case, folder / f"damaged_{case}"
     whole = path.read_bytes()
     original = read_recording(path)
-    target = folder / f"damaged_{case}"
-    found = {"read": 0, "refused": 0, "slowest_s": 0.0, "faults": []}
+    found: dict[str, Any] = {"read": 0, "refused": 0, "slowest_s": 0.0, "faults": []}
     for number in range(first, first + count):
-        rng = np.random.default_rng([number, *case.encode()])
-        target.write_bytes(damaged(whole, rng))
+        target.write_bytes(damaged(whole, np.random.default_rng([number, *case.encode()])))
         start = time.monotonic()
         fault = ""
         signal.alarm(SECONDS)
@@ -110,8 +104,21 @@ def main() -> None:
         found["slowest_s"] = max(found["slowest_s"], time.monotonic() - start)
         if fault:
             found["faults"].append([number, fault[:300]])
-    found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps(found))
+    return found
+
+
+def main() -> None:
+    folder, cases, first, count = Path(sys.argv[1]), sys.argv[2].split(","), int(sys.argv[3]), int(sys.argv[4])
+    faulthandler.enable()
+    logging.disable(logging.CRITICAL)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    signal.signal(signal.SIGALRM, _alarm)
+    results = {}
+    for case in cases:
+        results[case] = read_damaged(folder, case, first, count)
+        print(case, file=sys.stderr)
+    results["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps(results))
 
 
 if __name__ == "__main__":

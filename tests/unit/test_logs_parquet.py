@@ -100,11 +100,15 @@ def test_encrypted_files_say_so(tmp_path):
 
 def test_a_stamp_that_is_far_off_does_not_fill_the_memory(tmp_path):
     time = TIME.copy()
-    time[-1] = 1e12
+    time[-1] = 1e10
     path = table(tmp_path / "a.parquet", [("time", time), ("BmUp", TIME)])
     with pytest.raises(DataError, match=r"would take .* of memory.*a stamp that is far off"):
         read_recording(path)
     assert any("far off" in finding.what for finding in inspect_log(path).findings)
+    path = table(tmp_path / "b.parquet", [("time", TIME * 1e9 + 1.7e18), ("BmUp", TIME)])
+    with pytest.raises(DataError, match='set time_unit = "ms", "us" or "ns"'):
+        read_recording(path)
+    assert read_recording(path, SignalMap(time_unit="ns")).samples > 50
 
 
 def test_a_recording_larger_than_memory_names_the_ways_out(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import scipy.io
+from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
 from edp.logs.mat_check import check_size
@@ -144,6 +146,17 @@ def _own(value: Any, path: Path) -> OwnFacts:
     return own_facts(str(array.ravel()[0]) if array.size else "", f"'{path}', variable '{INFO}'")
 
 
+class _Table:
+    """Columns in memory."""
+
+    def __init__(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        self.columns = columns
+
+    def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+        """See `edp.logs.raw.Table`."""
+        yield [self.columns[name][start:stop] for name in names]
+
+
 def _raw_log(path: Path, found: Found, own: OwnFacts, signal_map: SignalMap) -> RawLog:
     names = [part.name for part in found.signals]
     timeless = [part.name for part in found.signals if part.time is None]
@@ -153,6 +166,7 @@ def _raw_log(path: Path, found: Found, own: OwnFacts, signal_map: SignalMap) -> 
         part = found.signals[names.index(time_name)]
         time = np.asarray(part.values, dtype=np.float64) * time_factor(time_name, None, signal_map)
     signals: dict[str, RawSignal] = {}
+    table = _Table({part.name: part.values for part in found.signals})
     for part in found.signals:
         if part.name == time_name:
             continue
@@ -168,6 +182,8 @@ def _raw_log(path: Path, found: Found, own: OwnFacts, signal_map: SignalMap) -> 
             unit=part.unit or (channel.unit if channel else None),
             kind=channel.kind if channel else None,
             description=channel.description if channel else "",
+            table=table,
+            key=part.name,
         )
     if own.channels:
         signals = {name: signals[name] for name in own.channels if name in signals}

@@ -95,6 +95,8 @@ class _Bag:
             weakref.finalize(self, _close, self.reader)
             by_topic: dict[str, list[Any]] = {}
             for connection in self.reader.connections:
+                if not isinstance(connection.topic, str):
+                    raise DataError("a topic without a name")
                 by_topic.setdefault(connection.topic, []).append(connection)
             self.about = {name: sum(each.msgcount for each in group) for name, group in by_topic.items()}
             filled = {name: group for name, group in by_topic.items() if self.about[name]}

@@ -27,6 +27,8 @@ UNIFORM_RMS = 0.05
 UNIFORM_MAX = 0.5
 GAP_STEPS = 5.0
 GAP_SECONDS = 0.05
+LATEST_SECONDS = 1e11
+SHORTEST_STEP_S = 1e-9
 _SAME_TICK = 1e-6
 _MIN_ROLLOVERS = 5
 
@@ -76,11 +78,19 @@ def judge(stamps: Stamps, where: str) -> Clock:
             f"{where}: {len(broken)} time stamp(s) are missing or not finite, first in row {broken[0]}; "
             "mend the file, or set 'sample_time_s' in the signal map if rows are uniform"
         )
+    largest = float(np.abs(stamps).max())
+    if largest > LATEST_SECONDS:
+        raise DataError(
+            f"{where}: the time stamp of row {int(np.abs(stamps).argmax())} lies {largest:g} s from zero; where the "
+            'file counts in another unit, set time_unit = "ms", "us" or "ns" in the signal map, else mend the stamp'
+        )
     steps = np.diff(stamps)
     rising = steps[steps > 0]
     if not len(rising):
         raise DataError(f"{where}: no time stamp is later than the first; is this the time column?")
     median = float(np.median(rising))
+    if median < SHORTEST_STEP_S:
+        raise DataError(f"{where}: time steps of {median:g} s; is this the time column, and in which unit?")
     start, step = _line(stamps)
     off = stamps - (start + step * np.arange(len(stamps))) if step > 0 else np.full(len(stamps), np.inf)
     jitter = float(np.sqrt(np.mean(off**2)) / step) if step > 0 else float("inf")
