@@ -180,7 +180,7 @@ def load_experiment(
         table = merged(table, _with_set_file(read_toml(path), Path(path).parent))
         where = f"'{path}'"
     for text in overrides:
-        table = merged(table, _with_set_file(_override(text), Path()))
+        table = merged(table, _with_set_file(override(text), Path()))
     where += " with --set" if overrides else ""
     return build(Experiment, table, where)
 
@@ -274,7 +274,12 @@ def _with_set_file(table: Table, folder: Path) -> Table:
     return {**table, "task": {**task, "features": features}}
 
 
-def _override(text: str) -> Table:
+def override(text: str) -> Table:
+    """The table that one ``key.path=value`` stands for; a value that is no TOML is a string.
+
+    Raises:
+        ConfigError: not of this form.
+    """
     key, sign, value = text.partition("=")
     if not sign or not key.strip():
         raise ConfigError(f"--set '{text}': write key.path=value, for example training.epochs=10")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp import __version__
-from edp.cli import animate, demo, evaluate, footprint, inspect, report, simulate, train
+from edp.cli import animate, demo, evaluate, footprint, inspect, report, screen, simulate, train
 from edp.cli.console import run_app
 
 app = typer.Typer(
@@ -22,6 +22,7 @@ app = typer.Typer(
 app.command("demo")(demo.demo)
 app.command("simulate")(simulate.simulate)
 app.command("inspect")(inspect.inspect)
+app.command("screen")(screen.screen)
 app.command("animate")(animate.animate)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)

@@ -1,0 +1,235 @@
+"""``edp screen``: which channels to feed a model, with how much memory, and why."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.quality import LogDisplay, show_between, verdict_text
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from edp.selection import Selection, SelectionOrder
+    from edp.training import Event
+
+SHOWN = 40
+SHOWN_FLAGS = 20
+
+
+def screen(
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder for page, pictures, feature sets and figures.")],
+    targets: Annotated[str, typer.Option(help="Channels to predict: a,b. Default: the velocities.")] = "",
+    horizon: Annotated[int, typer.Option(help="How many samples ahead the model will predict.")] = 10,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    exclude: Annotated[str, typer.Option(help="Channels that are no candidates: a,b.")] = "",
+    trusted: Annotated[str, typer.Option(help="Channels known to be measured, commands above all: never leaks: a,b.")] = "",
+    truth: Annotated[bool, typer.Option(help="Let channels that only a simulation knows be candidates.")] = False,
+    changes: Annotated[
+        list[str], typer.Option("--set", help="An option of the screening, for example max_lag=200 or forest.trees=60.")
+    ] = [],  # noqa: B006
+    pictures: Annotated[bool, typer.Option(help="Write the pictures as SVG and PNG too.")] = True,
+    trials: Annotated[
+        bool, typer.Option(help="Also train a network on each set, and compare their held-out errors.")
+    ] = False,
+    config: Annotated[Path | None, typer.Option(help="Of --trials: settings (TOML) laid over the preset.")] = None,
+    preset: Annotated[str, typer.Option(help="Of --trials: quick, small, standard or thesis.")] = "quick",
+    own: Annotated[list[Path], typer.Option("--features", help="Of --trials: a feature-set file to try as well.")] = [],  # noqa: B006
+    random: Annotated[int, typer.Option(help="Of --trials: sets drawn at random, of the proposed size.")] = 3,
+    as_json: JsonFlag = False,
+) -> None:
+    """Screen recordings for the channels a model needs: a ranked, reasoned proposal with its evidence.
+
+    Without a map every column of numbers is a candidate. Writes a page, pictures, feature sets (TOML) and JSON.
+
+    Example: `edp screen logs/ --out screen --targets v_boom,v_arm --horizon 10`
+
+    Example: `edp train logs/ --config screen/settings.toml --out runs/first`
+    """
+    source = source_of(data, signal_map, repair)
+    order = _order(
+        {"targets": _names(targets), "trusted": _names(trusted), "horizon": horizon},
+        changes,
+        (_names(exclude), truth, pictures),
+        _trials(config, preset, own, random) if trials else {},
+    )
+    made = run_screening(source, folder, order, as_json)
+    command = next_command(data, signal_map, repair, made)
+
+    def show() -> None:
+        show_between(made.quality)
+        out.print(verdict_text(made.quality))
+        out.print()
+        show_selection(made)
+        out.print(f"next: {command}")
+
+    emit(as_json, facts_of(made) | {"next": command}, show)
+
+
+def run_screening(source: Any, folder: Path, order: SelectionOrder, quiet: bool = False) -> Selection:
+    """Screen with a progress display."""
+    from edp.selection import Listeners, select_features
+
+    with progress(quiet) as shown:
+        display = ScreeningDisplay(shown, Steps(quiet))
+        logs = LogDisplay(shown, Steps(quiet))
+        listeners = Listeners(on_log=logs.on_log, on_progress=display.on_progress, on_trial=display.on_trial)
+        return select_features(source, folder, order, listeners)
+
+
+class ScreeningDisplay:
+    """Shows the stages of a screening and the trainings of its trials."""
+
+    def __init__(self, shown: Progress, steps: Steps) -> None:
+        self.shown, self.steps = shown, steps
+        self.bars: dict[str, Any] = {}
+        self.began: dict[str, float] = {}
+
+    def on_progress(self, stage: str, share: float) -> None:
+        """Show a stage."""
+        self._show("screen", share, stage)
+
+    def on_trial(self, name: str, done: int, total: int, event: Event | None) -> None:
+        """Show a training."""
+        part = 0.0 if event is None else ((event.epoch - 1) + event.update / event.updates) / event.epochs
+        self._show("trials", (done + part) / total, f"{name}, {done + 1} of {total}")
+
+    def _show(self, what: str, share: float, note: str) -> None:
+        if what not in self.bars:
+            self.bars[what] = self.shown.add_task(what, total=1.0, note="")
+            self.began[what] = time.monotonic()
+        left = (time.monotonic() - self.began[what]) * (1.0 / max(share, 1e-3) - 1.0)
+        self.shown.update(self.bars[what], completed=share, note=note)
+        self.steps.say(f"{what}: {note}, {100 * share:.0f} %, {duration(left)} left")
+
+
+def show_selection(made: Selection) -> None:
+    """Print the proposal, the flags and where everything is."""
+    found = made.found
+    rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in found.proposal.choices if c.keep]
+    _listing(f"keep: {len(rows)} of {len(found.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
+    if len(rows) > SHOWN:
+        out.print(f"  ... and {len(rows) - SHOWN} more in {made.files['page']}")
+    out.print()
+    if found.flags:
+        flags = [(flag.channel, str(flag.kind), flag.evidence) for flag in found.flags]
+        _listing(f"flags: {len(flags)}", ["channel", "what", "evidence"], flags[:SHOWN_FLAGS])
+        if len(flags) > SHOWN_FLAGS:
+            out.print(f"  ... and {len(flags) - SHOWN_FLAGS} more in {made.files['page']}")
+        out.print()
+    _show_lags(made)
+    window = found.proposal.window
+    out.print(f"memory: W = {window} samples ({1e3 * window / found.rate_hz:g} ms): {found.proposal.window_reason}")
+    for note in (*found.proposal.notes, *made.notes):
+        out.print(f"note: {note}")
+    if made.trials is not None:
+        _show_trials(made)
+    out.print(f"page: {made.files['page']}")
+    out.print(f"feature sets: {made.files['sets']}")
+
+
+def _listing(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Rows of text, everything to the left; names come from files and may hold brackets."""
+    from rich.table import Table
+
+    made = Table(title=title, title_justify="left", title_style="bold", header_style="bold", box=None, pad_edge=False)
+    for heading in headings:
+        made.add_column(heading, overflow="fold")
+    for row in rows:
+        made.add_row(*(cell.replace("[", r"\[") for cell in row))
+    out.print(made)
+
+
+def _show_lags(made: Selection) -> None:
+    from edp.report.screening_views import lag_ranges
+
+    rows = [
+        (row.group, "-" if row.low is None else f"{row.low} to {row.high}", f"{row.certain} of {row.curves}")
+        for row in lag_ranges(made.found)
+    ]
+    table("best lags, samples; negative: the channel leads", ["kind of signal", "range", "certain"], rows)
+    out.print()
+
+
+def _show_trials(made: Selection) -> None:
+    trials = made.trials
+    if trials is None:
+        return
+    ahead = list(trials.persistence)
+    rows = [(t.name, len(t.channels), t.parameters, *(f"{t.error[h]:.3f}" for h in ahead)) for t in trials.trials]
+    rows.append(("persistence", "-", "-", *(f"{trials.persistence[h]:.3f}" for h in ahead)))
+    headings = ["feature set", "channels", "parameters", *(f"MAE {h} ahead, {trials.unit}" for h in ahead)]
+    out.print()
+    table("held-out error of one network on each set", headings, rows)
+    for note in trials.notes:
+        out.print(f"note: {note}")
+    out.print()
+
+
+def facts_of(made: Selection) -> dict[str, Any]:
+    """What a machine needs; the whole is in the files."""
+    proposal = made.found.proposal
+    return {
+        "kept": list(proposal.kept),
+        "dropped": list(proposal.dropped),
+        "window": proposal.window,
+        "flags": [
+            {"channel": flag.channel, "kind": str(flag.kind), "source": flag.source, "lag": flag.lag}
+            for flag in made.found.flags
+        ],
+        "verdict": made.quality.verdict,
+        "repeats": [repeat.to_json() for repeat in made.quality.repeats],
+        "notes": [*proposal.notes, *made.notes],
+        "seconds": made.found.seconds,
+        "trials": None if made.trials is None else made.trials.to_json(),
+        "files": {name: str(path) for name, path in made.files.items()},
+    }
+
+
+def next_command(data: Path, signal_map: Path | None, repair: Sequence[str], made: Selection) -> str:
+    """The training that the proposal is for."""
+    chosen = signal_map or made.map
+    parts = [f"edp train {data}"] + ([f"--map {chosen}"] if chosen is not None else [])
+    parts += [f"--repair {entry}" for entry in repair]
+    return " ".join([*parts, f"--config {made.files['settings']}", "--out runs/first"])
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _order(
+    given: dict[str, Any], changes: Sequence[str], others: tuple[list[str], bool, bool], trials: dict[str, Any]
+) -> SelectionOrder:
+    """What the options ask for."""
+    from edp.config import build, merged, override
+    from edp.screening import ScreeningSpec
+    from edp.selection import SelectionOrder
+
+    options = given
+    for text in changes:
+        options = merged(options, override(text))
+    exclude, truth, pictures = others
+    spec = build(ScreeningSpec, options, "of the screening (--set)")
+    return SelectionOrder(spec=spec, exclude=tuple(exclude), truth=truth, pictures=pictures, **trials)
+
+
+def _trials(config: Path | None, preset: str, own: Sequence[Path], random: int) -> dict[str, Any]:
+    """What the trials are made with."""
+    from edp.config import FeatureSettings, build, load_experiment
+    from edp.data.feature_files import read_set_table
+    from edp.trials import TrialSpec
+
+    sets = {}
+    for path in own:
+        features = build(FeatureSettings, read_set_table(path), f"'{path}'")
+        sets[features.name] = features
+    return {"experiment": load_experiment(config, preset), "trials": TrialSpec(random=random), "sets": sets}

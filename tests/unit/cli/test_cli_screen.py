@@ -1,0 +1,123 @@
+"""``edp screen`` and what it leaves, up to a training on the proposed set."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from edp.config import load_experiment, load_signal_map
+
+QUICK = [
+    word
+    for change in (
+        "max_lag=30",
+        "pieces=6",
+        "information_samples=400",
+        "rank_samples=800",
+        "piece_samples=200",
+        "forest.trees=5",
+        "forest.samples=800",
+        "forest.tests=400",
+        "forest.repeats=2",
+    )
+    for word in ("--set", change)
+]
+
+
+def drive(path, seed, samples=2500, more=""):
+    """A velocity that follows its command 8 samples later, a leak of it, a dead channel, noise and a text."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples + 40) / 100
+    u = sum(np.sin(2 * np.pi * f * t + p) for f, p in zip(rng.uniform(0.2, 2.0, 8), rng.uniform(0, 6, 8)))
+    v = np.zeros(len(t))
+    for k in range(8, len(t)):
+        v[k] = 0.9 * v[k - 1] + 2.0 * u[k - 8]
+    v += rng.normal(0, 0.02, len(t))
+    columns = [v[:samples], u[:samples], v[20 : samples + 20], rng.normal(size=samples), np.full(samples, 3.0)]
+    rows = "\n".join(
+        f"{k / 100:.2f}," + ",".join(f"{column[k]:.7g}" for column in columns) + ",ok" + (",1" if more else "")
+        for k in range(samples)
+    )
+    path.write_text(f"t,speed [mm/s],lever,oracle,dice,dead,state{more}\n{rows}\n")
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("screened") / "logs"
+    folder.mkdir()
+    for i in range(4):
+        drive(folder / f"drive_{i}.csv", i, more=",extra" if i == 2 else "")
+    return folder
+
+
+def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
+    out = tmp_path / "screen"
+    ended = edp("screen", logs, "--out", out, "--horizon", "5", "--trusted", "lever", "--no-pictures", *QUICK)
+    assert ended.code == 0, ended.err
+    assert "read: drive_0.csv" in ended.err
+    assert "screen: " in ended.err
+    assert "Only some recordings hold extra: left out." in ended.out
+    assert "leak of the future" in ended.out
+    assert "memory: W = " in ended.out
+    assert f"next: edp train {logs} --map {out / 'map.toml'} --config {out / 'settings.toml'}" in ended.out
+
+    found = json.loads((out / "screening.json").read_text())
+    assert found["proposal"]["kept"] == ["lever", "speed"]
+    assert {"oracle", "dice", "dead"} <= set(found["proposal"]["dropped"])
+    assert json.loads((out / "quality.json").read_text())["verdict"] == "check"
+    proposed = (out / "sets" / "proposed.toml").read_text()
+    assert "# dropped: oracle: leak of the future" in proposed
+    assert tomllib.loads(proposed)["channels"] == ["lever", "speed"]
+    assert "oracle knows the future" in (out / "report.html").read_text(encoding="utf-8")
+    assert not (out / "pictures").exists()
+    kinds = {entry.name: str(entry.kind) for entry in load_signal_map(out / "map.toml").channels}
+    assert kinds == {"speed": "velocity", "lever": "generic"}
+
+    settings = ["--map", out / "map.toml", "--config", out / "settings.toml", "--out", tmp_path / "run"]
+    trained = edp("train", logs, *settings, *small)
+    assert trained.code == 0, trained.err
+    kept = load_experiment(tmp_path / "run" / "config.toml", preset=None).task
+    assert (kept.features.name, kept.features.channels, kept.horizons) == ("proposed", ("lever", "speed"), (5,))
+
+
+def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("edp.selection.write_pictures", lambda found, folder: drawn.append(folder))
+    (tmp_path / "mine.toml").write_text('channels = ["speed", "dice"]')
+    (tmp_path / "tiny.toml").write_text(
+        "[training]\nepochs = 1\nupdates = 3\n"
+        '[training.chunks]\nregime = "chunk"\nlength = 32\nbatch = 4\nburn_in = 10\n'
+        '[model.backbone]\nkind = "lstm"\nunits = 4\n[judge]\nhistory = 5\n'
+    )
+    out = tmp_path / "screen"
+    trials = ["--trials", "--random", "1", "--config", tmp_path / "tiny.toml", "--features", tmp_path / "mine.toml"]
+    ended = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", "--json", *QUICK, *trials)
+    assert ended.code == 0, ended.err
+    facts = ended.json
+    assert "oracle" not in facts["kept"] + facts["dropped"]
+    names = [trial["name"] for trial in facts["trials"]["trials"]]
+    assert names == ["proposed", "all candidates", "mine", "random 1"]
+    assert drawn == [out / "pictures"]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "What the sets are worth to a model" in page
+    assert facts["files"]["trials"] == str(out / "trials")
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--targets", "sped"], "did you mean 'speed'"),
+        (["--exclude", "levr"], "cannot exclude 'levr'"),
+        (["--set", "max_lags=3"], "unknown key 'max_lags'; did you mean 'max_lag'"),
+        (["--set", "forest.trees=0"], "must be at least 1"),
+        (["--horizon", "200"], "beyond max_lag"),
+        (["--set", "max_lag"], "write key.path=value"),
+    ],
+)
+def test_mistakes_are_told(edp, logs, tmp_path, args, says):
+    ended = edp("screen", logs, "--out", tmp_path / "x", "--no-pictures", *args)
+    assert (ended.code, says in ended.err) == (1, True), ended.err
+    assert not (tmp_path / "x" / "report.html").exists()
