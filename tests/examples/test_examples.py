@@ -21,6 +21,7 @@ from edp.logs import write_recording
 from edp.losses import AdaptiveWeights
 from edp.models.predictor import ModelSpec
 from edp.recording import Recording
+from edp.screening import ForestSpec, ScreeningSpec
 from edp.signals import TABLE_A1
 from edp.training import TrainingSpec
 
@@ -101,6 +102,16 @@ def test_settings_page_names_every_part_and_key():
     for title, cls in classes.items():
         keys = re.findall(r"^\| `(\w+)` \|", sections[title], re.MULTILINE)
         assert keys == [entry.name for entry in dataclasses.fields(cls)], title
+
+
+def test_screening_page_names_every_option_and_its_default():
+    page = (ROOT / "docs" / "screening.md").read_text(encoding="utf-8").split("## Options")[1]
+    shown = re.findall(r"^\| `(\w+)` \| (.+?) \|", page, re.MULTILINE)
+    entries = [*dataclasses.fields(ScreeningSpec), *dataclasses.fields(ForestSpec)]
+    assert [name for name, _ in shown] == [entry.name for entry in entries]
+    for (name, text), entry in zip(shown, entries):
+        if entry.default not in (dataclasses.MISSING, ()):
+            assert text == f"`{round(entry.default, 3)}`", name
 
 
 def test_quickstart(tmp_path, capsys):

@@ -31,7 +31,7 @@ def screen(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     exclude: Annotated[str, typer.Option(help="Channels that are no candidates: a,b.")] = "",
-    trusted: Annotated[str, typer.Option(help="Channels known to be measured, commands above all: never leaks: a,b.")] = "",
+    trusted: Annotated[str, typer.Option(help="Channels known to be measured, above all commands: a,b.")] = "",
     truth: Annotated[bool, typer.Option(help="Let channels that only a simulation knows be candidates.")] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="An option of the screening, for example max_lag=200 or forest.trees=60.")
