@@ -44,7 +44,8 @@ from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_dat
 
 ROOT = Path(__file__).resolve().parents[1]
 THESIS = ROOT / "examples" / "thesis"
-LOOKS = 24  # validations in a training of given length
+LOOKS = 12  # validations in a training of given length
+VALIDATED = 8  # recordings that validate: a look at all of them costs large networks more than training does
 ROUNDS = 3  # turns in which the costs of updates are measured
 TEACHER = "thesis teacher"
 BASELINES = ("persistence", "ridge_arx", "boosted_trees", "small_mlp")
@@ -135,8 +136,9 @@ class League:
     def _measure(self, contender: Contender, horizons: list[int], budget_s: float, patience: int) -> dict[str, Any]:
         experiment = contender.experiment(horizons, self.seed)
         data = prepare_data(self.source, experiment)
+        data = dataclasses.replace(data, validation=data.validation[:VALIDATED])
         cost = self.cost(contender, len(horizons))
-        looks = 2 * self.looks if patience else self.looks
+        looks = 4 * self.looks if patience else self.looks
         updates = max(1, int(budget_s / looks / cost))
         training = dataclasses.replace(experiment.training, updates=updates, epochs=looks, patience=patience)
         if patience:  # where a schedule over the whole length would have ended is not known

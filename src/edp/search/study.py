@@ -1,0 +1,245 @@
+"""Ask and tell: the only door to Optuna. Nothing is stored; what was told is told again when a search goes on.
+
+A study is a pure function of its root seed and of what it was told, in the order of the trials: each question is asked
+with a sampler seeded by root and number. So a search that was killed asks the same again and finds the answers in the
+ledger, and any number of workers gives the same sequence.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from edp.errors import ConfigError
+from edp.search.space import Candidate, Choice, Range, Real, Space, Value, check, names
+
+if TYPE_CHECKING:
+    import optuna
+
+GP_TRIALS = 100  # a Gaussian process is the better sampler up to here, then it gets slow
+STARTUP = 10
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One question of a study.
+
+    Attributes:
+        number: from 0 in the order of asking.
+        values: of the dimensions of the space.
+        flags: names of the switches that are on.
+    """
+
+    number: int
+    values: Candidate
+    flags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerSpec:
+    """How questions are chosen.
+
+    Attributes:
+        kind: ``gp`` (a Gaussian process for the first 100 trials, then TPE), ``tpe``, ``thesis_tpe`` (univariate,
+            without liar, as in the thesis) or ``random``.
+        startup: trials at random before the first model.
+
+    Raises:
+        ConfigError: an unknown kind, or fewer than one trial at random.
+    """
+
+    kind: str = "gp"
+    startup: int = STARTUP
+
+    def __post_init__(self) -> None:
+        if self.kind not in SAMPLERS:
+            raise ConfigError(f"sampler '{self.kind}'; {', '.join(SAMPLERS)} must hold")
+        if self.startup < 1:
+            raise ConfigError(f"sampler: startup = {self.startup}; at least 1 must hold")
+
+
+@dataclass
+class Study:
+    """Questions about a space and what they gave; smaller values are better.
+
+    Attributes:
+        space: dimensions and their ranges.
+        root: seed of the whole sequence.
+        sampler: how questions are chosen.
+        flags: switches that may be on or off.
+        barred: sets of switches that cannot be on together: of each the later one in `flags` is switched off.
+        objectives: how many values are told.
+        bounds: how many costs are told that must not exceed zero; a trial that exceeds may be told by its costs alone,
+            so that what cannot be used need not be trained. With bounds TPE stands in for the Gaussian process.
+    """
+
+    space: Space
+    root: int
+    sampler: SamplerSpec = field(default_factory=SamplerSpec)
+    flags: tuple[str, ...] = ()
+    barred: frozenset[frozenset[str]] = frozenset()
+    objectives: int = 1
+    bounds: int = 0
+
+    def __post_init__(self) -> None:
+        import optuna
+
+        both = sorted(set(self.flags) & set(self.space))
+        if both:
+            raise ConfigError(f"study: {', '.join(both)} would be a dimension and a switch; rename one of them")
+        logging.getLogger("optuna").setLevel(logging.ERROR)
+        self._study = optuna.create_study(
+            directions=["minimize"] * self.objectives, sampler=optuna.samplers.RandomSampler(seed=0)
+        )
+        self._distributions = {name: _distribution(self.space[name]) for name in names(self.space)} | {
+            name: _distribution(Choice((0, 1))) for name in self.flags
+        }
+        self._open: dict[int, optuna.Trial] = {}
+        self._told = 0
+        self._waiting: dict[int, tuple[Sequence[float] | None, Sequence[float]]] = {}
+
+    def suggest(self, values: Candidate, flags: Sequence[str] = ()) -> None:
+        """Have this asked next: a warm start.
+
+        Raises:
+            ConfigError: a value outside the space, or an unknown switch.
+        """
+        check(self.space, values)
+        unknown = [name for name in flags if name not in self.flags]
+        if unknown:
+            raise ConfigError(f"study: there is no switch '{unknown[0]}' (it has {', '.join(self.flags)})")
+        given = {name: values[name] for name in self.space} | {name: int(name in flags) for name in self.flags}
+        self._study.enqueue_trial(given)
+
+    def ask(self, count: int) -> list[Trial]:
+        """The next questions, `count` of them; those asked before count as unanswered until they are told."""
+        return [self._ask() for _ in range(count)]
+
+    def _ask(self) -> Trial:
+        number = len(self._study.trials)
+        waiting = any(trial.state.name == "WAITING" for trial in self._study.trials)
+        if waiting:
+            number = next(trial.number for trial in self._study.trials if trial.state.name == "WAITING")
+        self._study.sampler = self._sampler(number)
+        asked = self._study.ask(self._distributions)
+        self._open[asked.number] = asked
+        values = {name: asked.params[name] for name in names(self.space)}
+        on = tuple(name for name in self.flags if asked.params[name])
+        return Trial(asked.number, values, self._allowed(on))
+
+    def _allowed(self, on: tuple[str, ...]) -> tuple[str, ...]:
+        kept: tuple[str, ...] = ()
+        for name in on:
+            if not any(name in pair and set(pair) <= {*kept, name} for pair in self.barred):
+                kept = (*kept, name)
+        return kept
+
+    def tell(self, number: int, values: Sequence[float] | None, costs: Sequence[float] = ()) -> None:
+        """What a question gave; told in any order, it counts in the order of numbers.
+
+        Args:
+            number: of the trial.
+            values: of the objectives; None where the training failed, diverged or was not done.
+            costs: each at most 0 where its bound is kept.
+
+        Raises:
+            ConfigError: a question that was not asked, a value that is not finite, or another count of them.
+        """
+        if number not in self._open and number not in self._waiting:
+            raise ConfigError(f"study: trial {number} was not asked, or was told before; tell each once")
+        for what, wanted, given in (("values", self.objectives, values), ("costs", self.bounds, costs)):
+            if given is not None and (len(given) != wanted or not all(map(math.isfinite, given))):
+                raise ConfigError(f"study: trial {number} is told {what} {list(given)}; {wanted} finite ones must hold")
+        self._waiting[number] = (values, costs)
+        while self._told in self._waiting:
+            self._pass_on(self._told, *self._waiting.pop(self._told))
+            self._told += 1
+
+    def _pass_on(self, number: int, values: Sequence[float] | None, costs: Sequence[float]) -> None:
+        from optuna.trial import TrialState
+
+        trial = self._open.pop(number)
+        for place, cost in enumerate(costs):
+            trial.set_constraint(f"bound {place}", cost)
+        if values is None:  # Never as infinity: a sampler would model the wall.
+            beyond = any(cost > 0 for cost in costs)
+            self._study.tell(trial, state=TrialState.PRUNED if beyond else TrialState.FAIL)
+        else:
+            self._study.tell(trial, list(values))
+
+    def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
+        seed = int.from_bytes(hashlib.blake2b(f"{self.root} {number}".encode(), digest_size=4).digest(), "big")
+        kind = self.sampler.kind
+        # A Gaussian process does not learn from trials that were refused for their costs.
+        if kind == "gp" and (number >= GP_TRIALS or self.bounds):
+            kind = "tpe"
+        return SAMPLERS[kind](seed, self.sampler.startup)
+
+
+def _gp(seed: int, startup: int) -> Any:
+    from optuna.samplers import GPSampler, TPESampler
+
+    fallback = TPESampler(seed=seed, n_startup_trials=startup)
+    return GPSampler(
+        seed=seed,
+        n_startup_trials=startup,
+        independent_sampler=fallback,
+        warn_independent_sampling=False,
+    )
+
+
+def _tpe(seed: int, startup: int) -> Any:
+    from optuna.samplers import TPESampler
+
+    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
+
+
+def _thesis_tpe(seed: int, startup: int) -> Any:
+    from optuna.samplers import TPESampler
+
+    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=False, constant_liar=False)
+
+
+def _random(seed: int, startup: int) -> Any:
+    from optuna.samplers import RandomSampler
+
+    return RandomSampler(seed=seed)
+
+
+SAMPLERS: dict[str, Callable[[int, int], Any]] = {
+    "gp": _gp,
+    "tpe": _tpe,
+    "thesis_tpe": _thesis_tpe,
+    "random": _random,
+}
+
+
+def _distribution(held: Range) -> Any:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if isinstance(held, Real):
+        return FloatDistribution(held.low, held.high, log=held.log)
+    if held.options == (0, 1):
+        return IntDistribution(0, 1)
+    return CategoricalDistribution(held.options)
+
+
+def pareto(points: Sequence[Sequence[float]]) -> list[int]:
+    """Places of the points that no other one betters in one value without being worse in another, in order."""
+    kept = []
+    for place, point in enumerate(points):
+        better = (
+            all(a <= b for a, b in zip(other, point, strict=True))
+            and any(a < b for a, b in zip(other, point, strict=True))
+            for other in points
+        )
+        if not any(better):
+            kept.append(place)
+    return kept
+
+
+__all__ = ["SAMPLERS", "Candidate", "SamplerSpec", "Study", "Trial", "Value", "pareto"]
