@@ -104,6 +104,24 @@ class LagCurve:
     at_edge: bool
 
 
+@dataclass(frozen=True)
+class LagRange:
+    """A row of Table 4.2: where the best lags of a group of channels lie, each with the target it goes best with.
+
+    Attributes:
+        group: kind of signal.
+        low, high: smallest and largest best lag, samples.
+        channels: those whose best lag is certain and within the search.
+        left_out: the others of the group.
+    """
+
+    group: str
+    low: int
+    high: int
+    channels: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Stability:
     """One metric of a channel at t and a target at t + horizon, in each piece of the data.
@@ -276,9 +294,28 @@ class Screening:
         """The lag curve of a channel and a target."""
         return next(c for c in self.lags if (c.channel, c.target) == (channel, target))
 
+    def lag_table(self) -> tuple[LagRange, ...]:
+        """Table 4.2 for this data: a row for each group with a certain lag; targets and flagged channels left out."""
+        left_out = {*self.targets, *(flag.channel for flag in self.flags)}
+        best: dict[str, LagCurve] = {}
+        for curve in self.lags:
+            known = best.get(curve.channel)
+            if curve.channel not in left_out and (known is None or abs(curve.value) > abs(known.value)):
+                best[curve.channel] = curve
+        rows = []
+        for group in dict.fromkeys(curve.group for curve in best.values()):
+            mine = [curve for curve in best.values() if curve.group == group]
+            sure = [curve for curve in mine if curve.certain and not curve.at_edge]
+            if sure:
+                lags = [curve.best for curve in sure]
+                others = tuple(curve.channel for curve in mine if curve not in sure)
+                rows.append(LagRange(group, min(lags), max(lags), tuple(c.channel for c in sure), others))
+        return tuple(rows)
+
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values: arrays as lists, a number that is not finite as None."""
         plain: dict[str, Any] = _plain(self)
+        plain["lag_table"] = _plain(self.lag_table())
         plain["proposal"]["kept"] = list(self.proposal.kept)
         plain["proposal"]["dropped"] = list(self.proposal.dropped)
         return plain

@@ -46,7 +46,7 @@ def metrics_by_piece(
     table: Table, live: NDArray[np.int64], spec: ScreeningSpec, on_share: Callable[[float], None] | None = None
 ) -> Metrics:
     """Every metric in every piece, and between pieces."""
-    rows = [_rows(table, p, spec) for p in range(len(table.pieces))]
+    rows = [piece_rows(table, p, spec) for p in range(len(table.pieces))]
     count, shifts = len(rows), min(_SHIFTS, len(rows) - 1)
 
     def of_pair(pair: tuple[int, int]) -> Array:
@@ -60,7 +60,7 @@ def metrics_by_piece(
     return Metrics(found[:, 0], found[:, 1:])
 
 
-def _rows(table: Table, place: int, spec: ScreeningSpec) -> tuple[FloatArray, FloatArray]:
+def piece_rows(table: Table, place: int, spec: ScreeningSpec) -> tuple[FloatArray, FloatArray]:
     """Evenly spread rows of a piece: all channels at t, targets at t + horizon."""
     now, ahead = [], []
     piece = table.pieces[place]

@@ -211,7 +211,9 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
     total = sum(len(values) for values in columns)
     made: list[Piece] = []
     if len(columns) >= spec.pieces:
-        per = -(-len(columns) // MOST_PIECES)
+        # lagged covariances of all pairs are held for every piece: a gigabyte at most
+        each = 4 * (2 * spec.max_lag + 1) * columns[0].shape[1] ** 2
+        per = -(-len(columns) // max(spec.pieces, min(MOST_PIECES, int(1e9 / each))))
         for start in range(0, len(columns), per):
             label = names[start] if per == 1 else f"{names[start]} to {names[min(start + per, len(names)) - 1]}"
             made.append(Piece(label, tuple(columns[start : start + per])))

@@ -56,6 +56,11 @@ def test_lags_have_the_sign_of_table_4_2(found: Screening) -> None:
     assert not curve.at_edge
     assert not found.curve("aux_noise", "v_a").certain
     assert found.proposal.window >= -curve.best
+    (row,) = found.lag_table()
+    assert row.group == "generic"
+    assert row.low <= curve.best <= row.high
+    assert "lever_b" in row.channels
+    assert not {"v_a", "aux_ahead"} & {*row.channels, *row.left_out}
 
 
 def test_without_trust_a_lever_may_stay_and_leaks_of_targets_go(sessions: list[Recording]) -> None:
