@@ -65,8 +65,19 @@ def clock_flags(table: Table, live: Sequence[int]) -> list[Flag]:
     ]
 
 
-def changing_flags(names: Sequence[str], lagged: Lagged, judged: Sequence[int]) -> list[Flag]:
-    """Channels that follow another one closely in every piece, but not with the same sign or gain."""
+def changing_flags(
+    names: Sequence[str], lagged: Lagged, judged: Sequence[int], trusted: Sequence[int], support: Array
+) -> list[Flag]:
+    """Channels that follow another one closely in every piece, but not with the same sign or gain.
+
+    Args:
+        names: channels.
+        lagged: covariances of every piece.
+        judged: columns that may be flagged.
+        trusted: columns that a channel is held against.
+        support: largest correlation of each channel with a target over all pieces, ``(channel,)``. Of two channels that
+            are both in question, the one that has less than half the other's is taken for the changing one.
+    """
     squares = lagged.squares().astype(np.float64)
     usable = np.asarray((squares > 0).all(axis=0))
 
@@ -75,7 +86,10 @@ def changing_flags(names: Sequence[str], lagged: Lagged, judged: Sequence[int]) 
             return None
         scale = np.sqrt(squares[:, None, i, None] * squares[:, None, :])
         found: Array = np.divide(lagged.sums[:, :, i], scale, out=np.zeros(lagged.sums[:, :, i].shape), where=scale > 0)
-        found[:, :, ~usable] = 0.0
+        held_against = np.zeros(len(names), dtype=np.bool_)
+        held_against[list(trusted)] = True
+        held_against[list(judged)] = support[list(judged)] > 2.0 * support[i]
+        found[:, :, ~(usable & held_against)] = 0.0
         found[:, :, i] = 0.0
         least: Array = np.abs(found).min(axis=0)
         lag, j = (int(k) for k in np.unravel_index(int(least.argmax()), least.shape))
@@ -96,7 +110,7 @@ def changing_flags(names: Sequence[str], lagged: Lagged, judged: Sequence[int]) 
     return [flag for flag in spread(of_channel, judged) if flag is not None]
 
 
-def turned_flags(table: Table, live: Sequence[int], judged: Sequence[int]) -> list[Flag]:
+def turned_flags(table: Table, live: Sequence[int], judged: Sequence[int], trusted: Sequence[int]) -> list[Flag]:
     """Channels that show another one with the same gain in many recordings, but not with the same sign.
 
     Pieces may join recordings with different signs, so every stretch is looked at for itself, at lag 0. Natural
@@ -105,7 +119,8 @@ def turned_flags(table: Table, live: Sequence[int], judged: Sequence[int]) -> li
     Args:
         table: the data.
         live: its columns that change.
-        judged: places in `live` of the channels that may be flagged; the others are what they are held against.
+        judged: places in `live` of the channels that may be flagged.
+        trusted: places of those that they are held against: of two in question, it cannot be told which one turns.
     """
     found = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
     relations, slopes = np.array([r for r, _ in found]), np.array([s for _, s in found])
@@ -113,10 +128,9 @@ def turned_flags(table: Table, live: Sequence[int], judged: Sequence[int]) -> li
     counts = strong.sum(axis=0)
     turned = np.minimum((strong & (relations > 0)).sum(axis=0), (strong & (relations < 0)).sum(axis=0))
     enough = (counts >= max(4, len(found) // 4)) & (turned >= np.maximum(2, 0.2 * counts))
-    flags, open_ones = [], set(judged)
+    flags = []
     for i in judged:
-        # Of two channels that are both in question, it cannot be told which one turns.
-        sources = [int(j) for j in np.flatnonzero(enough[i]) if int(j) not in open_ones]
+        sources = [j for j in trusted if enough[i, j] and j != i]
         sources.sort(key=lambda j: -float(np.abs(relations[strong[:, i, j], i, j]).mean()))
         for j in sources:
             gains = np.abs(slopes[strong[:, i, j], i, j])
