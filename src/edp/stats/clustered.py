@@ -1,0 +1,80 @@
+"""The default test: a t-test of paired differences clustered by session and by training run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtri, stdtrit
+
+from edp.errors import DataError
+from edp.stats.checks import Array, finite, lower_p, tested_mask
+
+
+@dataclass(frozen=True, eq=False)
+class MeanTest:
+    """One-sided test of ``mean < 0``; fields are arrays over the leading axes of what was tested (0-d for one).
+
+    Attributes:
+        mean: mean difference, in the unit of the scores.
+        error: standard error.
+        statistic: mean over error.
+        df: degrees of freedom; infinite for a z-test.
+        p: one-sided p-value, small where the module is better.
+    """
+
+    mean: Array
+    error: Array
+    statistic: Array
+    df: float
+    p: Array
+
+    def interval(self, level: float = 0.95) -> tuple[Array, Array]:
+        """Two-sided interval of the mean at `level`."""
+        tail = 0.5 + 0.5 * level
+        reach = (ndtri(tail) if np.isinf(self.df) else stdtrit(self.df, tail)) * self.error
+        return np.asarray(self.mean - reach), np.asarray(self.mean + reach)
+
+
+def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> MeanTest:
+    """Two-way clustered t-test over sessions and training runs.
+
+    Cells of one session share its difficulty for the module, cells of one run share its weights; a cell is in one
+    of each, so both variances add and what they count twice comes off. With e the differences less their mean, N
+    cells, R sessions and G runs::
+
+        V_S = R / (R - 1) * sum_r (sum_f e)^2 / N^2
+        V_F = G / (G - 1) * sum_f (sum_r e)^2 / N^2
+        V   = max(V_S + V_F - sum(e^2) / N^2, V_S, V_F),    df = min(R, G) - 1
+
+    After Cameron, Gelbach and Miller (2011); the maximum keeps V positive with few clusters.
+
+    Args:
+        differences: ``(..., run, session)``, module minus baseline; values outside `tested` are not read.
+        tested: ``(run, session)``, the cells that exist; None: all.
+
+    Raises:
+        DataError: fewer than two runs or sessions, or cells that are not finite.
+    """
+    array = np.asarray(differences, dtype=np.float64)
+    if array.ndim < 2:
+        raise DataError(f"the differences have shape {array.shape}; give (..., run, session)")
+    mask = tested_mask(tested, array.shape)
+    runs, sessions = mask.shape
+    if min(runs, sessions) < 2:
+        raise DataError(f"{runs} runs on {sessions} sessions came; a clustered test needs at least two of each")
+    array = finite(np.where(mask, array, 0.0), "table of differences", 2)
+    cells = int(mask.sum())
+    mean = array.sum(axis=(-2, -1)) / cells
+    rest = np.where(mask, array - mean[..., None, None], 0.0)
+    by_session = sessions / (sessions - 1) * np.square(rest.sum(axis=-2)).sum(axis=-1) / cells**2
+    by_run = runs / (runs - 1) * np.square(rest.sum(axis=-1)).sum(axis=-1) / cells**2
+    by_cell = np.square(rest).sum(axis=(-2, -1)) / cells**2
+    variance = np.maximum(by_session + by_run - by_cell, np.maximum(by_session, by_run))
+    # Equal differences leave rounding in the sums; what is below it is no variance.
+    dust = (1e-14 * np.abs(array).max(axis=(-2, -1))) ** 2
+    error = np.sqrt(np.where(variance > dust, variance, 0.0))
+    df = float(min(runs, sessions) - 1)
+    statistic, p = lower_p(mean, error, df)
+    return MeanTest(np.asarray(mean), error, statistic, df, p)

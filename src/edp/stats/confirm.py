@@ -1,0 +1,176 @@
+"""The default decision on modules: race, clustered test, adjustment over all registered, practical gate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edp.errors import ConfigError, DataError
+from edp.stats.checks import Array, Mask, tested_mask
+from edp.stats.clustered import clustered_t
+from edp.stats.effects import EffectSize, effect_size, rank_stability
+from edp.stats.mixed import mixed_model
+from edp.stats.multiple import adjust_registered
+from edp.stats.paired import fill_worst, run_means
+from edp.stats.race import LOOKS, Look, race
+from edp.stats.resampled import paired_t, resampled_t
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """What a module must show.
+
+    Attributes:
+        alpha: level of the adjusted p-value.
+        least_gain: improvement of the mean score over the baseline's that is worth having, as a share.
+        looks: of the race; none: every module goes all the way.
+        level: of the intervals.
+    """
+
+    alpha: float = 0.05
+    least_gain: float = 0.01
+    looks: tuple[Look, ...] = LOOKS
+    level: float = 0.95
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.alpha < 1.0 and 0.0 < self.level < 1.0 and self.least_gain >= 0.0):
+            raise ConfigError(
+                f"alpha {self.alpha}, level {self.level}, least_gain {self.least_gain} came; the first two must lie "
+                "between 0 and 1, the last not below 0"
+            )
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a confirmation found on one module. Negative differences are improvements.
+
+    Attributes:
+        module: name.
+        confirmed: whether it passed all gates.
+        reason: why, or why not, as a sentence.
+        runs: of the module, 0 where it never reached the confirmation.
+        dropped_after: runs after which the race dropped it; 0 where it did not.
+        change: mean difference over the baseline's mean score.
+        low, high: interval of `change`.
+        p, adjusted: of the clustered test; adjusted over all registered modules.
+        resampled_p: of Nadeau and Bengio's test on run means.
+        paired_p: of the plain t-test on run means.
+        mixed_p: of the thesis's mixed model on run means.
+        d_z: of the run means; None with fewer than two runs.
+        stability: share of the runs in which the module won.
+    """
+
+    module: str
+    confirmed: bool
+    reason: str
+    runs: int = 0
+    dropped_after: int = 0
+    change: float | None = None
+    low: float | None = None
+    high: float | None = None
+    p: float = 1.0
+    adjusted: float = 1.0
+    resampled_p: float | None = None
+    paired_p: float | None = None
+    mixed_p: float | None = None
+    d_z: EffectSize | None = None
+    stability: float | None = None
+
+
+def confirm(
+    scores: ArrayLike,
+    modules: Sequence[str],
+    registered: Sequence[str],
+    tested: ArrayLike | None = None,
+    rule: Rule | None = None,
+    worst: ArrayLike | None = None,
+) -> tuple[Evidence, ...]:
+    """Decide on every registered module from scores on one primary metric.
+
+    Args:
+        scores: ``(1 + module, run, session)``, the baseline first, lower is better. A planned cell that failed is
+            NaN or infinite and counts as the worst. Runs that a module did not make because the race had dropped
+            it may hold anything: they are not read.
+        modules: names of the arms after the baseline.
+        registered: every module of the study, in the order of the answer; those not in `modules` were dropped
+            before and enter the adjustment with p = 1.
+        tested: ``(run, session)``; None: every run is judged on every session.
+        rule: what a module must show; None: the defaults.
+        worst: ``(session,)``, the least that a failed cell costs; see `fill_worst`.
+
+    Raises:
+        DataError: names and scores do not fit, a baseline score that is not above zero, or see `fill_worst`.
+    """
+    rule = rule or Rule()
+    array = np.asarray(scores, dtype=np.float64)
+    if array.ndim != 3 or array.shape[0] != 1 + len(modules) or not modules:
+        raise DataError(
+            f"scores of shape {array.shape} came for {len(modules)} modules; give (1 + module, run, session)"
+        )
+    mask = tested_mask(tested, array.shape)
+    filled = fill_worst(array, mask, worst)
+    differences = filled[1:] - filled[0]
+    raced = race(differences, mask, rule.looks)
+    adjusted = adjust_registered({name: float(p) for name, p in zip(modules, raced.p)}, registered)
+    found = {}
+    for place, name in enumerate(modules):
+        runs, dropped = int(raced.runs[place]), int(raced.dropped_after[place])
+        part = mask[:runs]
+        seen = part.any(axis=0)
+        cells = (filled[1 + place, :runs][:, seen], filled[0, :runs][:, seen], part[:, seen])
+        found[name] = _evidence(name, cells, dropped, adjusted[name], rule)
+    absent = "it did not pass the screening, so it counts with p = 1"
+    return tuple(found.get(name, Evidence(name, False, absent)) for name in registered)
+
+
+def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjusted: float, rule: Rule) -> Evidence:
+    """All figures on one module from its scores, the baseline's and the cells that exist."""
+    module, baseline, mask = cells
+    difference = module - baseline
+    reference = float(baseline[mask].mean())
+    if reference <= 0.0:
+        raise DataError(f"the baseline's mean score is {reference:.4g}; shares need a score above zero")
+    test = clustered_t(difference, mask)
+    low, high = (float(bound) / reference for bound in test.interval(rule.level))
+    change = float(test.mean) / reference
+    means = run_means(difference, mask)
+    runs = len(means)
+    judged = mask.sum() / runs
+    ratio = float(judged / (mask.shape[1] - judged)) if mask.shape[1] > judged else 0.0
+    mixed = mixed_model(run_means(module, mask)[:, None], run_means(baseline, mask)[:, None])
+    confirmed = not dropped and adjusted < rule.alpha and change <= -rule.least_gain
+    return Evidence(
+        module=name,
+        confirmed=confirmed,
+        reason=_reason((change, low, high), adjusted, dropped, float(test.p), rule),
+        runs=runs,
+        dropped_after=dropped,
+        change=change,
+        low=low,
+        high=high,
+        p=1.0 if dropped else float(test.p),
+        adjusted=adjusted,
+        resampled_p=float(resampled_t(means, ratio).p),
+        paired_p=float(paired_t(means).p),
+        mixed_p=float(mixed.effect.p),
+        d_z=effect_size(means, rule.level),
+        stability=float(rank_stability(means)),
+    )
+
+
+def _reason(change: tuple[float, float, float], adjusted: float, dropped: int, p: float, rule: Rule) -> str:
+    """Why a module is in or out, with the figures."""
+    middle, low, high = (100.0 * share for share in change)
+    figures = f"{middle:+.2f} % ({low:+.2f} to {high:+.2f} %)"
+    if dropped:
+        return f"dropped after {dropped} runs: {figures}, p {p:.2g}, no sign of an improvement"
+    if adjusted >= rule.alpha:
+        return f"{figures}, but adjusted p {adjusted:.2g} is not below {rule.alpha:g}"
+    if middle > -100.0 * rule.least_gain:
+        return (
+            f"{figures}: significant (adjusted p {adjusted:.2g}), but below the {100 * rule.least_gain:g} % asked for"
+        )
+    return f"{figures}, adjusted p {adjusted:.2g}"

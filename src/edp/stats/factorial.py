@@ -1,0 +1,164 @@
+"""Two-level screening designs of resolution IV, with modules that exclude each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from edp.errors import ConfigError, closest
+from edp.stats.checks import Array, Mask
+
+MOST_RUNS = 256
+INTERACTION = 0.03
+PASSES = 12
+"""Rounds of exchanges; a design of 14 factors in 32 runs settles in fewer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Factorial:
+    """Which factors are on in which run.
+
+    Attributes:
+        factors: names.
+        levels: ``(run, factor)``, True where on.
+        exclusive: groups of factors of which at most one is on.
+        alias: the largest share of a two-factor interaction that gets into a main effect; 0 in resolution IV.
+            Main effects are averages over the other factors at the rates with which the design has them on.
+        error: the largest standard error of a main effect (on minus off) over the noise of one run.
+    """
+
+    factors: tuple[str, ...]
+    levels: Mask
+    exclusive: tuple[tuple[str, ...], ...]
+    alias: float
+    error: float
+
+
+def two_level_design(
+    factors: Sequence[str], runs: int | None = None, exclusive: Sequence[Sequence[str]] = ()
+) -> Factorial:
+    """A design in which no main effect is aliased with an interaction of two factors.
+
+    In N = 2^m runs the columns are products of an odd number of basic ones (the even ones left out, as in a
+    fold-over), so a product of two columns is never a third: resolution IV, for up to N / 2 factors. Among the
+    columns those are taken that give the fewest aliases between interactions.
+
+    Where factors exclude each other no such design exists. The clashes are then taken out and the levels exchanged
+    one at a time while that lowers the errors and aliases of the main effects; `alias` and `error` say what is left.
+
+    Args:
+        factors: names, at least two.
+        runs: a power of two, at least twice the factors; None: the smallest.
+        exclusive: groups of names of which a network can have only one.
+
+    Raises:
+        ConfigError: runs too few or not a power of two, names twice or unknown.
+    """
+    names = tuple(factors)
+    groups = tuple(tuple(group) for group in exclusive)
+    wanted = _checked_runs(names, runs)
+    for group in groups:
+        for name in group:
+            if name not in names:
+                raise ConfigError(f"exclusive factor '{name}' is not among the factors{closest(name, names)}")
+        if len(set(group)) != len(group) or len(group) < 2:
+            raise ConfigError(f"exclusive group {list(group)} needs at least two different factors")
+    levels = _regular(len(names), wanted)
+    if groups:
+        indices = [tuple(names.index(name) for name in group) for group in groups]
+        levels = _exchanged(_repaired(levels, indices), indices)
+        _, alias, error = _quality(levels, indices)
+    else:
+        _, alias, error = _quality(levels, [])
+    return Factorial(names, levels, groups, float(alias), float(error))
+
+
+def _checked_runs(names: tuple[str, ...], runs: int | None) -> int:
+    if len(names) < 2 or len(set(names)) != len(names):
+        raise ConfigError(f"factors {list(names)} came; give at least two, each once")
+    least = 4
+    while least < 2 * len(names):
+        least *= 2
+    if least > MOST_RUNS:
+        raise ConfigError(f"{len(names)} factors need {least} runs; screen at most {MOST_RUNS // 2} at a time")
+    if runs is None:
+        return least
+    if runs < least or runs > MOST_RUNS or runs & (runs - 1):
+        raise ConfigError(
+            f"{runs} runs came for {len(names)} factors; resolution IV needs a power of two from {least} to {MOST_RUNS}"
+        )
+    return runs
+
+
+def _regular(factors: int, runs: int) -> Mask:
+    """Columns of odd weight; greedily the one that adds the fewest words of four letters."""
+    words = [word for word in range(1, runs) if word.bit_count() % 2]
+    basic = [1 << place for place in range(runs.bit_length() - 1)]
+    chosen = basic[:factors]
+    while len(chosen) < factors:
+        triples = [a ^ b ^ c for a, b, c in combinations(chosen, 3)]
+        free = [word for word in words if word not in chosen]
+        chosen.append(min(free, key=lambda word: (triples.count(word), -word.bit_count(), word)))
+    return np.array([[(run & word).bit_count() % 2 == 1 for word in chosen] for run in range(runs)], dtype=bool)
+
+
+def _repaired(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
+    """Where several of a group are on keep one, the one kept least often so far."""
+    fixed = levels.copy()
+    for group in groups:
+        kept = dict.fromkeys(group, 0)
+        for row in fixed:
+            on = [factor for factor in group if row[factor]]
+            if len(on) > 1:
+                stays = min(on, key=lambda factor: (kept[factor], factor))
+                kept[stays] += 1
+                row[[factor for factor in on if factor != stays]] = False
+    return fixed
+
+
+def _exchanged(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
+    """Flip a level of a run, or hand it on within a group, wherever that lowers the cost most; until nothing does."""
+    best, cost = levels.copy(), float(_quality(levels, groups)[0])
+    moves: list[tuple[int, ...]] = [(factor,) for factor in range(levels.shape[1])]
+    moves += sorted(pair for group in groups for pair in combinations(group, 2))
+    for _ in range(PASSES):
+        before = cost
+        for run in range(levels.shape[0]):
+            trials = np.repeat(best[None], len(moves), axis=0)
+            for trial, move in zip(trials, moves):
+                trial[run, list(move)] ^= True
+            counts = np.stack([trials[:, run, list(group)].sum(axis=1) for group in groups])
+            trials = trials[(counts <= 1).all(axis=0)]
+            costs = _quality(trials, groups)[0]
+            place = int(np.argmin(costs))
+            if costs[place] < cost - 1e-9:
+                best, cost = trials[place], float(costs[place])
+        if cost == before:
+            break
+    return best
+
+
+def _quality(levels: Mask, groups: Sequence[tuple[int, ...]]) -> tuple[Array, Array, Array]:
+    """Of designs ``(..., run, factor)``: what the exchange lowers, the largest alias, the largest error of an effect.
+
+    The cost is the mean squared error of a main effect when every interaction has `INTERACTION` times a run's variance.
+    """
+    factors = levels.shape[-1]
+    signs = np.where(levels, 1.0, -1.0)
+    design = np.concatenate([np.ones((*levels.shape[:-1], 1)), signs], axis=-1)
+    moments = design.swapaxes(-1, -2) @ design
+    barred = {pair for group in groups for pair in combinations(sorted(group), 2)}
+    pairs = [pair for pair in combinations(range(factors), 2) if pair not in barred]
+    first, second = (np.array([pair[side] for pair in pairs], dtype=int) for side in (0, 1))
+    rest = signs - signs.mean(axis=-2, keepdims=True)
+    # The small addition keeps a singular design from stopping the others; its errors are then beyond any bound.
+    inverse = np.linalg.inv(moments + 1e-9 * np.eye(factors + 1))
+    errors = 4.0 * np.diagonal(inverse, axis1=-2, axis2=-1)[..., 1:]
+    alias = (inverse @ (design.swapaxes(-1, -2) @ (rest[..., first] * rest[..., second])))[..., 1:, :]
+    alias = np.where(np.abs(alias) < 1e-8, 0.0, alias)
+    cost = errors.mean(axis=-1) + 4.0 * INTERACTION * np.square(alias).sum(axis=-1).mean(axis=-1)
+    cost = np.where((errors > 0.0).all(axis=-1) & (errors < 1e6).all(axis=-1), cost, np.inf)
+    return cost, np.abs(alias).max(axis=(-2, -1), initial=0.0), np.sqrt(np.abs(errors).max(axis=-1))

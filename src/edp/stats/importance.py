@@ -1,0 +1,104 @@
+"""Main effects and importances of modules from a designed screening, by least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import stdtr
+
+from edp.errors import DataError
+from edp.stats.checks import finite
+
+PASS_AT = 0.30
+"""Largest one-sided p-value with which a module passes the screening: it is to lose few true modules, not to
+confirm any."""
+
+
+@dataclass(frozen=True)
+class MainEffect:
+    """What turning one factor on does to the score, on average over all others.
+
+    Attributes:
+        factor: name.
+        effect: on minus off, in the unit of the scores; negative is better.
+        error: standard error.
+        p: one-sided, small where on is better.
+        importance: the factor's share of the variance that all factors explain, 0 to 1.
+        passed: p is at most the screening's level.
+    """
+
+    factor: str
+    effect: float
+    error: float
+    p: float
+    importance: float
+    passed: bool
+
+
+def main_effects(
+    levels: ArrayLike,
+    factors: Sequence[str],
+    scores: ArrayLike,
+    covariates: ArrayLike | None = None,
+    pass_at: float = PASS_AT,
+) -> tuple[MainEffect, ...]:
+    """Least squares of the scores on all factors at once, and on covariates such as randomised rates.
+
+    Args:
+        levels: ``(run, factor)``, True where on; a repeated design is stacked.
+        factors: names.
+        scores: ``(run,)``; failed runs filled with the worst.
+        covariates: ``(run, covariate)``; None: none.
+        pass_at: one-sided p-value up to which a factor passes.
+
+    Returns:
+        One for each factor, in their order.
+
+    Raises:
+        DataError: shapes that do not fit, values that are not finite, a factor that never changes or cannot be
+            told from others, or no run left to estimate the noise from.
+    """
+    y = finite(scores, "list of scores", 1)
+    on = np.asarray(levels, dtype=bool)
+    if y.ndim != 1 or on.shape != (y.size, len(factors)):
+        raise DataError(f"{y.size} scores of {len(factors)} factors came with levels of shape {on.shape}")
+    columns = [np.ones(y.size), *np.where(on, 0.5, -0.5).T]
+    if covariates is not None:
+        extra = finite(covariates, "table of covariates", 2)
+        if extra.shape[0] != y.size:
+            raise DataError(f"{extra.shape[0]} rows of covariates came for {y.size} scores")
+        scale = extra.std(axis=0)
+        if (scale == 0.0).any():
+            raise DataError("a covariate never changes; leave it out")
+        columns += list(((extra - extra.mean(axis=0)) / scale).T)
+    design = np.stack(columns, axis=1)
+    free = y.size - design.shape[1]
+    if free < 1:
+        raise DataError(f"{y.size} runs came for {design.shape[1]} coefficients; repeat the design")
+    if np.linalg.cond(design) > 1e8:
+        raise DataError(
+            "some factors or covariates cannot be told apart; every factor must change, each in its own way"
+        )
+    inverse = np.linalg.inv(design.T @ design)
+    found = inverse @ (design.T @ y)
+    noise = float(np.square(y - design @ found).sum()) / free
+    chosen = slice(1, 1 + len(factors))
+    effect, spread = found[chosen], np.diag(inverse)[chosen]
+    error = np.sqrt(noise * spread)
+    explained = np.square(effect) / spread
+    total = float(explained.sum())
+    p = stdtr(free, np.divide(effect, error, out=np.zeros_like(effect), where=error > 0.0))
+    return tuple(
+        MainEffect(
+            factor=name,
+            effect=float(effect[i]),
+            error=float(error[i]),
+            p=float(p[i]),
+            importance=float(explained[i] / total) if total > 0.0 else 0.0,
+            passed=bool(p[i] <= pass_at),
+        )
+        for i, name in enumerate(factors)
+    )

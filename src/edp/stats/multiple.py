@@ -1,0 +1,72 @@
+"""Adjusting p-values for the number of modules that were registered, not for those that are left."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edp.errors import DataError, closest
+from edp.stats.checks import Array, finite
+
+
+def benjamini_hochberg(p: ArrayLike) -> Array:
+    """Adjusted p-values after Benjamini and Hochberg (1995), over the last axis.
+
+    They control the false discovery rate: the expected share of wrong ones among the confirmed. That is the
+    probability of any wrong one only where all are null; `holm` bounds that probability always.
+
+    Raises:
+        DataError: empty, or values outside 0 to 1.
+    """
+    array, order, n = _sorted(p)
+    scaled = np.take_along_axis(array, order, axis=-1) * n / np.arange(1, n + 1)
+    steps = np.minimum.accumulate(scaled[..., ::-1], axis=-1)[..., ::-1]
+    return _unsorted(np.minimum(steps, 1.0), order)
+
+
+def holm(p: ArrayLike) -> Array:
+    """Adjusted p-values after Holm (1979), over the last axis: the probability of any false confirmation.
+
+    Raises:
+        DataError: empty, or values outside 0 to 1.
+    """
+    array, order, n = _sorted(p)
+    scaled = np.take_along_axis(array, order, axis=-1) * np.arange(n, 0, -1)
+    return _unsorted(np.minimum(np.maximum.accumulate(scaled, axis=-1), 1.0), order)
+
+
+def adjust_registered(p: Mapping[str, float], registered: Iterable[str]) -> dict[str, float]:
+    """Benjamini-Hochberg over all registered modules; one that was dropped before its test enters with p = 1.
+
+    Adjusting only for the survivors of a screening would forget that the others were tried on the same sessions.
+
+    Args:
+        p: raw p-values of the modules that were tested.
+        registered: every module of the study, fixed before its first run.
+
+    Raises:
+        DataError: a tested module is not registered, one is registered twice, or p is outside 0 to 1.
+    """
+    names = list(registered)
+    if len(set(names)) != len(names):
+        raise DataError("a module is registered twice; give each once")
+    for name in p:
+        if name not in names:
+            raise DataError(f"module '{name}' has a p-value but is not registered{closest(name, names)}")
+    adjusted = benjamini_hochberg([p.get(name, 1.0) for name in names])
+    return {name: float(value) for name, value in zip(names, adjusted)}
+
+
+def _sorted(p: ArrayLike) -> tuple[Array, np.ndarray, int]:
+    array = finite(p, "list of p-values", 1)
+    if (array < 0.0).any() or (array > 1.0).any():
+        raise DataError("p-values must lie between 0 and 1")
+    return array, np.argsort(array, axis=-1, kind="stable"), array.shape[-1]
+
+
+def _unsorted(values: Array, order: np.ndarray) -> Array:
+    result = np.empty_like(values)
+    np.put_along_axis(result, order, values, axis=-1)
+    return result

@@ -1,0 +1,70 @@
+"""Differences of two arms on the same cells; what is missing or diverged counts as the worst."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edp.errors import DataError
+from edp.stats.checks import Array, tested_mask
+
+
+def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayLike | None = None) -> Array:
+    """Scores of all arms with each planned cell that is missing or diverged set to the session's worst.
+
+    Leaving such a pair out would reward the arm that fails where it is hard. An infinite score would decide a
+    mean alone. So a failed cell gets the largest finite score that any arm had on that session, or `worst`, where
+    that is larger: the score of a useless predictor, such as persistence, says best what a failure costs.
+
+    Args:
+        scores: ``(arm, run, session)``, lower is better; NaN or infinite where a run failed.
+        tested: ``(run, session)``, the planned cells; None: all.
+        worst: ``(session,)``, the least that a failure costs; None: what was seen.
+
+    Returns:
+        ``(arm, run, session)``, finite; zero outside the planned cells.
+
+    Raises:
+        DataError: wrong shapes, or no arm has a score on some session.
+    """
+    array = np.asarray(scores, dtype=np.float64)
+    if array.ndim != 3:
+        raise DataError(f"the scores have shape {array.shape}; give (arm, run, session)")
+    mask = tested_mask(tested, array.shape)
+    known = np.isfinite(array) & mask
+    seen = np.where(known, array, -np.inf).max(axis=(0, 1))
+    if worst is not None:
+        floor = np.asarray(worst, dtype=np.float64)
+        if floor.shape != seen.shape or not np.isfinite(floor).all():
+            raise DataError(f"`worst` has shape {floor.shape}; give one finite score for each of {seen.size} sessions")
+        seen = np.maximum(seen, floor)
+    if not np.isfinite(seen).all():
+        raise DataError(
+            f"no arm has a score on sessions {np.flatnonzero(~np.isfinite(seen)).tolist()}; repeat the runs there or "
+            "leave these sessions out of the study"
+        )
+    return np.where(known, array, np.where(mask, seen, 0.0))
+
+
+def paired(
+    module: ArrayLike, baseline: ArrayLike, tested: ArrayLike | None = None, worst: ArrayLike | None = None
+) -> Array:
+    """Module minus baseline in each cell, ``(run, session)``; failed cells of either arm count as the worst.
+
+    With several modules use `fill_worst` on all arms at once, so that all share one worst.
+
+    Raises:
+        DataError: as `fill_worst`.
+    """
+    first, second = np.asarray(module, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
+    if first.shape != second.shape:
+        raise DataError(f"the module has scores of shape {first.shape}, the baseline {second.shape}; pair equal cells")
+    filled = fill_worst(np.stack([first, second]), tested, worst)
+    return np.asarray(filled[0] - filled[1])
+
+
+def run_means(differences: ArrayLike, tested: ArrayLike | None = None) -> Array:
+    """Mean over the tested sessions of each run, ``(..., run)``: what the thesis calls the score of a split."""
+    array = np.asarray(differences, dtype=np.float64)
+    mask = tested_mask(tested, array.shape)
+    return np.asarray(np.where(mask, array, 0.0).sum(axis=-1) / mask.sum(axis=-1))
