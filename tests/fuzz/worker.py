@@ -86,6 +86,8 @@ def read_damaged(folder: Path, case: str, first: int, count: int) -> dict[str, A
         start = time.monotonic()
         fault = ""
         signal.alarm(SECONDS)
+        # A library that hangs does not answer to a signal; this ends the process with a trace.
+        faulthandler.dump_traceback_later(2 * SECONDS, exit=True)
         try:
             read = read_recording(target)
             found["read"] += 1
@@ -101,6 +103,7 @@ def read_damaged(folder: Path, case: str, first: int, count: int) -> dict[str, A
             fault = f"{type(error).__name__}: {error}"
         finally:
             signal.alarm(0)
+            faulthandler.cancel_dump_traceback_later()
         found["slowest_s"] = max(found["slowest_s"], time.monotonic() - start)
         if fault:
             found["faults"].append([number, fault[:300]])

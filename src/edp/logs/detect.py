@@ -40,6 +40,7 @@ _OTHERS = {
     b"<!DOCTYPE": "a web page instead of the data (a login or an error page was saved)",
     b"<!doctype": "a web page instead of the data (a login or an error page was saved)",
     b"<html": "a web page instead of the data (a login or an error page was saved)",
+    b"# Created by Octave": "Octave's own text format (save -v7 writes a MAT file)",
     b"Salted__": "encrypted data (decrypt it first)",
     b"-----BEGIN PGP": "encrypted data (decrypt it first)",
 }

@@ -30,7 +30,9 @@ class Wanted:
         """File values to SI, float32."""
         if values.dtype == np.float32 and self.scale == 1.0 and self.unit.factor == 1.0 and not self.unit.offset:
             return values
-        values = values.astype(np.float64, copy=False)
+        # Damaged files hold bits that are no numbers; what they become is reported as missing.
+        with np.errstate(invalid="ignore"):
+            values = values.astype(np.float64, copy=False)
         if self.scale != 1.0 or self.unit.factor != 1.0:
             values = values * (self.scale * self.unit.factor)
         if self.unit.offset:
