@@ -22,7 +22,7 @@ from edp.screening.compiled import spread
 from edp.screening.linear import Tap, gram, peaks, unexplained
 from edp.screening.result import Array, Flag, FlagKind
 
-LEAKING = 0.5
+LEAKING = 0.25
 """Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak."""
 DIFFERENCING = 2.5
 """Sum of the absolute weights of the future, from which it is differences of the future that explain: so do leaks that
@@ -33,6 +33,8 @@ TELLING = 1e-4
 """Less left unexplained by pasts than this share of the variance: nothing to learn from the future."""
 MATERIAL = 0.15
 """Correlation of the rest of a copy with anything, above which it is more than noise."""
+SEEN = 0.7
+"""Largest lag of a noisy copy, as a share of the largest one searched."""
 RELATED = 0.7
 """Least correlation of a noisy copy with its original."""
 EXPLAINED = 0.01
@@ -143,7 +145,9 @@ def find_copies(correlations: Array, least: float) -> list[Pair]:
         lag, value = int(lags[i, j]), float(best[i, j])
         if abs(lag) >= reach:
             return None
-        if abs(value) < least and rest_related(correlations, i, j, lag, value) > MATERIAL:
+        exact = abs(value) >= least
+        # the rest can only be judged where enough lags lie on either side
+        if not exact and (abs(lag) > SEEN * reach or rest_related(correlations, i, j, lag, value) > MATERIAL):
             return None
         return Pair(i, j, lag, value)
 

@@ -48,6 +48,8 @@ def rows_of(table: Table, pieces: Sequence[int], columns: Ints, count: int, hori
     for p in pieces:
         for stretch in table.pieces[p].stretches:
             usable = len(stretch) - horizon
+            if usable < 1:
+                continue
             wanted = np.linspace(0, usable - 1, max(1, min(usable, count * len(stretch) // total))).astype(np.int64)
             inputs.append(stretch[wanted][:, columns])
             ahead = stretch[wanted + horizon][:, table.targets].astype(np.float64)

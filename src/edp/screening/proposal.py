@@ -17,6 +17,8 @@ from edp.screening.table import Table
 
 NEGLIGIBLE = 0.002
 """Share of the remaining error that a channel must take away, held out, to be kept for that alone."""
+LARGE = 0.01
+"""The same, from which a channel that relates is not redundant even where the held-out pieces do not agree."""
 CLEAR = 0.2
 """Correlation from which a lag counts for the window."""
 STEP = 5
@@ -109,7 +111,7 @@ def redundant_flags(evidence: Evidence, judged: Sequence[str], free: Sequence[st
         judged: channels that may go.
         free: all channels without a flag, `judged` among them.
     """
-    idle = {name for name in judged if not _adds(evidence, name)}
+    idle = {name for name in judged if not (_adds(evidence, name) or evidence.gain(name)[0] > LARGE)}
     flags = _cluster_flags(evidence, idle)
     idle -= {flag.channel for flag in flags}
     names = [evidence.table.names[column] for column in evidence.live]
@@ -255,6 +257,8 @@ def _notes(evidence: Evidence, flags: Sequence[Flag], horizon: int) -> tuple[str
         notes.append(
             f"{len(leaks)} channels know the future: a model fed with them does well in tests and fails on the machine"
         )
+    if table.left_out:
+        notes.append(f"too short to be looked at and left out: {', '.join(table.left_out)}; lower max_lag to see them")
     if horizon == 0:
         notes.append("horizon 0: targets are no inputs")
     return tuple(notes)

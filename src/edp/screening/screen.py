@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from edp.errors import DataError
 from edp.recording import Recording
 from edp.screening import artefacts, copies, forest, stability, values
 from edp.screening.clusters import clusters_of, least_of
@@ -176,6 +177,11 @@ def _evidence(
     groups = clusters_of(spearman[np.ix_(columns, columns)], spec.collinear)
     held = values.held_out_pieces(len(table.pieces), spec.forest.held_out, spec.seed)
     read = columns if spec.horizon else columns[~np.isin(columns, table.targets)]
+    if not len(read):
+        raise DataError(
+            "no channel is left from which the targets could be predicted: at horizon 0 targets are no inputs, and all "
+            "others are flagged; give more channels, or a horizon of 1 or more"
+        )
     with clock.stage("forest") as tell:
         places = {int(c): k for k, c in enumerate(read)}
         grouped = [[places[int(columns[k])] for k in group if int(columns[k]) in places] for group in groups]

@@ -78,7 +78,7 @@ class ScreeningSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least = {"horizon": 0, "max_lag": 10, "pieces": 4, "neighbours": 1, "seed": 0}
+        least = {"horizon": 0, "max_lag": 20, "pieces": 4, "neighbours": 1, "seed": 0}
         least |= dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), 100)
         for name, low in least.items():
             if getattr(self, name) < low:

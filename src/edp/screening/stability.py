@@ -66,6 +66,8 @@ def piece_rows(table: Table, place: int, spec: ScreeningSpec) -> tuple[FloatArra
     piece = table.pieces[place]
     for stretch in piece.stretches:
         usable = len(stretch) - spec.horizon
+        if usable < 1:
+            continue
         count = min(usable, max(1, spec.piece_samples * len(stretch) // piece.samples))
         wanted = np.linspace(0, usable - 1, count).astype(np.int64)
         now.append(stretch[wanted])

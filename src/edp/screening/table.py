@@ -48,6 +48,7 @@ class Table:
         pieces: what is compared.
         rate_hz: samples per second.
         missing: names of the candidates left out since values are missing, with their count.
+        left_out: names of recordings that are too short for the lags.
     """
 
     names: tuple[str, ...]
@@ -56,6 +57,7 @@ class Table:
     pieces: tuple[Piece, ...]
     rate_hz: float
     missing: dict[str, int]
+    left_out: tuple[str, ...] = ()
 
     @property
     def samples(self) -> int:
@@ -140,6 +142,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Table:
                 f"recording '{other.name}' has {other.rate_hz:g} Hz, '{first.name}' {first.rate_hz:g} Hz; screening "
                 "needs one rate: set rate_hz in the signal map"
             )
+    recordings, short = _long_enough(recordings, spec.max_lag)
     targets = spec.targets or _usual_targets(first)
     names = tuple(dict.fromkeys((*(spec.candidates or first.channel_names), *targets)))
     for name in (*names, *spec.trusted):
@@ -170,6 +173,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Table:
         _pieces([r.name for r in recordings], columns, spec),
         first.rate_hz,
         missing,
+        short,
     )
     still = [names[i] for i in table.targets if not table.live[i]]
     if still:
@@ -197,6 +201,21 @@ def _usual_targets(recording: Recording) -> tuple[str, ...]:
     return found
 
 
+def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequence[Recording], tuple[str, ...]]:
+    """Recordings of at least five times the largest lag, and the names of the others."""
+    least = 5 * max_lag
+    long = [recording for recording in recordings if recording.samples >= least]
+    short = tuple(recording.name for recording in recordings if recording.samples < least)
+    if sum(recording.samples for recording in long) < 4 * least:
+        most = max(recording.samples for recording in recordings)
+        raise DataError(
+            f"lags up to {max_lag} samples need recordings of at least {least} samples, four times that in all; "
+            f"{len(long)} of {len(recordings)} recordings are long enough, the longest has {most}: lower max_lag, or "
+            "give longer recordings"
+        )
+    return long, short
+
+
 def _missing(names: Sequence[str], columns: Sequence[FloatArray]) -> dict[str, int]:
     """Channels with missing or infinite values and how many."""
     counts = np.zeros(len(names), dtype=np.int64)
@@ -219,16 +238,10 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
             made.append(Piece(label, tuple(columns[start : start + per])))
     else:
         for name, values in zip(names, columns, strict=True):
-            parts = max(1, round(spec.pieces * len(values) / total + 0.499))
+            # a part is as long as the lags need, if that leaves fewer parts than asked for
+            parts = max(1, min(round(spec.pieces * len(values) / total + 0.499), len(values) // (5 * spec.max_lag)))
             edges = np.linspace(0, len(values), parts + 1).astype(int)
             for i in range(parts):
                 label = name if parts == 1 else f"{name} part {i + 1}"
                 made.append(Piece(label, (values[edges[i] : edges[i + 1]],)))
-    least = 5 * spec.max_lag
-    for piece in made:
-        if max(len(stretch) for stretch in piece.stretches) < least:
-            raise DataError(
-                f"'{piece.name}' has {piece.samples} samples; lags up to {spec.max_lag} need stretches of at least "
-                f"{least}: lower max_lag, or give longer recordings"
-            )
     return tuple(made)

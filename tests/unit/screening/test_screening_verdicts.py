@@ -115,6 +115,18 @@ def test_one_long_recording_is_cut_and_a_channel_with_gaps_set_aside(sessions: l
     assert "pressure" in found.proposal.dropped
 
 
+def test_recordings_too_short_for_the_lags_are_left_out_and_named(sessions: list[Recording]) -> None:
+    spec = replace(SPEC, candidates=("lever_a", "aux_noise"), information_samples=500)
+    found = screen([*sessions[:6], sessions[6].rows(0, 40, "tiny")], spec)
+    assert "tiny" in next(note for note in found.proposal.notes if "too short" in note)
+    assert "lever_a" in found.proposal.kept
+
+
+def test_nothing_to_predict_from_is_an_error(sessions: list[Recording]) -> None:
+    with pytest.raises(DataError, match="at horizon 0 targets are no inputs"):
+        screen(sessions, replace(SPEC, horizon=0, candidates=("aux_dead",)))
+
+
 def test_bad_requests_are_named(sessions: list[Recording]) -> None:
     with pytest.raises(DataError, match="no recordings"):
         screen([])
@@ -124,7 +136,7 @@ def test_bad_requests_are_named(sessions: list[Recording]) -> None:
         screen(sessions, replace(SPEC, targets=("presure",)))
     with pytest.raises(DataError, match="target 'aux_dead' never changes"):
         screen(sessions, replace(SPEC, targets=("aux_dead",)))
-    with pytest.raises(DataError, match="lags up to 100 need stretches of at least 500"):
+    with pytest.raises(DataError, match="0 of 10 recordings are long enough, the longest has 300"):
         screen([s.rows(0, 300) for s in sessions])
     broken = sessions[0].values.copy()
     broken[3, 0] = np.nan
