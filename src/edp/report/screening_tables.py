@@ -16,6 +16,9 @@ FLAG_WORDS = {
     "duplicate": "duplicate",
     "per-file artefact": "artefact of a file",
     "no relation": "no relation",
+    "unsteady relation": "unsteady relation",
+    "redundant": "redundant",
+    "missing values": "missing values",
     "constant": "constant",
 }
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.screening.artefacts import lonely
 from edp.screening.copies import explained_flags
 from edp.screening.result import Choice, Cluster, Flag, FlagKind, Importance, LagCurve, Proposal, Value
-from edp.screening.stability import Relations
+from edp.screening.stability import ABOVE_CHANCE, LEAST_INFORMATION, Relations
 from edp.screening.table import Table
 
 NEGLIGIBLE = 0.002
@@ -99,6 +99,13 @@ def _noise(evidence: Evidence, place: int, name: str) -> Flag:
         text = f"{100 * between:.0f} % of its variance lies between recordings; within them {found}"
         return Flag(name, FlagKind.ARTEFACT, value=between, evidence=text)
     information = float(np.nan_to_num(relations.information[place]).max())
+    if value > ABOVE_CHANCE * chance or information > LEAST_INFORMATION:
+        spread = float(evidence.pieces[:, place].std(ddof=1))
+        text = (
+            f"relates to targets in some pieces, not in all alike (correlation {value:.2f} with deviation {spread:.2f} "
+            f"among pieces, mutual information above chance {information:.2f} nat); no help to forest or linear model"
+        )
+        return Flag(name, FlagKind.UNSTEADY, value=value, evidence=text)
     text = f"{found}; mutual information above chance {information:.3f} nat; no help to a forest or a linear model"
     return Flag(name, FlagKind.NOISE, value=value, evidence=text)
 
@@ -175,9 +182,15 @@ def propose(
 
 
 def _scores(evidence: Evidence) -> dict[str, float]:
-    """Half the importance, a quarter each of correlation and information, each relative to the largest; 0 to 1."""
-    linear = np.abs(evidence.relations.linear).max(axis=1)
-    information = np.nan_to_num(evidence.relations.information).max(axis=1)
+    """Half the importance, a quarter each of correlation and information, each relative to the largest; 0 to 1.
+
+    Correlation and information are penalised where they spread among the pieces: times ``m / (m + s)``, with mean m and
+    deviation s.
+    """
+    relations, count = evidence.relations, len(evidence.table.pieces)
+    linear = (np.abs(relations.linear) * _steadiness(relations.linear_t, count)).max(axis=1)
+    steady = _steadiness(relations.information_t, count)
+    information = (np.nan_to_num(relations.information) * steady).max(axis=1)
     names = [evidence.table.names[column] for column in evidence.live]
     entries = [evidence.importance_of(name) for name in names]
     weight = np.array([max(e.increase, 0.0) / len(e.members) if e is not None else 0.0 for e in entries])
@@ -186,6 +199,11 @@ def _scores(evidence: Evidence) -> dict[str, float]:
         for share, values in ((0.5, np.sqrt(weight)), (0.25, linear), (0.25, information))
     ]
     return dict(zip(names, np.clip(sum(parts), 0.0, 1.0).tolist()))
+
+
+def _steadiness(t: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """``m / (m + s)`` from mean over standard error, of `count` pieces."""
+    return t / (t + math.sqrt(count))
 
 
 def _reason(evidence: Evidence, name: str, target: bool, flags: tuple[Flag, ...], barred: bool) -> str:
@@ -202,7 +220,12 @@ def _reason(evidence: Evidence, name: str, target: bool, flags: tuple[Flag, ...]
     if target:
         parts.append("a target: its own past")
     else:
-        parts.append(f"correlation {relations.linear[place, best]:.2f} with {goal}")
+        pieces = evidence.pieces[:, place]
+        same = int((np.sign(pieces) == np.sign(relations.linear[place, best])).sum())
+        parts.append(
+            f"correlation {relations.linear[place, best]:.2f} with {goal}, of this sign in {same} of "
+            f"{len(pieces)} pieces"
+        )
     informed = int(np.nan_to_num(relations.information[place]).argmax())
     goal = evidence.table.names[evidence.table.targets[informed]]
     parts.append(f"{max(float(np.nan_to_num(relations.information[place, informed])), 0.0):.2f} nat on {goal}")

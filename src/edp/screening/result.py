@@ -29,6 +29,7 @@ class FlagKind(StrEnum):
     DUPLICATE = "duplicate"
     ARTEFACT = "per-file artefact"
     NOISE = "no relation"
+    UNSTEADY = "unsteady relation"
     REDUNDANT = "redundant"
     MISSING = "missing values"
 

@@ -153,6 +153,8 @@ class Relations:
     related: NDArray[np.bool_]
 
 
+ABOVE_CHANCE = 1.5
+"""A correlation counts from this multiple of the largest one between unrelated pieces."""
 LEAST_INFORMATION = 0.02
 """Mutual information below this many nat is not worth a channel, however certain."""
 
@@ -185,7 +187,7 @@ def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, le
     bound = float(student.ppf(1.0 - level / 20.0 / linear.shape[1], count - 1))
     bound_information = float(student.ppf(1.0 - level / linear.size, count - 1))
     with np.errstate(invalid="ignore"):
-        by_lag = (np.abs(linear) > 1.5 * chance) & (linear_t > bound)
+        by_lag = (np.abs(linear) > ABOVE_CHANCE * chance) & (linear_t > bound)
         by_information = (information > LEAST_INFORMATION) & (information_t > bound_information)
     return Relations(linear, chance.copy(), linear_t, information, information_t, by_lag | by_information)
 
@@ -234,7 +236,7 @@ def lag_curves(
                     float(low[i, j]),
                     float(high[i, j]),
                     agreement,
-                    bool(agreement >= 0.8 and abs(value[i, j]) > 1.5 * chance[i]),
+                    bool(agreement >= 0.8 and abs(value[i, j]) > ABOVE_CHANCE * chance[i]),
                     bool(abs(best[i, j]) == lagged.reach),
                 )
             )
