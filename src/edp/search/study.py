@@ -102,18 +102,25 @@ class Study:
         self._told = 0
         self._waiting: dict[int, tuple[Sequence[float] | None, Sequence[float]]] = {}
 
-    def suggest(self, values: Candidate, flags: Sequence[str] = ()) -> None:
-        """Have this asked next: a warm start.
+    def suggest(self, values: Candidate, flags: Sequence[str] | None = None) -> None:
+        """Have this asked next: a warm start. What is not given, the sampler chooses.
+
+        Args:
+            values: of some or all dimensions.
+            flags: switches that are on, the others being off; None leaves them all to the sampler.
 
         Raises:
-            ConfigError: a value outside the space, or an unknown switch.
+            ConfigError: a value outside the space, or an unknown dimension or switch.
         """
-        check(self.space, values)
-        unknown = [name for name in flags if name not in self.flags]
+        unknown = [name for name in values if name not in self.space]
         if unknown:
-            raise ConfigError(f"study: there is no switch '{unknown[0]}' (it has {', '.join(self.flags)})")
-        given = {name: values[name] for name in self.space} | {name: int(name in flags) for name in self.flags}
-        self._study.enqueue_trial(given)
+            raise ConfigError(f"study: there is no dimension '{unknown[0]}' (it has {', '.join(self.space)})")
+        check({name: self.space[name] for name in values}, values)
+        strange = [name for name in flags or () if name not in self.flags]
+        if strange:
+            raise ConfigError(f"study: there is no switch '{strange[0]}' (it has {', '.join(self.flags)})")
+        switched = {} if flags is None else {name: int(name in flags) for name in self.flags}
+        self._study.enqueue_trial(dict(values) | switched)
 
     def ask(self, count: int) -> list[Trial]:
         """The next questions, `count` of them; those asked before count as unanswered until they are told."""

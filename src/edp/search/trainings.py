@@ -15,9 +15,11 @@ from edp.data.splits import ByRecording
 from edp.errors import ConfigError, DataError
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import JudgeSpec, judge
+from edp.models.predictor import build_model
 from edp.recording import Recording
 from edp.sources import DataSource
 from edp.training import fit
+from edp.training.bundle import blank_scaler
 
 SCORES = ("mae", "rmse", "p95", "p99", "composite")
 
@@ -151,6 +153,14 @@ def _frozen(source: Mapping[str, Any]) -> str:
 def _recordings(source: str) -> Sequence[Recording]:
     """The recordings of a source, kept by the process that trains on them again and again."""
     return DataSource.from_plain(json.loads(source)).read()
+
+
+def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
+    """Analytic costs of the network of some settings, before anything is trained: parameters, MACs of a tick."""
+    experiment = build(Experiment, settings, "of a search")
+    task = experiment.task.resolve(100.0, channels, experiment.model.physics)
+    counted = footprint(build_model(task, experiment.model, blank_scaler(task), seed=0))
+    return {"parameters": float(counted.parameters), "macs_tick": float(counted.macs_tick)}
 
 
 def settings_of(experiment: Experiment) -> Table:

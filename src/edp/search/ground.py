@@ -1,0 +1,164 @@
+"""What the phases of a search stand on: sessions set apart, folds, orders and what came of them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.config import Table
+from edp.errors import DataError
+from edp.search.settings import SearchSpec
+from edp.search.trainings import Order
+from edp.stats.folds import repeated_folds
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an order.
+
+    Attributes:
+        order: what was to be trained.
+        status: ``done``, or how it ended.
+        result: of `edp.search.trainings.train_order`, where it is done.
+        message: what went wrong.
+    """
+
+    order: Order
+    status: str
+    result: Mapping[str, Any] | None = None
+    message: str = ""
+
+    def score(self, session: str, horizon: int, name: str = "composite") -> float:
+        """A score on one session; NaN where the training did not end well, which counts as the worst."""
+        if self.result is None:
+            return float("nan")
+        return float(self.result["sessions"][session][str(horizon)][name])
+
+    def mean(self, horizon: int, name: str = "composite") -> float:
+        """A score, mean over the judging sessions; NaN where the training did not end well."""
+        return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a phase found and decided.
+
+    Attributes:
+        phase: its name.
+        facts: plain values that later phases and the report read.
+        sentences: what was decided and why.
+    """
+
+    phase: str
+    facts: Mapping[str, Any]
+    sentences: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"phase": self.phase, "facts": dict(self.facts), "sentences": list(self.sentences)}
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What all phases share; nothing in it changes while a search runs but what was decided.
+
+    Attributes:
+        spec: the settings of the search.
+        base: settings of the network and its training from which everything starts (`settings_of`).
+        source: where the recordings are, plain.
+        development: names of the sessions that train and judge in all phases.
+        test: names of the sessions set apart.
+        channels: of the recordings.
+        decided: what earlier phases decided, by name.
+    """
+
+    spec: SearchSpec
+    base: Table
+    source: Mapping[str, Any]
+    development: tuple[str, ...]
+    test: tuple[str, ...]
+    channels: tuple[str, ...] = ()
+    decided: Mapping[str, Decision] = field(default_factory=dict)
+
+    def folds(self, runs: int) -> NDArray[np.bool_]:
+        """Which development sessions each run is judged on, ``(run, session)``; more runs have the same first ones."""
+        folds = self.spec.folds
+        return repeated_folds(len(self.development), folds, -(-runs // folds), self.spec.seed)[:runs]
+
+    def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[Order]:
+        """An order for each run: the same folds and, for common random numbers, the same seeds for every arm.
+
+        Args:
+            settings: of the arm.
+            runs: their numbers, from 0.
+            seed: number of the seed within a run.
+        """
+        mask = self.folds(max(runs) + 1)
+        names = np.array(self.development)
+        return [
+            Order(
+                settings,
+                self.source,
+                tuple(names[~mask[run]].tolist()),
+                tuple(names[mask[run]].tolist()),
+                self.seed("run", run, seed),
+                self.spec.updates,
+            )
+            for run in runs
+        ]
+
+    def seed(self, *parts: object) -> int:
+        """A seed of its own for each purpose, from the root."""
+        text = " ".join(map(str, (self.spec.seed, *parts)))
+        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big") >> 1
+
+    def table(self, outcomes: Sequence[Outcome], name: str = "composite") -> Array:
+        """Scores ``(run, session)`` of runs 0, 1, ...; NaN where a run is not judged on a session, or failed."""
+        place = {session: column for column, session in enumerate(self.development)}
+        scores = np.full((len(outcomes), len(place)), np.nan)
+        for row, outcome in enumerate(outcomes):
+            for session in outcome.order.judged:
+                scores[row, place[session]] = outcome.score(session, self.spec.horizon, name)
+        return scores
+
+
+def set_apart(
+    sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Development and test sessions: of each family its share, drawn once from the root.
+
+    Args:
+        sessions: names in order.
+        families: what kind of session each is, so that tests hold all kinds; may be empty.
+        spec: share and seed.
+
+    Raises:
+        DataError: too few sessions for the folds, or none to test.
+    """
+    rng = np.random.default_rng([spec.seed, 0x7E57])
+    wanted = max(1, round(spec.test_share * len(sessions)))
+    kinds: dict[str, list[str]] = {}
+    for name in sessions:
+        kinds.setdefault(families.get(name, ""), []).append(name)
+    queues = [list(rng.permutation(names)) for names in kinds.values()]
+    # Largest remainder: every kind gives its share, the rest comes from those with the largest part left over.
+    shares = [len(queue) * wanted / len(sessions) for queue in queues]
+    taken = [int(share) for share in shares]
+    for which in sorted(range(len(queues)), key=lambda i: taken[i] - shares[i])[: wanted - sum(taken)]:
+        taken[which] += 1
+    chosen = {str(name) for queue, count in zip(queues, taken, strict=True) for name in queue[:count]}
+    test = tuple(name for name in sessions if name in chosen)
+    development = tuple(name for name in sessions if name not in chosen)
+    if len(development) < max(spec.folds, 3):
+        raise DataError(
+            f"{len(sessions)} sessions came: {len(test)} are set apart as test, and {len(development)} are left for "
+            f"{spec.folds} folds; give more recordings, a smaller test_share, or fewer folds"
+        )
+    return development, test

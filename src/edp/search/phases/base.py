@@ -1,0 +1,124 @@
+"""What a phase is, and what several of them do: ask a study, train its questions, tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from edp.config import Table
+from edp.registry import Registry
+from edp.search.ground import Decision, Ground, Outcome
+from edp.search.study import Study, Trial
+from edp.search.trainings import Order, costs_of
+
+Course = Generator[list[Order], list[Outcome], Decision]
+"""Yields orders that may be done side by side, is sent their outcomes in the same order, and returns a decision."""
+
+
+class PhaseSpec(Protocol):
+    """A phase: a pure function of the ground and of what came of its orders; it does nothing else.
+
+    Attributes:
+        title: for progress and reports.
+    """
+
+    title: str
+
+    def run(self, ground: Ground) -> Course:
+        """The trainings that it needs, batch by batch, and what follows from them."""
+        ...
+
+
+PHASES: Registry[PhaseSpec] = Registry("phase")
+"""In the order in which they run."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A question of a study and what came of it.
+
+    Attributes:
+        trial: the question.
+        settings: the experiment that it stands for.
+        costs: analytic costs of its network, by name.
+        score: mean over its runs; None where it was not trained for its costs, or failed.
+        outcomes: of its runs; none where it was not trained.
+    """
+
+    trial: Trial
+    settings: Table
+    costs: dict[str, float]
+    score: float | None
+    outcomes: tuple[Outcome, ...]
+
+
+@dataclass(frozen=True)
+class Quest:
+    """A study with what its questions mean.
+
+    Attributes:
+        study: which asks.
+        settings: the experiment that a question stands for.
+        trials: how many questions.
+    """
+
+    study: Study
+    settings: Callable[[Trial], Table]
+    trials: int
+
+
+def answer_all(ground: Ground, quests: list[Quest]) -> Generator[list[Order], list[Outcome], list[list[Answer]]]:
+    """Ask all quests side by side, a batch each at a time, until each has all its answers.
+
+    A question whose costs exceed the limits is told so and not trained.
+    """
+    spec = ground.spec
+    answers: list[list[Answer]] = [[] for _ in quests]
+    while any(len(have) < quest.trials for have, quest in zip(answers, quests, strict=True)):
+        asked = [
+            (place, trial, quest.settings(trial))
+            for place, quest in enumerate(quests)
+            for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[place])))
+        ]
+        costs = [costs_of(settings, ground.channels) for _, _, settings in asked]
+        fit = [all(cost[name] <= most for name, most in spec.limits.items()) for cost in costs]
+        orders = [
+            ground.orders(settings, range(spec.trial_runs)) if fits else []
+            for (_, _, settings), fits in zip(asked, fit, strict=True)
+        ]
+        outcomes = iter((yield [order for some in orders for order in some]))
+        for (place, trial, settings), cost, some in zip(asked, costs, orders, strict=True):
+            own = tuple(next(outcomes) for _ in some)
+            answer = Answer(trial, settings, cost, _score(ground, own), own)
+            answers[place].append(answer)
+            tell(ground, quests[place].study, answer)
+    return answers
+
+
+def tell(ground: Ground, study: Study, answer: Answer) -> None:
+    """Pass an answer on to its study."""
+    spec = ground.spec
+    bounds = [answer.costs[name] / most - 1.0 for name, most in sorted(spec.limits.items())]
+    values = None
+    if answer.score is not None:
+        values = [answer.score] if spec.cost == "none" else [answer.score, answer.costs[spec.cost]]
+    study.tell(answer.trial.number, values, bounds)
+
+
+def study_options(ground: Ground) -> dict[str, int]:
+    """Objectives and bounds of a study under the costs of this search."""
+    return {"objectives": 1 if ground.spec.cost == "none" else 2, "bounds": len(ground.spec.limits)}
+
+
+def best(answers: list[Answer]) -> Answer | None:
+    """The answer with the lowest score; None where none was trained to its end."""
+    done = [answer for answer in answers if answer.score is not None]
+    return min(done, key=lambda answer: (answer.score, answer.trial.number), default=None)
+
+
+def _score(ground: Ground, outcomes: tuple[Outcome, ...]) -> float | None:
+    values = [outcome.mean(ground.spec.horizon) for outcome in outcomes]
+    return float(np.mean(values)) if values and np.isfinite(values).all() else None

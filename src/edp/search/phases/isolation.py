@@ -1,0 +1,153 @@
+"""Phase 0: how much scores vary between folds and seeds, and which feature set goes on (thesis 3.3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edp.config import Table, merged
+from edp.errors import DataError
+from edp.search.ground import Array, Decision, Ground, Outcome
+from edp.search.phases.base import PHASES, Course
+from edp.stats.clustered import clustered_t
+from edp.stats.paired import fill_worst
+from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
+
+DEFAULT_BACKBONE: dict[str, Table] = {
+    "lstm": {"kind": "lstm", "units": 64},
+    "gru": {"kind": "gru", "units": 64},
+    "tcn": {"kind": "tcn", "channels": [64, 64, 64, 64], "kernel": 3},
+    "hybrid": {"kind": "hybrid", "channels": [64], "kernel": 5, "units": 64},
+}
+
+
+def arm_settings(base: Table, backbone: str, features: str) -> Table:
+    """The base with another backbone of like size, and another feature set."""
+    held = base["model"]["backbone"]
+    if held["kind"] == backbone:
+        made = dict(held)
+    else:
+        made = dict(DEFAULT_BACKBONE[backbone])
+        width = int(held.get("units", (held.get("channels") or [64])[-1]))
+        if "units" in made:
+            made["units"] = width
+        if "channels" in made:
+            made["channels"] = [width] * len(made["channels"])
+    changed = merged(base, {"task": {"features": features}})
+    changed["model"] = {**base["model"], "backbone": made, "blocks": []}
+    return changed
+
+
+class Isolation:
+    """Phase 0."""
+
+    title = "isolation and variance"
+
+    def arms(self, ground: Ground) -> list[tuple[str, str]]:
+        """Backbone and feature set of each arm."""
+        return [(backbone, features) for backbone in ground.spec.backbones for features in ground.spec.features]
+
+    def run(self, ground: Ground) -> Course:
+        """All arms on the same folds with the same seeds, in one batch."""
+        spec = ground.spec
+        outcomes = yield [
+            order
+            for backbone, features in self.arms(ground)
+            for seed in range(spec.variance_seeds)
+            for order in ground.orders(
+                arm_settings(ground.base, backbone, features), range(spec.variance_runs), seed=seed
+            )
+        ]
+        return self.decide(ground, outcomes)
+
+    def decide(self, ground: Ground, outcomes: Sequence[Outcome]) -> Decision:
+        """Variance components of each arm; the feature set with the lowest mean score over all backbones."""
+        spec, arms = ground.spec, self.arms(ground)
+        tables = _tables(ground, outcomes, len(arms))
+        facts: dict[str, Any] = {"arms": {}, "runs": spec.variance_runs, "seeds": spec.variance_seeds}
+        for (backbone, features), scores in zip(arms, tables, strict=True):
+            by_run = np.nanmean(scores, axis=2).T  # (run, seed)
+            estimate = thesis_variance if spec.mode == "thesis" else split_variance
+            facts["arms"][f"{backbone} {features}"] = _plain(estimate(by_run))
+        means = {
+            features: float(np.mean([np.nanmean(t) for (_, f), t in zip(arms, tables, strict=True) if f == features]))
+            for features in spec.features
+        }
+        chosen = min(means, key=lambda name: means[name])
+        facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(ground, tables, chosen)}
+        facts["variance"] = _proxy(ground, tables, arms)
+        sentences = [
+            f"Feature set {chosen} goes on: mean composite score "
+            + ", ".join(f"{name} {value:.3g}" for name, value in means.items())
+            + " mm/s over all backbones."
+        ]
+        for backbone, found in facts["comparisons"].items():
+            sentences.append(
+                f"{backbone}: {chosen} against {found['rival']} {100 * found['change']:+.2f} % "
+                f"(one-sided p {found['p']:.2g}, two-way clustered t over {spec.variance_runs} runs)."
+            )
+        return Decision("isolation", facts, tuple(sentences))
+
+    def _comparisons(self, ground: Ground, tables: list[Array], chosen: str) -> dict[str, Any]:
+        """The chosen feature set against the next best one, for each backbone."""
+        spec = ground.spec
+        rivals = [name for name in spec.features if name != chosen]
+        found = {}
+        for place, backbone in enumerate(spec.backbones):
+            own = {f: tables[place * len(spec.features) + i] for i, f in enumerate(spec.features)}
+            if not rivals:
+                continue
+            rival = min(rivals, key=lambda name: float(np.nanmean(own[name])))
+            first, second = (own[name].mean(axis=0) for name in (chosen, rival))
+            mask = ground.folds(spec.variance_runs)
+            test = clustered_t(np.where(mask, first - second, 0.0), mask)
+            found[backbone] = {
+                "rival": rival,
+                "change": float(test.mean) / float(np.nanmean(second)),
+                "p": float(test.p),
+            }
+        return found
+
+
+def _tables(ground: Ground, outcomes: Sequence[Outcome], arms: int) -> list[Array]:
+    """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
+    spec = ground.spec
+    size = spec.variance_runs
+    raw = np.stack([ground.table(outcomes[at : at + size]) for at in range(0, len(outcomes), size)])
+    mask = ground.folds(size)
+    filled = fill_worst(raw, mask)
+    filled[:, ~mask] = np.nan
+    return list(filled.reshape(arms, spec.variance_seeds, size, -1))
+
+
+def _proxy(ground: Ground, tables: list[Array], arms: list[tuple[str, str]]) -> dict[str, float]:
+    """The variance of paired differences that planning takes for that of a module's effect.
+
+    Before a module was ever trained the variance of its effect is not known. That between the feature sets of one
+    backbone stands in for it; with one feature set, that between backbones, and with one arm, that between seeds. The
+    largest of them counts.
+    """
+    mask = ground.folds(ground.spec.variance_runs)
+    pairs = [(i, j) for i in range(len(arms)) for j in range(i + 1, len(arms))]
+    alike = [(i, j) for i, j in pairs if arms[i][0] == arms[j][0]] or pairs
+    differences = [tables[i][0] - tables[j][0] for i, j in alike] or [tables[0][0] - own for own in tables[0][1:]]
+    if not differences:
+        raise DataError("one backbone, one feature set and one seed show no variance; set variance_seeds = 2 or more")
+    found = [paired_variance(np.where(mask, difference, 0.0), mask) for difference in differences]
+    largest = max(found, key=lambda held: held.session + held.run + held.cell)
+    return {"session": largest.session, "run": largest.run, "cell": largest.cell}
+
+
+def _plain(found: SplitVariance) -> dict[str, Any]:
+    return {
+        "mean": found.mean,
+        "split": found.split,
+        "seed": found.seed,
+        "split_interval": found.split_interval,
+        "seed_interval": found.seed_interval,
+    }
+
+
+PHASES.register("isolation")(Isolation())

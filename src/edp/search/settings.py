@@ -1,0 +1,114 @@
+"""What a search is asked to do: budgets, arms and rules of its phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from edp.errors import ConfigError
+from edp.search.space import ELASTIC, THESIS, Space
+from edp.search.study import SamplerSpec
+
+MODES = ("sound", "thesis")
+COSTS = ("parameters", "macs_tick")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchSpec:
+    """The settings of a search. The thesis's own numbers are those of the preset ``thesis``.
+
+    Attributes:
+        mode: ``sound`` (docs/search.md) or ``thesis``, whose tests and rules are followed to the letter.
+        seed: root of folds, seeds of trainings and questions.
+        updates: training steps of every training but the final one.
+        final_updates: training steps of what is judged on the test sessions.
+        horizon: at which scores are taken, one of the task's.
+        test_share: share of the sessions that are set apart as test before anything else.
+        folds: into which the other sessions are dealt.
+        backbones: registered backbones that are compared.
+        features: feature sets that are compared.
+        variance_runs: phase 0: training runs of each backbone with each feature set, in whole repeats of the folds.
+        variance_seeds: phase 0: seeds of each of these runs.
+        trials: phase 1: questions for each backbone.
+        warm_rounds: phase 1: rounds in which every size is asked once before the sampler is free to choose.
+        trial_runs: runs over which a question of phases 1, 4 and 5 is judged.
+        screening_runs: phase 2, sound: runs of the two-level design; a power of two.
+        screening_repeats: phase 2, sound: how often the design is repeated, each time on another fold.
+        module_trials: phase 2, thesis: questions for each module.
+        least_effect: phase 2.5: the effect to be seen, as a share of the baseline's mean score.
+        power: phase 2.5: wanted.
+        most_runs: phase 3: training runs of each arm that may be spent at most.
+        run_seeds: phase 3, thesis: seeds of each split.
+        alpha: level of the confirmation.
+        least_gain: improvement that is worth having, as a share of the baseline's mean score.
+        joint_trials: phase 4: questions about the confirmed modules together.
+        free_trials: phase 5: questions about all modules together.
+        batch: questions that are asked before the first of them is answered.
+        space: dimensions and ranges of phase 1.
+        elastic: reach of the window around the baseline in later phases.
+        sampler: how questions are chosen.
+        cost: ``none``, or a cost that is made small beside the score in phases 1, 4 and 5: a Pareto front comes out.
+        limits: the most that a cost may be; what exceeds it is not trained.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    mode: str = "sound"
+    seed: int = 0
+    updates: int = 400
+    final_updates: int = 2000
+    horizon: int = 10
+    test_share: float = 0.2
+    folds: int = 5
+    backbones: tuple[str, ...] = ("lstm", "tcn", "hybrid")
+    features: tuple[str, ...] = ("FG1", "FG2")
+    variance_runs: int = 10
+    variance_seeds: int = 2
+    trials: int = 40
+    warm_rounds: int = 1
+    trial_runs: int = 1
+    screening_runs: int = 32
+    screening_repeats: int = 2
+    module_trials: int = 10
+    least_effect: float = 0.02
+    power: float = 0.80
+    most_runs: int = 20
+    run_seeds: int = 3
+    alpha: float = 0.05
+    least_gain: float = 0.01
+    joint_trials: int = 24
+    free_trials: int = 48
+    batch: int = 4
+    space: Space = field(default_factory=lambda: dict(THESIS))
+    elastic: dict[str, float] = field(default_factory=lambda: dict(ELASTIC))
+    sampler: SamplerSpec = field(default_factory=SamplerSpec)
+    cost: str = "none"
+    limits: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        counts = (
+            *("updates", "final_updates", "variance_seeds", "trials", "trial_runs", "screening_repeats"),
+            *("module_trials", "run_seeds", "joint_trials", "free_trials", "batch"),
+        )
+        wrong = [f"{name} = {getattr(self, name)} (at least 1)" for name in counts if getattr(self, name) < 1]
+        wrong += [f"{name} = {value} (between 0 and 1)" for name, value in self._shares() if not 0 < value < 1]
+        if self.mode not in MODES:
+            wrong.append(f"mode = '{self.mode}' ({' or '.join(MODES)})")
+        if self.cost not in ("none", *COSTS):
+            wrong.append(f"cost = '{self.cost}' (none, {' or '.join(COSTS)})")
+        wrong += [f"limits.{name} ({' or '.join(COSTS)})" for name in self.limits if name not in COSTS]
+        wrong += [f"limits.{name} = {most} (above 0)" for name, most in self.limits.items() if not most > 0]
+        if self.folds < 2 or self.variance_runs < self.folds or self.variance_runs % self.folds:
+            wrong.append(f"folds = {self.folds} (at least 2), variance_runs = {self.variance_runs} (a multiple of them)")
+        if self.most_runs < self.folds:
+            wrong.append(f"most_runs = {self.most_runs} (at least the {self.folds} folds)")
+        if not self.backbones or not self.features:
+            wrong.append("backbones and features (at least one of each)")
+        if self.warm_rounds < 0 or self.least_gain < 0:
+            wrong.append(f"warm_rounds = {self.warm_rounds}, least_gain = {self.least_gain} (at least 0)")
+        if wrong:
+            raise ConfigError("search: " + "; ".join(wrong) + " must hold")
+
+    def _shares(self) -> list[tuple[str, float]]:
+        names = ("test_share", "least_effect", "power", "alpha")
+        return [(name, getattr(self, name)) for name in names]
