@@ -98,8 +98,10 @@ class SearchSpec:
             wrong.append(f"cost = '{self.cost}' (none, {' or '.join(COSTS)})")
         wrong += [f"limits.{name} ({' or '.join(COSTS)})" for name in self.limits if name not in COSTS]
         wrong += [f"limits.{name} = {most} (above 0)" for name, most in self.limits.items() if not most > 0]
-        if self.folds < 2 or self.variance_runs < self.folds or self.variance_runs % self.folds:
-            wrong.append(f"folds = {self.folds} (at least 2), variance_runs = {self.variance_runs} (a multiple of them)")
+        if self.folds < 2 or self.variance_runs < 2 * self.folds or self.variance_runs % self.folds:
+            wrong.append(
+                f"folds = {self.folds} (at least 2), variance_runs = {self.variance_runs} (two repeats of them or more)"
+            )
         if self.most_runs < self.folds:
             wrong.append(f"most_runs = {self.most_runs} (at least the {self.folds} folds)")
         if not self.backbones or not self.features:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,6 +11,7 @@ import numpy as np
 from edp.config import Table
 from edp.registry import Registry
 from edp.search.ground import Decision, Ground, Outcome
+from edp.search.space import Space
 from edp.search.study import Study, Trial
 from edp.search.trainings import Order, costs_of
 
@@ -108,9 +109,18 @@ def tell(ground: Ground, study: Study, answer: Answer) -> None:
     study.tell(answer.trial.number, values, bounds)
 
 
-def study_options(ground: Ground) -> dict[str, int]:
-    """Objectives and bounds of a study under the costs of this search."""
-    return {"objectives": 1 if ground.spec.cost == "none" else 2, "bounds": len(ground.spec.limits)}
+def new_study(
+    ground: Ground,
+    name: str,
+    space: Space,
+    flags: Sequence[str] = (),
+    barred: frozenset[frozenset[str]] = frozenset(),
+) -> Study:
+    """A study under the costs and limits of this search, with a root of its own."""
+    spec = ground.spec
+    objectives = 1 if spec.cost == "none" else 2
+    root = ground.seed("study", name)
+    return Study(space, root, spec.sampler, tuple(flags), barred, objectives, len(spec.limits))
 
 
 def best(answers: list[Answer]) -> Answer | None:

@@ -7,10 +7,10 @@ from typing import Any
 from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Decision, Ground
-from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, study_options
+from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, new_study
 from edp.search.phases.isolation import arm_settings
 from edp.search.space import Choice, applicable, apply
-from edp.search.study import Study, pareto
+from edp.search.study import pareto
 from edp.stats.efficiency import Candidate, most_efficient
 
 
@@ -39,15 +39,12 @@ class Calibration:
             chosen[backbone] = picked
             facts["backbones"][backbone] = _plain(picked) | {"trials": [_plain(answer) for answer in own]}
             lowest = best(own)
-            sentences.append(
-                f"{backbone}: {_values(picked)} gives {picked.score:.3g} mm/s with "
-                f"{picked.costs['parameters']:,.0f} parameters"
-                + (
-                    "."
-                    if lowest is picked or lowest is None
-                    else f"; the lowest, {lowest.score:.3g}, needs {lowest.costs['parameters']:,.0f} and does not repay them."
-                )
-            )
+            size = f"{picked.costs['parameters']:,.0f}"
+            text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} mm/s with {size} parameters"
+            if lowest is not None and lowest is not picked:
+                size = f"{lowest.costs['parameters']:,.0f}"
+                text += f"; the lowest, {lowest.score:.3g}, has {size} and does not repay the difference"
+            sentences.append(f"{text}.")
         if not chosen:
             raise DataError(
                 "phase 1: no training of any backbone ended well; see the messages of the trainings, and lower the "
@@ -65,7 +62,7 @@ class Calibration:
 def _quest(ground: Ground, backbone: str, arm: Table) -> Quest:
     spec = ground.spec
     space = applicable(spec.space, arm)
-    study = Study(space, ground.seed("calibration", backbone), spec.sampler, **study_options(ground))
+    study = new_study(ground, f"calibration {backbone}", space)
     sizes = space.get("units")
     for _ in range(spec.warm_rounds):
         for size in sizes.options if isinstance(sizes, Choice) else ():
@@ -103,7 +100,10 @@ def _plain(answer: Answer) -> dict[str, Any]:
 
 
 def _values(answer: Answer) -> str:
-    return ", ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in answer.trial.values.items())
+    return ", ".join(
+        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in answer.trial.values.items()
+    )
 
 
 PHASES.register("calibration")(Calibration())

@@ -1,0 +1,203 @@
+"""Phases of the search on a made-up world, in which what a training gives is a known function of its settings."""
+
+import dataclasses
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from edp.config import load_experiment, plain_tree
+from edp.errors import ConfigError, DataError
+from edp.search.conduct import conduct
+from edp.search.ground import Ground, Outcome, set_apart
+from edp.search.phases import PHASES
+from edp.search.settings import SearchSpec
+from edp.search.space import Choice, Real
+from edp.search.study import SamplerSpec
+from edp.search.trainings import SCORES, settings_of
+
+SESSIONS = tuple(f"s{number:02d}" for number in range(12))
+SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16))}
+SPEC = SearchSpec(
+    updates=10,
+    folds=3,
+    variance_runs=6,
+    trials=8,
+    space=SPACE,
+    sampler=SamplerSpec(kind="tpe", startup=4),
+    backbones=("lstm", "hybrid"),
+)
+
+
+def ground(spec=SPEC):
+    base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
+    return Ground(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:])
+
+
+class World:
+    """Scores by settings, session and seed; remembers what it did, like a ledger."""
+
+    def __init__(self, effect, noise=0.02):
+        self.effect, self.noise, self.done, self.trained = effect, noise, {}, 0
+
+    def __call__(self, orders):
+        return [self.outcome(order) for order in orders]
+
+    def outcome(self, order):
+        key = json.dumps(order.to_json(), sort_keys=True)
+        if key not in self.done:
+            self.trained += 1
+            self.done[key] = self._train(order)
+        return self.done[key]
+
+    def _train(self, order):
+        score = self.effect(order.settings)
+        if score is None:
+            return Outcome(order, "diverged", None, "the loss is nan")
+        digest = hashlib.blake2b(json.dumps([order.settings, order.seed], sort_keys=True).encode(), digest_size=8)
+        rng = np.random.default_rng(int.from_bytes(digest.digest(), "big"))
+        sessions = {
+            name: {"10": dict.fromkeys(SCORES, score + 0.1 * int(name[1:]) / 12 + self.noise * rng.normal())}
+            for name in order.judged
+        }
+        return Outcome(order, "done", {"sessions": sessions})
+
+
+def by_rate(settings):
+    """Best at a rate of 3e-3; FG2 and hybrids better; units hardly matter."""
+    rate = np.log10(settings["training"]["optimizer"]["learning_rate"])
+    score = 5.0 + 0.5 * (rate + 2.5) ** 2 - 0.002 * settings["model"]["backbone"]["units"]
+    score -= 0.5 * (settings["task"]["features"] == "FG2")
+    return score - 0.3 * (settings["model"]["backbone"]["kind"] == "hybrid")
+
+
+@pytest.fixture(scope="module")
+def found():
+    return conduct(ground(), World(by_rate), until="calibration")
+
+
+def test_phase_0_takes_the_better_feature_set_and_says_how_sure_it_is(found):
+    facts = found.decided["isolation"].facts
+    assert facts["features"] == "FG2"
+    assert set(facts["arms"]) == {"lstm FG1", "lstm FG2", "hybrid FG1", "hybrid FG2"}
+    assert all(held["p"] < 0.05 and held["change"] < -0.05 for held in facts["comparisons"].values())
+    assert 0 < facts["arms"]["hybrid FG2"]["seed"] < 0.1
+    assert facts["variance"]["run"] >= 0
+
+
+def test_phase_0_pairs_all_arms_on_the_same_folds_and_seeds():
+    world = World(by_rate)
+    conduct(ground(), world, until="isolation")
+    orders = [json.loads(key) for key in world.done]
+    assert len(orders) == 4 * 6 * 2
+    pairs = {(tuple(order["judged"]), order["seed"]) for order in orders}
+    assert len(pairs) == 12
+    for order in orders:
+        assert not set(order["judged"]) & set(order["train"])
+        assert set(order["judged"]) | set(order["train"]) == set(SESSIONS[:9])
+
+
+def test_phase_1_finds_the_rate_and_the_smallest_size_that_is_not_bettered(found):
+    facts = found.decided["calibration"].facts
+    assert facts["backbone"] == "hybrid"
+    assert abs(np.log10(facts["baseline"]["learning_rate"]) + 2.5) < 1.0
+    assert facts["settings"]["task"]["features"] == "FG2"
+    assert facts["settings"]["training"]["optimizer"]["learning_rate"] == facts["baseline"]["learning_rate"]
+    assert len(facts["backbones"]["lstm"]["trials"]) == 8
+    units = [trial["values"]["units"] for trial in facts["backbones"]["lstm"]["trials"][:3]]
+    assert units == [4, 8, 16]  # the warm round asks every size once
+
+
+def test_decisions_are_plain_and_come_again_without_a_training(found):
+    world = World(by_rate)
+    first = conduct(ground(), world, until="calibration")
+    trained = world.trained
+    again = conduct(ground(), world, until="calibration")
+    assert world.trained == trained
+    for name in ("isolation", "calibration"):
+        plain = json.loads(json.dumps(again.decided[name].to_json()))
+        assert plain == json.loads(json.dumps(first.decided[name].to_json()))
+        assert first.decided[name].facts == found.decided[name].facts
+        assert all(sentence.endswith(".") for sentence in plain["sentences"])
+
+
+def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
+    def brittle(settings):
+        return None if settings["training"]["optimizer"]["learning_rate"] > 1e-2 else by_rate(settings)
+
+    facts = conduct(ground(), World(brittle), until="calibration").decided["calibration"].facts
+    assert facts["baseline"]["learning_rate"] <= 1e-2
+    statuses = [status for trial in facts["backbones"]["lstm"]["trials"] for status in trial["statuses"]]
+    assert "diverged" in statuses
+
+    def fg1_breaks(settings):
+        return (
+            None if settings["task"]["features"] == "FG1" and settings["model"]["backbone"]["kind"] == "lstm" else 5.0
+        )
+
+    assert conduct(ground(), World(fg1_breaks), until="isolation").decided["isolation"].facts["features"] == "FG2"
+    usual = ground().base["training"]["optimizer"]["learning_rate"]
+
+    def only_as_it_was(settings):
+        return 9.0 if settings["training"]["optimizer"]["learning_rate"] == usual else None
+
+    with pytest.raises(DataError, match="no training of any backbone ended well"):
+        conduct(ground(), World(only_as_it_was), until="calibration")
+
+
+def test_what_costs_too_much_is_not_trained_and_a_cost_gives_a_front():
+    spec = dataclasses.replace(SPEC, limits={"parameters": 4000.0}, cost="parameters", backbones=("lstm",))
+    world = World(by_rate)
+    facts = conduct(ground(spec), world, until="calibration").decided["calibration"].facts
+    trials = facts["backbones"]["lstm"]["trials"]
+    assert any(trial["parameters"] > 4000 for trial in trials)
+    assert all((trial["score"] is None) == (trial["parameters"] > 4000) for trial in trials)
+    front = facts["front"]["lstm"]
+    costs = [held["parameters"] for held in sorted(front, key=lambda held: held["score"])]
+    assert costs == sorted(costs, reverse=True)
+
+
+def test_the_thesis_mode_uses_its_own_estimates():
+    spec = dataclasses.replace(SPEC, mode="thesis")
+    sound, thesis = (
+        conduct(ground(s), World(by_rate), until="isolation").decided["isolation"].facts for s in (SPEC, spec)
+    )
+    assert sound["arms"]["lstm FG1"]["split_interval"] is not None
+    assert thesis["arms"]["lstm FG1"]["split_interval"] is None
+
+
+def test_sessions_set_apart_are_spread_over_families_and_drawn_by_the_root():
+    families = {name: "dig" if number % 3 else "grading" for number, name in enumerate(SESSIONS)}
+    spec = dataclasses.replace(SPEC, test_share=0.25)
+    development, test = set_apart(SESSIONS, families, spec)
+    assert len(test) == 3
+    assert {families[name] for name in test} == {"dig", "grading"}
+    assert sorted(development + test) == list(SESSIONS)
+    assert set_apart(SESSIONS, families, spec) == (development, test)
+    others = {set_apart(SESSIONS, families, dataclasses.replace(spec, seed=seed))[1] for seed in range(6)}
+    assert len(others) > 1
+    with pytest.raises(DataError, match="2 are left for 3 folds"):
+        set_apart(SESSIONS[:3], {}, spec)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "quick"}, "mode = 'quick'"),
+        ({"updates": 0, "alpha": 1.0}, r"updates = 0 \(at least 1\); alpha = 1\.0"),
+        ({"folds": 3, "variance_runs": 4}, "two repeats of them"),
+        ({"limits": {"flash": 1.0}}, "limits.flash"),
+        ({"cost": "cycles"}, "cost = 'cycles'"),
+    ],
+)
+def test_settings_out_of_range_are_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
+        SearchSpec(**options)
+
+
+def test_an_unknown_phase_is_named():
+    with pytest.raises(ConfigError, match="unknown phase 'calibratoin'"):
+        conduct(ground(), World(by_rate), until="calibratoin")
+    assert list(PHASES)[:2] == ["isolation", "calibration"]
+    assert plain_tree(load_experiment(None, "quick"))["task"]["features"] == "FG2"
