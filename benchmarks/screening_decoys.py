@@ -4,8 +4,8 @@ Decoys (`decoys.py`) are noise, delayed copies, leaks of the future and artefact
 24 channels of Table A.1. What matters is asked of the simulator (`m22_truth.py`), never of the screening. Then the
 network of a preset is trained on the proposal, on FG1, FG2, on what the simulator says is needed, on all channels, on
 all but the flagged leaks, and on random sets of the proposal's size, with equal settings, and judged on held-out
-recordings. Last, each channel is taken away
-from the network that was trained on FG1.
+recordings. Last, each channel is taken away from the network that was
+trained on FG1.
 
 A set that holds leaks has errors that no machine will ever see, because there the future is not known.
 """
