@@ -5,15 +5,15 @@ import pytest
 
 from edp.recording import Recording
 from edp.screening import FlagKind, ScreeningSpec
-from edp.screening.artefacts import turned_flags
+from edp.screening.artefacts import broken_flags
 from edp.screening.table import build_table
 from edp.signals import Channel, Kind
 
-NAMES = ("v", "turned", "steady", "weak", "sloped", "other")
+NAMES = ("v", "turned", "steady", "weak", "sloped", "sometimes")
 
 
 def drives(count=9, samples=700):
-    """A velocity, and channels that show it with a sign of the file, as it is, hardly, and with a gain of the file."""
+    """A velocity, and what shows it: with a sign of the file, as it is, hardly, with gains of the files, or in some."""
     rng = np.random.default_rng(4)
     signs = rng.permutation(np.resize([1.0, -1.0], count))
     made = []
@@ -22,7 +22,8 @@ def drives(count=9, samples=700):
         v -= v.mean()
         noise = rng.normal(size=(4, samples))
         columns = [v, signs[i] * v + noise[0], v + noise[1], signs[i] * v + 300 * noise[2],
-                   signs[i] * rng.uniform(0.2, 5.0) * v + noise[3], rng.normal(size=samples)]  # fmt: skip
+                   signs[i] * rng.uniform(0.2, 5.0) * v + noise[3],
+                   (i > 3) * v + rng.normal(size=samples)]  # fmt: skip
         channels = tuple(Channel(n, Kind.VELOCITY if n == "v" else Kind.GENERIC) for n in NAMES)
         made.append(Recording(f"drive_{i}", channels, np.stack(columns, axis=1).astype(np.float32), 100.0))
     return made
@@ -34,11 +35,13 @@ def table():
 
 
 def test_one_gain_with_two_signs_is_an_artefact(table):
-    (flag,) = turned_flags(table, list(range(6)), [1, 2, 3, 4, 5])
-    assert (flag.channel, flag.kind, flag.source) == ("turned", FlagKind.ARTEFACT, "v")
-    assert "other sign in 4 of them" in flag.evidence
+    turned, sometimes = broken_flags(table, list(range(6)), [1, 2, 3, 4, 5], [0])
+    assert (turned.channel, turned.kind, turned.source) == ("turned", FlagKind.ARTEFACT, "v")
+    assert "other sign in 4 of them" in turned.evidence
+    assert (sometimes.channel, sometimes.kind, sometimes.source) == ("sometimes", FlagKind.ARTEFACT, "v")
+    assert "not at all in 3 others" in sometimes.evidence
 
 
 def test_only_what_is_judged_is_flagged(table):
-    assert turned_flags(table, list(range(6)), [1, 3]) != []
-    assert turned_flags(table, list(range(6)), [3, 4, 5]) == []
+    assert broken_flags(table, list(range(6)), [1, 3], [0]) != []
+    assert broken_flags(table, list(range(6)), [3, 4], [0]) == []

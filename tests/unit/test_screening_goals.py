@@ -27,7 +27,7 @@ def bench():
 
 @pytest.fixture(scope="module")
 def plan():
-    return SimulationOrder(minutes=5.6, recordings=14, seed=2).scenarios()
+    return SimulationOrder(minutes=4.2, recordings=14, seed=2).scenarios()
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +37,14 @@ def recordings(plan, bench):
 
 @pytest.fixture(scope="module")
 def laid(recordings, bench):
-    return bench("decoys").lay_decoys(recordings, each=5, seed=1)
+    return bench("decoys").lay_decoys(recordings, each=4, seed=1)
 
 
 @pytest.fixture(scope="module")
 def found(laid):
-    spec = ScreeningSpec(
-        targets=TARGETS, max_lag=60, information_samples=1_500, forest=ForestSpec(trees=10, samples=4_000, tests=2_000)
-    )
-    return screen(laid[0], spec)
+    forest = ForestSpec(trees=10, samples=4_000, tests=2_000)
+    few = {"information_samples": 1_500, "rank_samples": 1_000}
+    return screen(laid[0], ScreeningSpec(targets=TARGETS, max_lag=60, forest=forest, **few))
 
 
 def test_decoys_are_seen_through(plan, recordings, laid, found, bench):

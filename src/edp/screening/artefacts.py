@@ -20,8 +20,10 @@ EXACT = 0.97
 """The same before a change of its gain counts."""
 GAIN = 1.5
 """Ratio of the largest to the smallest gain."""
-STEADY = 1.25
-"""Largest ratio of gains (90 % to 10 %) that count as one gain."""
+STEADY, SAME = 1.25, 1.05
+"""Largest ratio of gains (90 % to 10 %) that count as one gain where a sign turns, and where a relation is absent."""
+VISIBLE, ABSENT = 0.8, 0.3
+"""Correlation that gain and noise let expect, and the one found, where a relation is absent."""
 
 
 def dead_flags(table: Table) -> list[Flag]:
@@ -110,45 +112,64 @@ def changing_flags(
     return [flag for flag in spread(of_channel, judged) if flag is not None]
 
 
-def turned_flags(table: Table, live: Sequence[int], judged: Sequence[int], trusted: Sequence[int]) -> list[Flag]:
-    """Channels that show another one with the same gain in many recordings, but not with the same sign.
+def broken_flags(table: Table, live: Sequence[int], judged: Sequence[int], trusted: Sequence[int]) -> list[Flag]:
+    """Channels that show another one with one gain in some recordings, elsewhere with the other sign or not at all.
 
-    Pieces may join recordings with different signs, so every stretch is looked at for itself, at lag 0. Natural
-    relations change their gain where they change their sign; a plug turned round, or a set-up script, does not.
+    Pieces may join recordings with different relations, so every stretch is looked at for itself, at lag 0. Natural
+    relations change their gain where they change their sign or fade; a plug turned round or left out does not. A
+    stretch counts where the source moves so much that the gain and noise of the other stretches would show it.
 
     Args:
         table: the data.
         live: its columns that change.
         judged: places in `live` of the channels that may be flagged.
-        trusted: places of those that they are held against: of two in question, it cannot be told which one turns.
+        trusted: places of those that they are held against: of two in question, it cannot be told which one is broken.
     """
     found = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
-    relations, slopes = np.array([r for r, _ in found]), np.array([s for _, s in found])
-    strong = np.abs(relations) >= STRONG
-    counts = strong.sum(axis=0)
-    turned = np.minimum((strong & (relations > 0)).sum(axis=0), (strong & (relations < 0)).sum(axis=0))
-    enough = (counts >= max(4, len(found) // 4)) & (turned >= np.maximum(2, 0.2 * counts))
+    relations, slopes, squares = (np.array(values) for values in zip(*found, strict=True))
     flags = []
     for i in judged:
-        sources = [j for j in trusted if enough[i, j] and j != i]
-        sources.sort(key=lambda j: -float(np.abs(relations[strong[:, i, j], i, j]).mean()))
-        for j in sources:
-            gains = np.abs(slopes[strong[:, i, j], i, j])
-            low, high = np.quantile(gains, (0.1, 0.9))
-            if high > STEADY * low:
-                continue
-            text = (
-                f"shows {table.names[live[j]]} with one gain in {counts[i, j]} of {len(found)} stretches, but with the "
-                f"other sign in {turned[i, j]} of them"
-            )
-            value = float(np.abs(relations[strong[:, i, j], i, j]).mean())
-            flags.append(Flag(table.names[live[i]], FlagKind.ARTEFACT, table.names[live[j]], 0, value, text))
-            break
+        sources = [j for j in trusted if j != i]
+        made = [(_broken(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
+        told = [(*verdict, j) for verdict, j in made if verdict is not None]
+        if told:
+            value, text, j = max(told)
+            source = table.names[live[j]]
+            flags.append(Flag(table.names[live[i]], FlagKind.ARTEFACT, source, 0, value, f"shows {source} {text}"))
     return flags
 
 
-def _moments(stretches: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Correlations ``[i, j]`` and slopes of i on j, ``(channel, channel)``; 0 where one of them stands still."""
+def _broken(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
+    """Mean correlation where there is one, and in words how it breaks; None where it does not.
+
+    Args:
+        relation: correlation of channel and source, ``(stretch,)``.
+        slope: size of the channel's slope on the source, ``(stretch,)``.
+        squares: variances of channel and source, ``(stretch, 2)``.
+    """
+    strong = np.abs(relation) >= STRONG
+    count = int(strong.sum())
+    if count < max(4, len(strong) // 5):
+        return None
+    low, high = np.quantile(slope[strong], (0.1, 0.9))
+    turned = min(int((strong & (relation > 0)).sum()), int((strong & (relation < 0)).sum()))
+    value = float(np.abs(relation[strong]).mean())
+    if high <= STEADY * low and turned >= max(2, 0.2 * count):
+        return (
+            value,
+            f"with one gain in {count} of {len(strong)} stretches, but with the other sign in {turned} of them",
+        )
+    noise = float(np.median((squares[:, 0] * (1.0 - relation**2))[strong]))
+    shown = float(np.median(slope[strong])) ** 2 * squares[:, 1]
+    looked = np.sqrt(shown / np.maximum(shown + noise, 1e-300)) >= VISIBLE
+    absent = int((looked & (np.abs(relation) <= ABSENT)).sum())
+    if high <= SAME * low and absent >= max(2, 0.2 * looked.sum()):
+        return value, f"with one gain in {count} stretches, but not at all in {absent} others where it moves as much"
+    return None
+
+
+def _moments(stretches: Sequence[np.ndarray]) -> tuple[Array, Array, Array]:
+    """Correlations ``[i, j]`` and slopes of i on j, 0 where one of them stands still; and variances ``(channel,)``."""
     count = sum(len(stretch) for stretch in stretches)
     mean = sum(stretch.sum(axis=0, dtype=np.float64) for stretch in stretches) / count
     products = np.zeros((len(mean), len(mean)))
@@ -159,7 +180,8 @@ def _moments(stretches: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     moving = square > 1e-12 * count * np.maximum(mean * mean, 1e-30)
     both = np.outer(moving, moving)
     relation = np.divide(products, np.sqrt(np.outer(square, square)), out=np.zeros_like(products), where=both)
-    return relation, np.divide(products, square[None, :], out=np.zeros_like(products), where=both)
+    slope = np.divide(products, square[None, :], out=np.zeros_like(products), where=both)
+    return relation, slope, np.where(moving, square, 0.0) / count
 
 
 def lonely(values: Array, chance: float) -> int | None:

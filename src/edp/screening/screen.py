@@ -154,7 +154,7 @@ def _structural_flags(table: Table, lagged: Lagged, spec: ScreeningSpec) -> list
     correlations = lagged.pooled()
     support = np.abs(correlations[:, :, targets]).max(axis=(0, 2))
     flags += artefacts.changing_flags(names, lagged, open_ones(), trusted, support)
-    flags += artefacts.turned_flags(table, [int(k) for k in lagged.live], open_ones(), trusted)
+    flags += artefacts.broken_flags(table, [int(k) for k in lagged.live], open_ones(), trusted)
     known = sorted(set(range(len(names))) - set(open_ones()))
     flags += copies.find_leaks(names, correlations, trusted, targets, known)
     settled = {names.index(flag.channel) for flag in flags if flag.channel in names}

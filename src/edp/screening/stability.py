@@ -157,6 +157,10 @@ ABOVE_CHANCE = 1.5
 """A correlation counts from this multiple of the largest one between unrelated pieces."""
 LEAST_INFORMATION = 0.02
 """Mutual information below this many nat is not worth a channel, however certain."""
+LEAST_CORRELATION = 0.03
+"""The same for the correlation at the best lag."""
+CLEARLY = 3.0
+"""Times the largest correlation between unrelated pieces at which a relation is clear."""
 
 
 def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, level: float) -> Relations:
@@ -187,7 +191,11 @@ def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, le
     bound = float(student.ppf(1.0 - level / 20.0 / linear.shape[1], count - 1))
     bound_information = float(student.ppf(1.0 - level / linear.size, count - 1))
     with np.errstate(invalid="ignore"):
-        by_lag = (np.abs(linear) > ABOVE_CHANCE * chance) & (linear_t > bound)
+        # Pieces of unlike manoeuvres differ so much that a real relation may be unsure among few of them: far above
+        # all draws of chance, less will do.
+        sure = (np.abs(linear) > ABOVE_CHANCE * chance) & (linear_t > bound)
+        clear = (np.abs(linear) > CLEARLY * chance) & (linear_t > float(student.ppf(0.995, count - 1)))
+        by_lag = (np.abs(linear) > LEAST_CORRELATION) & (sure | clear)
         by_information = (information > LEAST_INFORMATION) & (information_t > bound_information)
     return Relations(linear, chance.copy(), linear_t, information, information_t, by_lag | by_information)
 
