@@ -4,14 +4,14 @@ Decoys (`decoys.py`) are noise, delayed copies, leaks of the future and artefact
 24 channels of Table A.1. What matters is asked of the simulator (`m22_truth.py`), never of the screening. Then the
 network of a preset is trained on the proposal, on FG1, FG2, on what the simulator says is needed, on all channels, on
 all but the flagged leaks, and on random sets of the proposal's size, with equal settings, and judged on held-out
-recordings. Last, each channel is taken away from the network that was
-trained on FG1.
+recordings. Last, each channel is taken away from the network that was trained on FG1.
 
 A set that holds leaks has errors that no machine will ever see, because there the future is not known.
 """
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 import time
 from collections import Counter
@@ -120,8 +120,8 @@ def tried(source: DataSource, found: Screening, truth: Sequence[Cause], folder: 
         ),
         "all": "all",
     }
-    if quick:
-        sets = {name: sets[name] for name in ("proposed", "FG1", "all")}
+    if quick or given.sets:
+        sets = {name: sets[name] for name in (given.sets.split(",") if given.sets else ("proposed", "FG1", "all"))}
     told = [""]
 
     def tell(name: str, done: int, total: int, event: object) -> None:
@@ -129,7 +129,8 @@ def tried(source: DataSource, found: Screening, truth: Sequence[Cause], folder: 
             told[0] = name
             print(f"training {done + 1}/{total}: {name}", flush=True)
 
-    spec = TrialSpec(random=1 if quick else 3, draw=seed, barred=tuple(sorted(flagged)), seeds=(seed,))
+    drawn = given.random if given.random is not None else 1 if quick else 3
+    spec = TrialSpec(random=drawn, draw=seed, barred=tuple(sorted(flagged)), seeds=(seed,))
     return try_feature_sets(source, load_experiment(None, "quick", changes), sets, folder, spec, tell)
 
 
@@ -167,6 +168,8 @@ def main() -> None:
     options = parser(__doc__.splitlines()[0])
     options.add_argument("--workers", type=int, default=2)
     options.add_argument("--draws", type=int, default=None, help="how often decoys are laid anew (default 3, quick 1)")
+    options.add_argument("--random", type=int, default=None, help="random sets (default 3, quick 1)")
+    options.add_argument("--sets", default="", help="names of the sets to train on, FG1 among them: a,b (default all)")
     given = options.parse_args()
     quick, seed = given.quick, given.seed
     minutes, count = (7.0, 14) if quick else (60.0, 30)
@@ -194,7 +197,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.data or Path(temporary)
         source = on_disk(first, folder / "logs")
-        trials = tried(source, first_screening, truth, folder / "trials", quick, seed)
+        trials = tried(source, first_screening, truth, folder / "trials", given)
         show_trials(trials)
         worths = show_worths(folder / "trials" / f"FG1_seed{seed}", truth, quick)
     errors = {trial.name: trial.error["10"] for trial in trials.trials}
