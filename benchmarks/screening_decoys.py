@@ -102,8 +102,11 @@ def on_disk(recordings: Sequence[Recording], folder: Path) -> DataSource:
     return DataSource(folder, SignalMap(channels=entries))
 
 
-def tried(source: DataSource, found: Screening, truth: Sequence[Cause], folder: Path, quick: bool, seed: int) -> Trials:
+def tried(
+    source: DataSource, found: Screening, truth: Sequence[Cause], folder: Path, given: argparse.Namespace
+) -> Trials:
     """Train and judge the network on every set."""
+    quick, seed = given.quick, given.seed
     changes = [f"training.seed={seed}", f"split.seed={seed}", "split.test_share=0.25"]
     changes += ["training.epochs=2", "training.updates=15"] if quick else ["training.epochs=6", "training.updates=250"]
     flagged = {flag.channel for flag in found.flags if flag.kind is FlagKind.LEAK}
