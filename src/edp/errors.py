@@ -32,6 +32,16 @@ class StorageError(EdpError):
     """Writing or reading a file failed (disk full, read-only folder, missing path)."""
 
 
+class BusyError(StorageError):
+    """Another process holds the folder; the message says which. The exit code is the system's "try again later"."""
+
+    exit_code = 75
+
+
+class NotFiniteError(EdpError):
+    """A loss, score or result is NaN or infinite."""
+
+
 def closest(name: str, options: Iterable[str]) -> str:
     """A suffix for messages: ``; did you mean 'x'?`` or ``; known: a, b, c``."""
     known = sorted(options)

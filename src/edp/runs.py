@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
-import os
 import platform
 import sys
 import time
@@ -16,8 +14,8 @@ from types import TracebackType
 from typing import Any
 
 from edp import __version__
-from edp.errors import StorageError
-from edp.storage import make_folder, read_json, storage_error, write_bytes, write_json
+from edp.errors import BusyError, StorageError
+from edp.storage import hold, make_folder, read_json, remove_unfinished, write_bytes, write_json
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
 
@@ -47,30 +45,20 @@ class RunFolder:
         path: the folder; made when absent.
 
     Raises:
-        StorageError: the folder cannot be made or another process holds it.
+        BusyError: another process holds it.
+        StorageError: the folder cannot be made.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = make_folder(path)
-        lock = self.path / ".lock"
         try:
-            self._lock = lock.open("a+")
-        except OSError as error:
-            raise storage_error(lock, error, "write") from error
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._lock.seek(0)
-            holder = self._lock.read().strip() or "unknown"
-            self._lock.close()
-            raise StorageError(
+            self._lock = hold(self.path / ".lock")
+        except BusyError as error:
+            holder = str(error).rpartition("process ")[2]
+            raise BusyError(
                 f"run folder '{self.path}' is in use by process {holder}; wait for it or choose another folder"
             ) from None
-        self._lock.truncate(0)
-        self._lock.write(str(os.getpid()))
-        self._lock.flush()
-        for rest in self.path.glob(".*.tmp"):  # of a process that was killed while it wrote
-            rest.unlink(missing_ok=True)
+        remove_unfinished(self.path)
 
     def __enter__(self) -> RunFolder:
         """The folder itself; leaving the block frees the lock."""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from edp.errors import StorageError
+from edp.errors import BusyError, StorageError
 
 
 def storage_error(path: Path, error: OSError, doing: str) -> StorageError:
@@ -58,6 +60,51 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def hold(path: str | Path) -> IO[str]:
+    """Lock a file for this process; closing it, or the end of the process, however it ends, frees it.
+
+    A holder may remove the file before it closes it: who waited for the removed one then locks the new one.
+
+    Raises:
+        BusyError: another process holds it; the message says which.
+        StorageError: the file cannot be written.
+    """
+    lock = Path(path)
+    while True:
+        try:
+            stream = lock.open("a+")
+        except OSError as error:
+            raise storage_error(lock, error, "write") from error
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            stream.seek(0)
+            holder = stream.read().strip() or "unknown"
+            stream.close()
+            raise BusyError(f"'{lock}' is held by process {holder}") from None
+        try:
+            current = lock.stat().st_ino == os.fstat(stream.fileno()).st_ino
+        except FileNotFoundError:
+            current = False
+        if current:
+            break
+        stream.close()
+    try:
+        stream.truncate(0)
+        stream.write(f"{os.getpid()} on {os.uname().nodename} since {time.strftime('%Y-%m-%d %H:%M:%S')}")
+        stream.flush()
+    except OSError as error:
+        stream.close()
+        raise storage_error(lock, error, "write") from error
+    return stream
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a process that was killed while it wrote has left; only for who holds the folder."""
+    for rest in folder.glob(".*.tmp"):
+        rest.unlink(missing_ok=True)
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

@@ -8,8 +8,12 @@ import pytest
 
 from edp.config import load_experiment
 from edp.errors import ConfigError, DataError
+from edp.ledger import Ledger, Status
 from edp.logs import write_recording
 from edp.recording import Recording
+from edp.search.batch import complete
+from edp.search.jobs import job_of
+from edp.search.local import LocalPool
 from edp.search.trainings import SCORES, Order, experiment_of, settings_of, train_order
 from edp.signals import Channel, Kind
 from edp.sources import DataSource
@@ -105,3 +109,18 @@ def test_orders_that_cannot_be_are_refused(order):
         train_order(dataclasses.replace(order, judged=("s9",)).to_json())
     with pytest.raises(DataError, match="two training sessions or more"):
         train_order(dataclasses.replace(order, train=("s0",)).to_json())
+
+
+def test_a_process_of_a_pool_does_an_order_to_the_same_bits(order, record, tmp_path):
+    job = job_of(order, "digest of the data")
+    moved = dataclasses.replace(order, source={**order.source, "path": "elsewhere"})
+    assert job_of(moved, "digest of the data").key == job.key
+    others = [dataclasses.replace(order, **change) for change in ({"seed": 2}, {"updates": 13}, {"judged": ("s4",)})]
+    assert (
+        len({job.key, job_of(order, "other").key, *(job_of(other, "digest of the data").key for other in others)}) == 5
+    )
+    with LocalPool(1) as pool, Ledger(tmp_path) as ledger:
+        for _ in range(2):
+            (found,) = complete(ledger, pool, [job]).values()
+            assert found.status is Status.DONE, found.message
+            assert {**found.result, "seconds": record["seconds"]} == record

@@ -13,7 +13,7 @@ import torch
 
 from edp.data.chunks import Batch, ChunkSampler
 from edp.data.prepared import Prepared
-from edp.errors import ConfigError, DataError, EdpError
+from edp.errors import ConfigError, DataError, EdpError, NotFiniteError
 from edp.models.predictor import ModelSpec, Predictor, build_model, trainable
 from edp.runs import RunFolder
 from edp.streaming import State, detach_state, reset_where
@@ -61,7 +61,7 @@ class Fitted:
     resumed_at: int
 
 
-class Diverged(TrainingError):
+class Diverged(TrainingError, NotFiniteError):
     """The loss or the validation score is not finite any more.
 
     Attributes:

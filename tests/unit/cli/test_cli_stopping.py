@@ -93,7 +93,7 @@ def test_stopped_simulation_keeps_whole_logs_and_goes_on(edp, tmp_path):
 def test_run_folder_in_use(edp, logs, tmp_path, small):
     with RunFolder(tmp_path / "run"):
         ended = edp("train", logs, "--out", tmp_path / "run", *small)
-    assert ended.code == 1
+    assert ended.code == 75
     assert f"in use by process {os.getpid()}" in ended.err
     assert edp("train", logs, "--out", tmp_path / "run", *small).code == 0
 

@@ -1,0 +1,132 @@
+"""What does a search cost beside its trainings, and what does a second worker bring?
+
+How long a ledger of 10,000 records takes to open, every checksum verified; what share of a core the coordinator takes
+while trainings run; and trainings an hour with two workers against one. The trainings are real and small: the network
+of the preset `quick`, a fold of simulated M22 sessions, few updates, one thread, by the function that a search calls.
+Reading the data and starting the processes come before the time taken.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+from common import finish, parser, table, verdict
+from edp.config import load_experiment
+from edp.ledger import Identity, Ledger, Record, Status, digest_of
+from edp.runs import environment
+from edp.search.batch import complete
+from edp.search.executor import Job
+from edp.search.jobs import job_of
+from edp.search.local import LocalPool
+from edp.search.trainings import Order, settings_of
+from edp.workflow import DataSource, SimulationOrder, simulate_data_set
+
+OPEN_S, SHARE, SPEEDUP = 1.0, 0.02, 1.8
+HORIZONS, SCORES, SESSIONS = ("1", "10"), ("mae", "rmse", "p95", "p99", "composite"), 5
+
+
+def fill(folder: Path, count: int) -> None:
+    """Records of the size that a search writes; not synced one by one, as they are only read."""
+    with Ledger(folder):
+        pass
+    settings = settings_of(load_experiment(None, "quick"))
+    for seed in range(count):
+        split = {"train": [f"session {i}" for i in range(20)], "judged": [f"session {i}" for i in range(20, 25)]}
+        config = {"settings": settings, "updates": 800}
+        identity = Identity("edp.search.jobs:train", config, split, seed, 1, "code", "data", environment(1))
+        scores = {name: seed / (7 + i) for i, name in enumerate(SCORES)}
+        result = {"sessions": {name: dict.fromkeys(HORIZONS, scores) for name in split["judged"]}, "scores": scores}
+        measured = {"seconds": 12.3, "peak_mb": 456.7, "host": "host", "attempts": 1}
+        record = Record(identity, Status.DONE, result, "", measured)
+        (folder / "records" / f"{record.key}.json").write_bytes(record.to_bytes())
+
+
+def opening(folder: Path, count: int, repeats: int) -> tuple[list[float], list[float]]:
+    """Wall and processor seconds of opening a ledger."""
+    wall, processor = [], []
+    for _ in range(repeats):
+        began, spent = time.perf_counter(), time.process_time()
+        with Ledger(folder) as ledger:
+            wall.append(time.perf_counter() - began)
+            processor.append(time.process_time() - spent)
+            if len(ledger) != count:
+                raise SystemExit(f"{len(ledger)} records of {count} came back")
+    return wall, processor
+
+
+def orders(data: Path, count: int, updates: int, first_seed: int) -> list[Job]:
+    source = DataSource.of(data)
+    recordings = source.read()
+    digest = digest_of(sorted(recording.digest for recording in recordings))
+    names = [recording.name for recording in recordings]
+    settings = settings_of(load_experiment(None, "quick", ["training.threads=1"]))
+    found = []
+    for number in range(count):
+        judged = (names[number % len(names)],)
+        train = tuple(name for name in names if name not in judged)
+        order = Order(settings, source.to_plain(), train, judged, first_seed + number, updates)
+        found.append(job_of(order, digest))
+    return found
+
+
+def rate(workers: int, warm: Sequence[Job], jobs: Sequence[Job]) -> dict[str, float]:
+    """Trainings an hour of a pool, and what the coordinator took of a core meanwhile."""
+    with tempfile.TemporaryDirectory() as folder, Ledger(folder) as ledger, LocalPool(workers) as pool:
+        complete(ledger, pool, warm[:workers])
+        began, spent = time.perf_counter(), time.process_time()
+        found = complete(ledger, pool, jobs)
+        wall, processor = time.perf_counter() - began, time.process_time() - spent
+        bad = [record.message for record in found.values() if record.status is not Status.DONE]
+        if bad:
+            raise SystemExit(f"a training ended badly: {bad[0]}")
+        seconds = median(record.measured["seconds"] for record in found.values())
+    return {
+        "workers": workers,
+        "trainings an hour": 3600 * len(jobs) / wall,
+        "seconds a training": seconds,
+        "coordinator's share of a core": processor / wall,
+        "coordinator, ms a training": 1000 * processor / len(jobs),
+    }
+
+
+def main() -> None:
+    arguments = parser(__doc__ or "").parse_args()
+    quick, seed = arguments.quick, arguments.seed
+    count, trainings, updates, minutes = (2000, 4, 10, 2.0) if quick else (10_000, 16, 60, 6.0)
+    with tempfile.TemporaryDirectory() as temporary:
+        ledger = Path(temporary) / "ledger"
+        fill(ledger, count)
+        wall, processor = opening(ledger, count, 3 if quick else 7)
+        shutil.rmtree(ledger)
+        data = arguments.data or Path(temporary) / "data"
+        simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=6, seed=seed))
+        warm = orders(data, 2, 1, 10_000)
+        rows = []
+        for turn in range(1 if quick else 3):  # in turn, so that other load of the machine meets both alike
+            jobs = orders(data, trainings, updates, 100 * turn)
+            rows += [rate(workers, warm, jobs) for workers in (1, 2)]
+    table([f"opening {count:,} records", "least", "median"], [
+        ["wall s", min(wall), median(wall)],
+        ["processor s", min(processor), median(processor)],
+    ])  # fmt: skip
+    print()
+    table(list(rows[0]), [list(row.values()) for row in rows])
+    one, two = (median(row["trainings an hour"] for row in rows if row["workers"] == n) for n in (1, 2))
+    share = max(row["coordinator's share of a core"] for row in rows)
+    bound = OPEN_S * count / 10_000
+    verdicts = [
+        verdict(f"opening {count:,} records, of {bound:g} s", min(wall), bound, "<= 1", "s", quick),
+        verdict("coordinator's share of a core, of 2 %", share, SHARE, "<= 1", "core", quick),
+        verdict("trainings an hour, two workers against one", two, one, f">= {SPEEDUP}", "1/h", quick),
+    ]
+    details = {"opening_s": wall, "opening_processor_s": processor, "pools": rows}
+    finish("search_scaling", verdicts, seed, details)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,27 @@
+"""The ledger of trainings: one checksummed record a training, found by the content of what decides its result.
+
+A training is never done twice, whatever is killed: a record is whole or absent, damaged ones are set apart and trained
+again, and a search that starts anew reads here what was done.
+"""
+
+from edp.ledger.claims import Claim, claim, known, leave_arrival
+from edp.ledger.record import FINAL, Identity, Record, Status, canonical, code_version, digest_of
+from edp.ledger.store import Damage, Ledger, Opening, read_records
+
+__all__ = [
+    "FINAL",
+    "Claim",
+    "Damage",
+    "Identity",
+    "Ledger",
+    "Opening",
+    "Record",
+    "Status",
+    "canonical",
+    "claim",
+    "code_version",
+    "digest_of",
+    "known",
+    "leave_arrival",
+    "read_records",
+]

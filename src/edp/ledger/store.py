@@ -1,0 +1,223 @@
+"""The ledger on disk: one file a training, written by one coordinator at a time."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from edp.errors import BusyError, ConfigError, StorageError
+from edp.ledger.claims import free_dead_claims, whole
+from edp.ledger.record import FINAL, Record, Status, canonical, digest_of
+from edp.storage import hold, make_folder, read_json, remove_unfinished, storage_error, write_bytes, write_json
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A file that is no whole record."""
+
+    file: Path
+    why: str
+
+
+def read_records(folder: str | Path) -> tuple[dict[str, Record], list[Damage]]:
+    """All records of a ledger, whoever holds it, and the damaged files; nothing is changed."""
+    found: dict[str, Record] = {}
+    damaged = []
+    for file in sorted(Path(folder, "records").glob("*.json")):
+        try:
+            record = Record.from_bytes(file.read_bytes())
+            if record.key != file.stem:
+                raise ValueError(f"it holds the record {record.key}")
+            found[record.key] = record
+        except (ValueError, KeyError, TypeError) as error:
+            damaged.append(Damage(file, str(error)))
+        except FileNotFoundError:  # set apart by its holder since it was listed
+            continue
+        except OSError as error:
+            raise storage_error(file, error, "read") from error
+    return found, damaged
+
+
+@dataclass(frozen=True)
+class Opening:
+    """One look into a lock-box: who was judged, why, and when."""
+
+    box: str
+    judged: tuple[str, ...]
+    why: str
+    time: str
+
+
+class Ledger:
+    """A ledger that this process, the coordinator, writes; a second one is refused.
+
+    Folders in it: ``records``, one file a training; ``arrived``, what workers left that is not entered yet; ``claims``,
+    trainings under way; ``quarantine``, damaged files; ``set_aside``, records of trainings to be tried again.
+
+    Args:
+        folder: made when absent.
+
+    Attributes:
+        damaged: what was set apart on opening; these trainings count as not done.
+
+    Raises:
+        BusyError: another process coordinates here; exit code 75.
+        StorageError: the folder cannot be used.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.path = make_folder(folder)
+        try:
+            self._lock = hold(self.path / ".lock")
+        except BusyError as error:
+            holder = str(error).rpartition("process ")[2]
+            raise BusyError(
+                f"'{self.path}' is coordinated by process {holder}; wait for it, stop it, or choose another folder"
+            ) from None
+        try:
+            for part in ("records", "arrived"):
+                remove_unfinished(make_folder(self.path / part))
+            free_dead_claims(self.path)
+            self._enter_arrivals()
+            self._records, self.damaged = read_records(self.path)
+            for damage in self.damaged:
+                self._move(damage.file, "quarantine")
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Ledger:
+        """The ledger itself; leaving the block lets another process coordinate."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Let go."""
+        self.close()
+
+    def close(self) -> None:
+        """Let another process coordinate."""
+        self._lock.close()
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __iter__(self) -> Iterator[Record]:
+        """Records in the order of their keys."""
+        return iter([self._records[key] for key in sorted(self._records)])
+
+    def get(self, key: str) -> Record | None:
+        """What became of a training, lost ones too."""
+        return self._records.get(key)
+
+    def finished(self, key: str) -> Record | None:
+        """What became of a training that is not to be tried again."""
+        record = self._records.get(key)
+        return record if record is not None and record.status in FINAL else None
+
+    def put(self, record: Record) -> None:
+        """Enter a training; on disk when this returns.
+
+        Raises:
+            StorageError: the disk is full (earlier records stay, nothing half written is left), or the ledger holds
+                another end of the same training.
+        """
+        held = self.finished(record.key)
+        if held is not None and held.told() != record.told():
+            raise StorageError(
+                f"training {record.key} is in '{self.path}' as {held.status} and came again, {record.status}, with "
+                "another result; equal trainings must give equal results: is something not in its key?"
+            )
+        if held is None:
+            write_bytes(self.path / "records" / f"{record.key}.json", record.to_bytes())
+            self._records[record.key] = record
+        (self.path / "arrived" / f"{record.key}.json").unlink(missing_ok=True)
+
+    def digest(self) -> str:
+        """Hash over all results; what is measured, such as seconds, is left out."""
+        return digest_of([record.told() for record in self])
+
+    def set_aside(self, statuses: Collection[Status]) -> int:
+        """Put records away so that their trainings are tried again, for example after a cap was raised; how many."""
+        chosen = [record.key for record in self if record.status in statuses]
+        for key in chosen:
+            self._move(self.path / "records" / f"{key}.json", "set_aside")
+            del self._records[key]
+        return len(chosen)
+
+    def bind(self, facts: Mapping[str, Any]) -> bool:
+        """Bind the ledger to what it is about, such as data and search space; True where it was so bound before.
+
+        Raises:
+            ConfigError: it is bound to something else; the message says in which part. Nothing is changed.
+        """
+        file = self.path / "about.json"
+        canonical(facts)
+        wanted = json.loads(json.dumps(facts))
+        if not file.exists():
+            write_json(file, wanted)
+            return False
+        held = read_json(file)
+        other = sorted(part for part in {*held, *wanted} if held.get(part) != wanted.get(part))
+        if other:
+            raise ConfigError(
+                f"'{self.path}' was begun with other {' and '.join(other)}; nothing was changed. Go on with the same "
+                "ones, or choose another folder"
+            )
+        return True
+
+    def open_box(self, box: str, judged: Sequence[str], why: str, again: bool = False) -> Opening:
+        """Record that held-out recordings are looked at; the same look again, after a stop, counts once.
+
+        Args:
+            box: name of the lock-box.
+            judged: keys of what is judged on it.
+            why: a sentence for the report.
+            again: allow a further look at other things; it is recorded, too, and weakens what the box can show.
+
+        Raises:
+            ConfigError: the box was opened before for something else.
+        """
+        before = self.openings(box)
+        for opening in before:
+            if opening.judged == tuple(judged):
+                return opening
+        if before and not again:
+            raise ConfigError(
+                f"lock-box '{box}' was opened on {before[0].time} ({before[0].why}) for other models; scores on it "
+                "would no longer be of unseen recordings. Judge on other recordings, or say that it is opened again"
+            )
+        opening = Opening(box, tuple(judged), why, time.strftime("%Y-%m-%dT%H:%M:%S%z"))
+        write_json(self.path / "openings" / f"{len(self.openings()) + 1:04d}.json", asdict(opening))
+        return opening
+
+    def openings(self, box: str | None = None) -> list[Opening]:
+        """Looks into one lock-box or all, oldest first."""
+        plain = [read_json(file) for file in sorted((self.path / "openings").glob("*.json"))]
+        found = [Opening(**(one | {"judged": tuple(one["judged"])})) for one in plain]
+        return [one for one in found if box in (None, one.box)]
+
+    def _enter_arrivals(self) -> None:
+        """Enter what workers had finished when the last coordinator was killed."""
+        for file in sorted((self.path / "arrived").glob("*.json")):
+            target = self.path / "records" / file.name
+            if whole(file) is None:
+                self._move(file, "quarantine")
+            elif whole(target) is None:  # absent, damaged or of a lost training
+                file.replace(target)
+            else:
+                file.unlink()
+
+    def _move(self, file: Path, folder: str) -> None:
+        target = make_folder(self.path / folder)
+        number = len(list(target.glob(f"{file.stem}.*")))
+        try:
+            file.replace(target / f"{file.stem}.{number}.json")
+        except OSError as error:
+            raise storage_error(file, error, "move") from error

@@ -1,0 +1,55 @@
+"""Orders of a search as jobs for an executor: what decides a result is in the identity, the rest is beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from edp.ledger import Identity, code_version
+from edp.runs import environment
+from edp.search.executor import Job
+from edp.search.trainings import Order, experiment_of, train_order
+
+
+def job_of(
+    order: Order, data: str, threads: int = 1, seconds: float | None = None, memory_mb: float | None = None
+) -> Job:
+    """The job that does an order.
+
+    Args:
+        order: what to train.
+        data: hash of the recordings that it names; where they lie is no part of the key.
+        threads: that the pool gives to a training.
+        seconds: cap on its time.
+        memory_mb: cap on the memory of its process.
+
+    Raises:
+        ConfigError: settings that cannot be built, or an unknown machine.
+    """
+    config: dict[str, Any] = {"settings": order.settings, "updates": order.updates}
+    physics = experiment_of(order).model.physics
+    if physics is not None:
+        config["machine"] = physics.digest()  # its file may change, and its name stays
+    identity = Identity(
+        f"{__name__}:train",
+        config,
+        {"train": list(order.train), "judged": list(order.judged)},
+        order.seed,
+        1,
+        code_version(),
+        data,
+        environment(threads),
+    )
+    return Job(identity, {"source": dict(order.source)}, seconds, memory_mb)
+
+
+def train(identity: Identity, where: Mapping[str, Any]) -> dict[str, Any]:
+    """Do the order; what differs from repeat to repeat is left to the record's measures.
+
+    Raises:
+        EdpError: as `edp.search.trainings.train_order`.
+    """
+    plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
+    found = train_order(plain)
+    del found["seconds"]
+    return found

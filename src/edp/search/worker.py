@@ -1,0 +1,145 @@
+"""The process that does trainings for a pool: ``python -m edp.search.worker`` with a socket; nothing for people.
+
+It lives as long as its parent and not longer, and answers each job with one record.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import os
+import queue
+import resource
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import Connection
+from typing import Any
+
+from edp.errors import BusyError, ConfigError, EdpError, NotFiniteError, StorageError
+from edp.ledger import Identity, Record, Status, canonical, claim, known, leave_arrival
+
+PR_SET_PDEATHSIG = 1
+CLAIM_WAIT_S = 10.0
+"""For how long a worker waits for the claim of another one, such as that of a pool that was killed a moment ago."""
+SHOWN_TRACE = 4000
+BEGUN = b"begun"
+
+
+def perform(identity: Identity, where: Mapping[str, Any], folder: str | None, begun: Callable[[], None]) -> Record:
+    """Do a training; whatever happens in it comes back as a record.
+
+    Args:
+        identity: what to train.
+        where: see `edp.search.executor.Job`.
+        folder: of the ledger, to claim the training and leave its record.
+        begun: called before the function of the training.
+    """
+    with contextlib.ExitStack() as stack:
+        if folder is not None:
+            try:
+                stack.enter_context(_claimed(folder, identity.key))
+            except (BusyError, StorageError) as error:
+                return Record(identity, Status.LOST, None, str(error))
+            before = known(folder, identity.key)
+            if before is not None:
+                return before
+        record = _end_of(identity, where, begun)
+        if folder is not None:
+            with contextlib.suppress(StorageError):  # a full disk: the coordinator meets it, too, and says so
+                leave_arrival(folder, record)
+        return record
+
+
+def _claimed(folder: str, key: str) -> Any:
+    patience = time.monotonic() + CLAIM_WAIT_S
+    while True:
+        try:
+            return claim(folder, key)
+        except BusyError:
+            if time.monotonic() > patience:
+                raise
+            time.sleep(0.05)
+
+
+def _end_of(identity: Identity, where: Mapping[str, Any], begun: Callable[[], None]) -> Record:
+    started = time.monotonic()
+    status, result, message, trace = Status.DONE, None, "", ""
+    try:
+        function = resolve(identity.job)
+        begun()
+        started = time.monotonic()
+        result = function(identity, where)
+        if not isinstance(result, Mapping):
+            raise ConfigError(f"'{identity.job}' returned {type(result).__name__}; a training returns a table")
+        canonical(result)
+    except NotFiniteError as error:
+        status, result, message = Status.DIVERGED, None, str(error)
+    except EdpError as error:
+        status, result, message = Status.FAILED, None, str(error)
+    except (Exception, SystemExit) as error:
+        status = Status.OOM if _out_of_memory(error) else Status.FAILED
+        result, message, trace = None, f"{type(error).__name__}: {error}", traceback.format_exc()[-SHOWN_TRACE:]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    measured: dict[str, Any] = {
+        "seconds": time.monotonic() - started,
+        "peak_mb": peak,
+        "host": os.uname().nodename,
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    return Record(identity, status, result, message, measured | ({"trace": trace} if trace else {}))
+
+
+def resolve(name: str) -> Callable[[Identity, Mapping[str, Any]], Any]:
+    """The function called ``package.module:name``.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    module, _, function = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"there is no job '{name}' ({error}); give it as package.module:function") from error
+    return found  # type: ignore[no-any-return]
+
+
+def _out_of_memory(error: BaseException) -> bool:
+    """Python's, NumPy's and PyTorch's ways to say so."""
+    named = any("OutOfMemoryError" in kind.__name__ for kind in type(error).__mro__)
+    return named or isinstance(error, MemoryError) or "can't allocate memory" in str(error)
+
+
+def die_with_parent(parent: int) -> None:
+    """Have the system kill this process when its parent ends; Linux only, elsewhere the closed socket tells."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before that
+        os._exit(1)
+
+
+def serve(connection: Connection) -> None:
+    """Do jobs until the other side closes."""
+    jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def listen() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                jobs.put(connection.recv())
+        os._exit(1)  # in the middle of a training, too: nobody waits for it
+
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        identity, where, folder = jobs.get()
+        record = perform(identity, where, folder, lambda: connection.send_bytes(BEGUN))
+        connection.send_bytes(record.to_bytes())
+
+
+if __name__ == "__main__":
+    os.set_inheritable(int(sys.argv[1]), False)
+    die_with_parent(int(sys.argv[2]))
+    serve(Connection(int(sys.argv[1])))
