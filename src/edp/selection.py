@@ -19,7 +19,7 @@ from edp.logs.resolve import resolve
 from edp.recording import Recording
 from edp.report import build_screening_page, write_pictures
 from edp.runs import command_line
-from edp.screening import OnProgress, Screening, ScreeningSpec, screen
+from edp.screening import FlagKind, OnProgress, Screening, ScreeningSpec, screen
 from edp.signals import VOCABULARY, SignalMap
 from edp.sources import DataSource
 from edp.storage import make_folder, write_bytes, write_json
@@ -273,7 +273,11 @@ def _tried(
         return None
     experiment = replace(order.experiment, task=trial_task(order.experiment.task, screening))
     asked: dict[str, str | FeatureSettings] = {**sets, **order.sets}
-    return try_feature_sets(source, experiment, asked, folder / "trials", order.trials, on_trial)
+    leaks = {flag.channel for flag in screening.flags if flag.kind is FlagKind.LEAK}
+    barred = tuple(sorted(leaks | set(order.trials.barred)))  # a random set with a leak would look best of all
+    return try_feature_sets(
+        source, experiment, asked, folder / "trials", replace(order.trials, barred=barred), on_trial
+    )
 
 
 def trial_task(task: TaskSettings, found: Screening) -> TaskSettings:

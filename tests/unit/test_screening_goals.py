@@ -11,6 +11,7 @@ from edp.data_sets import SimulationOrder
 from edp.screening import ForestSpec, ScreeningSpec, screen
 from edp.sim import simulate
 
+pytestmark = pytest.mark.slow
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 TARGETS = ("CylVels_1", "CylVels_2", "CylVels_3")
 
