@@ -22,8 +22,11 @@ from edp.screening.compiled import spread
 from edp.screening.linear import Tap, gram, peaks, unexplained
 from edp.screening.result import Array, Flag, FlagKind
 
-LEAKING = 0.25
-"""Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak."""
+LEAKING, DETERMINED = 0.25, 0.5
+"""Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak; the
+second where hardly anything remains, as from the ends of stretches."""
+HARDLY = 0.01
+"""Share of the variance that counts as hardly anything."""
 DIFFERENCING = 2.5
 """Sum of the absolute weights of the future, from which it is differences of the future that explain: so do leaks that
 are derivatives, but also causes, whose effect is turned back. Shifts and means have a sum of 2 or less."""
@@ -86,7 +89,7 @@ def find_leaks(
         future = [(k, -a) for k in sources for a in range(max(1, ahead[k] - far + 1), ahead[k] + 1)]
         future = [tap for tap in future if -tap[1] + max(near) <= reach]
         before, after = unexplained(correlations, channel, past, future)
-        if before < TELLING or after > LEAKING * before:
+        if before < TELLING or after > (DETERMINED if after < HARDLY else LEAKING) * before:
             return None
         return _leak(names, correlations, channel, past, future, (before, after))
 
