@@ -201,3 +201,79 @@ def test_an_unknown_phase_is_named():
         conduct(ground(), World(by_rate), until="calibratoin")
     assert list(PHASES)[:2] == ["isolation", "calibration"]
     assert plain_tree(load_experiment(None, "quick"))["task"]["features"] == "FG2"
+
+
+def with_effects(settings):
+    """Squeeze-excitation gains 6 %, zoneout loses 6 %, the others do nothing."""
+    kinds = {block["kind"] for block in settings["model"]["blocks"]}
+    score = by_rate(settings) * (1 - 0.06 * ("squeeze_excitation" in kinds))
+    return score * (1 + 0.06 * (settings["model"]["backbone"].get("zoneout", 0) > 0))
+
+
+CONFIRMED = dataclasses.replace(SPEC, backbones=("hybrid",), features=("FG1", "FG2"), most_runs=6, trials=6)
+
+
+@pytest.fixture(scope="module")
+def sound():
+    world = World(with_effects)
+    return conduct(ground(CONFIRMED), world, until="confirmation"), world
+
+
+def test_the_design_passes_what_helps_and_stops_what_harms(sound):
+    facts = sound[0].decided["screening"].facts
+    assert len(facts["registered"]) == 14
+    assert "squeeze_excitation" in facts["passed"]
+    assert "zoneout" not in facts["passed"]
+    assert facts["modules"]["squeeze_excitation"]["change"] == pytest.approx(-0.06, abs=0.02)
+    assert facts["modules"]["squeeze_excitation"]["importance"] > 0.2
+
+
+def test_the_plan_says_how_many_runs_and_why(sound):
+    decision = sound[0].decided["planning"]
+    assert 3 <= decision.facts["runs"] <= 6
+    assert "To see 2 %" in decision.sentences[0]
+
+
+def test_only_what_really_helps_is_confirmed(sound):
+    facts = sound[0].decided["confirmation"].facts
+    assert facts["confirmed"] == ["squeeze_excitation"]
+    by_name = {held["module"]: held for held in facts["evidence"]}
+    assert set(by_name) == set(sound[0].decided["screening"].facts["registered"])
+    assert by_name["squeeze_excitation"]["change"] == pytest.approx(-0.06, abs=0.02)
+    assert by_name["zoneout"]["p"] == 1.0
+
+
+def test_what_a_look_drops_is_not_trained_any_more(sound):
+    facts = sound[0].decided["confirmation"].facts
+    runs = sound[0].decided["planning"].facts["runs"]
+    for held in facts["evidence"]:
+        assert held["runs"] in (0, 5, runs)
+        assert (held["runs"] == 5 and runs > 5) == bool(held["dropped_after"])
+
+
+def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
+    spec = dataclasses.replace(CONFIRMED, mode="thesis", module_trials=3, run_seeds=2, most_runs=4)
+    found = conduct(ground(spec), World(with_effects), until="confirmation")
+    screening, confirmation = (found.decided[name].facts for name in ("screening", "confirmation"))
+    assert "squeeze_excitation" in screening["passed"]
+    assert found.decided["planning"].facts["runs"] <= 4
+    assert "squeeze_excitation" in confirmation["confirmed"]
+    assert {held["metric"] for held in confirmation["evidence"]} == {"mae", "rmse", "p95", "p99"}
+
+
+def test_without_a_survivor_nothing_is_trained():
+    world = World(lambda settings: 5.0 + bool(settings["model"]["blocks"]), noise=0.0)
+    first = conduct(ground(CONFIRMED), world, until="planning")
+    first = dataclasses.replace(
+        first,
+        decided={
+            **first.decided,
+            "screening": dataclasses.replace(
+                first.decided["screening"], facts={**first.decided["screening"].facts, "passed": []}
+            ),
+        },
+    )
+    trained = world.trained
+    found = conduct(first, world, phases=["confirmation"])
+    assert world.trained == trained
+    assert found.decided["confirmation"].facts["confirmed"] == []

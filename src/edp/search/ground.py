@@ -14,7 +14,7 @@ from edp.config import Table
 from edp.errors import DataError
 from edp.search.settings import SearchSpec
 from edp.search.trainings import Order
-from edp.stats.folds import repeated_folds
+from edp.stats.folds import repeated_folds, repeated_splits
 
 Array = NDArray[np.float64]
 
@@ -88,9 +88,14 @@ class Ground:
     decided: Mapping[str, Decision] = field(default_factory=dict)
 
     def folds(self, runs: int) -> NDArray[np.bool_]:
-        """Which development sessions each run is judged on, ``(run, session)``; more runs have the same first ones."""
-        folds = self.spec.folds
-        return repeated_folds(len(self.development), folds, -(-runs // folds), self.spec.seed)[:runs]
+        """Which development sessions each run is judged on, ``(run, session)``; more runs have the same first ones.
+
+        Repeated folds; in the thesis's mode independent draws of as many sessions as a fold has.
+        """
+        sessions, folds = len(self.development), self.spec.folds
+        if self.spec.mode == "thesis":
+            return repeated_splits(sessions, max(1, round(sessions / folds)), runs, self.spec.seed)
+        return repeated_folds(sessions, folds, -(-runs // folds), self.spec.seed)[:runs]
 
     def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[Order]:
         """An order for each run: the same folds and, for common random numbers, the same seeds for every arm.

@@ -1,6 +1,22 @@
-"""The phases of a search, a file each: coroutines that yield orders, are sent what came of them, and conclude."""
+"""The phases of a search, a file each: coroutines that yield orders, are sent what came of them, and conclude.
 
-from edp.search.phases import calibration, isolation
+The order of the imports is the order in which they run.
+"""
+
+from edp.search.phases import isolation  # isort: skip
+from edp.search.phases import calibration  # isort: skip
+from edp.search.phases import screening  # isort: skip
+from edp.search.phases import planning  # isort: skip
+from edp.search.phases import confirmation  # isort: skip
 from edp.search.phases.base import PHASES, Course, PhaseSpec
 
-__all__ = ["PHASES", "Course", "PhaseSpec", "calibration", "isolation"]
+__all__ = [
+    "PHASES",
+    "Course",
+    "PhaseSpec",
+    "calibration",
+    "confirmation",
+    "isolation",
+    "planning",
+    "screening",
+]

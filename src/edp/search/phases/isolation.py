@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.config import Table, merged
 from edp.errors import DataError
@@ -101,7 +102,7 @@ class Isolation:
                 continue
             rival = min(rivals, key=lambda name: float(np.nanmean(own[name])))
             first, second = (own[name].mean(axis=0) for name in (chosen, rival))
-            mask = ground.folds(spec.variance_runs)
+            mask, _ = _judged(ground)
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
             found[backbone] = {
                 "rival": rival,
@@ -115,11 +116,18 @@ def _tables(ground: Ground, outcomes: Sequence[Outcome], arms: int) -> list[Arra
     """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
     spec = ground.spec
     size = spec.variance_runs
-    raw = np.stack([ground.table(outcomes[at : at + size]) for at in range(0, len(outcomes), size)])
-    mask = ground.folds(size)
+    mask, seen = _judged(ground)
+    raw = np.stack([ground.table(outcomes[at : at + size])[:, seen] for at in range(0, len(outcomes), size)])
     filled = fill_worst(raw, mask)
     filled[:, ~mask] = np.nan
     return list(filled.reshape(arms, spec.variance_seeds, size, -1))
+
+
+def _judged(ground: Ground) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Cells ``(run, session)`` of the sessions that some run is judged on, and which sessions these are."""
+    mask = ground.folds(ground.spec.variance_runs)
+    seen = np.asarray(mask.any(axis=0))
+    return mask[:, seen], seen
 
 
 def _proxy(ground: Ground, tables: list[Array], arms: list[tuple[str, str]]) -> dict[str, float]:
@@ -129,7 +137,7 @@ def _proxy(ground: Ground, tables: list[Array], arms: list[tuple[str, str]]) -> 
     backbone stands in for it; with one feature set, that between backbones, and with one arm, that between seeds. The
     largest of them counts.
     """
-    mask = ground.folds(ground.spec.variance_runs)
+    mask, _ = _judged(ground)
     pairs = [(i, j) for i in range(len(arms)) for j in range(i + 1, len(arms))]
     alike = [(i, j) for i, j in pairs if arms[i][0] == arms[j][0]] or pairs
     differences = [tables[i][0] - tables[j][0] for i, j in alike] or [tables[0][0] - own for own in tables[0][1:]]

@@ -1,0 +1,63 @@
+"""Phase 2.5: how many runs a confirmation needs (thesis 3.3.3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from edp.search.ground import Decision, Ground
+from edp.search.phases.base import PHASES, Course
+from edp.stats.power import plan_runs
+from edp.stats.thesis_power import thesis_plan
+from edp.stats.variance import PairedVariance
+
+
+class Planning:
+    """Phase 2.5: nothing is trained."""
+
+    title = "power"
+
+    def run(self, ground: Ground) -> Course:
+        """Decide at once."""
+        yield from ()
+        return _thesis(ground) if ground.spec.mode == "thesis" else _sound(ground)
+
+
+def _sound(ground: Ground) -> Decision:
+    """Closed form for the clustered test, at the level that a single true module has to pass."""
+    spec = ground.spec
+    facts = ground.decided["isolation"].facts
+    mean = facts["mean_scores"][facts["features"]]
+    modules = max(1, len(ground.decided["screening"].facts["registered"]))
+    plan = plan_runs(
+        spec.least_effect * mean,
+        PairedVariance(**facts["variance"]),
+        len(ground.development),
+        folds=spec.folds,
+        alpha=spec.alpha / modules,
+        target=spec.power,
+        most=spec.most_runs,
+    )
+    runs = plan.runs or spec.most_runs - spec.most_runs % spec.folds
+    sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} mm/s: {plan.reason}."]
+    if plan.runs is None:
+        sentences.append(f"{runs} runs are made nevertheless; effects below what they can show will be missed.")
+    return Decision("planning", {"runs": runs, **asdict(plan)}, tuple(sentences))
+
+
+def _thesis(ground: Ground) -> Decision:
+    """J after eq. 3.42, from the largest standard deviation between seeds of phase 0."""
+    spec = ground.spec
+    arms = ground.decided["isolation"].facts["arms"]
+    sigma = max((held["seed"] or 0.0) for held in arms.values())
+    mean = min(held["mean"] for held in arms.values())
+    if sigma <= 0.0:
+        plan = {"splits": 2, "simulated": None, "analytical": 0.0}
+    else:
+        found = thesis_plan(mean, sigma, spec.run_seeds, share=spec.least_effect, alpha=spec.alpha, power=spec.power)
+        plan = asdict(found)
+    runs = min(int(plan["splits"] or 2), spec.most_runs)
+    text = f"J = {plan['splits']} splits of {spec.run_seeds} seeds after eq. 3.42; {runs} are made."
+    return Decision("planning", {"runs": runs, **plan}, (text,))
+
+
+PHASES.register("planning")(Planning())
