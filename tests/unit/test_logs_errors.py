@@ -336,3 +336,13 @@ def test_text_block_by_block_is_read_as_the_whole(tmp_path, monkeypatch):
         stream.write("50.00,1\n")
     with pytest.raises(DataError, match="has 2 cells, the header has 3"):
         read_recording(path)
+
+
+def test_one_name_in_two_variables_is_never_chosen_silently(tmp_path):
+    time = np.arange(9.0)
+    struct = {"time": time, "BmUp": time, "BmDwn": time}
+    scipy.io.savemat(tmp_path / "a.mat", {"left": struct, "right": {"time": time, "BmUp": 2 * time}})
+    with pytest.raises(DataError, match=r"2 columns named 'BmUp': left.BmUp, right.BmUp; name the wanted one"):
+        read_recording(tmp_path / "a.mat")
+    read = read_recording(tmp_path / "a.mat", SignalMap((ChannelMap("BmUp", "right.BmUp"),)))
+    assert read.values[-1, 0] == 16.0

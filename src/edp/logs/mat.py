@@ -187,4 +187,5 @@ def _raw_log(path: Path, found: Found, own: OwnFacts, signal_map: SignalMap) -> 
         )
     if own.channels:
         signals = {name: signals[name] for name in own.channels if name in signals}
-    return RawLog(path, signals, found.scalars, **own.for_log())
+    repeated = {name: full for name, full in found.repeated.items() if name != time_name and set(full) <= set(signals)}
+    return RawLog(path, signals, found.scalars, repeated=repeated, **own.for_log())

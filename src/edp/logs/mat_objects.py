@@ -7,6 +7,7 @@ Known wrappers: vectors and matrices, structs (one time vector per struct), Simu
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,6 +47,7 @@ class Found:
 
     signals: list[Part] = field(default_factory=list)
     scalars: dict[str, float] = field(default_factory=dict)
+    repeated: dict[str, list[str]] = field(default_factory=dict)
 
 
 def collect(variables: dict[str, Any]) -> Found:
@@ -53,14 +55,17 @@ def collect(variables: dict[str, Any]) -> Found:
     found = Found()
     for name, value in variables.items():
         _walk(value, name, name, None, found)
-    names = [part.name for part in found.signals]
+    short = [part.name for part in found.signals]
+    counts = Counter(short)
     for part in found.signals:
-        if names.count(part.name) > 1:
+        if counts[part.name] > 1:
             outer = f"{re.split(r'[.({]', part.path)[0]}.{part.name}"
-            part.name = part.path if outer in names else outer
-    names = [part.name for part in found.signals]
-    for part in found.signals:
-        part.name = part.path if names.count(part.name) > 1 else part.name
+            part.name = part.path if outer in counts else outer
+    counts_now = Counter(part.name for part in found.signals)
+    for name, part in zip(short, found.signals):
+        part.name = part.path if counts_now[part.name] > 1 else part.name
+        if counts[name] > 1:
+            found.repeated.setdefault(name, []).append(part.name)
     return found
 
 

@@ -157,7 +157,7 @@ class _Table:
             first += rows
         wanted = list(dict.fromkeys(names[place] for place in places))
         try:
-            for batch in self.file.iter_batches(PIECE_ROWS, row_groups=groups, columns=wanted, use_threads=False):
+            for batch in self.file.iter_batches(PIECE_ROWS, row_groups=groups, columns=wanted):
                 found = batch.schema.names
                 yield skipped, [batch.column(_nth(found, names, place)) for place in places]
                 skipped += batch.num_rows

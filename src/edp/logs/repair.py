@@ -121,7 +121,10 @@ def mend_values(
         DataError: there are some and `repair` does not allow them, or a channel starts with one.
     """
     made: list[dict[str, Any]] = []
-    sound = np.asarray(np.isfinite(values).all(axis=0))
+    finite = np.isfinite(values)
+    if finite.all():
+        return made
+    sound = np.asarray(finite.all(axis=0))
     for column, name in enumerate(names):
         if sound[column]:
             continue
