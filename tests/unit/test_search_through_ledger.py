@@ -1,0 +1,78 @@
+"""Phases through ledger and pool: real trainings, and a search that was stopped comes to the same decision."""
+
+import numpy as np
+import pytest
+
+from edp.config import load_experiment
+from edp.ledger import Ledger, Status
+from edp.logs import write_recording
+from edp.recording import Recording
+from edp.search.conduct import conduct
+from edp.search.ground import Ground
+from edp.search.local import LocalPool
+from edp.search.settings import SearchSpec
+from edp.search.through_ledger import through_ledger
+from edp.search.trainings import settings_of
+from edp.signals import Channel, Kind
+from edp.sources import DataSource
+
+CHANGES = (
+    'task.targets=["speed"]',
+    "task.horizons=[1]",
+    'model.backbone={kind="lstm", units=4}',
+    "model.blocks=[]",
+    "model.window=5",
+    "training.chunks={length=20, batch=4, burn_in=5}",
+)
+SPEC = SearchSpec(
+    updates=5, horizon=1, folds=2, variance_runs=4, variance_seeds=2, backbones=("lstm",), features=("all",)
+)
+
+
+class Stop(Exception):
+    """Stands for Ctrl-C."""
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sessions")
+    for number in range(5):
+        rng = np.random.default_rng(number)
+        lever = np.repeat(rng.normal(size=20), 15)
+        speed = np.zeros(300)
+        for t in range(1, 300):
+            speed[t] = 0.9 * speed[t - 1] + 0.01 * lever[t - 1]
+        channels = (Channel("lever", Kind.GENERIC), Channel("speed", Kind.VELOCITY))
+        values = np.column_stack([lever, speed]).astype(np.float32)
+        write_recording(Recording(f"s{number}", channels, values, 100.0), folder / f"s{number}.parquet")
+    base = settings_of(load_experiment(None, "quick", CHANGES))
+    names = tuple(f"s{number}" for number in range(5))
+    return Ground(SPEC, base, DataSource.of(folder).to_plain(), names[:4], names[4:], ("lever", "speed"))
+
+
+def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(ground, tmp_path):
+    trained = []
+
+    def search(on_record):
+        with Ledger(tmp_path / "ledger") as ledger, LocalPool(1) as pool:
+            do = through_ledger(ledger, pool, "data", on_record=on_record)
+            return conduct(ground, do, until="isolation").decided["isolation"]
+
+    def stop_after_three(record, now):
+        trained.append(record.key)
+        assert now
+        if len(trained) == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        search(stop_after_three)
+    seen = []
+    decision = search(lambda record, now: seen.append((record.key, now, record.status)))
+    assert sum(not now for _, now, _ in seen) >= 3
+    assert len({key for key, _, _ in seen}) == len(seen) == 8
+    assert {status for *_, status in seen} == {Status.DONE}
+    seen.clear()
+    again = search(lambda record, now: seen.append(now))
+    assert not any(seen)
+    assert again == decision
+    assert decision.facts["arms"]["lstm all"]["seed"] > 0
