@@ -137,7 +137,7 @@ def find_copies(correlations: Array, least: float) -> list[Pair]:
 
     Args:
         correlations: ``[reach + lag, i, j]``, over all pieces.
-        least: correlation from which a pair counts as exact, whatever is left.
+        least: correlation from which a channel that is not ahead counts as a copy, whatever is left of it.
     """
     reach = len(correlations) // 2
     lags, best = peaks(correlations, -reach, reach)
@@ -148,7 +148,8 @@ def find_copies(correlations: Array, least: float) -> list[Pair]:
         lag, value = int(lags[i, j]), float(best[i, j])
         if abs(lag) >= reach:
             return None
-        exact = abs(value) >= least
+        # What leads may be a reference that a controlled machine follows closely: there the rest always counts.
+        exact = abs(value) >= least and lag >= -SLACK
         # the rest can only be judged where enough lags lie on either side
         if not exact and (abs(lag) > SEEN * reach or rest_related(correlations, i, j, lag, value) > MATERIAL):
             return None
@@ -158,12 +159,21 @@ def find_copies(correlations: Array, least: float) -> list[Pair]:
 
 
 def rest_related(correlations: Array, i: int, j: int, lag: int, value: float) -> float:
-    """Largest correlation of ``x_i[t] - value x_j[t - lag]`` with any channel but i, at any lag."""
+    """Largest correlation of ``x_i[t] - value x_j[t - lag]`` with any channel but i, at any lag.
+
+    Where i leads, also with the steps of the channels from sample to sample: what a reference tells of a machine that
+    follows it shows there, however slow both are.
+    """
     reach = len(correlations) // 2
     shown = np.arange(max(-reach, lag - reach), min(reach, lag + reach) + 1) + reach
     rest = correlations[shown, i, :] - value * correlations[shown - lag, j, :]
     rest[:, i] = 0.0
-    return float(np.abs(rest).max() / math.sqrt(max(1.0 - value * value, 1e-9)))
+    most = float(np.abs(rest).max())
+    if lag < -SLACK:
+        steps = np.sqrt(2.0 * np.maximum(1.0 - np.diagonal(correlations[reach + 1]), 1e-6))
+        steps[i] = np.inf
+        most = max(most, float((np.abs(np.diff(rest, axis=0)) / steps).max()))
+    return most / math.sqrt(max(1.0 - value * value, 1e-9))
 
 
 def copy_flags(

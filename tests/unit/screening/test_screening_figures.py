@@ -189,3 +189,15 @@ def test_pieces_follow_from_recordings(sessions: list) -> None:
     many = build_table([s.rows(i * 500, (i + 1) * 500) for s in sessions for i in range(6)], spec)
     assert len(many.pieces) <= 24
     assert many.samples == 30_000
+
+
+def test_a_reference_that_a_machine_follows_closely_is_no_copy_of_its_answer() -> None:
+    rng = np.random.default_rng(8)
+    reference = lfilter([0.01], [1.0, -0.99], rng.normal(size=20_000))
+    answer = lfilter([0.2], [1.0, -0.8], np.roll(reference, 5)) + 1e-4 * rng.normal(size=20_000)
+    x = np.stack([answer, reference], axis=1).astype(np.float32)
+    sums = lagged_covariances(table_of([[x], [x]]), 40).pooled()
+    lags, best = peaks(sums, -40, 40)
+    assert best[1, 0] > 0.99
+    assert lags[1, 0] < -5
+    assert not [pair for pair in find_copies(sums, 0.99) if pair.copy == 1]
