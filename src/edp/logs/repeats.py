@@ -29,8 +29,10 @@ _CHANNELS = 3
 _OWN, _OWN_UNNAMED = 2, 16
 _SAME = 0.98
 _LEAST_WINDOWS = 2
+_LEAST_VOTES = 4
+_HOPELESS = 0.8
 _LEAST_SHARE = 0.5
-_SHIFTS = np.linspace(-0.5, 0.5, 5)
+_SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
 
 Floats = NDArray[np.float32]
 
@@ -177,11 +179,18 @@ def _voted(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> dict[tuple[int
     swap = mine[:, 0] > theirs[:, 0]
     a, b = np.where(swap[:, None], theirs, mine), np.where(swap[:, None], mine, theirs)
     votes, counts = np.unique(np.stack([a[:, 0], b[:, 0], b[:, 1] - a[:, 1]], axis=1), axis=0, return_counts=True)
-    best: dict[tuple[int, int], tuple[int, int]] = {}
-    for (i, j, lag), count in zip(votes.tolist(), counts.tolist()):
-        if count >= _LEAST_WINDOWS and count > best.get((i, j), (0, 0))[0]:
-            best[i, j] = (count, lag)
-    return {pair: lag for pair, (_, lag) in best.items()}
+    # the true lag lies between two blocks: its votes may be shared by them
+    follows = (np.diff(votes[:, :2], axis=0) == 0).all(axis=1) & (np.diff(votes[:, 2]) == 1)
+    both = counts.astype(np.int64)
+    both[:-1] += np.where(follows, counts[1:], 0)
+    both[1:] += np.where(follows, counts[:-1], 0)
+    best: dict[tuple[int, int], tuple[int, int, int]] = {}
+    for k in np.flatnonzero(both >= _LEAST_VOTES).tolist():
+        i, j, lag = (int(value) for value in votes[k])
+        found = (int(both[k]), int(counts[k]), lag)
+        if found[:2] > best.get((i, j), (0, 0, 0))[:2]:
+            best[i, j] = found
+    return {pair: lag for pair, (_, _, lag) in best.items()}
 
 
 def _telling(sketches: Sequence[Sketch]) -> list[list[int]]:
@@ -216,12 +225,14 @@ def _fingerprints(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Fingerprints of every window in which the channel moves, shape ``(window, 12)``, and where they begin."""
     windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW)
     phase = np.pi * (np.arange(WINDOW) + 0.5) / WINDOW
-    basis = np.cos(np.outer(phase, np.arange(1, _COEFFICIENTS + 1))) * np.sqrt(2.0 / WINDOW)
+    order = np.arange(1, _COEFFICIENTS + 1)
+    basis = np.cos(np.outer(phase, order)) * np.sqrt(2.0 / WINDOW)
     marks = windows @ basis.astype(np.float32)
-    size = np.linalg.norm(marks, axis=1)
     # The channel's own deviation is one.
-    kept = np.flatnonzero(size > _MOVES * WINDOW**0.5)
-    return marks[kept] / size[kept, None], kept
+    kept = np.flatnonzero(np.linalg.norm(marks, axis=1) > _MOVES * WINDOW**0.5)
+    # Slow parts are large in every motion: as in a derivative, faster ones count for more.
+    marks = marks[kept] * order.astype(np.float32)
+    return marks / np.linalg.norm(marks, axis=1, keepdims=True), kept
 
 
 def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
@@ -248,6 +259,8 @@ def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
         score = float(np.nanmedian(alike)) if np.isfinite(alike).any() else -1.0
         if best is None or score > best[0]:
             best = (score, alike)
+        if shift == 0.0 and float(np.mean(np.nan_to_num(alike) > _HOPELESS)) * alike.shape[0] < 1:
+            return None
     return None if best is None else _judged(a, b, lag, start, pairs, best[1])
 
 

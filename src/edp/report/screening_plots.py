@@ -80,7 +80,7 @@ def matrix_plot(views: Sequence[MatrixView]) -> Plot | None:
         )
     size = min(max(_CELL * count + 150, _LEAST), _MOST)
     styled(figure, size)
-    figure.update_layout(margin={"t": 12, "r": 70, "b": 110, "l": 120})
+    figure.update_layout(margin={"t": 36, "r": 70, "b": 110, "l": 120})
     small = {"tickfont": {"size": 11 if count <= 60 else 8, "color": SOFT}, "dtick": 1, "showgrid": False}
     figure.update_xaxes(tickangle=-60, **small)
     figure.update_yaxes(autorange="reversed", **small)
@@ -114,7 +114,7 @@ def lag_plot(views: Sequence[LagView], rate_hz: float) -> Plot | None:
     styled(figure, 460)
     figure.add_vline(x=0, line={"color": SOFT, "width": 1, "dash": "dot"})
     figure.update_layout(
-        legend={"orientation": "v", "x": 1.01, "y": 1, "yref": "paper", "xanchor": "left"}, margin={"r": 190, "t": 12}
+        legend={"orientation": "v", "x": 1.01, "y": 1, "yref": "paper", "xanchor": "left"}, margin={"r": 190, "t": 36}
     )
     figure.update_xaxes(title_text=f"Lag [samples of {1e3 / rate_hz:g} ms]; left: the channel leads", showgrid=True)
     figure.update_yaxes(title_text="Cross-correlation", zeroline=True, zerolinecolor="#c4cbd2")

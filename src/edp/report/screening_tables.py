@@ -91,9 +91,11 @@ def ranges_table(found: Screening) -> Table:
     )
     columns = (
         ("Kind of signal", ""), ("Best lags", "samples"), ("Median", "samples"), ("Leads", "share"),
-        ("Certain", "curves"),
+        ("Certain", "channels"),
     )  # fmt: skip
-    return Table("Lags by kind of signal, unflagged channels", columns, rows)
+    return Table(
+        "Lags by kind of signal: each unflagged channel against the target that it goes best with", columns, rows
+    )
 
 
 def lags_table(found: Screening) -> Table:

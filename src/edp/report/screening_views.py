@@ -81,15 +81,15 @@ class BarView:
 
 @dataclass(frozen=True)
 class LagRange:
-    """A row of Table 4.2's form: where the best lags of a kind of signal lie, over certain curves.
+    """A row of Table 4.2's form: where the best lags of a kind of signal lie, over channels whose lag is certain.
 
     Attributes:
         group: kind of signal.
-        low, high: smallest and largest best lag, None where no curve is certain.
+        low, high: smallest and largest best lag, None where none is certain.
         median: of them.
-        leads: share of the certain curves whose channel leads.
-        certain: how many curves are certain.
-        curves: how many there are.
+        leads: share of these channels that lead.
+        certain: how many they are.
+        curves: how many channels there are.
     """
 
     group: str
@@ -130,7 +130,8 @@ def lag_views(found: Screening) -> tuple[LagView, ...]:
 def lag_ranges(found: Screening, within: Sequence[str] | None = None) -> tuple[LagRange, ...]:
     """Where the best lags lie, by kind of signal, in Table 4.2's form.
 
-    A curve counts where it is certain and its maximum is inside the search; a target's curve with itself does not.
+    Each channel counts once, against the target that it goes best with, itself left out; and it counts where that lag
+    is certain and inside the search.
 
     Args:
         found: the screening.
@@ -141,7 +142,7 @@ def lag_ranges(found: Screening, within: Sequence[str] | None = None) -> tuple[L
     made = []
     for group in dict.fromkeys(found.groups):
         members = {name for name, own in zip(found.channels, found.groups) if own == group} & set(names)
-        curves = [c for c in found.lags if c.channel in members and c.channel != c.target]
+        curves = [curve for name in names if name in members and (curve := _strongest(found, name)) is not None]
         certain = [curve.best for curve in curves if curve.certain and not curve.at_edge]
         if not curves:
             continue
@@ -154,6 +155,12 @@ def lag_ranges(found: Screening, within: Sequence[str] | None = None) -> tuple[L
             row = LagRange(group, None, None, None, None, 0, len(curves))
         made.append(row)
     return tuple(made)
+
+
+def _strongest(found: Screening, channel: str) -> LagCurve | None:
+    """The curve of a channel against the target that it goes best with."""
+    curves = [c for c in found.lags if c.channel == channel != c.target and math.isfinite(c.value)]
+    return max(curves, key=lambda curve: abs(curve.value), default=None)
 
 
 def stability_views(found: Screening) -> tuple[BarView, ...]:
