@@ -46,6 +46,7 @@ SLACK = 1
 """Samples by which an exact copy may be off and still count as simultaneous."""
 _FAR = 30
 _NEAR_PAST = range(21)
+_LONG_PAST = range(61)
 _SPARSE_PAST = (0, 1, 2, 4, 7, 12, 20)
 _MOST_TRUSTED = 40
 _PARTNERS = 2
@@ -237,7 +238,7 @@ def explained_flags(
     for channel in judged:
         others = sorted((k for k in remaining if k != channel), key=lambda k: -strength[channel, k])
         near = others[:_PARTNERS]
-        taps = [(k, a) for k in others for a in (_NEAR_PAST if k in near else _SPARSE_PAST) if a <= reach]
+        taps = [(k, a) for k in others for a in (_LONG_PAST if k in near else _SPARSE_PAST) if a <= reach]
         if not taps or (left := unexplained(correlations, channel, taps)[1]) > EXPLAINED:
             continue
         text = f"the presents and pasts of {names[near[0]]} and others make up all but {100 * left:.2g} % of it"
