@@ -64,7 +64,13 @@ def paired(
 
 
 def run_means(differences: ArrayLike, tested: ArrayLike | None = None) -> Array:
-    """Mean over the tested sessions of each run, ``(..., run)``: what the thesis calls the score of a split."""
+    """Mean over the tested sessions of each run, ``(..., run)``: what the thesis calls the score of a split.
+
+    Raises:
+        DataError: a run without a tested session, or a mask that does not fit.
+    """
     array = np.asarray(differences, dtype=np.float64)
-    mask = tested_mask(tested, array.shape)
+    mask = np.ones(array.shape[-2:], dtype=bool) if tested is None else np.asarray(tested, dtype=bool)
+    if mask.shape != array.shape[-2:] or not mask.any(axis=1).all():
+        raise DataError(f"a mask of shape {mask.shape} came for scores of {array.shape}; each run needs a tested session")
     return np.asarray(np.where(mask, array, 0.0).sum(axis=-1) / mask.sum(axis=-1))
