@@ -35,16 +35,34 @@ def tested_mask(tested: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
     """Which session each run was judged on, ``(run, session)``; None: every one on all.
 
     Raises:
-        DataError: another shape, or a run or session without a cell.
+        DataError: another shape, or no cell.
     """
     if tested is None:
         return np.ones(shape[-2:], dtype=bool)
     mask = np.asarray(tested, dtype=bool)
-    if mask.shape != shape[-2:]:
-        raise DataError(f"the mask of tested cells has shape {mask.shape}, the differences have {shape[-2:]}")
-    if not (mask.any(axis=0).all() and mask.any(axis=1).all()):
-        raise DataError("a run was judged on no session or a session by no run; leave such rows and columns out")
+    if mask.shape != shape[-2:] or not mask.any():
+        raise DataError(
+            f"a mask of shape {mask.shape} with {int(mask.sum())} tested cells came for tables of shape {shape[-2:]}"
+        )
     return mask
+
+
+def tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tuple[Array, Mask]:
+    """Differences ``(..., run, session)``, zero outside the tested cells, and the mask of these.
+
+    Runs and sessions without a cell, as a design that is not finished has, are left out of both.
+
+    Raises:
+        DataError: too few axes, a mask that does not fit, or tested cells that are not finite.
+    """
+    array = np.asarray(differences, dtype=np.float64)
+    if array.ndim < 2:
+        raise DataError(f"the differences have shape {array.shape}; give (..., run, session)")
+    mask = tested_mask(tested, array.shape)
+    runs, sessions = mask.any(axis=1), mask.any(axis=0)
+    if not (runs.all() and sessions.all()):
+        array, mask = array[..., runs, :][..., sessions], mask[runs][:, sessions]
+    return finite(np.where(mask, array, 0.0), "table of differences", 2), mask
 
 
 def lower_p(mean: Array, error: Array, df: float) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtri, stdtrit
 
 from edp.errors import DataError
-from edp.stats.checks import Array, finite, lower_p, tested_mask
+from edp.stats.checks import Array, lower_p, tested_cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +57,10 @@ def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> Mean
     Raises:
         DataError: fewer than two runs or sessions, or cells that are not finite.
     """
-    array = np.asarray(differences, dtype=np.float64)
-    if array.ndim < 2:
-        raise DataError(f"the differences have shape {array.shape}; give (..., run, session)")
-    mask = tested_mask(tested, array.shape)
+    array, mask = tested_cells(differences, tested)
     runs, sessions = mask.shape
     if min(runs, sessions) < 2:
         raise DataError(f"{runs} runs on {sessions} sessions came; a clustered test needs at least two of each")
-    array = finite(np.where(mask, array, 0.0), "table of differences", 2)
     cells = int(mask.sum())
     mean = array.sum(axis=(-2, -1)) / cells
     rest = np.where(mask, array - mean[..., None, None], 0.0)

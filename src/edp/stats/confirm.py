@@ -142,10 +142,17 @@ def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjuste
     ratio = float(judged / (mask.shape[1] - judged)) if mask.shape[1] > judged else 0.0
     mixed = mixed_model(run_means(module, mask)[:, None], run_means(baseline, mask)[:, None])
     confirmed = not dropped and adjusted < rule.alpha and change <= -rule.least_gain
+    resampled = float(resampled_t(means, ratio).p)
+    reason = _reason((change, low, high), adjusted, dropped, float(test.p), rule)
+    if confirmed and resampled >= rule.alpha:
+        reason += (
+            f"; the corrected resampled t-test does not agree (p {resampled:.2g}): if the module depends on what all "
+            "training sets share, more sessions are needed"
+        )
     return Evidence(
         module=name,
         confirmed=confirmed,
-        reason=_reason((change, low, high), adjusted, dropped, float(test.p), rule),
+        reason=reason,
         runs=runs,
         dropped_after=dropped,
         change=change,
@@ -153,7 +160,7 @@ def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjuste
         high=high,
         p=1.0 if dropped else float(test.p),
         adjusted=adjusted,
-        resampled_p=float(resampled_t(means, ratio).p),
+        resampled_p=resampled,
         paired_p=float(paired_t(means).p),
         mixed_p=float(mixed.effect.p),
         d_z=effect_size(means, rule.level),

@@ -38,9 +38,10 @@ def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayL
         if floor.shape != seen.shape or not np.isfinite(floor).all():
             raise DataError(f"`worst` has shape {floor.shape}; give one finite score for each of {seen.size} sessions")
         seen = np.maximum(seen, floor)
-    if not np.isfinite(seen).all():
+    empty = mask.any(axis=0) & ~np.isfinite(seen)
+    if empty.any():
         raise DataError(
-            f"no arm has a score on sessions {np.flatnonzero(~np.isfinite(seen)).tolist()}; repeat the runs there or "
+            f"no arm has a score on sessions {np.flatnonzero(empty).tolist()}; repeat the runs there or "
             "leave these sessions out of the study"
         )
     return np.where(known, array, np.where(mask, seen, 0.0))
@@ -72,5 +73,7 @@ def run_means(differences: ArrayLike, tested: ArrayLike | None = None) -> Array:
     array = np.asarray(differences, dtype=np.float64)
     mask = np.ones(array.shape[-2:], dtype=bool) if tested is None else np.asarray(tested, dtype=bool)
     if mask.shape != array.shape[-2:] or not mask.any(axis=1).all():
-        raise DataError(f"a mask of shape {mask.shape} came for scores of {array.shape}; each run needs a tested session")
+        raise DataError(
+            f"a mask of shape {mask.shape} came for scores of {array.shape}; each run needs a tested session"
+        )
     return np.asarray(np.where(mask, array, 0.0).sum(axis=-1) / mask.sum(axis=-1))

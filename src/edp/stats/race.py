@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edp.errors import ConfigError
-from edp.stats.checks import Array, Mask, tested_mask
+from edp.stats.checks import Array, tested_mask
 from edp.stats.clustered import clustered_t
 from edp.stats.power import simulate_differences
 from edp.stats.variance import PairedVariance
@@ -69,18 +69,10 @@ def race(differences: ArrayLike, tested: ArrayLike | None = None, looks: Sequenc
     dropped = np.zeros(array.shape[:-2], dtype=np.int64)
     for look in looks:
         if look.runs < mask.shape[0]:
-            seen, part = _first(array, mask, look.runs)
-            hopeless = clustered_t(seen, part).p > look.drop_above
+            hopeless = clustered_t(array[..., : look.runs, :], mask[: look.runs]).p > look.drop_above
             dropped = np.where((dropped == 0) & hopeless, look.runs, dropped)
     p = np.where(dropped == 0, clustered_t(array, mask).p, 1.0)
     return RaceResult(dropped, np.where(dropped == 0, mask.shape[0], dropped), p)
-
-
-def _first(array: Array, mask: Mask, runs: int) -> tuple[Array, Mask]:
-    """The cells of the first runs, on the sessions that they were judged on."""
-    part = mask[:runs]
-    sessions = part.any(axis=0)
-    return array[..., :runs, :][..., sessions], part[:, sessions]
 
 
 @dataclass(frozen=True)

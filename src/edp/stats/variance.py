@@ -10,7 +10,7 @@ from scipy.special import chdtri
 from scipy.stats import f as f_distribution
 
 from edp.errors import DataError
-from edp.stats.checks import finite, tested_mask
+from edp.stats.checks import finite, tested_cells
 
 
 @dataclass(frozen=True)
@@ -148,11 +148,9 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
     Raises:
         DataError: the cells cannot tell the variances apart, or hold values that are not finite.
     """
-    array = np.asarray(differences, dtype=np.float64)
+    array, mask = tested_cells(differences, tested)
     if array.ndim != 2:
         raise DataError(f"the differences have shape {array.shape}; give (run, session)")
-    mask = tested_mask(tested, array.shape)
-    array = finite(np.where(mask, array, 0.0), "table of differences", 2)
     per_run, per_session, cells = mask.sum(axis=1), mask.sum(axis=0), int(mask.sum())
     runs, sessions = mask.shape
     level = float(array.sum()) ** 2 / cells

@@ -72,6 +72,16 @@ def test_a_module_that_diverges_in_a_third_of_its_runs_is_not_confirmed(scores):
     assert found.change > 0.0
 
 
+def test_says_so_where_the_test_for_shared_training_sets_disagrees(scores):
+    assert "does not agree" not in by_name(confirm(scores, NAMES, REGISTERED, MASK))["good"].reason
+    noisy = scores.copy()
+    noisy[1] += 0.2 * np.random.default_rng(2).normal(size=(30, 1))  # runs differ by as much as the module brings
+    good = by_name(confirm(noisy, NAMES, NAMES, MASK, Rule(looks=())))["good"]
+    assert good.confirmed
+    assert good.resampled_p > 0.05 > good.adjusted
+    assert "more sessions are needed" in good.reason
+
+
 def test_identical_arms_are_never_confirmed(scores):
     same = np.repeat(scores[:1], 4, axis=0)
     assert not any(one.confirmed for one in confirm(same, NAMES, REGISTERED, MASK, Rule(looks=())))

@@ -51,6 +51,18 @@ def test_only_tested_cells_are_read_and_axes_broadcast():
     assert together.error == pytest.approx([float(one.error) for one in apart])
 
 
+def test_a_design_that_is_not_finished_counts_what_it_has():
+    rng = np.random.default_rng(8)
+    mask = repeated_folds(12, 5, 2)
+    mask[3:] = False  # three runs of ten, so some sessions were not judged yet
+    table = rng.normal(size=(10, 12))
+    used = mask[:3].any(axis=0)
+    cut = clustered_t(table[:3][:, used], mask[:3][:, used])
+    whole = clustered_t(table, mask)
+    assert (float(whole.p), whole.df) == (float(cut.p), cut.df)
+    assert fill_worst(np.stack([table, table]), mask)[:, 3:].max() == 0.0
+
+
 @pytest.mark.parametrize("test", [clustered_t, paired_t, lambda d: mixed_model(d, np.zeros_like(d)).effect])
 def test_a_module_that_changes_nothing_is_no_improvement(test):
     assert test(np.zeros((4, 6))).p == pytest.approx(1.0)
@@ -145,7 +157,7 @@ def test_rankings_that_agree_and_that_do_not():
         (lambda: clustered_t(np.zeros((1, 5))), "at least two"),
         (lambda: clustered_t([[0.0, np.nan], [1.0, 2.0]]), "NaN or infinite"),
         (lambda: clustered_t(np.zeros((3, 3)), np.ones((2, 3))), "shape"),
-        (lambda: clustered_t(np.zeros((2, 2)), [[True, False], [True, False]]), "leave such rows"),
+        (lambda: clustered_t(np.zeros((2, 2)), np.zeros((2, 2), bool)), "0 tested cells"),
         (lambda: clustered_t(np.zeros(4)), "run, session"),
         (lambda: resampled_t([1.0], 0.2), "at least two"),
         (lambda: resampled_t([1.0, 2.0], -1.0), "not negative"),
