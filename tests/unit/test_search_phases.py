@@ -11,6 +11,7 @@ from edp.config import load_experiment, plain_tree
 from edp.errors import ConfigError, DataError
 from edp.search.conduct import conduct
 from edp.search.ground import Ground, Outcome, set_apart
+from edp.search.modules import MODULES
 from edp.search.phases import PHASES
 from edp.search.settings import SearchSpec
 from edp.search.space import Choice, Real
@@ -210,13 +211,15 @@ def with_effects(settings):
     return score * (1 + 0.06 * (settings["model"]["backbone"].get("zoneout", 0) > 0))
 
 
-CONFIRMED = dataclasses.replace(SPEC, backbones=("hybrid",), features=("FG1", "FG2"), most_runs=6, trials=6)
+CONFIRMED = dataclasses.replace(
+    SPEC, backbones=("hybrid",), features=("FG1", "FG2"), most_runs=6, trials=6, joint_trials=6, free_trials=16
+)
 
 
 @pytest.fixture(scope="module")
 def sound():
     world = World(with_effects)
-    return conduct(ground(CONFIRMED), world, until="confirmation"), world
+    return conduct(ground(CONFIRMED), world), world
 
 
 def test_the_design_passes_what_helps_and_stops_what_harms(sound):
@@ -277,3 +280,52 @@ def test_without_a_survivor_nothing_is_trained():
     found = conduct(first, world, phases=["confirmation"])
     assert world.trained == trained
     assert found.decided["confirmation"].facts["confirmed"] == []
+
+
+def test_the_synthesis_opens_the_test_sessions_once_and_only_there(sound):
+    found, world = sound
+    orders = [json.loads(key) for key in world.done]
+    opened = [order for order in orders if set(order["judged"]) & set(SESSIONS[9:])]
+    assert len(opened) == 2 * CONFIRMED.run_seeds
+    assert all(order["judged"] == list(SESSIONS[9:]) and order["train"] == list(SESSIONS[:9]) for order in opened)
+    assert {order["updates"] for order in opened} == {CONFIRMED.final_updates}
+    assert not any(set(order["train"]) & set(SESSIONS[9:]) for order in orders)
+    facts = found.decided["synthesis"].facts
+    assert facts["modules"] == ["squeeze_excitation"]
+    assert facts["test"]["synthesis"]["composite"] < facts["test"]["baseline"]["composite"]
+    assert len(facts["trials"]) == 6
+    assert facts["trials"][0]["modules"] == ["squeeze_excitation"]  # the warm start
+
+
+def test_the_exploration_starts_from_the_synthesis_and_is_judged_on_fresh_folds(sound):
+    found, world = sound
+    facts = found.decided["exploration"].facts
+    first = facts["trials"][0]
+    assert first["modules"] == found.decided["synthesis"].facts["modules"]
+    assert facts["runs"] == 6
+    assert facts["teacher"] in ("synthesis", "exploration")
+    assert (
+        "squeeze_excitation"
+        in (facts if facts["teacher"] == "exploration" else found.decided["synthesis"].facts)["modules"]
+    )
+    seeds = {order["seed"] for order in map(json.loads, world.done)}
+    fresh = {ground(CONFIRMED).seed("run", run, 0) for run in range(6, 12)}
+    assert fresh <= seeds
+
+
+def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
+    def together(settings):
+        kinds = {block["kind"] for block in settings["model"]["blocks"]}
+        return by_rate(settings) * (1 - 0.2 * ({"squeeze_excitation", "temporal_difference"} <= kinds))
+
+    spec = dataclasses.replace(CONFIRMED, free_trials=40)
+    world = World(together)
+    found = conduct(ground(spec), world)
+    facts = found.decided["exploration"].facts
+    assert {"squeeze_excitation", "temporal_difference"} <= set(facts["modules"])
+    alone = found.decided["confirmation"].facts["confirmed"]
+    assert facts["teacher"] == "exploration" or {"squeeze_excitation", "temporal_difference"} <= set(alone)
+
+
+def test_module_names_are_those_of_the_registry(sound):
+    assert set(sound[0].decided["screening"].facts["registered"]) == set(MODULES)

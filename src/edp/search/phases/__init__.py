@@ -8,6 +8,8 @@ from edp.search.phases import calibration  # isort: skip
 from edp.search.phases import screening  # isort: skip
 from edp.search.phases import planning  # isort: skip
 from edp.search.phases import confirmation  # isort: skip
+from edp.search.phases import synthesis  # isort: skip
+from edp.search.phases import exploration  # isort: skip
 from edp.search.phases.base import PHASES, Course, PhaseSpec
 
 __all__ = [
@@ -16,7 +18,9 @@ __all__ = [
     "PhaseSpec",
     "calibration",
     "confirmation",
+    "exploration",
     "isolation",
     "planning",
     "screening",
+    "synthesis",
 ]

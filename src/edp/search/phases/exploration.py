@@ -1,0 +1,73 @@
+"""Phase 5: all modules at once, from the winner of phase 4 on (thesis 3.3.6, eq. 3.43)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edp.search.ground import Decision, Ground, Outcome
+from edp.search.modules import MODULES, fitting
+from edp.search.phases.base import PHASES, Course
+from edp.search.phases.joint import ask_together, winner_of
+from edp.search.phases.screening import baseline_of
+from edp.stats.clustered import clustered_t
+from edp.stats.paired import fill_worst
+
+
+class Exploration:
+    """Phase 5. Its winner is held against that of phase 4 on folds that no earlier phase has used."""
+
+    title = "exploration"
+
+    def run(self, ground: Ground) -> Course:
+        """Ask about all modules; then both winners on fresh folds with the same seeds."""
+        spec = ground.spec
+        free = fitting(baseline_of(ground)[0], ground.channels)
+        earlier = ground.decided["synthesis"].facts
+        starts = [(earlier["values"], earlier["modules"])]
+        answers = yield from ask_together(ground, "exploration", free, spec.free_trials, starts)
+        facts = winner_of(ground, "exploration", free, answers)
+        runs = fresh_runs(ground)
+        arms = (earlier["settings"], facts["settings"])
+        outcomes = yield [order for settings in arms for order in ground.orders(settings, runs)]
+        return self.decide(ground, facts, outcomes)
+
+    def decide(self, ground: Ground, facts: dict[str, Any], outcomes: Sequence[Outcome]) -> Decision:
+        """The teacher: the winner of phase 5 where fresh folds bear it out, else that of phase 4."""
+        earlier = ground.decided["synthesis"].facts
+        size = len(outcomes) // 2
+        mask = ground.folds(fresh_runs(ground)[-1] + 1)[-size:]
+        seen = mask.any(axis=0)
+        scores = np.stack([ground.table(part)[:, seen] for part in (outcomes[:size], outcomes[size:])])
+        filled = fill_worst(scores, mask[:, seen])
+        test = clustered_t(filled[1] - filled[0], mask[:, seen])
+        change = float(test.mean) / float(filled[0][mask[:, seen]].mean())
+        better = change < 0 and float(test.p) < ground.spec.alpha
+        names = ", ".join(MODULES[name].title for name in facts["modules"]) or "no module"
+        facts |= {
+            "change": change,
+            "p": float(test.p),
+            "runs": size,
+            "teacher": "exploration" if better else "synthesis",
+        }
+        facts["teacher_settings"] = facts["settings"] if better else earlier["settings"]
+        verdict = "it is the teacher" if better else "the winner of phase 4 stays the teacher"
+        sentences = (
+            f"Best of {len(facts['trials'])} questions about all modules: {names}.",
+            f"Against the winner of phase 4 on {size} fresh runs: {100 * change:+.2f} % (one-sided p "
+            f"{float(test.p):.2g}); {verdict}.",
+        )
+        return Decision("exploration", facts, sentences)
+
+
+def fresh_runs(ground: Ground) -> range:
+    """Two repeats of the folds behind all that phases 0 to 4 may have used."""
+    spec = ground.spec
+    used = max(spec.most_runs, spec.variance_runs, spec.trial_runs, spec.screening_repeats)
+    start = -(-used // spec.folds) * spec.folds
+    return range(start, start + 2 * spec.folds)
+
+
+PHASES.register("exploration")(Exploration())

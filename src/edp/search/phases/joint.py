@@ -1,0 +1,85 @@
+"""What phases 4 and 5 share: modules and rates tuned together, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from typing import Any
+
+from edp.config import Table
+from edp.errors import DataError
+from edp.search.ground import Ground, Outcome
+from edp.search.modules import contradicting, with_modules
+from edp.search.phases.base import Answer, Quest, answer_all, best, new_study
+from edp.search.phases.screening import baseline_of
+from edp.search.space import Candidate, Real, Space, apply
+from edp.search.study import pareto
+from edp.search.trainings import Order
+
+Asked = Generator[list[Order], list[Outcome], list[Answer]]
+
+
+def ask_together(
+    ground: Ground, name: str, modules: Sequence[str], trials: int, starts: Sequence[tuple[Candidate, Sequence[str]]]
+) -> Asked:
+    """Questions about modules on or off and rates inside the window, with warm starts first.
+
+    Args:
+        ground: with the baseline of phase 1.
+        name: of the phase.
+        modules: that may be on.
+        trials: how many questions, the warm starts among them.
+        starts: values and modules to begin with.
+    """
+    base, _, window = baseline_of(ground)
+    study = new_study(ground, name, window, modules, contradicting(base, modules, ground.channels))
+    for values, flags in starts[:trials]:
+        study.suggest(_inside(window, values), flags)
+
+    def settings(trial: Any) -> Table:
+        return with_modules(apply(base, trial.values), trial.flags, ground.channels)
+
+    (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)])
+    return answers
+
+
+def winner_of(ground: Ground, name: str, modules: Sequence[str], answers: list[Answer]) -> dict[str, Any]:
+    """The best answer, how often each module was on, and the front where a cost counts.
+
+    Raises:
+        DataError: no training ended well.
+    """
+    found = best(answers)
+    if found is None:
+        raise DataError(f"{name}: none of {len(answers)} trainings ended well; see their messages in the ledger")
+    done = [answer for answer in answers if answer.score is not None]
+    facts: dict[str, Any] = {
+        "settings": found.settings,
+        "values": dict(found.trial.values),
+        "modules": list(found.trial.flags),
+        "score": found.score,
+        "costs": found.costs,
+        "on": {module: sum(module in answer.trial.flags for answer in done) / len(done) for module in modules},
+        "trials": [
+            {
+                "number": answer.trial.number,
+                "values": dict(answer.trial.values),
+                "modules": list(answer.trial.flags),
+                "score": answer.score,
+                **answer.costs,
+            }
+            for answer in answers
+        ],
+    }
+    if ground.spec.cost != "none":
+        points = [(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done]
+        facts["front"] = [done[place].trial.number for place in pareto(points)]
+    return facts
+
+
+def _inside(window: Space, values: Candidate) -> dict[str, Any]:
+    """Values of the window's dimensions, brought into it."""
+    made: dict[str, Any] = {}
+    for name, held in window.items():
+        if name in values and isinstance(held, Real):
+            made[name] = min(max(float(values[name]), held.low), held.high)
+    return made

@@ -1,0 +1,83 @@
+"""Phase 4: the confirmed modules together, and the one look at the test sessions (thesis 3.3.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edp.config import Table
+from edp.search.ground import Decision, Ground, Outcome
+from edp.search.modules import MODULES
+from edp.search.phases.base import PHASES, Course
+from edp.search.phases.joint import ask_together, winner_of
+from edp.search.phases.screening import baseline_of
+from edp.search.trainings import SCORES, Order
+
+
+class Synthesis:
+    """Phase 4."""
+
+    title = "synthesis"
+
+    def run(self, ground: Ground) -> Course:
+        """Tune modules and rates together; then train the best and the baseline at length and judge both once."""
+        confirmed = list(ground.decided["confirmation"].facts["confirmed"])
+        base, values, _ = baseline_of(ground)
+        starts = [(values, confirmed), (values, [])] if confirmed else [(values, [])]
+        answers = yield from ask_together(ground, "synthesis", confirmed, ground.spec.joint_trials, starts)
+        facts = winner_of(ground, "synthesis", confirmed, answers)
+        arms = {"synthesis": facts["settings"], "baseline": base}
+        outcomes = yield [order for settings in arms.values() for order in final_orders(ground, settings)]
+        facts["test"] = judged(ground, list(arms), outcomes)
+        return self.decide(ground, confirmed, facts)
+
+    def decide(self, ground: Ground, confirmed: Sequence[str], facts: dict[str, Any]) -> Decision:
+        """What stays, what works against the others, and what the test sessions say."""
+        facts["antagonistic"] = [name for name in confirmed if name not in facts["modules"]]
+        names = ", ".join(MODULES[name].title for name in facts["modules"]) or "no module"
+        sentences = [f"Best together: {names}; {facts['score']:.3g} mm/s on development sessions."]
+        if facts["antagonistic"]:
+            left = ", ".join(MODULES[name].title for name in facts["antagonistic"])
+            sentences.append(f"Confirmed alone, but not wanted together: {left}.")
+        test = facts["test"]
+        ours, base = (_shown(test[arm]["composite"]) for arm in ("synthesis", "baseline"))
+        sentences.append(
+            f"On {len(ground.test)} test sessions, opened once: {ours}, the baseline {base} (composite score, mean of "
+            f"{ground.spec.run_seeds} seeds)."
+        )
+        return Decision("synthesis", facts, tuple(sentences))
+
+
+def final_orders(ground: Ground, settings: Table) -> list[Order]:
+    """Trainings on all development sessions at full length, judged on the test sessions; an order a seed."""
+    return [
+        Order(
+            settings,
+            ground.source,
+            ground.development,
+            ground.test,
+            ground.seed("final", seed),
+            ground.spec.final_updates,
+        )
+        for seed in range(ground.spec.run_seeds)
+    ]
+
+
+def judged(ground: Ground, arms: Sequence[str], outcomes: Sequence[Outcome]) -> dict[str, dict[str, float | None]]:
+    """Means over seeds of each score on the test sessions, by arm; None where a training did not end well."""
+    seeds = ground.spec.run_seeds
+    found: dict[str, dict[str, float | None]] = {}
+    for place, arm in enumerate(arms):
+        own = outcomes[place * seeds : (place + 1) * seeds]
+        means = {name: float(np.mean([o.mean(ground.spec.horizon, name) for o in own])) for name in SCORES}
+        found[arm] = {name: value if np.isfinite(value) else None for name, value in means.items()}
+    return found
+
+
+def _shown(score: float | None) -> str:
+    return "no score, since a training failed" if score is None else f"{score:.3g} mm/s"
+
+
+PHASES.register("synthesis")(Synthesis())
