@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import struct
 import tempfile
+import time
 import zlib
 from pathlib import Path
 
@@ -346,3 +347,11 @@ def test_one_name_in_two_variables_is_never_chosen_silently(tmp_path):
         read_recording(tmp_path / "a.mat")
     read = read_recording(tmp_path / "a.mat", SignalMap((ChannelMap("BmUp", "right.BmUp"),)))
     assert read.values[-1, 0] == 16.0
+
+
+def test_a_hdf5_library_that_hangs_is_ended(tmp_path, monkeypatch):
+    path = write_recording(make(), tmp_path / "a.mat", WriteOptions(mat_version="v7.3"))
+    monkeypatch.setattr("edp.logs.mat_check._PROBE_S", 0.2)
+    monkeypatch.setattr("edp.logs.mat_check._attributes", lambda *_: time.sleep(60))
+    with pytest.raises(DataError, match="HDF5 finds no end in its structure"):
+        read_recording(path)

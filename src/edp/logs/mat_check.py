@@ -6,7 +6,11 @@ holds one array (14), whose length stands in its first 8 bytes. v7.3 is HDF5.
 
 from __future__ import annotations
 
+import os
+import signal
 import struct
+import time
+import warnings
 import zlib
 from pathlib import Path
 
@@ -19,6 +23,8 @@ _HEADER = 128
 _PACKED, _MATRIX = 15, 14
 _COPIES = 2
 """An array is in memory as it was unpacked and as a column."""
+_PROBE_S = 8.0
+_PROBE_BYTES_PER_S = 1e8
 _ADVICE = "it may be damaged, or was made to exhaust memory; else save fewer variables, or Parquet or MDF, in a file"
 
 
@@ -64,7 +70,44 @@ def _unpacked(start: bytes, order: str) -> int:
     return int(length) if kind == _MATRIX else 0
 
 
+def _probe(path: Path) -> None:
+    """Walk a file's structure in a process of its own: HDF5 itself may loop for ever, or crash, on damaged bytes."""
+    if not hasattr(os, "fork"):
+        return
+    deadline = time.monotonic() + _PROBE_S + path.stat().st_size / _PROBE_BYTES_PER_S
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        child = os.fork()
+    if child == 0:
+        try:
+            with h5py.File(path, "r") as file:
+                file.visititems(_attributes)
+        finally:
+            # Other errors are met again, and told, by the process that reads.
+            os._exit(0)
+    pause = 1e-4
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            break
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            status = signal.SIGKILL
+            break
+        time.sleep(pause)
+        pause = min(2 * pause, 0.01)
+    if status:
+        raise DataError(f"'{path}' is a damaged MAT file: HDF5 finds no end in its structure; copy or export it again")
+
+
+def _attributes(_: str, part: h5py.HLObject) -> None:
+    for name in part.attrs:
+        part.attrs[name]
+
+
 def _announced_v73(path: Path) -> int:
+    _probe(path)
     total = 0
 
     def add(_: str, part: h5py.HLObject) -> None:
