@@ -34,11 +34,11 @@ def fill(folder: Path, count: int) -> None:
     """Records of the size that a search writes; not synced one by one, as they are only read."""
     with Ledger(folder):
         pass
-    settings = settings_of(load_experiment(None, "quick"))
+    settings, machine = settings_of(load_experiment(None, "quick")), environment(1)
     for seed in range(count):
         split = {"train": [f"session {i}" for i in range(20)], "judged": [f"session {i}" for i in range(20, 25)]}
         config = {"settings": settings, "updates": 800}
-        identity = Identity("edp.search.jobs:train", config, split, seed, 1, "code", "data", environment(1))
+        identity = Identity("edp.search.jobs:train", config, split, seed, 1, "code", "data", machine)
         scores = {name: seed / (7 + i) for i, name in enumerate(SCORES)}
         result = {"sessions": {name: dict.fromkeys(HORIZONS, scores) for name in split["judged"]}, "scores": scores}
         measured = {"seconds": 12.3, "peak_mb": 456.7, "host": "host", "attempts": 1}
@@ -64,7 +64,7 @@ def orders(data: Path, count: int, updates: int, first_seed: int) -> list[Job]:
     recordings = source.read()
     digest = digest_of(sorted(recording.digest for recording in recordings))
     names = [recording.name for recording in recordings]
-    settings = settings_of(load_experiment(None, "quick", ["training.threads=1"]))
+    settings = settings_of(load_experiment(None, "quick"))
     found = []
     for number in range(count):
         judged = (names[number % len(names)],)

@@ -8,10 +8,10 @@ import pytest
 
 from edp.config import load_experiment
 from edp.errors import ConfigError, DataError
-from edp.ledger import Ledger, Status
+from edp.ledger import Ledger
 from edp.logs import write_recording
 from edp.recording import Recording
-from edp.search.batch import complete
+from edp.search.doing import Doing
 from edp.search.jobs import job_of
 from edp.search.local import LocalPool
 from edp.search.trainings import SCORES, Order, experiment_of, settings_of, train_order
@@ -25,6 +25,7 @@ CHANGES = (
     'model.backbone={kind="lstm", units=4}',
     "model.blocks=[]",
     "model.window=5",
+    "training.threads=1",
     "training.chunks={length=20, batch=4, burn_in=5}",
 )
 
@@ -113,6 +114,7 @@ def test_orders_that_cannot_be_are_refused(order):
 
 def test_a_process_of_a_pool_does_an_order_to_the_same_bits(order, record, tmp_path):
     job = job_of(order, "digest of the data")
+    told = []
     moved = dataclasses.replace(order, source={**order.source, "path": "elsewhere"})
     assert job_of(moved, "digest of the data").key == job.key
     others = [dataclasses.replace(order, **change) for change in ({"seed": 2}, {"updates": 13}, {"judged": ("s4",)})]
@@ -120,7 +122,12 @@ def test_a_process_of_a_pool_does_an_order_to_the_same_bits(order, record, tmp_p
         len({job.key, job_of(order, "other").key, *(job_of(other, "digest of the data").key for other in others)}) == 5
     )
     with LocalPool(1) as pool, Ledger(tmp_path) as ledger:
-        for _ in range(2):
-            (found,) = complete(ledger, pool, [job]).values()
-            assert found.status is Status.DONE, found.message
-            assert {**found.result, "seconds": record["seconds"]} == record
+        do = Doing(ledger, pool, "digest of the data", on_record=lambda _, trained: told.append(trained))
+        bad = dataclasses.replace(order, train=("s0", "s9"))
+        outcomes = do([order, bad, order])
+        assert [outcome.order for outcome in outcomes] == [order, bad, order]
+        assert [outcome.status for outcome in outcomes] == ["done", "failed", "done"]
+        assert "has no session s9" in outcomes[1].message
+        assert {**outcomes[0].result, "seconds": record["seconds"]} == record
+        assert do([order]) == outcomes[:1]
+        assert told == [True, True, False]

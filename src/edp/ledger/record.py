@@ -164,17 +164,26 @@ class Record:
             ValueError: cut off or changed.
             StorageError: written by a later version.
         """
-        if data[HEAD - len(BEFORE) : HEAD] != BEFORE or data[-2:] != b"}\n":
-            raise ValueError("it is cut off or is no record")
-        body = data[HEAD:-2]
-        if data[len(START) : len(START) + 32] != _checksum(body).encode():
-            raise ValueError("its checksum does not fit")
-        plain = json.loads(body)
+        plain = json.loads(body_of(data))
         if plain["schema"] != SCHEMA:
             raise StorageError(f"a record of schema {plain['schema']} was written by a later version of EDP; update it")
         identity = Identity(**plain["identity"])
-        identity.__dict__["key"] = plain["key"]  # the checksum covers it: hashing ten thousand again takes a second
+        identity.__dict__["key"] = plain["key"]  # the checksum covers it, so it is not hashed again
         return Record(identity, Status(plain["status"]), plain["result"], plain["message"], plain["measured"])
+
+
+def body_of(data: bytes) -> bytes:
+    """The canonical text in a record's bytes, its checksum verified; reading it takes longer than this.
+
+    Raises:
+        ValueError: cut off or changed.
+    """
+    if data[HEAD - len(BEFORE) : HEAD] != BEFORE or data[-2:] != b"}\n":
+        raise ValueError("it is cut off or is no record")
+    body = data[HEAD:-2]
+    if data[len(START) : len(START) + 32] != _checksum(body).encode():
+        raise ValueError("its checksum does not fit")
+    return body
 
 
 START, BEFORE = b'{"checksum":"', b'","record":'

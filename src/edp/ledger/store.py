@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +13,7 @@ from typing import Any
 
 from edp.errors import BusyError, ConfigError, StorageError
 from edp.ledger.claims import free_dead_claims, whole
-from edp.ledger.record import FINAL, Record, Status, canonical, digest_of
+from edp.ledger.record import FINAL, SCHEMA, Record, Status, body_of, canonical, digest_of
 from edp.storage import hold, make_folder, read_json, remove_unfinished, storage_error, write_bytes, write_json
 
 
@@ -26,20 +27,32 @@ class Damage:
 
 def read_records(folder: str | Path) -> tuple[dict[str, Record], list[Damage]]:
     """All records of a ledger, whoever holds it, and the damaged files; nothing is changed."""
-    found: dict[str, Record] = {}
+    whole, damaged = _read(Path(folder, "records"))
+    return {key: Record.from_bytes(data) for key, data in whole.items()}, damaged
+
+
+def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
+    """Bytes of the whole records by key, not yet taken apart: with ten thousand that is most of the time."""
+    found: dict[str, bytes] = {}
     damaged = []
-    for file in sorted(Path(folder, "records").glob("*.json")):
+    names = sorted(name for name in os.listdir(folder) if name.endswith(".json")) if folder.is_dir() else []
+    for name in names:
+        key, file = name[: -len(".json")], f"{folder}/{name}"
         try:
-            record = Record.from_bytes(file.read_bytes())
-            if record.key != file.stem:
-                raise ValueError(f"it holds the record {record.key}")
-            found[record.key] = record
+            with open(file, "rb", buffering=0) as stream:
+                data = stream.read()
+            body = body_of(data)
+            if f'"schema":{SCHEMA},"status":"'.encode() not in body[-48:]:
+                Record.from_bytes(data)  # says which schema it is
+            if f'"key":"{key}"'.encode() not in body:
+                raise ValueError("it holds the record of another training")
+            found[key] = data
         except (ValueError, KeyError, TypeError) as error:
-            damaged.append(Damage(file, str(error)))
+            damaged.append(Damage(Path(file), str(error)))
         except FileNotFoundError:  # set apart by its holder since it was listed
             continue
         except OSError as error:
-            raise storage_error(file, error, "read") from error
+            raise storage_error(Path(file), error, "read") from error
     return found, damaged
 
 
@@ -84,7 +97,8 @@ class Ledger:
                 remove_unfinished(make_folder(self.path / part))
             free_dead_claims(self.path)
             self._enter_arrivals()
-            self._records, self.damaged = read_records(self.path)
+            self._unread, self.damaged = _read(self.path / "records")
+            self._records: dict[str, Record] = {}
             for damage in self.damaged:
                 self._move(damage.file, "quarantine")
         except BaseException:
@@ -106,19 +120,23 @@ class Ledger:
         self._lock.close()
 
     def __len__(self) -> int:
-        return len(self._records)
+        return len({*self._records, *self._unread})
 
     def __iter__(self) -> Iterator[Record]:
         """Records in the order of their keys."""
+        for key in list(self._unread):
+            self.get(key)
         return iter([self._records[key] for key in sorted(self._records)])
 
     def get(self, key: str) -> Record | None:
         """What became of a training, lost ones too."""
+        if key in self._unread:
+            self._records[key] = Record.from_bytes(self._unread.pop(key))
         return self._records.get(key)
 
     def finished(self, key: str) -> Record | None:
         """What became of a training that is not to be tried again."""
-        record = self._records.get(key)
+        record = self.get(key)
         return record if record is not None and record.status in FINAL else None
 
     def put(self, record: Record) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from edp.ledger import Identity, code_version
@@ -19,17 +20,18 @@ def job_of(
     Args:
         order: what to train.
         data: hash of the recordings that it names; where they lie is no part of the key.
-        threads: that the pool gives to a training.
+        threads: of the training, whatever its settings say; the pool pins as many.
         seconds: cap on its time.
         memory_mb: cap on the memory of its process.
 
     Raises:
         ConfigError: settings that cannot be built, or an unknown machine.
     """
-    config: dict[str, Any] = {"settings": order.settings, "updates": order.updates}
-    physics = experiment_of(order).model.physics
-    if physics is not None:
-        config["machine"] = physics.digest()  # its file may change, and its name stays
+    settings = {**order.settings, "training": {**order.settings.get("training", {}), "threads": threads}}
+    config: dict[str, Any] = {"settings": settings, "updates": order.updates}
+    if settings.get("model", {}).get("physics"):
+        physics = experiment_of(order).model.physics
+        config["machine"] = None if physics is None else physics.digest()  # its file may change, and its name stays
     identity = Identity(
         f"{__name__}:train",
         config,
@@ -38,9 +40,12 @@ def job_of(
         1,
         code_version(),
         data,
-        environment(threads),
+        _environment(threads),
     )
     return Job(identity, {"source": dict(order.source)}, seconds, memory_mb)
+
+
+_environment = cache(environment)  # looking up versions takes as long as a record
 
 
 def train(identity: Identity, where: Mapping[str, Any]) -> dict[str, Any]:

@@ -169,7 +169,7 @@ def test_a_record_under_another_name_or_of_a_later_version(identity_of, tmp_path
     shutil.copy(file, file.with_name(f"{'0' * 32}.json"))
     with Ledger(tmp_path) as ledger:
         assert len(ledger) == 1
-        assert "holds the record" in ledger.damaged[0].why
+        assert "record of another training" in ledger.damaged[0].why
     body = canonical({"schema": 2})
     file.write_text(f'{{"checksum":"{edp.ledger.record._checksum(body.encode())}","record":{body}}}\n')
     with pytest.raises(StorageError, match="later version"):
