@@ -8,10 +8,10 @@ from edp.ledger import Ledger, Status
 from edp.logs import write_recording
 from edp.recording import Recording
 from edp.search.conduct import conduct
+from edp.search.doing import Doing
 from edp.search.ground import Ground
 from edp.search.local import LocalPool
 from edp.search.settings import SearchSpec
-from edp.search.through_ledger import through_ledger
 from edp.search.trainings import settings_of
 from edp.signals import Channel, Kind
 from edp.sources import DataSource
@@ -55,7 +55,7 @@ def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(groun
 
     def search(on_record):
         with Ledger(tmp_path / "ledger") as ledger, LocalPool(1) as pool:
-            do = through_ledger(ledger, pool, "data", on_record=on_record)
+            do = Doing(ledger, pool, "data", on_record=on_record)
             return conduct(ground, do, until="isolation").decided["isolation"]
 
     def stop_after_three(record, now):
