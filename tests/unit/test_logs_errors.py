@@ -16,6 +16,7 @@ import scipy.io
 
 from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.logs import FORMATS, LAYOUTS, WriteOptions, inspect_log, read_recording, write_recording
+from edp.logs.own import facts_text, own_facts
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
 
@@ -354,4 +355,20 @@ def test_a_hdf5_library_that_hangs_is_ended(tmp_path, monkeypatch):
     monkeypatch.setattr("edp.logs.mat_check._PROBE_S", 0.2)
     monkeypatch.setattr("edp.logs.mat_check._attributes", lambda *_: time.sleep(60))
     with pytest.raises(DataError, match="HDF5 finds no end in its structure"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize("key", ["dig\u0435st", "digess", "more"])
+def test_facts_with_a_key_that_is_not_known_are_damaged(key):
+    text = facts_text(Recording("r", (Channel("u", Kind.GENERIC),), np.zeros((3, 1), np.float32), 100.0))
+    assert own_facts(text, "'r.mat'").digest
+    with pytest.raises(DataError, match="which this version does not know"):
+        own_facts(text.replace('"digest"', f'"{key}"'), "'r.mat'")
+
+
+def test_a_variable_without_a_readable_name_is_damage(tmp_path, monkeypatch):
+    path = tmp_path / "r.mat"
+    write_recording(Recording("r", (Channel("u", Kind.GENERIC),), np.zeros((3, 1), np.float32), 100.0), path)
+    monkeypatch.setattr("edp.logs.mat.matio.load_from_mat", lambda *_, **__: {b"\xff": 1})
+    with pytest.raises(DataError, match="whose name is no text"):
         read_recording(path)

@@ -136,6 +136,11 @@ def _load(path: Path) -> dict[str, Any]:
     failed = [str(item.message) for item in caught if "Failed to load" in str(item.message)]
     if failed:
         raise DataError(f"'{path}': an object in this MAT file is damaged ({failed[0]}); copy or export it again")
+    nameless = [name for name in variables if not isinstance(name, str)]
+    if nameless:
+        raise DataError(
+            f"'{path}' holds a variable whose name is no text ({nameless[0]!r}); it is damaged: copy or export it again"
+        )
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 

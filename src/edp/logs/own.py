@@ -37,6 +37,9 @@ class OwnFacts:
         }
 
 
+KNOWN = frozenset({"name", "rate_hz", "source", "meta", "channels", "digest", "truth", "truth_digest"})
+
+
 def facts_text(recording: Recording, truth: Recording | None = None) -> str:
     """A recording's facts as JSON, with those of the channels that the file holds apart."""
     facts = {
@@ -64,6 +67,10 @@ def own_facts(text: str, where: str) -> OwnFacts:
     """
     try:
         facts = json.loads(text)
+        strange = sorted(set(facts) - KNOWN)
+        if strange:
+            # A damaged key must not pass for a file that states no digest.
+            raise ValueError(f"it states {', '.join(map(repr, strange))}, which this version does not know")
         rate = float(facts["rate_hz"])
         if not (math.isfinite(rate) and rate > 0):
             raise ValueError(f"rate_hz is {rate}")
