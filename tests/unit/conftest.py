@@ -11,10 +11,13 @@ from edp.data.features import Derived, FeatureSet
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
+from edp.logs import write_recording
 from edp.models.backbones import HybridSpec
 from edp.models.heads import MlpHead
 from edp.models.predictor import ModelSpec
+from edp.recording import Recording
 from edp.signals import Channel, Kind
+from edp.sources import DataSource
 from edp.training.fit import TrainingSpec
 
 SPEEDS = ("boom", "arm", "bucket")
@@ -80,3 +83,19 @@ def tiny_bypass() -> ModelSpec:
 def tiny_training() -> TrainingSpec:
     """Five short epochs on one thread."""
     return TRAINING
+
+
+@pytest.fixture(scope="session")
+def lever_sessions(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
+    """Five logs of a speed that follows a lever, on disk, for parts that read recordings themselves."""
+    folder = tmp_path_factory.mktemp("sessions")
+    for number in range(5):
+        rng = np.random.default_rng(number)
+        lever = np.repeat(rng.normal(size=20), 15)
+        speed = np.zeros(300)
+        for t in range(1, 300):
+            speed[t] = 0.9 * speed[t - 1] + 0.01 * lever[t - 1]
+        channels = (Channel("lever", Kind.GENERIC), Channel("speed", Kind.VELOCITY))
+        values = np.column_stack([lever, speed]).astype(np.float32)
+        write_recording(Recording(f"s{number}", channels, values, 100.0), folder / f"s{number}.parquet")
+    return DataSource.of(folder)

@@ -9,14 +9,10 @@ import pytest
 from edp.config import load_experiment
 from edp.errors import ConfigError, DataError
 from edp.ledger import Ledger
-from edp.logs import write_recording
-from edp.recording import Recording
 from edp.search.doing import Doing
 from edp.search.jobs import job_of
 from edp.search.local import LocalPool
 from edp.search.trainings import SCORES, Order, experiment_of, settings_of, train_order
-from edp.signals import Channel, Kind
-from edp.sources import DataSource
 
 CHANGES = (
     'task.features={name="tiny", channels=["lever", "speed"]}',
@@ -31,18 +27,8 @@ CHANGES = (
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sessions")
-    for number in range(5):
-        rng = np.random.default_rng(number)
-        lever = np.repeat(rng.normal(size=20), 15)
-        speed = np.zeros(300)
-        for t in range(1, 300):
-            speed[t] = 0.9 * speed[t - 1] + 0.01 * lever[t - 1]
-        channels = (Channel("lever", Kind.GENERIC), Channel("speed", Kind.VELOCITY))
-        values = np.column_stack([lever, speed]).astype(np.float32)
-        write_recording(Recording(f"s{number}", channels, values, 100.0), folder / f"s{number}.parquet")
-    return DataSource.of(folder)
+def source(lever_sessions):
+    return lever_sessions
 
 
 @pytest.fixture(scope="module")

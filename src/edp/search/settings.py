@@ -17,7 +17,7 @@ class SearchSpec:
     """The settings of a search. The thesis's own numbers are those of the preset ``thesis``.
 
     Attributes:
-        mode: ``sound`` (docs/search.md) or ``thesis``, whose tests and rules are followed to the letter.
+        mode: ``sound`` (docs/statistics.md) or ``thesis``, whose tests and rules are followed to the letter.
         seed: root of folds, seeds of trainings and questions.
         updates: training steps of every training but the final one.
         final_updates: training steps of what is judged on the test sessions.

@@ -1,20 +1,15 @@
 """Phases through ledger and pool: real trainings, and a search that was stopped comes to the same decision."""
 
-import numpy as np
 import pytest
 
 from edp.config import load_experiment
 from edp.ledger import Ledger, Status
-from edp.logs import write_recording
-from edp.recording import Recording
 from edp.search.conduct import conduct
 from edp.search.doing import Doing
 from edp.search.ground import Ground
 from edp.search.local import LocalPool
 from edp.search.settings import SearchSpec
 from edp.search.trainings import settings_of
-from edp.signals import Channel, Kind
-from edp.sources import DataSource
 
 CHANGES = (
     'task.targets=["speed"]',
@@ -34,20 +29,10 @@ class Stop(Exception):
 
 
 @pytest.fixture(scope="module")
-def ground(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sessions")
-    for number in range(5):
-        rng = np.random.default_rng(number)
-        lever = np.repeat(rng.normal(size=20), 15)
-        speed = np.zeros(300)
-        for t in range(1, 300):
-            speed[t] = 0.9 * speed[t - 1] + 0.01 * lever[t - 1]
-        channels = (Channel("lever", Kind.GENERIC), Channel("speed", Kind.VELOCITY))
-        values = np.column_stack([lever, speed]).astype(np.float32)
-        write_recording(Recording(f"s{number}", channels, values, 100.0), folder / f"s{number}.parquet")
+def ground(lever_sessions):
     base = settings_of(load_experiment(None, "quick", CHANGES))
     names = tuple(f"s{number}" for number in range(5))
-    return Ground(SPEC, base, DataSource.of(folder).to_plain(), names[:4], names[4:], ("lever", "speed"))
+    return Ground(SPEC, base, lever_sessions.to_plain(), names[:4], names[4:], ("lever", "speed"))
 
 
 def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(ground, tmp_path):
