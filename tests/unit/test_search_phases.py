@@ -84,6 +84,9 @@ def test_phase_0_takes_the_better_feature_set_and_says_how_sure_it_is(found):
     assert set(facts["arms"]) == {"lstm FG1", "lstm FG2", "hybrid FG1", "hybrid FG2"}
     assert all(held["p"] < 0.05 and held["change"] < -0.05 for held in facts["comparisons"].values())
     assert 0 < facts["arms"]["hybrid FG2"]["seed"] < 0.1
+    assert np.mean(facts["arms"]["hybrid FG2"]["by_run"]) == pytest.approx(facts["arms"]["hybrid FG2"]["mean"])
+    assert facts["arms"]["hybrid FG2"]["mae"]["mean"] == pytest.approx(facts["arms"]["hybrid FG2"]["mean"])
+    assert all(held["low"] < held["change"] < held["high"] < 0 for held in facts["comparisons"].values())
     assert facts["variance"]["run"] >= 0
 
 
@@ -293,6 +296,10 @@ def test_the_synthesis_opens_the_test_sessions_once_and_only_there(sound):
     facts = found.decided["synthesis"].facts
     assert facts["modules"] == ["squeeze_excitation"]
     assert facts["test"]["synthesis"]["composite"] < facts["test"]["baseline"]["composite"]
+    assert facts["test_gain"]["low"] < facts["test_gain"]["change"] < 0
+    assert facts["test_gain"]["change"] == pytest.approx(
+        facts["test"]["synthesis"]["composite"] / facts["test"]["baseline"]["composite"] - 1
+    )
     assert len(facts["trials"]) == 6
     assert facts["trials"][0]["modules"] == ["squeeze_excitation"]  # the warm start
 

@@ -14,6 +14,7 @@ from edp.search.ground import Decision, Ground, Outcome
 from edp.search.space import Space
 from edp.search.study import Study, Trial
 from edp.search.trainings import Order, costs_of
+from edp.stats.clustered import MeanTest
 
 Course = Generator[list[Order], list[Outcome], Decision]
 """Yields orders that may be done side by side, is sent their outcomes in the same order, and returns a decision."""
@@ -93,7 +94,7 @@ def answer_all(ground: Ground, quests: list[Quest]) -> Generator[list[Order], li
         outcomes = iter((yield [order for some in orders for order in some]))
         for (place, trial, settings), cost, some in zip(asked, costs, orders, strict=True):
             own = tuple(next(outcomes) for _ in some)
-            answer = Answer(trial, settings, cost, _score(ground, own), own)
+            answer = Answer(trial, settings, cost, mean_of(ground, own), own)
             answers[place].append(answer)
             tell(ground, quests[place].study, answer)
     return answers
@@ -129,6 +130,18 @@ def best(answers: list[Answer]) -> Answer | None:
     return min(done, key=lambda answer: (answer.score, answer.trial.number), default=None)
 
 
-def _score(ground: Ground, outcomes: tuple[Outcome, ...]) -> float | None:
-    values = [outcome.mean(ground.spec.horizon) for outcome in outcomes]
+def mean_of(ground: Ground, outcomes: Sequence[Outcome], name: str = "composite") -> float | None:
+    """A score, mean over outcomes; None where there is none, or one did not end well."""
+    values = [outcome.mean(ground.spec.horizon, name) for outcome in outcomes]
     return float(np.mean(values)) if values and np.isfinite(values).all() else None
+
+
+def changed(test: MeanTest, reference: float) -> dict[str, float]:
+    """A test of a mean difference as shares of a reference: change, its 95 % interval and the one-sided p-value."""
+    low, high = test.interval()
+    return {
+        "change": float(test.mean) / reference,
+        "low": float(low) / reference,
+        "high": float(high) / reference,
+        "p": float(test.p),
+    }

@@ -7,7 +7,7 @@ from typing import Any
 from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Decision, Ground
-from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, new_study
+from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, mean_of, new_study
 from edp.search.phases.isolation import arm_settings
 from edp.search.space import Choice, applicable, apply
 from edp.search.study import pareto
@@ -37,7 +37,7 @@ class Calibration:
                 sentences.append(f"{backbone}: no training of {len(own)} ended well; it is left out.")
                 continue
             chosen[backbone] = picked
-            facts["backbones"][backbone] = _plain(picked) | {"trials": [_plain(answer) for answer in own]}
+            facts["backbones"][backbone] = _plain(ground, picked) | {"trials": [_plain(ground, held) for held in own]}
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
             text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} mm/s with {size} parameters"
@@ -86,14 +86,15 @@ def _efficient(answers: list[Answer]) -> Answer | None:
 def _front(ground: Ground, answers: list[Answer]) -> list[dict[str, Any]]:
     done = [answer for answer in answers if answer.score is not None]
     kept = pareto([(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done])
-    return [_plain(done[place]) for place in kept]
+    return [_plain(ground, done[place]) for place in kept]
 
 
-def _plain(answer: Answer) -> dict[str, Any]:
+def _plain(ground: Ground, answer: Answer) -> dict[str, Any]:
     return {
         "number": answer.trial.number,
         "values": dict(answer.trial.values),
         "score": answer.score,
+        "mae": mean_of(ground, answer.outcomes, "mae"),
         **answer.costs,
         "statuses": [outcome.status for outcome in answer.outcomes],
     }

@@ -9,7 +9,7 @@ import numpy as np
 
 from edp.search.ground import Decision, Ground, Outcome
 from edp.search.modules import MODULES, fitting
-from edp.search.phases.base import PHASES, Course
+from edp.search.phases.base import PHASES, Course, changed
 from edp.search.phases.joint import ask_together, winner_of
 from edp.search.phases.screening import baseline_of
 from edp.stats.clustered import clustered_t
@@ -43,12 +43,13 @@ class Exploration:
         scores = np.stack([ground.table(part)[:, seen] for part in (outcomes[:size], outcomes[size:])])
         filled = fill_worst(scores, mask[:, seen])
         test = clustered_t(filled[1] - filled[0], mask[:, seen])
-        change = float(test.mean) / float(filled[0][mask[:, seen]].mean())
-        better = change < 0 and float(test.p) < ground.spec.alpha
+        fresh = [float(own[mask[:, seen]].mean()) for own in filled]
+        found = changed(test, fresh[0])
+        better = found["change"] < 0 and found["p"] < ground.spec.alpha
         names = ", ".join(MODULES[name].title for name in facts["modules"]) or "no module"
         facts |= {
-            "change": change,
-            "p": float(test.p),
+            **found,
+            "fresh": {"synthesis": fresh[0], "exploration": fresh[1]},
             "runs": size,
             "teacher": "exploration" if better else "synthesis",
         }
@@ -56,8 +57,8 @@ class Exploration:
         verdict = "it is the teacher" if better else "the winner of phase 4 stays the teacher"
         sentences = (
             f"Best of {len(facts['trials'])} questions about all modules: {names}.",
-            f"Against the winner of phase 4 on {size} fresh runs: {100 * change:+.2f} % (one-sided p "
-            f"{float(test.p):.2g}); {verdict}.",
+            f"Against the winner of phase 4 on {size} fresh runs: {100 * found['change']:+.2f} % (one-sided p "
+            f"{found['p']:.2g}); {verdict}.",
         )
         return Decision("exploration", facts, sentences)
 

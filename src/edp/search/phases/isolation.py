@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edp.config import Table, merged
 from edp.errors import DataError
 from edp.search.ground import Array, Decision, Ground, Outcome
-from edp.search.phases.base import PHASES, Course
+from edp.search.phases.base import PHASES, Course, changed
 from edp.stats.clustered import clustered_t
 from edp.stats.paired import fill_worst
 from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
@@ -67,11 +67,15 @@ class Isolation:
         """Variance components of each arm; the feature set with the lowest mean score over all backbones."""
         spec, arms = ground.spec, self.arms(ground)
         tables = _tables(ground, outcomes, len(arms))
+        errors = _tables(ground, outcomes, len(arms), "mae")
         facts: dict[str, Any] = {"arms": {}, "runs": spec.variance_runs, "seeds": spec.variance_seeds}
-        for (backbone, features), scores in zip(arms, tables, strict=True):
+        estimate = thesis_variance if spec.mode == "thesis" else split_variance
+        for (backbone, features), scores, mae in zip(arms, tables, errors, strict=True):
             by_run = np.nanmean(scores, axis=2).T  # (run, seed)
-            estimate = thesis_variance if spec.mode == "thesis" else split_variance
-            facts["arms"][f"{backbone} {features}"] = _plain(estimate(by_run))
+            facts["arms"][f"{backbone} {features}"] = _plain(estimate(by_run)) | {
+                "by_run": by_run.tolist(),
+                "mae": _plain(estimate(np.nanmean(mae, axis=2).T)),
+            }
         means = {
             features: float(np.mean([np.nanmean(t) for (_, f), t in zip(arms, tables, strict=True) if f == features]))
             for features in spec.features
@@ -104,20 +108,16 @@ class Isolation:
             first, second = (own[name].mean(axis=0) for name in (chosen, rival))
             mask, _ = _judged(ground)
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
-            found[backbone] = {
-                "rival": rival,
-                "change": float(test.mean) / float(np.nanmean(second)),
-                "p": float(test.p),
-            }
+            found[backbone] = {"rival": rival, **changed(test, float(np.nanmean(second)))}
         return found
 
 
-def _tables(ground: Ground, outcomes: Sequence[Outcome], arms: int) -> list[Array]:
+def _tables(ground: Ground, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
     """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
     spec = ground.spec
     size = spec.variance_runs
     mask, seen = _judged(ground)
-    raw = np.stack([ground.table(outcomes[at : at + size])[:, seen] for at in range(0, len(outcomes), size)])
+    raw = np.stack([ground.table(outcomes[at : at + size], name)[:, seen] for at in range(0, len(outcomes), size)])
     filled = fill_worst(raw, mask)
     filled[:, ~mask] = np.nan
     return list(filled.reshape(arms, spec.variance_seeds, size, -1))

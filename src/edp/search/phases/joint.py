@@ -9,7 +9,7 @@ from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Ground, Outcome
 from edp.search.modules import contradicting, with_modules
-from edp.search.phases.base import Answer, Quest, answer_all, best, new_study
+from edp.search.phases.base import Answer, Quest, answer_all, best, mean_of, new_study
 from edp.search.phases.screening import baseline_of
 from edp.search.space import Candidate, Real, Space, apply
 from edp.search.study import pareto
@@ -65,6 +65,7 @@ def winner_of(ground: Ground, name: str, modules: Sequence[str], answers: list[A
                 "values": dict(answer.trial.values),
                 "modules": list(answer.trial.flags),
                 "score": answer.score,
+                "mae": mean_of(ground, answer.outcomes, "mae"),
                 **answer.costs,
             }
             for answer in answers

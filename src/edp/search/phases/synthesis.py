@@ -10,10 +10,11 @@ import numpy as np
 from edp.config import Table
 from edp.search.ground import Decision, Ground, Outcome
 from edp.search.modules import MODULES
-from edp.search.phases.base import PHASES, Course
+from edp.search.phases.base import PHASES, Course, changed
 from edp.search.phases.joint import ask_together, winner_of
 from edp.search.phases.screening import baseline_of
 from edp.search.trainings import SCORES, Order
+from edp.stats.clustered import clustered_t
 
 
 class Synthesis:
@@ -31,6 +32,7 @@ class Synthesis:
         arms = {"synthesis": facts["settings"], "baseline": base}
         outcomes = yield [order for settings in arms.values() for order in final_orders(ground, settings)]
         facts["test"] = judged(ground, list(arms), outcomes)
+        facts["test_gain"] = gained(ground, outcomes)
         return self.decide(ground, confirmed, facts)
 
     def decide(self, ground: Ground, confirmed: Sequence[str], facts: dict[str, Any]) -> Decision:
@@ -43,9 +45,11 @@ class Synthesis:
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
         test = facts["test"]
         ours, base = (_shown(test[arm]["composite"]) for arm in ("synthesis", "baseline"))
+        gain = facts["test_gain"]
+        interval = "" if gain is None else f"; {100 * gain['change']:+.2f} %, p {gain['p']:.2g}"
         sentences.append(
             f"On {len(ground.test)} test sessions, opened once: {ours}, the baseline {base} (composite score, mean of "
-            f"{ground.spec.run_seeds} seeds)."
+            f"{ground.spec.run_seeds} seeds{interval})."
         )
         return Decision("synthesis", facts, tuple(sentences))
 
@@ -74,6 +78,18 @@ def judged(ground: Ground, arms: Sequence[str], outcomes: Sequence[Outcome]) -> 
         means = {name: float(np.mean([o.mean(ground.spec.horizon, name) for o in own])) for name in SCORES}
         found[arm] = {name: value if np.isfinite(value) else None for name, value in means.items()}
     return found
+
+
+def gained(ground: Ground, outcomes: Sequence[Outcome]) -> dict[str, float] | None:
+    """The first arm against the second on the test sessions, clustered by session and seed.
+
+    None with one test session, one seed, or a training that did not end well.
+    """
+    scores = np.array([[o.score(name, ground.spec.horizon) for name in ground.test] for o in outcomes])
+    arms = scores.reshape(2, ground.spec.run_seeds, len(ground.test))
+    if min(arms.shape[1:]) < 2 or not np.isfinite(arms).all():
+        return None
+    return changed(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
 
 
 def _shown(score: float | None) -> str:
