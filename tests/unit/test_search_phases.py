@@ -240,6 +240,14 @@ def test_the_plan_says_how_many_runs_and_why(sound):
     assert "To see 2 %" in decision.sentences[0]
 
 
+def test_a_plan_that_no_number_of_runs_meets_makes_the_most_that_are_allowed(sound):
+    small = dataclasses.replace(sound[0], spec=dataclasses.replace(CONFIRMED, least_effect=1e-4))
+    decision = conduct(small, World(with_effects), phases=["planning"]).decided["planning"]
+    assert decision.facts["runs"] == 6
+    assert decision.facts["enough"] is None
+    assert "6 runs are made nevertheless" in decision.sentences[1]
+
+
 def test_only_what_really_helps_is_confirmed(sound):
     facts = sound[0].decided["confirmation"].facts
     assert facts["confirmed"] == ["squeeze_excitation"]

@@ -41,7 +41,7 @@ def _sound(ground: Ground) -> Decision:
     sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} mm/s: {plan.reason}."]
     if plan.runs is None:
         sentences.append(f"{runs} runs are made nevertheless; effects below what they can show will be missed.")
-    return Decision("planning", {"runs": runs, **asdict(plan)}, tuple(sentences))
+    return Decision("planning", {**asdict(plan), "runs": runs, "enough": plan.runs}, tuple(sentences))
 
 
 def _thesis(ground: Ground) -> Decision:
