@@ -38,6 +38,12 @@ class BusyError(StorageError):
     exit_code = 75
 
 
+class LostError(EdpError):
+    """Processes were killed again and again, so that nothing is known of what they did; to be tried again."""
+
+    exit_code = 75
+
+
 class NotFiniteError(EdpError):
     """A loss, score or result is NaN or infinite."""
 

@@ -101,6 +101,19 @@ def hold(path: str | Path) -> IO[str]:
     return stream
 
 
+def held_by(path: str | Path) -> str | None:
+    """Who holds a file that `hold` locks, None for nobody; nothing is changed."""
+    try:
+        with Path(path).open() as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except OSError:
+                return stream.read().strip() or "unknown"
+    except OSError:
+        return None
+    return None
+
+
 def remove_unfinished(folder: Path) -> None:
     """Remove what a process that was killed while it wrote has left; only for who holds the folder."""
     for rest in folder.glob(".*.tmp"):

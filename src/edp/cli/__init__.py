@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp import __version__
-from edp.cli import animate, demo, evaluate, footprint, inspect, report, screen, simulate, train
+from edp.cli import animate, demo, evaluate, footprint, inspect, report, screen, search, simulate, train
 from edp.cli.console import run_app
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app.command("screen")(screen.screen)
 app.command("animate")(animate.animate)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
+app.add_typer(search.app, name="search")
 app.command("footprint")(footprint.footprint)
 app.command("report")(report.report)
 

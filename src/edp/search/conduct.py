@@ -20,6 +20,7 @@ def conduct(
     until: str | None = None,
     on_decision: Callable[[Decision], None] | None = None,
     phases: Sequence[str] | None = None,
+    on_phase: Callable[[str, Ground], None] | None = None,
 ) -> Ground:
     """Run the phases in order, each on what the ones before decided.
 
@@ -32,6 +33,7 @@ def conduct(
         until: the last phase to run; None for all.
         on_decision: told of each decision.
         phases: names of those to run; None for all that are registered.
+        on_phase: told of each phase before it begins, and what it stands on.
 
     Raises:
         ConfigError: an unknown phase.
@@ -43,6 +45,8 @@ def conduct(
             raise ConfigError(f"search: phase '{until}' is not among those to run: {', '.join(names)}")
         names = names[: names.index(until) + 1]
     for name in names:
+        if on_phase is not None:
+            on_phase(name, ground)
         decision = _run(name, ground, do)
         ground = replace(ground, decided={**ground.decided, name: decision})
         if on_decision is not None:

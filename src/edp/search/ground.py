@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.config import Table
-from edp.errors import DataError
+from edp.errors import ConfigError, DataError, closest
 from edp.search.settings import SearchSpec
 from edp.search.trainings import Order
 from edp.stats.folds import repeated_folds, repeated_splits
@@ -154,8 +154,25 @@ def set_apart(
         spec: share and seed.
 
     Raises:
-        DataError: too few sessions for the folds, or none to test.
+        ConfigError: a session that is to test is not there.
+        DataError: too few sessions for the folds.
     """
+    strange = [name for name in spec.test if name not in sessions]
+    if strange:
+        raise ConfigError(
+            f"search: test names '{strange[0]}', and there is no such session{closest(strange[0], sessions)}"
+        )
+    test = tuple(name for name in sessions if name in spec.test) or _drawn(sessions, families, spec)
+    development = tuple(name for name in sessions if name not in test)
+    if len(development) < max(spec.folds, 3):
+        raise DataError(
+            f"{len(sessions)} sessions came: {len(test)} are set apart as test, and {len(development)} are left for "
+            f"{spec.folds} folds; give more recordings, a smaller test_share, or fewer folds"
+        )
+    return development, test
+
+
+def _drawn(sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec) -> tuple[str, ...]:
     rng = np.random.default_rng([spec.seed, 0x7E57])
     wanted = max(1, round(spec.test_share * len(sessions)))
     kinds: dict[str, list[str]] = {}
@@ -168,11 +185,4 @@ def set_apart(
     for which in sorted(range(len(queues)), key=lambda i: taken[i] - shares[i])[: wanted - sum(taken)]:
         taken[which] += 1
     chosen = {str(name) for queue, count in zip(queues, taken, strict=True) for name in queue[:count]}
-    test = tuple(name for name in sessions if name in chosen)
-    development = tuple(name for name in sessions if name not in chosen)
-    if len(development) < max(spec.folds, 3):
-        raise DataError(
-            f"{len(sessions)} sessions came: {len(test)} are set apart as test, and {len(development)} are left for "
-            f"{spec.folds} folds; give more recordings, a smaller test_share, or fewer folds"
-        )
-    return development, test
+    return tuple(name for name in sessions if name in chosen)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
+from edp.config import FeatureSettings, plain_tree
 from edp.errors import ConfigError
 from edp.search.space import ELASTIC, THESIS, Space
 from edp.search.study import SamplerSpec
@@ -23,9 +25,10 @@ class SearchSpec:
         final_updates: training steps of what is judged on the test sessions.
         horizon: at which scores are taken, one of the task's.
         test_share: share of the sessions that are set apart as test before anything else.
+        test: names of the sessions to set apart, instead of a share that is drawn.
         folds: into which the other sessions are dealt.
         backbones: registered backbones that are compared.
-        features: feature sets that are compared.
+        features: feature sets that are compared: names, or sets of one's own.
         variance_runs: phase 0: training runs of each backbone with each feature set, in whole repeats of the folds.
         variance_seeds: phase 0: seeds of each of these runs.
         trials: phase 1: questions for each backbone.
@@ -59,9 +62,10 @@ class SearchSpec:
     final_updates: int = 2000
     horizon: int = 10
     test_share: float = 0.2
+    test: tuple[str, ...] = ()
     folds: int = 5
     backbones: tuple[str, ...] = ("lstm", "tcn", "hybrid")
-    features: tuple[str, ...] = ("FG1", "FG2")
+    features: tuple[str | FeatureSettings, ...] = ("FG1", "FG2")
     variance_runs: int = 10
     variance_seeds: int = 2
     trials: int = 40
@@ -108,8 +112,18 @@ class SearchSpec:
             wrong.append("backbones and features (at least one of each)")
         if self.warm_rounds < 0 or self.least_gain < 0:
             wrong.append(f"warm_rounds = {self.warm_rounds}, least_gain = {self.least_gain} (at least 0)")
+        if len(self.feature_sets) < len(self.features):
+            wrong.append("features (sets of different names)")
         if wrong:
             raise ConfigError("search: " + "; ".join(wrong) + " must hold")
+
+    @property
+    def feature_sets(self) -> dict[str, Any]:
+        """By name, what ``task.features`` of an experiment is set to: a name, or a plain table."""
+        return {
+            held if isinstance(held, str) else held.name: held if isinstance(held, str) else plain_tree(held)
+            for held in self.features
+        }
 
     def _shares(self) -> list[tuple[str, float]]:
         names = ("test_share", "least_effect", "power", "alpha")

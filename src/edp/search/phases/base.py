@@ -9,9 +9,10 @@ from typing import Protocol
 import numpy as np
 
 from edp.config import Table
+from edp.errors import ConfigError
 from edp.registry import Registry
 from edp.search.ground import Decision, Ground, Outcome
-from edp.search.space import Space
+from edp.search.space import Choice, Range, Space, apply
 from edp.search.study import Study, Trial
 from edp.search.trainings import Order, costs_of
 from edp.stats.clustered import MeanTest
@@ -33,6 +34,10 @@ class PhaseSpec(Protocol):
         """The trainings that it needs, batch by batch, and what follows from them."""
         ...
 
+    def trainings(self, ground: Ground) -> int:
+        """How many it will order at most, as far as is known now; for the time left, and for nothing else."""
+        ...
+
 
 PHASES: Registry[PhaseSpec] = Registry("phase")
 """In the order in which they run."""
@@ -45,7 +50,7 @@ class Answer:
     Attributes:
         trial: the question.
         settings: the experiment that it stands for.
-        costs: analytic costs of its network, by name.
+        costs: analytic costs of its network, by name; none where its values make no network.
         score: mean over its runs; None where it was not trained for its costs, or failed.
         outcomes: of its runs; none where it was not trained.
     """
@@ -75,7 +80,7 @@ class Quest:
 def answer_all(ground: Ground, quests: list[Quest]) -> Generator[list[Order], list[Outcome], list[list[Answer]]]:
     """Ask all quests side by side, a batch each at a time, until each has all its answers.
 
-    A question whose costs exceed the limits is told so and not trained.
+    A question whose costs exceed the limits, or whose network cannot be, is told so and not trained.
     """
     spec = ground.spec
     answers: list[list[Answer]] = [[] for _ in quests]
@@ -85,8 +90,8 @@ def answer_all(ground: Ground, quests: list[Quest]) -> Generator[list[Order], li
             for place, quest in enumerate(quests)
             for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[place])))
         ]
-        costs = [costs_of(settings, ground.channels) for _, _, settings in asked]
-        fit = [all(cost[name] <= most for name, most in spec.limits.items()) for cost in costs]
+        costs = [_costs(settings, ground) for _, _, settings in asked]
+        fit = [bool(cost) and all(cost[name] <= most for name, most in spec.limits.items()) for cost in costs]
         orders = [
             ground.orders(settings, range(spec.trial_runs)) if fits else []
             for (_, _, settings), fits in zip(asked, fit, strict=True)
@@ -100,10 +105,35 @@ def answer_all(ground: Ground, quests: list[Quest]) -> Generator[list[Order], li
     return answers
 
 
+def _costs(settings: Table, ground: Ground) -> dict[str, float]:
+    try:
+        return costs_of(settings, ground.channels)
+    except ConfigError:  # values that are each in their range, and make no network together
+        return {}
+
+
+def possible(ground: Ground, space: Space, arm: Table) -> tuple[Space, list[str]]:
+    """The part of a space in which every value makes a network of this arm, and in words what was left out."""
+    kept: dict[str, Range] = {}
+    notes = []
+    for name, held in space.items():
+        if not isinstance(held, Choice):
+            kept[name] = held
+            continue
+        fit = tuple(value for value in held.options if _costs(apply(arm, {name: value}), ground))
+        out = [str(value) for value in held.options if value not in fit]
+        if len(fit) > 1:
+            kept[name] = Choice(fit)
+        if out:
+            left = f"{', '.join(map(str, fit))} stay" if len(fit) > 1 else "it keeps its own"
+            notes.append(f"{name} {', '.join(out)} cannot be with a window of {arm['model']['window']}; {left}")
+    return kept, notes
+
+
 def tell(ground: Ground, study: Study, answer: Answer) -> None:
     """Pass an answer on to its study."""
     spec = ground.spec
-    bounds = [answer.costs[name] / most - 1.0 for name, most in sorted(spec.limits.items())]
+    bounds = [answer.costs[name] / most - 1.0 if answer.costs else 1.0 for name, most in sorted(spec.limits.items())]
     values = None
     if answer.score is not None:
         values = [answer.score] if spec.cost == "none" else [answer.score, answer.costs[spec.cost]]

@@ -7,9 +7,9 @@ from typing import Any
 from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Decision, Ground
-from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, mean_of, new_study
+from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, mean_of, new_study, possible
 from edp.search.phases.isolation import arm_settings
-from edp.search.space import Choice, applicable, apply
+from edp.search.space import Choice, Space, applicable, apply
 from edp.search.study import pareto
 from edp.stats.efficiency import Candidate, most_efficient
 
@@ -19,18 +19,25 @@ class Calibration:
 
     title = "calibration"
 
+    def trainings(self, ground: Ground) -> int:
+        """Every question of every backbone, were none too costly."""
+        return len(ground.spec.backbones) * ground.spec.trials * ground.spec.trial_runs
+
     def run(self, ground: Ground) -> Course:
         """All backbones side by side; first every size in turn, then what the sampler asks."""
-        features = ground.decided["isolation"].facts["features"]
+        features = ground.spec.feature_sets[ground.decided["isolation"].facts["features"]]
         arms = {backbone: arm_settings(ground.base, backbone, features) for backbone in ground.spec.backbones}
-        answers = yield from answer_all(ground, [_quest(ground, name, arm) for name, arm in arms.items()])
-        return self.decide(ground, dict(zip(arms, answers, strict=True)))
+        spaces = {name: possible(ground, applicable(ground.spec.space, arm), arm) for name, arm in arms.items()}
+        quests = [_quest(ground, name, arm, spaces[name][0]) for name, arm in arms.items()]
+        answers = yield from answer_all(ground, quests)
+        notes = [f"{name}: {note}." for name, (_, some) in spaces.items() for note in some]
+        return self.decide(ground, dict(zip(arms, answers, strict=True)), notes)
 
-    def decide(self, ground: Ground, answers: dict[str, list[Answer]]) -> Decision:
+    def decide(self, ground: Ground, answers: dict[str, list[Answer]], notes: list[str]) -> Decision:
         """Of each backbone the smallest size that no larger one repays; of these the lowest score."""
         facts: dict[str, Any] = {"backbones": {}}
         chosen: dict[str, Answer] = {}
-        sentences = []
+        sentences = list(notes)
         for backbone, own in answers.items():
             picked = _efficient(own)
             if picked is None:
@@ -59,9 +66,8 @@ class Calibration:
         return Decision("calibration", facts, tuple(sentences))
 
 
-def _quest(ground: Ground, backbone: str, arm: Table) -> Quest:
+def _quest(ground: Ground, backbone: str, arm: Table, space: Space) -> Quest:
     spec = ground.spec
-    space = applicable(spec.space, arm)
     study = new_study(ground, f"calibration {backbone}", space)
     sizes = space.get("units")
     for _ in range(spec.warm_rounds):
@@ -74,8 +80,10 @@ def _efficient(answers: list[Answer]) -> Answer | None:
     """The best answer of the size that the efficiency rule chooses (`edp.stats.efficiency`)."""
     by_size: dict[float, Answer] = {}
     for answer in answers:
+        if answer.score is None:
+            continue
         held = by_size.get(answer.costs["parameters"])
-        if answer.score is not None and (held is None or held.score is None or answer.score < held.score):
+        if held is None or held.score is None or answer.score < held.score:
             by_size[answer.costs["parameters"]] = answer
     if not by_size:
         return None

@@ -28,6 +28,13 @@ class Confirmation:
 
     title = "confirmation"
 
+    def trainings(self, ground: Ground) -> int:
+        """Were nothing dropped at a look; before the screening, with half of the modules."""
+        spec, decided = ground.spec, ground.decided
+        arms = len(decided["screening"].facts["passed"]) if "screening" in decided else len(MODULES) // 2
+        runs = int(decided["planning"].facts["runs"]) if "planning" in decided else spec.most_runs
+        return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
+
     def run(self, ground: Ground) -> Course:
         """Trainings of the mode, and what is confirmed."""
         passed = list(ground.decided["screening"].facts["passed"])

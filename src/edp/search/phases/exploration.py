@@ -21,6 +21,10 @@ class Exploration:
 
     title = "exploration"
 
+    def trainings(self, ground: Ground) -> int:
+        """The questions, and both winners on fresh folds."""
+        return ground.spec.free_trials * ground.spec.trial_runs + 2 * len(fresh_runs(ground))
+
     def run(self, ground: Ground) -> Course:
         """Ask about all modules; then both winners on fresh folds with the same seeds."""
         spec = ground.spec

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config import Table, merged
+from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Array, Decision, Ground, Outcome
 from edp.search.phases.base import PHASES, Course, changed
@@ -24,8 +24,8 @@ DEFAULT_BACKBONE: dict[str, Table] = {
 }
 
 
-def arm_settings(base: Table, backbone: str, features: str) -> Table:
-    """The base with another backbone of like size, and another feature set."""
+def arm_settings(base: Table, backbone: str, features: Any) -> Table:
+    """The base with another backbone of like size, and another feature set (a name, or a plain table)."""
     held = base["model"]["backbone"]
     if held["kind"] == backbone:
         made = dict(held)
@@ -36,9 +36,11 @@ def arm_settings(base: Table, backbone: str, features: str) -> Table:
             made["units"] = width
         if "channels" in made:
             made["channels"] = [width] * len(made["channels"])
-    changed = merged(base, {"task": {"features": features}})
-    changed["model"] = {**base["model"], "backbone": made, "blocks": []}
-    return changed
+    return {
+        **base,
+        "task": {**base["task"], "features": features},
+        "model": {**base["model"], "backbone": made, "blocks": []},
+    }
 
 
 class Isolation:
@@ -48,7 +50,11 @@ class Isolation:
 
     def arms(self, ground: Ground) -> list[tuple[str, str]]:
         """Backbone and feature set of each arm."""
-        return [(backbone, features) for backbone in ground.spec.backbones for features in ground.spec.features]
+        return [(backbone, features) for backbone in ground.spec.backbones for features in ground.spec.feature_sets]
+
+    def trainings(self, ground: Ground) -> int:
+        """All of them at once."""
+        return len(self.arms(ground)) * ground.spec.variance_runs * ground.spec.variance_seeds
 
     def run(self, ground: Ground) -> Course:
         """All arms on the same folds with the same seeds, in one batch."""
@@ -58,7 +64,7 @@ class Isolation:
             for backbone, features in self.arms(ground)
             for seed in range(spec.variance_seeds)
             for order in ground.orders(
-                arm_settings(ground.base, backbone, features), range(spec.variance_runs), seed=seed
+                arm_settings(ground.base, backbone, spec.feature_sets[features]), range(spec.variance_runs), seed=seed
             )
         ]
         return self.decide(ground, outcomes)
@@ -78,7 +84,7 @@ class Isolation:
             }
         means = {
             features: float(np.mean([np.nanmean(t) for (_, f), t in zip(arms, tables, strict=True) if f == features]))
-            for features in spec.features
+            for features in spec.feature_sets
         }
         chosen = min(means, key=lambda name: means[name])
         facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(ground, tables, chosen)}
@@ -98,10 +104,10 @@ class Isolation:
     def _comparisons(self, ground: Ground, tables: list[Array], chosen: str) -> dict[str, Any]:
         """The chosen feature set against the next best one, for each backbone."""
         spec = ground.spec
-        rivals = [name for name in spec.features if name != chosen]
+        rivals = [name for name in spec.feature_sets if name != chosen]
         found = {}
         for place, backbone in enumerate(spec.backbones):
-            own = {f: tables[place * len(spec.features) + i] for i, f in enumerate(spec.features)}
+            own = {f: tables[place * len(spec.features) + i] for i, f in enumerate(spec.feature_sets)}
             if not rivals:
                 continue
             rival = min(rivals, key=lambda name: float(np.nanmean(own[name])))

@@ -16,6 +16,10 @@ class Planning:
 
     title = "power"
 
+    def trainings(self, ground: Ground) -> int:
+        """None."""
+        return 0
+
     def run(self, ground: Ground) -> Course:
         """Decide at once."""
         yield from ()
@@ -57,7 +61,7 @@ def _thesis(ground: Ground) -> Decision:
         plan = asdict(found)
     runs = min(int(plan["splits"] or 2), spec.most_runs)
     text = f"J = {plan['splits']} splits of {spec.run_seeds} seeds after eq. 3.42; {runs} are made."
-    return Decision("planning", {"runs": runs, **plan}, (text,))
+    return Decision("planning", {**plan, "runs": runs}, (text,))
 
 
 PHASES.register("planning")(Planning())

@@ -22,6 +22,13 @@ class Screening:
 
     title = "screening"
 
+    def trainings(self, ground: Ground) -> int:
+        """The design, or the questions of all modules with the baseline's seeds."""
+        spec = ground.spec
+        if spec.mode == "thesis":
+            return spec.run_seeds + len(MODULES) * spec.module_trials * spec.trial_runs
+        return spec.screening_runs * spec.screening_repeats
+
     def run(self, ground: Ground) -> Course:
         """Trainings of the mode, and what passes."""
         return (yield from (_thesis(ground) if ground.spec.mode == "thesis" else _sound(ground)))

@@ -22,6 +22,10 @@ class Synthesis:
 
     title = "synthesis"
 
+    def trainings(self, ground: Ground) -> int:
+        """The questions, and both arms at length."""
+        return ground.spec.joint_trials * ground.spec.trial_runs + 2 * ground.spec.run_seeds
+
     def run(self, ground: Ground) -> Course:
         """Tune modules and rates together; then train the best and the baseline at length and judge both once."""
         confirmed = list(ground.decided["confirmation"].facts["confirmed"])

@@ -1,0 +1,184 @@
+"""``edp search``: the phased model search, its state, its page and its export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from edp.search.diary import Diary
+    from edp.search.ground import Decision
+    from edp.search.runner import Found
+
+StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study: what edp search --study was given.")]
+DEFAULT = "run"
+
+
+class _RunByDefault(TyperGroup):
+    """`edp search DATA ...` is `edp search run DATA ...`."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is named, or `run`."""
+        if args and args[0] not in self.commands:
+            args = [DEFAULT, *args]
+        return super().resolve_command(ctx, args)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Options before the data belong to `run`."""
+        if args and args[0].startswith("-") and args[0] not in ("--help", "-h"):
+            args = [DEFAULT, *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_RunByDefault,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Search for the network: phases, tests and a report. `edp search DATA --study DIR` is `edp search run ...`.",
+)
+
+
+@app.command(DEFAULT)
+def run(
+    data: Annotated[Path, typer.Argument(help="A folder of logs, or a data-set file (.toml); each log is a session.")],
+    study: Annotated[Path, typer.Option("--study", help="Folder of the study; goes on where it stopped.")],
+    preset: Annotated[str, typer.Option(help="quick (minutes), standard (hours) or thesis (days).")] = "quick",
+    mode: Annotated[str | None, typer.Option(help="sound, or thesis: its tests and rules to the letter.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset, with [search].")] = None,
+    changes: Annotated[
+        list[str], typer.Option("--set", help="One setting, for example search.trials=30 or model.window=40.")
+    ] = [],  # noqa: B006
+    phase: Annotated[str | None, typer.Option(help="The last phase to run now; all, where not given.")] = None,
+    workers: Annotated[int, typer.Option(help="Trainings side by side; 0: as many as cores.")] = 0,
+    threads: Annotated[int, typer.Option(help="Of each training; another number is another training.")] = 1,
+    seconds: Annotated[float | None, typer.Option(help="Cap on the time of a training.")] = None,
+    memory: Annotated[float | None, typer.Option(help="Cap on the memory of a training, MB.")] = None,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Search for the network: from which features and backbone to which modules, each step tested.
+
+    Stop it at any moment (Ctrl-C, or pull the plug): the same command goes on, and trains nothing twice.
+
+    Example: `edp search logs/ --study studies/first --preset quick`
+
+    Example: `edp search logs/ --study studies/first --phase screening --set search.features='["FG2", "own.toml"]'`
+    """
+    from edp.search.plan import load_plan
+    from edp.search.runner import Crew, Watchers, run_search
+
+    changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
+    plan = load_plan(config, preset, changes)
+    crew = Crew(workers=workers, threads=threads, seconds=seconds, memory_mb=memory)
+    source = source_of(data, signal_map, repair)
+    with progress(as_json) as shown:
+        display = SearchDisplay(shown, Steps(as_json), crew.size, as_json)
+        watchers = Watchers(
+            on_note=display.on_note,
+            on_phase=display.on_phase,
+            on_progress=display.on_progress,
+            on_decision=display.on_decision,
+        )
+        found = run_search(source, plan, study, crew, phase, watchers)
+    emit(as_json, _facts(found), lambda: _show(found, data))
+
+
+@app.command("status")
+def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
+    """How far a study is: phases, trainings done, running and left, what was decided. Changes nothing.
+
+    Example: `edp search status studies/first`
+    """
+    from edp.search.diary import look_at
+
+    held = look_at(study)
+    emit(as_json, held, lambda: _show_status(held))
+
+
+class SearchDisplay:
+    """Shows phases, trainings and the time left; decisions as sentences."""
+
+    def __init__(self, shown: Progress, steps: Steps, workers: int, quiet: bool) -> None:
+        self.shown, self.steps, self.workers, self.quiet = shown, steps, workers, quiet
+        self.bar = shown.add_task("search", total=1.0, note="reading recordings")
+        self.title = ""
+
+    def on_note(self, text: str) -> None:
+        """Print a sentence."""
+        if not self.quiet:
+            out.print(text)
+
+    def on_phase(self, name: str, diary: Diary) -> None:
+        """A phase begins."""
+        from edp.search.phases import PHASES
+
+        self.title = f"phase {list(PHASES).index(name) + 1} of {len(PHASES)}, {PHASES[name].title}"
+        self.on_progress(diary)
+
+    def on_progress(self, diary: Diary) -> None:
+        """Show how far it is."""
+        counts, left = diary.counts(), diary.seconds_left(self.workers)
+        running = min(self.workers, counts["asked"] - counts["done"])
+        note = f"{self.title}: {counts['done']} trainings, {running} running, {counts['total'] - counts['done']} left"
+        self.shown.update(self.bar, completed=counts["done"] / max(1, counts["total"]), note=note)
+        self.steps.say(f"search: {note}" + ("" if left is None else f", at most {duration(left)}"))
+
+    def on_decision(self, decision: Decision) -> None:
+        """Print what was decided, and why."""
+        from edp.search.phases import PHASES
+
+        if not self.quiet:
+            out.print(f"[bold]{PHASES[decision.phase].title}[/]")
+            for sentence in decision.sentences:
+                out.print("  " + sentence.replace("[", r"\["))
+
+
+def _facts(found: Found) -> dict[str, Any]:
+    return {
+        "study": str(found.folder),
+        "state": found.state,
+        "phases": list(found.ground.decided),
+        "trained_now": found.trained,
+        "digest": found.digest,
+        "decisions": [decision.to_json() for decision in found.ground.decided.values()],
+        "teacher": None if found.teacher is None else str(found.teacher),
+    }
+
+
+def _show(found: Found, data: Path) -> None:
+    out.print(f"study: {found.folder}, {found.state}; {found.trained} trainings now")
+    if found.teacher is None:
+        out.print("next: the same command without --phase, or with a later one")
+    else:
+        out.print(f"next: edp train {data} --config {found.teacher} --out runs/teacher")
+
+
+def _show_status(held: dict[str, Any]) -> None:
+    counts = held["counts"]
+    running = f"process {held['holder']}" if held["holder"] else "nobody now"
+    out.print(f"{held['data']['path']}: {held['data']['sessions']} sessions, {held['data']['hours']:.2f} h")
+    out.print(f"mode {held['mode']}, {held['state']}, coordinated by {running}; written {held['updated']}")
+    rows = [
+        (
+            phase["title"],
+            f"{phase['trained']}/{phase['trainings']}",
+            phase["failed"],
+            duration(phase["seconds"]),
+            "decided" if phase["ended"] else "under way",
+        )
+        for phase in held["phases"]
+    ]
+    table("phases", ["phase", "trainings", "failed", "training time", "state"], rows)
+    out.print(f"{counts['done']} trainings done, {held['running']} running, {counts['total'] - counts['done']} left")
+    for decision in held["decisions"]:
+        for sentence in decision["sentences"]:
+            out.print("  " + sentence.replace("[", r"\["))

@@ -1,0 +1,239 @@
+"""What a study has done so far, as plain values in ``study.json``: for progress, for its report, for a look aside."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from edp.config import Table
+from edp.errors import StorageError
+from edp.ledger import Opening, Record
+from edp.search.ground import Decision, Ground, Outcome
+from edp.search.modules import MODULES
+from edp.search.phases import PHASES
+from edp.search.trainings import Order
+from edp.storage import held_by, read_json, write_json
+
+SCHEMA = 1
+FILE = "study.json"
+EVERY_S = 2.0
+
+
+class Diary:
+    """Writes down what happens, at most every two seconds but for decisions and the end.
+
+    Rows of trainings stand in the order in which they were asked for, whatever order they ended in, so that a search
+    that was stopped and went on writes what one that was not would have written, times apart.
+
+    Args:
+        folder: of the study.
+        facts: what does not change: mode, preset, data, spec, sessions.
+        ground: of the search, before any decision.
+
+    Attributes:
+        trained: trainings of this sitting.
+        decisions: of the phases that have ended.
+        openings: looks into the lock-box.
+        state: ``running``, ``stopped`` or ``finished``.
+    """
+
+    def __init__(self, folder: Path, facts: Mapping[str, Any], ground: Ground) -> None:
+        self.file = folder / FILE
+        self.facts = dict(facts)
+        self.horizon = ground.spec.horizon
+        self.decisions: list[Decision] = []
+        self.phases: dict[str, dict[str, Any]] = {}
+        self.rows: dict[str, dict[str, Any]] = {}
+        self.openings: list[Opening] = []
+        self.trained = 0
+        self._expected = {name: phase.trainings(ground) for name, phase in PHASES.items()}
+        self._seconds = 0.0
+        self._phase_began = 0.0
+        self._written = 0.0
+        held = _held_before(self.file)
+        self._before = {phase["name"]: phase for phase in held.get("phases", [])}
+        self.facts["created"] = held.get("created", _now())
+        self.state = "running"
+
+    def on_phase(self, name: str, ground: Ground) -> None:
+        """A phase begins."""
+        held = self._before.get(name, {})
+        self._phase_began = time.monotonic()
+        self._expected[name] = PHASES[name].trainings(ground)
+        self.phases[name] = {
+            "name": name,
+            "title": PHASES[name].title,
+            "trainings": 0,
+            "trained": 0,
+            "failed": 0,
+            "seconds": 0.0,
+            "wall_s": 0.0,
+            "began": held.get("began", _now()),
+            "ended": None,
+        }
+        for later in list(PHASES)[list(PHASES).index(name) + 1 :]:
+            self._expected[later] = PHASES[later].trainings(ground)
+        self.write(force=True)
+
+    def on_orders(self, keys: Sequence[str], orders: Sequence[Order]) -> None:
+        """A batch of trainings is asked for; those that were asked for before are no new ones."""
+        phase = self._phase
+        for key, order in zip(keys, orders, strict=True):
+            if key not in self.rows:
+                phase["trainings"] += 1
+                label = label_of(order.settings)
+                self.rows[key] = {"phase": phase["name"], "number": len(self.rows), "label": label, "status": "waiting"}
+
+    def on_record(self, record: Record, order: Order, trained: bool) -> None:
+        """A training is in the ledger."""
+        row = self.rows[record.key]
+        if row["status"] != "waiting":
+            return
+        outcome = Outcome(order, str(record.status), record.result, record.message)
+        score, result = outcome.mean(self.horizon), record.result or {}
+        seconds = float(record.measured.get("seconds", 0.0))
+        row |= {
+            "status": outcome.status,
+            "score": score if score == score else None,
+            "seconds": round(seconds, 3),
+            "parameters": result.get("parameters"),
+            "macs_tick": result.get("macs_tick"),
+        }
+        if record.message:
+            row["message"] = record.message
+        phase = self.phases[row["phase"]]
+        phase["seconds"] = round(phase["seconds"] + seconds, 3)
+        phase["trained"] += 1
+        phase["failed"] += outcome.status != "done"
+        if trained:
+            self.trained += 1
+            self._seconds += seconds
+        self.write()
+
+    def on_decision(self, decision: Decision) -> None:
+        """A phase ends."""
+        phase, held = self._phase, self._before.get(decision.phase, {})
+        spent = time.monotonic() - self._phase_began
+        phase["wall_s"] = round(max(spent, float(held.get("wall_s", 0.0))), 1)
+        phase["ended"] = held.get("ended") or _now()
+        self.decisions.append(decision)
+        self.write(force=True)
+
+    def end(self, state: str) -> None:
+        """The search is finished, or stopped."""
+        self.state = state
+        self.write(force=True)
+
+    def counts(self) -> dict[str, int]:
+        """Trainings that are done, that were asked for, and that there will be in all at most."""
+        done = sum(row["status"] != "waiting" for row in self.rows.values())
+        ahead = sum(self._expected[name] for name in PHASES if name not in self.phases)
+        current = 0
+        if self.phases:
+            phase = self._phase
+            if phase["ended"] is None:
+                current = max(0, self._expected[phase["name"]] - phase["trainings"])
+        return {"done": done, "asked": len(self.rows), "total": len(self.rows) + current + ahead}
+
+    def seconds_left(self, workers: int) -> float | None:
+        """From the trainings of this sitting, or else of earlier ones; None before the first."""
+        counts = self.counts()
+        if self.trained:
+            each = self._seconds / self.trained
+        elif counts["done"]:
+            each = sum(row.get("seconds") or 0.0 for row in self.rows.values()) / counts["done"]
+        else:
+            return None
+        return (counts["total"] - counts["done"]) * each / workers
+
+    def to_json(self) -> Table:
+        """The whole, plain."""
+        return {
+            "schema": SCHEMA,
+            "state": self.state,
+            **self.facts,
+            "modules": {name: module.title for name, module in MODULES.items()},
+            "decisions": [decision.to_json() for decision in self.decisions],
+            "phases": list(self.phases.values()),
+            "history": list(self.rows.values()),
+            "openings": [vars(one) | {"judged": list(one.judged)} for one in self.openings],
+            "counts": self.counts(),
+            "updated": _now(),
+        }
+
+    def write(self, force: bool = False) -> None:
+        """Write it, unless that was done a moment ago."""
+        now = time.monotonic()
+        if force or now - self._written >= EVERY_S:
+            write_json(self.file, self.to_json())
+            self._written = time.monotonic()
+
+    @property
+    def _phase(self) -> dict[str, Any]:
+        return list(self.phases.values())[-1]
+
+
+def read_study(folder: str | Path) -> Table:
+    """What a study has written down.
+
+    Raises:
+        StorageError: no study is there, it cannot be read, or it is of another version.
+    """
+    file = Path(folder, FILE)
+    if not file.is_file():
+        raise StorageError(f"'{folder}' holds no study ({FILE} is missing); give the folder of edp search --study")
+    held: Table = read_json(file)
+    if held.get("schema") != SCHEMA:
+        raise StorageError(
+            f"'{file}' is of schema {held.get('schema')}, this version reads {SCHEMA}; run edp search on the folder "
+            "again, which writes it anew from the ledger"
+        )
+    return held
+
+
+def look_at(folder: str | Path) -> Table:
+    """What a study has written down, and who works on it: ``holder`` (process, None for nobody), ``running``.
+
+    Raises:
+        StorageError: as `read_study`.
+    """
+    held = read_study(folder)
+    ledger = Path(folder, "ledger")
+    holder = held_by(ledger / ".lock")
+    claims = list((ledger / "claims").glob("*.lock")) if holder else []
+    if held["state"] == "running" and holder is None:
+        held["state"] = "killed"
+    return held | {"holder": holder, "running": len(claims)}
+
+
+def label_of(settings: Table) -> str:
+    """A training in a few words: backbone, feature set, and what else is in the network."""
+    task, model = settings["task"], settings["model"]
+    features = task["features"] if isinstance(task["features"], str) else task["features"]["name"]
+    backbone = model["backbone"]
+    cell = backbone.get("cell", {}).get("kind", "lstm")
+    extra = [] if cell == "lstm" else [cell]
+    extra += [block["kind"] for block in model["blocks"]]
+    extra += [part for part in ("physics",) if model.get(part)]
+    extra += ["zoneout"] if backbone.get("zoneout") else []
+    head = model.get("head", {})
+    extra += [f"{head['kind']} head"] if head.get("kind", "mlp") != "mlp" else []
+    extra += ["deeper head"] if head.get("layers", 1) > 1 else []
+    activation = model.get("activation", {}).get("kind", "identity")
+    extra += [] if activation == "identity" else [activation]
+    return " + ".join([f"{backbone['kind']} {features}", *extra])
+
+
+def _held_before(file: Path) -> Table:
+    """What an earlier sitting wrote; what cannot be read is written anew, since the ledger holds all that counts."""
+    try:
+        held = read_json(file)
+    except StorageError:
+        return {}
+    return held if isinstance(held, dict) and held.get("schema") == SCHEMA else {}
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%S%z")

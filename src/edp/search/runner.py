@@ -1,0 +1,306 @@
+"""A whole search: data read and bound, sessions set apart, phases walked through, everything written down."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from edp.config import Experiment, Table, build
+from edp.errors import ConfigError, DataError, LostError
+from edp.ledger import Ledger, Record, Status
+from edp.recording import Recording
+from edp.search.conduct import conduct
+from edp.search.diary import Diary
+from edp.search.doing import Doing
+from edp.search.executor import Executor
+from edp.search.ground import Decision, Ground, Outcome, set_apart
+from edp.search.local import LocalPool
+from edp.search.phases import PHASES
+from edp.search.plan import SearchPlan, plain_spec
+from edp.search.trainings import Order, settings_of
+from edp.sources import DataSource
+from edp.storage import make_folder, write_bytes
+
+BOX = "test sessions"
+TEACHER = "teacher.toml"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crew:
+    """Who does the trainings.
+
+    Attributes:
+        workers: processes of this machine; 0 for one to each of its cores (of those that this process may use) over
+            `threads`.
+        threads: of each training; another number gives other bits, and is another training.
+        seconds: cap on the time of a training.
+        memory_mb: cap on its memory.
+
+    Raises:
+        ConfigError: a number out of range.
+    """
+
+    workers: int = 0
+    threads: int = 1
+    seconds: float | None = None
+    memory_mb: float | None = None
+
+    def __post_init__(self) -> None:
+        caps = [cap for cap in (self.seconds, self.memory_mb) if cap is not None]
+        if self.workers < 0 or self.threads < 1 or any(cap <= 0 for cap in caps):
+            raise ConfigError(
+                f"workers = {self.workers}, threads = {self.threads}, caps {self.seconds} s and {self.memory_mb} MB; "
+                "workers >= 0, threads >= 1 and caps above 0 must hold"
+            )
+
+    @property
+    def size(self) -> int:
+        """Processes."""
+        return self.workers or max(1, len(os.sched_getaffinity(0)) // self.threads)
+
+    def gather(self) -> Executor:
+        """What does the trainings."""
+        return LocalPool(self.size, self.threads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Watchers:
+    """Who is told of a search under way.
+
+    Attributes:
+        on_note: a sentence, such as that damaged records were set apart.
+        on_phase: a phase begins: its name.
+        on_progress: a training is asked for or has ended.
+        on_decision: a phase has decided.
+    """
+
+    on_note: Callable[[str], None] = lambda text: None
+    on_phase: Callable[[str, Diary], None] = lambda name, diary: None
+    on_progress: Callable[[Diary], None] = lambda diary: None
+    on_decision: Callable[[Decision], None] = lambda decision: None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search has found so far.
+
+    Attributes:
+        folder: of the study.
+        ground: with the decisions.
+        state: ``finished``, or ``stopped`` where not all phases were to run.
+        digest: hash over the results of all trainings.
+        trained: trainings of this sitting.
+        teacher: settings of the winner as an experiment file; None before phase 4.
+    """
+
+    folder: Path
+    ground: Ground
+    state: str
+    digest: str
+    trained: int
+    teacher: Path | None = field(default=None)
+
+
+def run_search(
+    source: DataSource,
+    plan: SearchPlan,
+    folder: str | Path,
+    crew: Crew | None = None,
+    until: str | None = None,
+    watchers: Watchers | None = None,
+) -> Found:
+    """Search, or go on with a search where it stopped.
+
+    Args:
+        source: where the recordings are; each is a session.
+        plan: what is searched.
+        folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml``.
+        crew: who does the trainings.
+        until: name of the last phase to run.
+        watchers: are told of what happens.
+
+    Raises:
+        BusyError: another process searches in this folder.
+        ConfigError: the study was begun with other data, space, settings or network; an unknown phase.
+        DataError: recordings that are the same session twice, too few of them, or without a channel that is needed.
+        LostError: the processes of a training were killed again and again.
+        StorageError: the disk is full or the folder cannot be written; what was done stays.
+    """
+    crew, watchers = crew or Crew(), watchers or Watchers()
+    if until is not None:
+        _ = PHASES[until]
+    target = make_folder(folder)
+    with ExitStack() as open_things:
+        ledger = open_things.enter_context(Ledger(target / "ledger"))
+        if ledger.damaged:
+            watchers.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
+        data = _Data.read(source, plan)
+        ledger.bind({"data": data.digest, **plan.to_plain()})
+        development, test = set_apart(data.names, data.families, plan.spec)
+        ground = Ground(plan.spec, settings_of(plan.experiment), source.to_plain(), development, test, data.channels)
+        diary = Diary(target, _facts(plan, data, source, ground), ground)
+        executor = open_things.enter_context(crew.gather())
+        work = _Work(ledger, diary, ground, watchers)
+        doing = Doing(
+            ledger, executor, data.digest, crew.threads, crew.seconds, crew.memory_mb, work.on_record, work.on_orders
+        )
+        state = "stopped"
+        try:
+            ground = conduct(
+                ground,
+                lambda orders: _whole(doing(orders)),
+                until,
+                on_decision=work.on_decision,
+                on_phase=work.on_phase,
+            )
+            state = "finished" if len(ground.decided) == len(PHASES) else "stopped"
+        finally:
+            diary.openings = ledger.openings()
+            diary.end(state)
+        return Found(target, ground, state, ledger.digest(), diary.trained, _write_teacher(target, ground))
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What a search must know of its recordings; they themselves are read by those who train."""
+
+    names: tuple[str, ...]
+    families: dict[str, str]
+    channels: tuple[str, ...]
+    digest: str
+    hours: float
+
+    @staticmethod
+    def read(source: DataSource, plan: SearchPlan) -> _Data:
+        recordings = source.read()
+        _refuse_twice(recordings)
+        _check_channels(recordings, plan)
+        names = tuple(recording.name for recording in recordings)
+        # Names such as m22_003_dig say what a session is of; a kind with one session is no kind.
+        kinds = {name: re.sub(r"\d+", "", name) for name in names}
+        count = Counter(kinds.values())
+        families = {name: kind if count[kind] > 1 else "" for name, kind in kinds.items()}
+        state = hashlib.blake2b(digest_size=16)
+        for recording in recordings:
+            state.update(f"{recording.name}\0{recording.digest}\0".encode())
+        hours = sum(recording.duration_s for recording in recordings) / 3600
+        return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours)
+
+
+class _Work:
+    """Passes on what happens, and opens the lock-box when a batch is to be judged on the test sessions."""
+
+    def __init__(self, ledger: Ledger, diary: Diary, ground: Ground, watchers: Watchers) -> None:
+        self.ledger, self.diary, self.ground, self.watchers = ledger, diary, ground, watchers
+        self.orders: dict[str, Order] = {}
+
+    def on_phase(self, name: str, ground: Ground) -> None:
+        self.diary.on_phase(name, ground)
+        self.watchers.on_phase(name, self.diary)
+
+    def on_orders(self, keys: Sequence[str], orders: Sequence[Order]) -> None:
+        self.orders = dict(zip(keys, orders, strict=True))
+        sealed = sorted({key for key, order in self.orders.items() if set(order.judged) & set(self.ground.test)})
+        if sealed:
+            self.ledger.open_box(BOX, sealed, "phase 4: its winner and the baseline, trained at length")
+            self.diary.openings = self.ledger.openings()
+        self.diary.on_orders(keys, orders)
+        self.watchers.on_progress(self.diary)
+
+    def on_record(self, record: Record, trained: bool) -> None:
+        self.diary.on_record(record, self.orders[record.key], trained)
+        self.watchers.on_progress(self.diary)
+
+    def on_decision(self, decision: Decision) -> None:
+        self.diary.on_decision(decision)
+        self.watchers.on_decision(decision)
+
+
+def _whole(outcomes: list[Outcome]) -> list[Outcome]:
+    """The outcomes of a batch, unless they tell of a fault that a decision must not rest on.
+
+    Raises:
+        LostError: a training was lost.
+        DataError: every one of several trainings ended in an error.
+    """
+    lost = [outcome for outcome in outcomes if outcome.status == Status.LOST]
+    if lost:
+        raise LostError(
+            f"{len(lost)} trainings were lost: {lost[0].message}. What is done is kept; free memory or take fewer "
+            "workers, and give the same command again"
+        )
+    failed = [outcome for outcome in outcomes if outcome.status == Status.FAILED]
+    if len(outcomes) > 1 and len(failed) == len(outcomes):
+        raise DataError(f"all {len(outcomes)} trainings of a batch failed; the first says: {failed[0].message}")
+    return outcomes
+
+
+def _refuse_twice(recordings: Sequence[Recording]) -> None:
+    """The same session twice would train and judge."""
+    seen: dict[str, str] = {}
+    for recording in recordings:
+        if recording.digest in seen:
+            raise DataError(
+                f"'{recording.name}' and '{seen[recording.digest]}' are the same session, value for value; one of "
+                "them would train and the other judge, or test: remove one (edp inspect names all that repeat)"
+            )
+        seen[recording.digest] = recording.name
+
+
+def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> None:
+    """Every feature set can be had of every recording."""
+    kinds: dict[tuple[str, ...], Recording] = {}
+    for recording in recordings:
+        kinds.setdefault(recording.channel_names, recording)
+    for name, features in plan.spec.feature_sets.items():
+        settings = settings_of(plan.experiment)
+        settings["task"] = {**settings["task"], "features": features}
+        experiment = build(Experiment, settings, "of the search")
+        for recording in kinds.values():
+            try:
+                names = recordings[0].channel_names
+                task = experiment.task.resolve(recording.rate_hz, names, experiment.model.physics)
+                task.series(recording)
+            except (ConfigError, DataError) as error:
+                raise DataError(
+                    f"feature set {name} cannot be had of '{recording.name}': {error}; name others with --set "
+                    "search.features=[...] (a file of edp screen is one)"
+                ) from error
+
+
+def _facts(plan: SearchPlan, data: _Data, source: DataSource, ground: Ground) -> Table:
+    return {
+        "mode": plan.spec.mode,
+        "preset": plan.preset,
+        "data": {
+            "path": str(source.path),
+            "sessions": len(data.names),
+            "hours": round(data.hours, 4),
+            "hash": data.digest,
+        },
+        "spec": plain_spec(plan.spec),
+        "sessions": {"development": list(ground.development), "test": list(ground.test)},
+    }
+
+
+def _write_teacher(folder: Path, ground: Ground) -> Path | None:
+    """The winner's settings, as `edp train --config` takes them."""
+    settings: Any = None
+    if "exploration" in ground.decided:
+        settings = ground.decided["exploration"].facts["teacher_settings"]
+    elif "synthesis" in ground.decided:
+        settings = ground.decided["synthesis"].facts["settings"]
+    if settings is None:
+        return None
+    file = folder / TEACHER
+    write_bytes(file, tomli_w.dumps(settings).encode())
+    return file
