@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.logs.limits import check_memory
+from edp.limits import check_memory
 from edp.logs.raw import RawLog, RawSignal, Table
 from edp.logs.repair import Mask, Repair, mend_gaps, mend_stamps, mend_values
 from edp.logs.resolve import Wanted

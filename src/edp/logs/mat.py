@@ -10,20 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
-from edp.logs.mat_check import check_size
-from edp.logs.mat_layouts import INFO, LAYOUTS
-from edp.logs.mat_objects import Found, collect
-from edp.logs.matlab import matio
+from edp.logs.mat_layouts import LAYOUTS
 from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import FORMATS, TRUTH, Column, RawLog, RawSignal, WriteOptions, find_time, parted, time_factor
+from edp.logs.units import normalise_unit
+from edp.matlab import INFO, MAGIC, Found, is_v4, unpack
 from edp.recording import Recording
 from edp.signals import SignalMap
 
-_MAGIC = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 _VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
 
 
@@ -37,27 +34,25 @@ class MatFormat:
 
     def claims(self, head: bytes) -> bool:
         """The text header of v5 and v7.3 (also when cut off), or the numbers of a v4 header."""
-        if any(head.startswith(magic) or magic.startswith(head) for magic in _MAGIC):
+        if any(head.startswith(magic) or magic.startswith(head) for magic in MAGIC):
             return True
-        return _is_v4(head)
+        return is_v4(head)
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read all variables, or the one that the map names."""
-        variables = _load(path)
-        own = _own(variables.pop(INFO, None), path)
+        found = unpack(path, signal_map.variable)
+        own = OwnFacts() if found.info is None else own_facts(found.info, f"'{path}', variable '{INFO}'")
         if signal_map.variable is not None:
-            if signal_map.variable not in variables:
+            if signal_map.variable not in found.names:
                 raise DataError(
-                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, variables)}; "
+                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, found.names)}; "
                     "set 'variable' in the signal map to an existing one"
                 )
-            variables = {signal_map.variable: variables[signal_map.variable]}
             if signal_map.variable == TRUTH and own.truth:
                 own = replace(own, channels=own.truth, digest=own.truth_digest)
-        found = collect(variables)
         if not found.signals:
             raise DataError(
-                f"'{path}' holds no signals (variables: {', '.join(list(variables)[:12]) or 'none'}); expected "
+                f"'{path}' holds no signals (variables: {', '.join(found.names[:12]) or 'none'}); expected "
                 "numeric vectors, structs of them, timeseries, a Dataset or a timetable"
             )
         return _raw_log(path, found, own, signal_map)
@@ -73,6 +68,8 @@ class MatFormat:
                 f"channel(s) {', '.join(long)} cannot be MATLAB names (letters, digits, underscore, at most 63); "
                 "rename them in the signal map"
             )
+        from edp.matlab.library import matio
+
         layout = LAYOUTS[options.mat_layout]
         measured, truth = parted(recording) if options.truth == "apart" else (recording, None)
         variables = layout.variables(measured or recording)
@@ -91,64 +88,13 @@ class MatFormat:
                 if options.mat_version == "v7.3":
                     # mat-io leaves the text of a v5 header there; MATLAB goes by the version number behind it.
                     with path.open("rb+") as stream:
-                        stream.write(_MAGIC[1])
+                        stream.write(MAGIC[1])
             except RuntimeError as error:
                 # h5py reports a failed write (disk full) as RuntimeError.
                 raise OSError(str(error)) from error
 
 
 FORMATS.register("mat")(MatFormat())
-
-
-def _is_v4(head: bytes) -> bool:
-    if len(head) < 20:
-        return False
-    for order in ("<", ">"):
-        kind, rows, columns, imaginary, name = (int(x) for x in np.frombuffer(head[:20], dtype=f"{order}i4"))
-        digits = [int(digit) for digit in f"{kind:04d}"] if 0 <= kind < 5000 else []
-        sizes_fit = rows >= 0 and columns >= 0 and imaginary in (0, 1) and 1 < name < 64
-        if digits and digits[1] == 0 and digits[2] <= 5 and digits[3] <= 2 and sizes_fit:
-            text = head[20 : 20 + name]
-            return len(text) == name and text.endswith(b"\0") and text[:1].isalpha()
-    return False
-
-
-def _load(path: Path) -> dict[str, Any]:
-    with path.open("rb") as stream:
-        head = stream.read(128)
-    if any(magic.startswith(head[: len(magic)]) for magic in _MAGIC) and len(head) < 128:
-        raise DataError(f"'{path}' is a MAT file that ends inside its header (truncated); copy or export it again")
-    if not _is_v4(head):
-        check_size(path)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            if _is_v4(head):
-                variables = scipy.io.loadmat(str(path))
-            else:
-                variables = matio.load_from_mat(str(path), add_table_attrs=True)
-        except Exception as error:
-            # The parsers meet damaged bytes with any exception there is; every one means the same to the user.
-            raise DataError(
-                f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {error}); it may be truncated or "
-                "damaged: copy or export it again"
-            ) from error
-    failed = [str(item.message) for item in caught if "Failed to load" in str(item.message)]
-    if failed:
-        raise DataError(f"'{path}': an object in this MAT file is damaged ({failed[0]}); copy or export it again")
-    nameless = [name for name in variables if not isinstance(name, str)]
-    if nameless:
-        raise DataError(
-            f"'{path}' holds a variable whose name is no text ({nameless[0]!r}); it is damaged: copy or export it again"
-        )
-    return {name: value for name, value in variables.items() if not name.startswith("__")}
-
-
-def _own(value: Any, path: Path) -> OwnFacts:
-    if value is None:
-        return OwnFacts()
-    array = np.asarray(value)
-    return own_facts(str(array.ravel()[0]) if array.size else "", f"'{path}', variable '{INFO}'")
 
 
 class _Table:
@@ -184,7 +130,7 @@ def _raw_log(path: Path, found: Found, own: OwnFacts, signal_map: SignalMap) -> 
             partial(np.asarray, part.values, dtype=np.float64),
             len(part.values),
             own_time,
-            unit=part.unit or (channel.unit if channel else None),
+            unit=normalise_unit(part.unit) or (channel.unit if channel else None),
             kind=channel.kind if channel else None,
             description=channel.description if channel else "",
             table=table,

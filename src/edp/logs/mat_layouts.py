@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from edp.logs.matlab import MatlabOpaque
-from edp.logs.matlab import pandas as pd
 from edp.recording import Recording
 from edp.registry import Registry
 
-INFO = "edp_info"
+if TYPE_CHECKING:
+    from edp.matlab.library import MatlabOpaque
+
 _DATASET = "Simulink.SimulationData.Dataset"
 _STORAGE = "Simulink.SimulationData.Storage.RamDatasetStorage"
 
@@ -53,6 +53,8 @@ def _struct(recording: Recording) -> Any:
 
 
 def _object(classname: str, **properties: Any) -> MatlabOpaque:
+    from edp.matlab.library import MatlabOpaque
+
     return MatlabOpaque(properties=properties, classname=classname)
 
 
@@ -151,6 +153,8 @@ def _saved(classname: str, fields: dict[str, Any]) -> MatlabOpaque:
 
 def _timetable(recording: Recording) -> Any:
     """A ``timetable`` with one variable per channel."""
+    from edp.matlab.library import pandas as pd
+
     stamps = np.rint(np.arange(recording.samples) * (1e9 / recording.rate_hz)).astype("timedelta64[ns]")
     columns = {name: np.ascontiguousarray(recording.column(name)) for name in recording.channel_names}
     return pd.DataFrame(columns, index=pd.TimedeltaIndex(stamps, name="Time"))

@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 
 from edp.errors import DataError
-from edp.logs.limits import check_memory
+from edp.limits import check_memory
 
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK, _FOOTER = 0x06, 0x02

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.logs.matlab import MatlabOpaque
-from edp.logs.matlab import pandas as pd
-from edp.logs.units import normalise_unit
+from edp.matlab.found import Found, Part
+from edp.matlab.library import MatlabOpaque
+from edp.matlab.library import pandas as pd
 
 _TIME_FIELDS = ("time_s", "time", "Time", "t", "tout")
 _SECONDS = {
@@ -28,26 +27,6 @@ _SECONDS = {
     "hours": 3600.0,
     "days": 86400.0,
 }
-
-
-@dataclass
-class Part:
-    """One column found: its values and own time in seconds, shape ``(time,)``, and unit."""
-
-    name: str
-    values: NDArray[Any]
-    time: NDArray[np.float64] | None
-    unit: str | None = None
-    path: str = ""
-
-
-@dataclass
-class Found:
-    """Everything found in a file."""
-
-    signals: list[Part] = field(default_factory=list)
-    scalars: dict[str, float] = field(default_factory=dict)
-    repeated: dict[str, list[str]] = field(default_factory=dict)
 
 
 def collect(variables: dict[str, Any]) -> Found:
@@ -66,7 +45,21 @@ def collect(variables: dict[str, Any]) -> Found:
         part.name = part.path if counts_now[part.name] > 1 else part.name
         if counts[name] > 1:
             found.repeated.setdefault(name, []).append(part.name)
+    _share_times(found)
     return found
+
+
+def _share_times(found: Found) -> None:
+    """Make equal times one array: a Dataset holds them once a signal, and each would be judged and kept again."""
+    known: list[NDArray[np.float64]] = []
+    for part in found.signals:
+        if part.time is None:
+            continue
+        same = next((time for time in known if time is part.time or np.array_equal(time, part.time)), None)
+        if same is None:
+            known.append(part.time)
+        else:
+            part.time = same
 
 
 def _walk(value: Any, name: str, path: str, time: NDArray[np.float64] | None, found: Found) -> None:
@@ -160,7 +153,7 @@ def _walk_table(table: pd.DataFrame, path: str, found: Found) -> None:
     for i, name in enumerate(table.columns):
         values = table[name].to_numpy()
         if values.dtype.kind in "fiub" and len(values):
-            unit = normalise_unit(str(units[i])) if i < len(units) else None
+            unit = str(units[i]) if i < len(units) else None
             found.signals.append(Part(str(name), values, time, unit, f"{path}.{name}"))
 
 
@@ -213,12 +206,12 @@ def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:
     return np.asarray(((start or 0.0) + step * np.arange(int(length))) * factor, dtype=np.float64)
 
 
-def _timeseries_unit(info: Any) -> str | None:
+def _timeseries_unit(info: Any) -> str:
     facts = info.properties if isinstance(info, MatlabOpaque) and isinstance(info.properties, dict) else {}
     units = facts.get("Units")
     if isinstance(units, MatlabOpaque) and isinstance(units.properties, dict):
         units = units.properties.get("Name")
-    return normalise_unit(_text(units))
+    return _text(units)
 
 
 def _text(value: Any) -> str:

@@ -6,30 +6,31 @@ holds one array (14), whose length stands in its first 8 bytes. v7.3 is HDF5.
 
 from __future__ import annotations
 
-import os
-import signal
 import struct
-import time
-import warnings
 import zlib
 from pathlib import Path
 
 import h5py
 
 from edp.errors import DataError
-from edp.logs.limits import check_memory
+from edp.limits import check_memory
 
 _HEADER = 128
 _PACKED, _MATRIX = 15, 14
 _COPIES = 2
 """An array is in memory as it was unpacked and as a column."""
-_PROBE_S = 8.0
-_PROBE_BYTES_PER_S = 1e8
+_DEFLATE_RATIO = 1100
+"""Deflate packs no better than 1,032 to 1."""
+_UNSTORED_BYTES = 1 << 20
+"""What an array may claim beyond that: HDF5 need not store what was never written."""
 _ADVICE = "it may be damaged, or was made to exhaust memory; else save fewer variables, or Parquet or MDF, in a file"
 
 
-def check_size(path: Path) -> None:
+def check_size(path: Path) -> int:
     """Add up what the variables of a file take.
+
+    Returns:
+        bytes when unpacked.
 
     Raises:
         DataError: the file is cut off or damaged, or its variables do not fit into memory.
@@ -37,6 +38,7 @@ def check_size(path: Path) -> None:
     # The text of the header does not tell: some writers leave that of v5 before HDF5.
     total = _announced_v73(path) if h5py.is_hdf5(path) else _announced_v5(path)
     check_memory(path, _COPIES * total, "the variables of this MAT file", _ADVICE)
+    return total
 
 
 def _announced_v5(path: Path) -> int:
@@ -53,7 +55,10 @@ def _announced_v5(path: Path) -> int:
                     f"'{path}' is a MAT file that is cut off: a variable at byte {at} has {length} bytes, the file "
                     f"ends after {size}; copy or export it again"
                 )
-            total += _unpacked(stream.read(min(length, 256)), order) if kind == _PACKED else length
+            held = _unpacked(stream.read(min(length, 256)), order) if kind == _PACKED else length
+            if held > _DEFLATE_RATIO * (length + 64):
+                raise _impossible(path, f"the variable at byte {at}", held, length)
+            total += held
             at += 8 + length
     return total
 
@@ -70,54 +75,22 @@ def _unpacked(start: bytes, order: str) -> int:
     return int(length) if kind == _MATRIX else 0
 
 
-def _probe(path: Path) -> None:
-    """Walk a file's structure in a process of its own: HDF5 itself may loop for ever, or crash, on damaged bytes."""
-    if not hasattr(os, "fork"):
-        return
-    deadline = time.monotonic() + _PROBE_S + path.stat().st_size / _PROBE_BYTES_PER_S
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        child = os.fork()
-    if child == 0:
-        try:
-            with h5py.File(path, "r") as file:
-                file.visititems(_attributes)
-        finally:
-            # Other errors are met again, and told, by the process that reads.
-            os._exit(0)
-    pause = 1e-4
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            break
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            status = signal.SIGKILL
-            break
-        time.sleep(pause)
-        pause = min(2 * pause, 0.01)
-    if status:
-        raise DataError(f"'{path}' is a damaged MAT file: HDF5 finds no end in its structure; copy or export it again")
-
-
-def _attributes(_: str, part: h5py.HLObject) -> None:
-    for name in part.attrs:
-        part.attrs[name]
-
-
 def _announced_v73(path: Path) -> int:
-    _probe(path)
     total = 0
 
-    def add(_: str, part: h5py.HLObject) -> None:
+    def add(name: str, part: h5py.HLObject) -> None:
         nonlocal total
         if isinstance(part, h5py.Dataset):
-            total += part.size * part.dtype.itemsize
+            held, stored = part.size * part.dtype.itemsize, part.id.get_storage_size()
+            if held > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
+                raise _impossible(path, f"the array '{name}'", held, stored)
+            total += held
 
     try:
         with h5py.File(path, "r") as file:
             file.visititems(add)
+    except DataError:
+        raise
     except Exception as error:
         # h5py meets damaged bytes with exceptions of many kinds; every one means the same to the user.
         raise DataError(
@@ -125,3 +98,10 @@ def _announced_v73(path: Path) -> int:
             "copy or export it again"
         ) from error
     return total
+
+
+def _impossible(path: Path, what: str, held: int, stored: int) -> DataError:
+    return DataError(
+        f"'{path}': {what} claims {held} bytes, packed into {stored}; it may be damaged, or was made to exhaust "
+        "memory: copy or export it again"
+    )
