@@ -104,6 +104,23 @@ def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
     emit(as_json, held, lambda: _show_status(held))
 
 
+@app.command("export")
+def export(
+    study: StudyArgument,
+    output: Annotated[Path | None, typer.Option("--out", help="The journal; default: optuna.journal in DIR.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Copy the questions of phases 1, 4 and 5 into a journal for optuna-dashboard; the study itself stays as it is.
+
+    Example: `edp search export studies/first && optuna-dashboard studies/first/optuna.journal`
+    """
+    from edp.search.export import export_study
+
+    file, names = export_study(study, output)
+    facts = {"journal": str(file), "studies": names}
+    emit(as_json, facts, lambda: out.print(f"{len(names)} studies in {file}\nnext: optuna-dashboard {file}"))
+
+
 class SearchDisplay:
     """Shows phases, trainings and the time left; decisions as sentences."""
 

@@ -121,17 +121,27 @@ def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
 
 
 def _spec(table: Table, where: str) -> SearchSpec:
-    space = dict(THESIS)
-    for name, given in dict(table.pop("space", {})).items():
+    space = space_of(table.pop("space", {}), THESIS, where)
+    if not space:
+        raise ConfigError(f"settings {where}: search.space holds no dimension; leave at least one in")
+    return replace(build(SearchSpec, table, f"{where}, search"), space=space)
+
+
+def space_of(table: Mapping[str, Any], over: Space | None = None, where: str = "of a study") -> dict[str, Range]:
+    """A space from its form in a settings file, laid over another one.
+
+    Raises:
+        ConfigError: an unknown dimension, or a range that holds nothing.
+    """
+    space = dict(over or {})
+    for name, given in dict(table).items():
         if name not in DIMENSIONS:
             raise ConfigError(f"settings {where}: unknown dimension 'search.space.{name}'{closest(name, DIMENSIONS)}")
         if given is False:
             space.pop(name, None)
         else:
             space[name] = _range(given, f"{where}: search.space.{name}")
-    if not space:
-        raise ConfigError(f"settings {where}: search.space holds no dimension; leave at least one in")
-    return replace(build(SearchSpec, table, f"{where}, search"), space=space)
+    return space
 
 
 def _range(given: Any, where: str) -> Range:

@@ -12,10 +12,12 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edp.errors import ConfigError
 from edp.search.space import Candidate, Choice, Range, Real, Space, Value, check, names
+from edp.storage import replacing
 
 if TYPE_CHECKING:
     import optuna
@@ -235,6 +237,57 @@ def _distribution(held: Range) -> Any:
     return CategoricalDistribution(held.options)
 
 
+@dataclass(frozen=True)
+class Told:
+    """A study that is over: what was asked and what came of it, for a viewer.
+
+    Attributes:
+        name: of the study.
+        space: dimensions and their ranges.
+        rows: of each question the values of its dimensions, its objectives (None where it was not trained to its end),
+            and what else is known of it.
+        objectives: names of what was made small.
+    """
+
+    name: str
+    space: Space
+    rows: Sequence[tuple[Candidate, Sequence[float] | None, dict[str, Any]]]
+    objectives: tuple[str, ...]
+
+
+def write_journal(path: str | Path, studies: Sequence[Told]) -> None:
+    """A copy of studies as a journal that Optuna and its dashboard read; replaced whole, never appended to.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
+    logging.getLogger("optuna").setLevel(logging.ERROR)
+    with replacing(path) as temporary:
+        storage = optuna.storages.JournalStorage(JournalFileBackend(str(temporary)))
+        for held in studies:
+            directions: list[Any] = ["minimize"] * len(held.objectives)
+            study = optuna.create_study(storage=storage, study_name=held.name, directions=directions)
+            study.set_user_attr("objectives", list(held.objectives))
+            study.add_trials([_frozen(held.space, *row) for row in held.rows])
+
+
+def _frozen(
+    space: Space, values: Candidate, objectives: Sequence[float] | None, known: dict[str, Any]
+) -> optuna.trial.FrozenTrial:
+    from optuna.trial import TrialState, create_trial
+
+    return create_trial(
+        state=TrialState.FAIL if objectives is None else TrialState.COMPLETE,
+        values=None if objectives is None else list(objectives),
+        params=dict(values),
+        distributions={name: _distribution(space[name]) for name in values},
+        user_attrs=known,
+    )
+
+
 def pareto(points: Sequence[Sequence[float]]) -> list[int]:
     """Places of the points that no other one betters in one value without being worse in another, in order."""
     kept = []
@@ -249,4 +302,14 @@ def pareto(points: Sequence[Sequence[float]]) -> list[int]:
     return kept
 
 
-__all__ = ["SAMPLERS", "Candidate", "SamplerSpec", "Study", "Trial", "Value", "pareto"]
+__all__ = [
+    "SAMPLERS",
+    "Candidate",
+    "SamplerSpec",
+    "Study",
+    "Told",
+    "Trial",
+    "Value",
+    "pareto",
+    "write_journal",
+]

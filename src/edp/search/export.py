@@ -1,0 +1,67 @@
+"""A copy of a study's questions and answers for optuna-dashboard; the ledger stays the only truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+from edp.search.diary import read_study
+from edp.search.plan import space_of
+from edp.search.space import Choice, Range, Space
+from edp.search.study import Told, write_journal
+
+JOURNAL = "optuna.journal"
+NO_VALUES = ("number", "values", "modules", "score", "statuses")
+
+
+def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Path, list[str]]:
+    """Write the studies of phases 1, 4 and 5 as a journal of Optuna: ``optuna-dashboard FILE`` shows them.
+
+    Args:
+        folder: of the study.
+        path: of the journal; default ``optuna.journal`` in the folder. Another file there is replaced.
+
+    Returns:
+        The file, and the names of the studies in it.
+
+    Raises:
+        StorageError: no study, none of these phases has ended, or the file cannot be written.
+    """
+    held = read_study(folder)
+    file = Path(folder, JOURNAL) if path is None else Path(path)
+    studies = told(held)
+    if not studies:
+        raise StorageError(
+            f"'{folder}' has asked no questions yet: phase 1 (calibration) has not ended; go on with edp search, then "
+            "export again"
+        )
+    write_journal(file, studies)
+    return file, [study.name for study in studies]
+
+
+def told(held: Mapping[str, Any]) -> list[Told]:
+    """The studies of phases 1, 4 and 5 that have ended."""
+    space, cost = space_of(held["spec"]["space"]), held["spec"]["cost"]
+    found = []
+    for decision in held["decisions"]:
+        phase, facts = decision["phase"], decision["facts"]
+        if phase == "calibration":
+            for backbone, own in facts["backbones"].items():
+                found.append(_told(f"{phase} {backbone}", own["trials"], space, [], cost))
+        elif phase in ("synthesis", "exploration"):
+            found.append(_told(phase, facts["trials"], space, list(facts["on"]), cost))
+    return found
+
+
+def _told(name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], cost: str) -> Told:
+    full: dict[str, Range] = dict(space) | {module: Choice((0, 1)) for module in modules}
+    objectives = ("composite, mm/s",) if cost == "none" else ("composite, mm/s", cost)
+    rows = []
+    for trial in trials:
+        values = dict(trial["values"]) | {module: int(module in trial.get("modules", ())) for module in modules}
+        score = trial["score"]
+        told_values = None if score is None else [score] if cost == "none" else [score, trial[cost]]
+        rows.append((values, told_values, {key: value for key, value in trial.items() if key not in NO_VALUES}))
+    return Told(name, full, rows, objectives)

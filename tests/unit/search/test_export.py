@@ -1,0 +1,79 @@
+"""The copy for optuna-dashboard says what the study found, and nothing else of the study is touched."""
+
+import json
+
+import optuna
+import pytest
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+
+from edp.errors import ConfigError, StorageError
+from edp.search.export import export_study
+from edp.search.plan import space_of
+from edp.search.space import Choice, Real
+
+SPACE = {"learning_rate": {"low": 1e-4, "high": 5e-3, "log": True}, "units": [8, 16]}
+RATES = ({"learning_rate": 1e-3, "units": 8}, {"learning_rate": 2e-3, "units": 16})
+TRIALS = [
+    {"number": 0, "values": RATES[0], "score": 12.5, "parameters": 100.0, "statuses": ["done"]},
+    {"number": 1, "values": RATES[1], "score": None, "parameters": 300.0, "statuses": ["oom"]},
+]
+JOINT = [{"number": 0, "values": {"learning_rate": 1e-3}, "modules": ["stanh"], "score": 11.0, "parameters": 101.0}]
+
+
+def study(folder, cost="none", decisions=True):
+    found = [
+        {"phase": "isolation", "facts": {}},
+        {"phase": "calibration", "facts": {"backbones": {"lstm": {"trials": TRIALS}}}},
+        {"phase": "synthesis", "facts": {"trials": JOINT, "on": {"stanh": 1.0, "zoneout": 0.0}}},
+    ]
+    held = {"schema": 1, "spec": {"space": SPACE, "cost": cost}, "decisions": found if decisions else found[:1]}
+    (folder / "study.json").write_text(json.dumps(held))
+    return folder
+
+
+def loaded(file, name):
+    return optuna.load_study(study_name=name, storage=JournalStorage(JournalFileBackend(str(file))))
+
+
+def test_questions_and_answers_come_back(tmp_path):
+    file, names = export_study(study(tmp_path))
+    assert (file.name, names) == ("optuna.journal", ["calibration lstm", "synthesis"])
+    first, second = loaded(file, "calibration lstm").trials
+    assert (first.params, first.value) == (RATES[0], 12.5)
+    assert first.user_attrs == {"parameters": 100.0}
+    assert second.state is TrialState.FAIL
+    (joint,) = loaded(file, "synthesis").trials
+    assert joint.params == {"learning_rate": 1e-3, "stanh": 1, "zoneout": 0}
+    assert loaded(file, "synthesis").user_attrs["objectives"] == ["composite, mm/s"]
+
+
+def test_a_second_export_replaces_the_first_and_leaves_nothing_beside_it(tmp_path):
+    export_study(study(tmp_path))
+    file, names = export_study(tmp_path)
+    storage = JournalStorage(JournalFileBackend(str(file)))
+    assert sorted(optuna.get_all_study_names(storage)) == names
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["optuna.journal", "study.json"]
+
+
+def test_a_cost_is_a_second_objective(tmp_path):
+    file, _ = export_study(study(tmp_path, cost="parameters"), tmp_path / "copy.journal")
+    held = loaded(file, "calibration lstm")
+    assert held.trials[0].values == [12.5, 100.0]
+    assert held.user_attrs["objectives"] == ["composite, mm/s", "parameters"]
+
+
+def test_a_study_that_has_asked_nothing_and_a_folder_without_one(tmp_path):
+    with pytest.raises(StorageError, match=r"asked no questions yet: phase 1"):
+        export_study(study(tmp_path, decisions=False))
+    assert not (tmp_path / "optuna.journal").exists()
+    with pytest.raises(StorageError, match="holds no study"):
+        export_study(tmp_path / "nowhere")
+
+
+def test_a_space_comes_back_from_its_plain_form():
+    found = space_of(SPACE)
+    assert found == {"learning_rate": Real(1e-4, 5e-3, log=True), "units": Choice((8, 16))}
+    with pytest.raises(ConfigError, match="unknown dimension"):
+        space_of({"unit": [1, 2]})
