@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,3 +111,39 @@ def _trained(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
 def trained(_trained: Path, tmp_path: Path) -> Path:
     """A copy of a judged run on `logs`, free to be changed."""
     return Path(shutil.copytree(_trained, tmp_path / "trained"))
+
+
+def _start(*args: object) -> subprocess.Popen[str]:
+    """A process of its own group, as a terminal starts one."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "edp", *map(str, args)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # Tests may run in the background, where a shell has Ctrl-C ignored; children would inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
+def _stop_once(process: subprocess.Popen[str], ready: Callable[[], bool], how: int) -> tuple[int, str]:
+    """Send a signal to the group as soon as `ready()`; returns exit code and standard error."""
+    until = time.monotonic() + 120
+    while not ready() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    if process.poll() is None:
+        os.killpg(process.pid, how)
+    _, err = process.communicate(timeout=60)
+    return process.returncode, err
+
+
+@pytest.fixture
+def start() -> Callable[..., subprocess.Popen[str]]:
+    """Start a command line as a terminal does."""
+    return _start
+
+
+@pytest.fixture
+def stop_once() -> Callable[..., tuple[int, str]]:
+    """Stop a process as soon as something holds; exit code and standard error."""
+    return _stop_once

@@ -2,9 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
-import time
 
 from safetensors.numpy import load_file
 
@@ -16,30 +13,6 @@ def weights_of(run):
     return load_file(file)
 
 
-def start(*args):
-    """A process of its own group, as a terminal starts one."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "edp", *map(str, args)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        # Tests may run in the background, where a shell has Ctrl-C ignored; children would inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-
-
-def stop_once(process, ready, how):
-    """Send a signal to the group as soon as `ready()`; returns exit code and standard error."""
-    until = time.monotonic() + 120
-    while not ready() and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.02)
-    if process.poll() is None:
-        os.killpg(process.pid, how)
-    _, err = process.communicate(timeout=60)
-    return process.returncode, err
-
-
 def test_a_second_call_finds_the_run_finished(edp, logs, tmp_path, small):
     run = tmp_path / "run"
     first = edp("train", logs, "--out", run, *small, "--json").json
@@ -49,7 +22,7 @@ def test_a_second_call_finds_the_run_finished(edp, logs, tmp_path, small):
     assert (run / "history.jsonl").read_bytes() == history
 
 
-def test_stopped_and_killed_training_ends_with_the_same_bits(edp, logs, tmp_path, small):
+def test_stopped_and_killed_training_ends_with_the_same_bits(edp, logs, tmp_path, small, start, stop_once):
     run, options = tmp_path / "run", [*small, "--set", "training.epochs=30", "--set", "training.updates=8"]
     command = ("train", logs, "--out", run, *options)
     checkpoint = run / "checkpoint.safetensors"
@@ -73,7 +46,7 @@ def test_stopped_and_killed_training_ends_with_the_same_bits(edp, logs, tmp_path
     assert not list(run.rglob("*.tmp"))
 
 
-def test_stopped_simulation_keeps_whole_logs_and_goes_on(edp, tmp_path):
+def test_stopped_simulation_keeps_whole_logs_and_goes_on(edp, tmp_path, start, stop_once):
     data = tmp_path / "data"
     command = ("simulate", data, "--minutes", 24, "--recordings", 12, "--workers", 1)
 
