@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -203,7 +204,13 @@ def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:
     start, step, length = (_number(facts.get(key)) for key in ("Start_", "Increment_", "Length"))
     if step is None or length is None:
         return None
-    return np.asarray(((start or 0.0) + step * np.arange(int(length))) * factor, dtype=np.float64)
+    return _even(start or 0.0, step, int(length), factor)
+
+
+@lru_cache(maxsize=1)
+def _even(start: float, step: float, length: int, factor: float) -> NDArray[np.float64]:
+    """Even times; the signals of one Dataset mostly have the same, and then share the array."""
+    return np.asarray((start + step * np.arange(length)) * factor, dtype=np.float64)
 
 
 def _timeseries_unit(info: Any) -> str:
