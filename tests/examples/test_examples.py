@@ -15,13 +15,16 @@ from edp.cli import app
 from edp.cli.console import run_app
 from edp.config import TAGGED, RecordingEntry, TaskSettings, load_data_set, load_experiment, load_signal_map
 from edp.data.chunks import ChunkSpec
-from edp.data_sets import SimulationOrder
+from edp.data_sets import SimulationOrder, simulate_data_set
 from edp.evaluation.judge import JudgeSpec
 from edp.logs import write_recording
 from edp.losses import AdaptiveWeights
 from edp.models.predictor import ModelSpec
 from edp.recording import Recording
 from edp.screening import ForestSpec, ScreeningSpec
+from edp.search.phases import PHASES
+from edp.search.plan import load_plan
+from edp.search.settings import SearchSpec
 from edp.signals import TABLE_A1
 from edp.training import TrainingSpec
 
@@ -44,6 +47,8 @@ def loader_of(path: Path) -> Callable[[Path], object]:
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     if path.parent.name == "scenarios":
         return SimulationOrder.of
+    if "search" in table:
+        return load_plan
     return load_data_set if "recordings" in table else load_signal_map if "channels" in table else load_experiment
 
 
@@ -54,6 +59,7 @@ def test_there_are_examples():
         load_data_set,
         load_experiment,
         SimulationOrder.of,
+        load_plan,
     }
 
 
@@ -112,6 +118,31 @@ def test_screening_page_names_every_option_and_its_default():
     for (name, text), entry in zip(shown, entries):
         if entry.default not in (dataclasses.MISSING, ()):
             assert text == f"`{round(entry.default, 3)}`", name
+
+
+def test_search_page_names_every_phase_and_key_and_shows_the_examples():
+    page = (ROOT / "docs" / "search.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`.+?) \|", page, re.MULTILINE)
+    named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    keys = [entry.name for entry in dataclasses.fields(SearchSpec)]
+    assert sorted(name for name in named if name in keys) == sorted(keys)
+    assert [name for name in named if name in PHASES] == list(PHASES)
+    assert (EXAMPLES / "search.toml").read_text(encoding="utf-8") in page
+    whole = (EXAMPLES / "search.py").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for line in shown.strip().splitlines():
+        assert line.strip() in whole, line
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_quick_search_on_simulated_recordings(tmp_path, capsys):
+    simulate_data_set(tmp_path / "data", SimulationOrder(minutes=20.0, recordings=20))
+    script = runpy.run_path(str(EXAMPLES / "search.py"))
+    script["main"](str(tmp_path / "data"), str(tmp_path / "study"))
+    printed = capsys.readouterr().out
+    assert all(f"{name}\n" in printed for name in PHASES)
+    load_experiment(tmp_path / "study" / "teacher.toml", "quick")
 
 
 def test_quickstart(tmp_path, capsys):

@@ -1,0 +1,19 @@
+"""A network searched for, and what the search says of it: ``python examples/search.py DATA STUDY``."""
+
+import sys
+
+from edp.search.plan import load_plan
+from edp.search.runner import Crew, run_search
+from edp.sources import DataSource
+
+
+def main(data: str, study: str, *changes: str) -> None:
+    plan = load_plan(preset="quick", overrides=changes)
+    found = run_search(DataSource.of(data), plan, study, Crew(workers=2))
+    for decision in found.ground.decided.values():
+        print(decision.phase, *decision.sentences, sep="\n  ")
+    print("settings of the winner:", found.teacher)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
