@@ -273,7 +273,7 @@ def test_a_refit_trains_on_all_stretches_for_the_epochs_that_were_best(tiny, tin
     first = fit(tiny, tiny_model, spec)
     best = max(row["epoch"] for row in first.history if row["best"])
     events = []
-    again = fit(tiny, tiny_model, dataclasses.replace(spec, refit=True), on_event=events.append)
+    again = fit(tiny, tiny_model, dataclasses.replace(spec, refit="best"), on_event=events.append)
     assert again.history == [dict(row, seconds=again.history[i]["seconds"]) for i, row in enumerate(first.history)]
     assert {event.epochs for event in events if event.refit} == {best}
     assert all(event.row is None for event in events if event.refit)
@@ -289,10 +289,23 @@ def test_a_refit_trains_on_all_stretches_for_the_epochs_that_were_best(tiny, tin
         assert not torch.equal(mine, theirs)
 
 
+@pytest.mark.parametrize("refit", ["best", "whole"])
+def test_a_refit_of_the_best_epoch_or_to_the_end_of_the_schedule(refit, tiny, tiny_model, tiny_training):
+    # A rate that spoils the weights soon: the first training stops early.
+    spec = dataclasses.replace(tiny_training, epochs=9, patience=1, refit=refit, optimizer=AdamW(learning_rate=1.0))
+    events = []
+    fitted = fit(tiny, tiny_model, spec, on_event=events.append)
+    best = max(row["epoch"] for row in fitted.history if row["best"])
+    assert best < len(fitted.history) < spec.epochs
+    epochs = {"best": best, "whole": spec.epochs}[refit]
+    assert {event.epochs for event in events if event.refit} == {epochs}
+    assert max(event.epoch for event in events if event.refit) == epochs
+
+
 def test_a_refit_keeps_the_calibration_of_the_first_training(tiny, tiny_model, tiny_training):
     model = dataclasses.replace(tiny_model, output=OUTPUTS["laplace"]())
     spec = dataclasses.replace(tiny_training, epochs=2, loss=LOSSES["heteroscedastic"]())
-    first, again = fit(tiny, model, spec), fit(tiny, model, dataclasses.replace(spec, refit=True))
+    first, again = fit(tiny, model, spec), fit(tiny, model, dataclasses.replace(spec, refit="best"))
     held, kept = first.predictor.output.state_dict(), again.predictor.output.state_dict()
     assert held
     assert all(torch.equal(held[name], kept[name]) for name in held)
@@ -300,8 +313,8 @@ def test_a_refit_keeps_the_calibration_of_the_first_training(tiny, tiny_model, t
 
 def test_a_refit_that_diverges_leaves_the_first_training(tiny, tiny_model, tiny_training):
     broken = dataclasses.replace(tiny.validation[0], targets=tiny.validation[0].targets.copy())
-    spec = dataclasses.replace(tiny_training, epochs=2, refit=True)
-    first = fit(tiny, tiny_model, dataclasses.replace(spec, refit=False))
+    spec = dataclasses.replace(tiny_training, epochs=2, refit="best")
+    first = fit(tiny, tiny_model, dataclasses.replace(spec, refit="none"))
 
     def on_event(event):
         if event.epoch == spec.epochs and event.row is not None:

@@ -230,9 +230,10 @@ def test_run_keys_depend_on_settings_and_data_and_not_on_their_order():
     assert len({key, run_key({"a": 1, "b": [3]}, "d"), run_key({"a": 1, "b": [2]}, "e")}) == 3
 
 
+@pytest.mark.parametrize("refit", ["best", "whole"])
 @pytest.mark.parametrize("stop", [(False, 2), (True, 1)])
-def test_a_stopped_refit_goes_on_to_the_same_bits(stop, tmp_path, tiny, tiny_model, tiny_training):
-    spec = dataclasses.replace(tiny_training, epochs=3, refit=True)
+def test_a_stopped_refit_goes_on_to_the_same_bits(refit, stop, tmp_path, tiny, tiny_model, tiny_training):
+    spec = dataclasses.replace(tiny_training, epochs=3, refit=refit)
 
     def on_event(event):
         if (event.refit, event.update) == (stop[0], event.updates) and event.epoch == stop[1]:

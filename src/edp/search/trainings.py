@@ -116,7 +116,7 @@ def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
 def experiment_of(order: Order) -> Experiment:
     """The experiment that an order trains: one long epoch, so that schedules run to their end and nothing is chosen."""
     made = build(Experiment, order.settings, "of a search")
-    training = replace(made.training, epochs=1, updates=order.updates, patience=0, refit=False, seed=order.seed)
+    training = replace(made.training, epochs=1, updates=order.updates, patience=0, refit="none", seed=order.seed)
     return replace(made, training=training)
 
 

@@ -101,10 +101,10 @@ def fit(
     tell = on_event or (lambda event: None)
     fitted = _Loop(data, model, spec, run).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
-    if not spec.refit or not best:
+    if spec.refit == "none" or not best:
         return fitted
     try:
-        again = _Loop(data, model, spec, run, fitted.history[:best]).fit(tell)
+        again = _Loop(data, model, spec, run, _rows_of_refit(fitted.history, best, spec)).fit(tell)
     except Diverged as end:
         raise Diverged(str(end), fitted, end.facts) from end
     again.predictor.output.load_state_dict(fitted.predictor.output.state_dict())
@@ -114,6 +114,13 @@ def fit(
 def thread_count(spec: TrainingSpec) -> int:
     """CPU threads that a training uses."""
     return spec.threads or os.cpu_count() or 1
+
+
+def _rows_of_refit(history: list[dict[str, Any]], best: int, spec: TrainingSpec) -> list[dict[str, Any]]:
+    """A row of the first training for each epoch of the refit; the last one stands for those it did not come to."""
+    if spec.refit == "best":
+        return history[:best]
+    return history + history[-1:] * (spec.epochs - len(history))
 
 
 class _Loop:

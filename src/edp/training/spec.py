@@ -15,6 +15,8 @@ from edp.training.averages import AverageSpec, Exponential
 from edp.training.optimizers import AdamW, OptimizerSpec
 from edp.training.schedules import Cosine, ScheduleSpec
 
+REFITS = ("none", "best", "whole")
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSpec:
@@ -34,8 +36,9 @@ class TrainingSpec:
         epochs: the longest training.
         updates: updates per epoch; 0 for one pass over the data.
         patience: epochs without a better validation score before an early stop; 0 never stops early.
-        refit: train anew on training and validation stretches together, for as many epochs as were best before; for
-            short data. The choice of the epoch, and the calibration of intervals, stay those of the first training.
+        refit: train anew on training and validation stretches together, for short data: ``best`` for as many epochs as
+            were best before, ``whole`` for all of them, to the end of the schedule, ``none`` not at all. The
+            calibration of intervals stays that of the first training.
         clip_norm: largest global gradient norm.
         seed: root of every random choice.
         threads: CPU threads, 0 for all cores; more than one pays for wide networks on an idle machine only, and
@@ -59,7 +62,7 @@ class TrainingSpec:
     epochs: int = 20
     updates: int = 0
     patience: int = 8
-    refit: bool = False
+    refit: str = "none"
     clip_norm: float = 1.0
     seed: int = 0
     threads: int = 1
@@ -76,6 +79,8 @@ class TrainingSpec:
                 f"training: clip_norm = {self.clip_norm}, horizon_decay = {self.horizon_decay}; clip_norm > 0 and "
                 "0 < horizon_decay <= 1 must hold"
             )
+        if self.refit not in REFITS:
+            raise ConfigError(f"training: refit = '{self.refit}'; {_either(REFITS)} must hold")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ConfigError(f"training: device = '{self.device}'; 'auto', 'cpu' or 'cuda' must hold")
         names = [TERMS.name_of(term) for term in self.terms]
