@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 SHOWN = 40
 SHOWN_FLAGS = 20
+TOLD_SHARE = 0.005
+"""Of the work, what must be done before the time left is told."""
 
 
 def screen(
@@ -91,7 +93,9 @@ class ScreeningDisplay:
     def __init__(self, shown: Progress, steps: Steps) -> None:
         self.shown, self.steps = shown, steps
         self.bars: dict[str, Any] = {}
-        self.began: dict[str, float] = {}
+        self.began: dict[str, tuple[float, float]] = {}
+        self.shares: dict[str, float] = {}
+        self.trained = False
 
     def on_progress(self, stage: str, share: float) -> None:
         """Show a stage."""
@@ -99,16 +103,26 @@ class ScreeningDisplay:
 
     def on_trial(self, name: str, done: int, total: int, event: Event | None) -> None:
         """Show a training."""
-        part = 0.0 if event is None else ((event.epoch - 1) + event.update / event.updates) / event.epochs
-        self._show("trials", (done + part) / total, f"{name}, {done + 1} of {total}")
+        part, note = 0.0, f"{name}, training {done + 1} of {total}"
+        if event is not None:
+            part = ((event.epoch - 1) + event.update / event.updates) / event.epochs
+            note += f", epoch {event.epoch}/{event.epochs}"
+        elif not self.trained:
+            # Trainings that are in the folder already take no time, and say nothing about the others.
+            self.began.pop("trials", None)
+        self.trained = self.trained or event is not None
+        self._show("trials", (done + part) / total, note)
 
     def _show(self, what: str, share: float, note: str) -> None:
+        now = time.monotonic()
         if what not in self.bars:
             self.bars[what] = self.shown.add_task(what, total=1.0, note="")
-            self.began[what] = time.monotonic()
-        left = (time.monotonic() - self.began[what]) * (1.0 / max(share, 1e-3) - 1.0)
+        self.shares[what] = share = max(share, self.shares.get(what, 0.0))  # a refit begins its epochs again
+        first_share, began = self.began.setdefault(what, (share, now))
+        gained, elapsed = share - first_share, now - began
+        tail = f", {duration(elapsed / gained * (1.0 - share))} left" if gained >= TOLD_SHARE else ""
         self.shown.update(self.bars[what], completed=share, note=note)
-        self.steps.say(f"{what}: {note}, {100 * share:.0f} %, {duration(left)} left")
+        self.steps.say(f"{what}: {note}, {100 * share:.0f} %{tail}")
 
 
 def show_selection(made: Selection) -> None:

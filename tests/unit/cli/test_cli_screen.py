@@ -8,7 +8,10 @@ import tomllib
 import numpy as np
 import pytest
 
+from edp.cli.console import Steps
+from edp.cli.screen import ScreeningDisplay
 from edp.config import load_experiment, load_signal_map
+from edp.training import Event
 
 QUICK = [
     word
@@ -94,16 +97,77 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     )
     out = tmp_path / "screen"
     trials = ["--trials", "--random", "1", "--config", tmp_path / "tiny.toml", "--features", tmp_path / "mine.toml"]
+    monkeypatch.setattr("edp.cli.screen.Steps", lambda quiet: Steps(quiet, every_s=0.0))
+    first = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", *QUICK, *trials)
+    assert first.code == 0, first.err
+    lines = [line for line in first.err.splitlines() if line.startswith("trials: ")]
+    assert lines[0] == "trials: proposed, training 1 of 4, 0 %"
+    assert any(line.startswith("trials: random 1, training 4 of 4, epoch 1/1, 100 %, 0 s left") for line in lines)
+    assert not [line for line in lines if line.endswith(" 0 %, 0 s left")]
+    assert "MAE 10 ahead, mm/s" in first.out
+    table = [
+        line.split()[0] for line in first.out.splitlines() if line.startswith(("proposed ", "mine ", "persistence "))
+    ]
+    assert table == ["proposed", "mine", "persistence"]
+
+    # What is trained already is not trained again.
+    kept = (out / "trials" / "trials.json").read_bytes()
     ended = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", "--json", *QUICK, *trials)
     assert ended.code == 0, ended.err
+    assert (out / "trials" / "trials.json").read_bytes() == kept
     facts = ended.json
     assert "oracle" not in facts["kept"] + facts["dropped"]
     names = [trial["name"] for trial in facts["trials"]["trials"]]
     assert names == ["proposed", "all candidates", "mine", "random 1"]
-    assert drawn == [out / "pictures"]
+    assert drawn == [out / "pictures"] * 2
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "What the sets are worth to a model" in page
+    for trial in facts["trials"]["trials"]:
+        assert trial["name"] in page
     assert facts["files"]["trials"] == str(out / "trials")
+
+
+class Said:
+    """Keeps what a display shows."""
+
+    def __init__(self):
+        self.lines = []
+
+    def add_task(self, *_, **__):
+        return len(self.lines)
+
+    def update(self, *_, **__):
+        pass
+
+    def say(self, text):
+        self.lines.append(text)
+
+
+def test_time_left_is_told_once_there_is_something_to_judge_it_by(monkeypatch):
+    now, said = [100.0], Said()
+    monkeypatch.setattr("edp.cli.screen.time.monotonic", lambda: now[0])
+    display = ScreeningDisplay(said, said)
+
+    def tell(seconds, name, done, event=None):
+        now[0] += seconds
+        display.on_trial(name, done, 4, event)
+
+    tell(0, "kept", 0)
+    tell(0.1, "proposed", 1)
+    tell(30, "proposed", 1, Event(1, 2, 0, 10, 0.0, 0.0))
+    tell(30, "proposed", 1, Event(1, 2, 10, 10, 0.0, 0.0))
+    tell(60, "proposed", 1, Event(2, 2, 10, 10, 0.0, 0.0))
+    tell(0, "proposed", 1, Event(1, 2, 5, 10, 0.0, 0.0, refit=True))
+    tell(60, "random 1", 2)
+    assert said.lines == [
+        "trials: kept, training 1 of 4, 0 %",
+        "trials: proposed, training 2 of 4, 25 %",
+        "trials: proposed, training 2 of 4, epoch 1/2, 25 %",
+        "trials: proposed, training 2 of 4, epoch 1/2, 38 %, 5 min 00 s left",
+        "trials: proposed, training 2 of 4, epoch 2/2, 50 %, 4 min 00 s left",
+        "trials: proposed, training 2 of 4, epoch 1/2, 50 %, 4 min 00 s left",
+        "trials: random 1, training 3 of 4, 50 %, 6 min 00 s left",
+    ]
 
 
 @pytest.mark.parametrize(
