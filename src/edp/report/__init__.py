@@ -5,14 +5,19 @@ from edp.report.facts import Facts, comparison_rows, headline, read_facts
 from edp.report.page import build_report
 from edp.report.pictures import write_pictures
 from edp.report.screening_page import build_screening_page
+from edp.report.study_facts import read_study
+from edp.report.study_page import StudyReport, write_study_page
 
 __all__ = [
     "Facts",
+    "StudyReport",
     "build_coverage_page",
     "build_report",
     "build_screening_page",
     "comparison_rows",
     "headline",
     "read_facts",
+    "read_study",
     "write_pictures",
+    "write_study_page",
 ]

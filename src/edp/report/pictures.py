@@ -1,8 +1,7 @@
-"""Pictures of a screening as files: SVG for documents, PNG for mail and slides; matplotlib's only door."""
+"""Pictures of a screening as files: SVG for documents, PNG for mail and slides."""
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from edp.report.drawing import BLUE, DROPPED, INK, RULE, SOFT, file_name, write_drawing
 from edp.report.screening_views import (
     METRICS,
     UNITS,
@@ -24,38 +24,17 @@ from edp.report.screening_views import (
     value_views,
 )
 from edp.screening import Screening
-from edp.storage import make_folder, write_bytes
+from edp.storage import make_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INK, SOFT, RULE, BLUE, DROPPED = "#26303a", "#66717d", "#e4e8ec", "#0b57d0", "#b4bcc5"
 LINES = (BLUE, "#c9892f", "#5a9c8c", "#a97da0", "#8b929a", "#a5a04a", "#b9705c", "#3c4650")
 DASHES = ("-", "--", ":", "-.")
 SEQUENTIAL = ("#f7fafe", "#b7d0f7", "#6d9fec", "#2567d3", "#062c74")
 DIVERGING = ("#7a4a06", "#d79a3c", "#ffffff", "#6d9fec", "#062c74")
-DPI = 150
-FORMATS = ("svg", "png")
 _FIGURES_IN_CELLS = 32
-_STYLE: Any = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same picture on every machine
-    "font.size": 9,
-    "text.color": INK,
-    "axes.edgecolor": "#c4cbd2",
-    "axes.labelcolor": SOFT,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.color": SOFT,
-    "ytick.color": SOFT,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "edp",
-    "text.parse_math": False,
-}
 
 
 def write_pictures(found: Screening, folder: str | Path) -> list[Path]:
@@ -72,7 +51,7 @@ def write_pictures(found: Screening, folder: str | Path) -> list[Path]:
         StorageError: the folder or a file cannot be written.
     """
     target = make_folder(folder)
-    return [path for name, draw in _drawings(found).items() for path in _write(target, name, draw)]
+    return [path for name, draw in _drawings(found).items() for path in write_drawing(target, name, draw)]
 
 
 def _drawings(found: Screening) -> dict[str, Callable[[Figure], None]]:
@@ -80,7 +59,7 @@ def _drawings(found: Screening) -> dict[str, Callable[[Figure], None]]:
     for matrix in matrix_views(found):
         made[f"matrix_{matrix.measure}"] = partial(_matrix, view=matrix)
     for lag in lag_views(found):
-        made[f"lags_{_file_name(lag.target)}"] = partial(_lags, view=lag, rate_hz=found.rate_hz)
+        made[f"lags_{file_name(lag.target)}"] = partial(_lags, view=lag, rate_hz=found.rate_hz)
     for name, views in (
         *((f"stability_{metric}", _of(stability_views(found), metric)) for metric in METRICS),
         ("importance", importance_views(found)),
@@ -93,29 +72,6 @@ def _drawings(found: Screening) -> dict[str, Callable[[Figure], None]]:
 
 def _of(views: Sequence[BarView], metric: str) -> tuple[BarView, ...]:
     return tuple(view for view in views if view.key == metric)
-
-
-def _write(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path]:
-    """One drawing in every format; the same screening gives the same bytes."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    streams = {suffix: io.BytesIO() for suffix in FORMATS}
-    with matplotlib.rc_context(_STYLE):
-        figure = Figure(dpi=DPI, layout="constrained")
-        bitmap = FigureCanvasAgg(figure)
-        draw(figure)
-        layout = figure.get_layout_engine()
-        if layout is not None:
-            layout.execute(figure)
-            figure.set_layout_engine("none")  # laid out once, not for every format
-        bitmap.print_png(streams["png"], metadata={"Software": None})
-        FigureCanvasSVG(figure).print_svg(streams["svg"], metadata={"Date": None})
-    for suffix, stream in streams.items():
-        write_bytes(folder / f"{name}.{suffix}", stream.getvalue())
-    return [folder / f"{name}.{suffix}" for suffix in FORMATS]
 
 
 def _matrix(figure: Figure, view: MatrixView) -> None:
@@ -192,8 +148,3 @@ def _panel(axes: Axes, view: BarView) -> None:
     axes.axvline(0, color="#c4cbd2", lw=0.8)
     more = f" (+ {view.more} more)" if view.more else ""
     axes.set_title(("mean of all targets" if view.target == "all" else view.target) + more, fontsize=9, weight="normal")
-
-
-def _file_name(target: str) -> str:
-    """A name that any file system takes."""
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in target)[:80] or "target"

@@ -122,7 +122,7 @@ def confirm(
         seen = part.any(axis=0)
         cells = (filled[1 + place, :runs][:, seen], filled[0, :runs][:, seen], part[:, seen])
         found[name] = _evidence(name, cells, dropped, adjusted[name], rule)
-    absent = "it did not pass the screening, so it counts with p = 1"
+    absent = "stopped by the screening, counted with p = 1"
     return tuple(found.get(name, Evidence(name, False, absent)) for name in registered)
 
 

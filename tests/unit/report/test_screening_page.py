@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from edp.report import build_screening_page, pictures, write_pictures
+from edp.report.drawing import write_drawing
 from edp.report.screening_page import headline, render_screening, sentence, verdict
 from edp.report.screening_plots import screening_plots
 from edp.report.screening_views import lag_ranges, lag_views, matrix_views, stability_views
@@ -177,7 +178,7 @@ def test_names_that_mean_something_elsewhere(tmp_path, odd):
     drawings = pictures._drawings(found)
     (lags,) = [name for name in drawings if name.startswith("lags_")]
     first, again = (
-        [path.read_bytes() for path in pictures._write(make_folder(tmp_path / part), lags, drawings[lags])]
+        [path.read_bytes() for path in write_drawing(make_folder(tmp_path / part), lags, drawings[lags])]
         for part in "ab"
     )
     assert first == again

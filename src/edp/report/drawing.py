@@ -1,0 +1,63 @@
+"""One drawing as files, SVG and PNG, in the style of the house: what the pictures of all pages share."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edp.storage import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+INK, SOFT, RULE, BLUE, DROPPED = "#26303a", "#66717d", "#e4e8ec", "#0b57d0", "#b4bcc5"
+DPI = 150
+FORMATS = ("svg", "png")
+_STYLE: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same picture on every machine
+    "font.size": 9,
+    "text.color": INK,
+    "axes.edgecolor": "#c4cbd2",
+    "axes.labelcolor": SOFT,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "edp",
+    "text.parse_math": False,
+}
+
+
+def write_drawing(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path]:
+    """One drawing in every format; the same content gives the same bytes."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    streams = {suffix: io.BytesIO() for suffix in FORMATS}
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(dpi=DPI, layout="constrained")
+        bitmap = FigureCanvasAgg(figure)
+        draw(figure)
+        layout = figure.get_layout_engine()
+        if layout is not None:
+            layout.execute(figure)
+            figure.set_layout_engine("none")  # laid out once, not for every format
+        bitmap.print_png(streams["png"], metadata={"Software": None})
+        FigureCanvasSVG(figure).print_svg(streams["svg"], metadata={"Date": None})
+    for suffix, stream in streams.items():
+        write_bytes(folder / f"{name}.{suffix}", stream.getvalue())
+    return [folder / f"{name}.{suffix}" for suffix in FORMATS]
+
+
+def file_name(target: str) -> str:
+    """A name that any file system takes."""
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in target)[:80] or "target"

@@ -1,0 +1,308 @@
+"""A model search as its folder's `study.json` holds it, checked: what the pages, pictures and tables of it read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+from edp.errors import StorageError
+from edp.storage import read_json
+
+SCHEMA = 1
+STATES = ("running", "stopped", "killed", "finished")
+TITLES = {
+    "isolation": "isolation and variance",
+    "calibration": "calibration",
+    "screening": "screening",
+    "planning": "power",
+    "confirmation": "confirmation",
+    "synthesis": "synthesis",
+    "exploration": "exploration",
+}
+"""Phases in their order, as those are called that have not begun."""
+NUMBERS = dict(zip(TITLES, ("0", "1", "2", "2.5", "3", "4", "5"), strict=True))
+"""Phases in the thesis's count."""
+
+Made = TypeVar("Made")
+Absent = TypeVar("Absent")
+
+
+@dataclass(frozen=True)
+class PhaseFacts:
+    """How far a phase is and what it took.
+
+    Attributes:
+        name, title: of the phase.
+        trainings: that it asked for, and that no earlier phase had.
+        trained: of these, those that have ended.
+        failed: of these, those that did not end well.
+        seconds: of training, summed over workers.
+        wall_s: by the clock.
+        began, ended: moments in ISO 8601; empty where it has not.
+    """
+
+    name: str
+    title: str
+    trainings: int = 0
+    trained: int = 0
+    failed: int = 0
+    seconds: float = 0.0
+    wall_s: float = 0.0
+    began: str = ""
+    ended: str = ""
+
+    @property
+    def heading(self) -> str:
+        """As ``Phase 2.5: power``."""
+        number = NUMBERS.get(self.name)
+        return f"Phase {number}: {self.title}" if number else self.title.capitalize()
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training of the history.
+
+    Attributes:
+        phase: that asked for it.
+        test: whether it was judged on the sessions set apart.
+        status: ``done``, or how it ended.
+        score: None where it failed.
+        seconds: that it took.
+        parameters, macs_tick: None where they were not counted.
+        label: what it was.
+    """
+
+    phase: str
+    test: bool
+    status: str
+    score: float | None
+    seconds: float
+    parameters: float | None
+    macs_tick: float | None
+    label: str
+
+
+@dataclass(frozen=True)
+class StudyFacts:
+    """A study.
+
+    Attributes:
+        state: one of `STATES`.
+        mode: ``sound`` or ``thesis``.
+        preset: name of its settings.
+        unit: of the scores.
+        data: path, number of sessions, hours and hash of the recordings.
+        spec: settings of the search.
+        development, test: names of sessions.
+        modules: title of each module by name.
+        phases: in their order, those that have not begun among them.
+        facts: what each decided phase found, by name.
+        sentences: what it decided and why.
+        history: every training that has ended, in the order in which they were asked for.
+        openings: looks at the test sessions.
+    """
+
+    state: str
+    mode: str
+    preset: str
+    unit: str
+    data: Mapping[str, Any]
+    spec: Mapping[str, Any]
+    development: tuple[str, ...]
+    test: tuple[str, ...]
+    modules: Mapping[str, str]
+    phases: tuple[PhaseFacts, ...]
+    facts: Mapping[str, Mapping[str, Any]]
+    sentences: Mapping[str, tuple[str, ...]]
+    history: tuple[Training, ...]
+    openings: tuple[Mapping[str, Any], ...]
+
+    @property
+    def title(self) -> str:
+        """Name of the data."""
+        return Path(str(self.data["path"])).name or str(self.data["path"])
+
+    def module(self, name: str) -> str:
+        """Title of a module."""
+        return self.modules.get(name, name)
+
+    def phase(self, name: str) -> PhaseFacts | None:
+        """A phase; None where the study has none of this name."""
+        return next((phase for phase in self.phases if phase.name == name), None)
+
+
+def read_study(path: str | Path) -> Mapping[str, Any]:
+    """The content of a study's file, for `facts_of` and `write_study_page`.
+
+    Args:
+        path: of ``study.json``, or of the folder that holds it.
+
+    Raises:
+        StorageError: missing, unreadable, of another schema, or no study.
+    """
+    file = Path(path)
+    file = file / "study.json" if file.is_dir() else file
+    study = read_json(file)
+    _check(study, str(file))
+    checked: Mapping[str, Any] = study
+    return checked
+
+
+def facts_of(study: Mapping[str, Any]) -> StudyFacts:
+    """A study, checked.
+
+    Raises:
+        StorageError: of another schema, or with parts missing or of a wrong kind; the message names the part.
+    """
+    _check(study, "study.json")
+    return reading("study.json", lambda: _facts_of(study))
+
+
+def _facts_of(study: Mapping[str, Any]) -> StudyFacts:
+    decisions = [dict(held) for held in study["decisions"]]
+    data, sessions = dict(study["data"]), dict(study["sessions"])
+    return StudyFacts(
+        state=study["state"],
+        mode=study["mode"],
+        preset=str(study["preset"]),
+        unit=str(study.get("unit", "mm/s")),
+        data=data | {"path": str(data["path"]), "sessions": int(data["sessions"]), "hours": real(data["hours"])},
+        spec={str(key): value for key, value in study["spec"].items()} | {"horizon": int(study["spec"]["horizon"])},
+        development=tuple(map(str, sessions["development"])),
+        test=tuple(map(str, sessions["test"])),
+        modules={str(name): str(title) for name, title in study["modules"].items()},
+        phases=_phases(study["phases"]),
+        facts={str(held["phase"]): dict(held["facts"]) for held in decisions},
+        sentences={str(held["phase"]): tuple(map(str, held["sentences"])) for held in decisions},
+        history=_history(study["history"], sum(len(held["judged"]) for held in study["openings"])),
+        openings=tuple(dict(held) for held in study["openings"]),
+    )
+
+
+def _phases(begun: Sequence[Mapping[str, Any]]) -> tuple[PhaseFacts, ...]:
+    made = {phase.name: phase for phase in map(_phase, begun)}
+    ahead = {name: PhaseFacts(name, title) for name, title in TITLES.items() if name not in made}
+    both = made | ahead
+    order = [name for name in TITLES if name in both] + [name for name in both if name not in TITLES]
+    return tuple(both[name] for name in order)
+
+
+def _phase(held: Mapping[str, Any]) -> PhaseFacts:
+    return PhaseFacts(
+        name=str(held["name"]),
+        title=str(held["title"]),
+        trainings=int(held["trainings"] or 0),
+        trained=int(held["trained"] or 0),
+        failed=int(held["failed"] or 0),
+        seconds=known(held["seconds"]) or 0.0,
+        wall_s=known(held["wall_s"]) or 0.0,
+        began=str(held["began"] or ""),
+        ended=str(held["ended"] or ""),
+    )
+
+
+def _history(rows: Sequence[Mapping[str, Any]], sealed: int) -> tuple[Training, ...]:
+    """What has ended. The last trainings that phase 4 asked for are those that the lock-box was opened for."""
+    places = [place for place, held in enumerate(rows) if held["phase"] == "synthesis"]
+    test = set(places[len(places) - sealed :] if sealed else ())
+    return tuple(_training(held, place in test) for place, held in enumerate(rows) if held["status"] != "waiting")
+
+
+def _training(held: Mapping[str, Any], test: bool) -> Training:
+    return Training(
+        phase=str(held["phase"]),
+        test=test,
+        status=str(held["status"]),
+        score=known(held["score"]),
+        seconds=known(held["seconds"]) or 0.0,
+        parameters=known(held.get("parameters")),
+        macs_tick=known(held.get("macs_tick")),
+        label=str(held["label"] or ""),
+    )
+
+
+def real(value: Any) -> float:
+    """A finite number.
+
+    Raises:
+        ValueError: none, or no number.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{str(value)[:40]!r} is no finite number")
+    return float(value)
+
+
+def known(value: Any) -> float | None:
+    """A finite number, or none.
+
+    Raises:
+        ValueError: something else.
+    """
+    return None if value is None else real(value)
+
+
+def pair(value: Any) -> tuple[float, float] | None:
+    """Bounds of an interval, or none."""
+    if value is None:
+        return None
+    low, high = value
+    return real(low), real(high)
+
+
+def of_phase(
+    name: str, absent: Absent
+) -> Callable[[Callable[[StudyFacts, Mapping[str, Any]], Made]], Callable[[StudyFacts], Made | Absent]]:
+    """Make a function of a study and a phase's facts one of the study: `absent` where the phase has not decided yet.
+
+    Facts that cannot be read become one `StorageError` that names the phase.
+    """
+
+    def wrap(function: Callable[[StudyFacts, Mapping[str, Any]], Made]) -> Callable[[StudyFacts], Made | Absent]:
+        @wraps(function)
+        def call(study: StudyFacts) -> Made | Absent:
+            facts = study.facts.get(name)
+            if facts is None:
+                return absent
+            return reading(f"study.json: phase '{name}'", lambda: function(study, facts))
+
+        return call
+
+    return wrap
+
+
+def reading(where: str, read: Callable[[], Made]) -> Made:
+    """What `read` gives.
+
+    Raises:
+        StorageError: it met something missing or of a wrong kind.
+    """
+    try:
+        return read()
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        what = f"it lacks {error}" if isinstance(error, KeyError) else f"it cannot be read: {error}"
+        raise StorageError(
+            f"{where}: {what}; another version of EDP wrote it, or it was edited. Call `edp search` on the study "
+            "again: it writes the file anew from its ledger"
+        ) from error
+
+
+def _check(study: Any, where: str) -> None:
+    """Refuse what is no study of this schema.
+
+    Raises:
+        StorageError: with what to do.
+    """
+    if not isinstance(study, Mapping) or "schema" not in study:
+        raise StorageError(f"{where} is no study: it has no 'schema'; give the study.json that `edp search` wrote")
+    if study["schema"] != SCHEMA:
+        raise StorageError(
+            f"{where} has schema {study['schema']!r}, this version of EDP reads {SCHEMA}; use the version that wrote "
+            "it, or call `edp search` on the study again with this one"
+        )
+    for name, options in (("state", STATES), ("mode", ("sound", "thesis"))):
+        if study.get(name) not in options:
+            raise StorageError(f"{where}: {name} = {study.get(name)!r}; {', '.join(options)} are known")

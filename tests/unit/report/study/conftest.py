@@ -1,0 +1,172 @@
+"""Studies of a made-up world as `study.json` holds them: every phase in both modes, without a training."""
+
+import copy
+import dataclasses
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from edp.config import load_experiment
+from edp.search.conduct import conduct
+from edp.search.ground import Ground, Outcome
+from edp.search.modules import MODULES
+from edp.search.phases import PHASES
+from edp.search.settings import SearchSpec
+from edp.search.space import Choice, Real
+from edp.search.study import SamplerSpec
+from edp.search.trainings import SCORES, costs_of, settings_of
+
+SESSIONS = tuple(f"s{number:02d}" for number in range(12))
+SPEC = SearchSpec(
+    updates=400,
+    folds=3,
+    variance_runs=6,
+    trials=8,
+    screening_runs=32,
+    screening_repeats=1,
+    module_trials=2,
+    most_runs=6,
+    run_seeds=2,
+    joint_trials=6,
+    free_trials=12,
+    space={"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16, 32))},
+    sampler=SamplerSpec(kind="random"),
+    backbones=("lstm", "hybrid"),
+)
+TIMES = {"began": "2026-03-04T10:20:00+0000", "ended": "2026-03-04T10:50:00+0000"}
+
+
+class World:
+    """Scores that are known functions of the settings, with a spread by session and seed."""
+
+    def __init__(self):
+        self.history, self.phase, self.counts = [], "", {}
+
+    def __call__(self, orders):
+        return [self.outcome(order) for order in orders]
+
+    def outcome(self, order):
+        score = self.effect(order.settings)
+        count = self.counts.setdefault(self.phase, [0, 0])
+        count[0] += 1
+        count[1] += score is None
+        outcome = Outcome(order, "diverged", None, "the loss is nan") if score is None else self.done(order, score)
+        number = outcome.mean(10)
+        self.history.append(
+            {
+                "phase": self.phase,
+                "number": len(self.history),
+                "status": outcome.status,
+                "score": float(number) if np.isfinite(number) else None,
+                "seconds": 2.5,
+                "parameters": costs_of(order.settings)["parameters"] if self.phase == "calibration" else None,
+                "macs_tick": None,
+                "label": f"{order.settings['model']['backbone']['kind']} {order.settings['task']['features']}",
+            }
+        )
+        return outcome
+
+    @staticmethod
+    def effect(settings):
+        """Best at a rate of 3e-3; FG2, hybrids and larger networks better; some modules help, some harm."""
+        rate = np.log10(settings["training"]["optimizer"]["learning_rate"])
+        if rate > -1.2:
+            return None
+        score = 5.0 + 0.5 * (rate + 2.5) ** 2 - 0.02 * settings["model"]["backbone"].get("units", 4)
+        score -= 0.5 * (settings["task"]["features"] == "FG2") + 0.3 * (
+            settings["model"]["backbone"]["kind"] == "hybrid"
+        )
+        kinds = {block["kind"] for block in settings["model"]["blocks"]}
+        score *= 1 - 0.06 * ("squeeze_excitation" in kinds) - 0.03 * ("attention_bridge" in kinds)
+        return score * (1 + 0.06 * (settings["model"]["backbone"].get("zoneout", 0) > 0))
+
+    @staticmethod
+    def done(order, score):
+        text = json.dumps([order.settings, order.seed], sort_keys=True).encode()
+        rng = np.random.default_rng(int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "big"))
+        sessions = {}
+        for name in order.judged:
+            value = score + 0.1 * int(name[1:]) + 0.08 * rng.normal()
+            factors = {"mae": 0.6, "rmse": 0.8, "p95": 1.7, "p99": 2.4, "composite": 1.0}
+            sessions[name] = {"10": {key: float(value * factors[key]) for key in SCORES}}
+        return Outcome(order, "done", {"sessions": sessions})
+
+
+def study_of(spec):
+    """What the search writes, from all phases on the made-up world."""
+    base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
+    ground, world = Ground(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:]), World()
+    for name in PHASES:
+        world.phase = name
+        ground = conduct(ground, world, phases=[name])
+    study = {
+        "schema": 1,
+        "state": "finished",
+        "mode": spec.mode,
+        "preset": "quick",
+        "data": {"path": "m22.toml", "sessions": len(SESSIONS), "hours": 1.2, "hash": "0123abcd"},
+        "spec": dataclasses.asdict(spec),
+        "sessions": {"development": list(SESSIONS[:9]), "test": list(SESSIONS[9:])},
+        "modules": {name: module.title for name, module in MODULES.items()},
+        "decisions": [held.to_json() for held in ground.decided.values()],
+        "phases": [
+            {
+                "name": name,
+                "title": phase.title,
+                "trainings": world.counts.get(name, [0, 0])[0],
+                "trained": world.counts.get(name, [0, 0])[0],
+                "failed": world.counts.get(name, [0, 0])[1],
+                "seconds": 2.5 * world.counts.get(name, [0, 0])[0],
+                "wall_s": 1.3 * world.counts.get(name, [0, 0])[0],
+                **TIMES,
+            }
+            for name, phase in PHASES.items()
+        ],
+        "history": world.history,
+        "openings": [{"box": "test", "judged": ["a1", "b2", "c3", "d4"], "why": "phase 4", "time": TIMES["ended"]}],
+    }
+    return json.loads(json.dumps(study, allow_nan=False))
+
+
+@pytest.fixture(scope="session")
+def sound_once():
+    return study_of(SPEC)
+
+
+@pytest.fixture(scope="session")
+def thesis_once():
+    return study_of(dataclasses.replace(SPEC, mode="thesis", least_effect=0.01))
+
+
+@pytest.fixture
+def sound(sound_once):
+    return copy.deepcopy(sound_once)
+
+
+@pytest.fixture
+def thesis(thesis_once):
+    return copy.deepcopy(thesis_once)
+
+
+def until(study, last):
+    """The study as it was while phase `last` ran."""
+    names = [phase["name"] for phase in study["phases"]]
+    place = names.index(last)
+    made = copy.deepcopy(study) | {"state": "running"}
+    made["decisions"] = made["decisions"][:place]
+    made["phases"] = made["phases"][: place + 1]
+    made["phases"][-1] |= {"ended": None, "trained": max(0, made["phases"][-1]["trained"] - 2)}
+    made["history"] = [held for held in made["history"] if held["phase"] in names[: place + 1]]
+    for row in made["history"][-2:]:
+        if row["phase"] == last:
+            row["status"] = "waiting"
+            del row["score"], row["seconds"], row["parameters"], row["macs_tick"]
+    made["openings"] = made["openings"] if place > names.index("synthesis") else []
+    return made
+
+
+@pytest.fixture
+def unfinished():
+    return until
