@@ -31,6 +31,8 @@ Sets = Mapping[str, str | FeatureSettings]
 OnTrial = Callable[[str, int, int, Event | None], None]
 FILE = "trials.json"
 COVERAGE = 0.95
+_DRAWS = 20
+"""Draws for one random set that is not there already."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +145,10 @@ def try_feature_sets(
     chosen, notes = _usable(sets, experiment, first)
     if not chosen:
         raise ConfigError("no feature set can be tried: " + "; ".join(notes))
-    chosen |= _drawn(chosen, experiment, first, spec)
+    drawn = _drawn(chosen, experiment, first, spec)
+    if len(drawn) < spec.random:
+        notes.append(f"{len(drawn)} of {spec.random} random sets were drawn: there are no others of this size")
+    chosen |= drawn
     folder = make_folder(out)
     total, done = len(chosen) * len(spec.seeds), 0
     found: dict[str, list[_Finished]] = {}
@@ -216,16 +221,26 @@ def _with_targets(features: FeatureSettings, targets: Sequence[str]) -> tuple[Fe
 def _drawn(
     chosen: Mapping[str, str | FeatureSettings], experiment: Experiment, first: Recording, spec: TrialSpec
 ) -> dict[str, str | FeatureSettings]:
-    """Sets of random channels, as many as the first set has; in delta mode the targets are always among them."""
-    size = len(_inputs(next(iter(chosen.values())), first))
+    """Sets of random channels, as many as the first set has, none like it or another drawn one.
+
+    In delta mode the targets are always among them.
+    """
+    first_inputs = _inputs(next(iter(chosen.values())), first)
+    size = len(first_inputs)
     always = experiment.task.targets if experiment.task.mode is TargetMode.DELTA else ()
     free = [name for name in first.channel_names if name not in {*always, *spec.barred}]
     rng = np.random.default_rng(spec.draw)
     drawn: dict[str, str | FeatureSettings] = {}
-    for number in range(1, spec.random + 1):
+    known = {frozenset(first_inputs)}
+    for _ in range(_DRAWS * spec.random):
         picked = sorted(rng.choice(len(free), max(0, min(size - len(always), len(free))), replace=False))
-        name = f"random {number}"
-        drawn[name] = FeatureSettings(name=name, channels=(*always, *(free[i] for i in picked)))
+        channels = (*always, *(free[i] for i in picked))
+        if frozenset(channels) not in known:
+            known.add(frozenset(channels))
+            name = f"random {len(drawn) + 1}"
+            drawn[name] = FeatureSettings(name=name, channels=channels)
+        if len(drawn) == spec.random:
+            break
     return drawn
 
 

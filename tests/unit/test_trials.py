@@ -12,7 +12,7 @@ from edp.logs import write_recording
 from edp.recording import Recording
 from edp.signals import Channel, Kind
 from edp.sources import DataSource
-from edp.trials import Difference, TrialSpec, _difference, try_feature_sets, with_differences
+from edp.trials import Difference, TrialSpec, _difference, _drawn, try_feature_sets, with_differences
 
 CHANNELS = (
     Channel("v", Kind.VELOCITY),
@@ -130,6 +130,17 @@ def test_pressures_get_their_differences():
     named = with_differences(settings, drive("d", 1), "with")
     assert named.derived == (Derived("dv", "v"), Derived("dp", "p", "difference", Kind.PRESSURE))
     assert with_differences(named, drive("d", 1), "with") == named
+
+
+@pytest.mark.parametrize(
+    ("channels", "asked", "found"),
+    [(("v", "u"), 9, {"more", "noise", "p"}), (("v",), 2, set()), (("v", "u"), 0, set())],
+)
+def test_no_set_is_drawn_that_is_there_already(experiment, channels, asked, found):
+    first = FeatureSettings(name="first", channels=channels)
+    drawn = _drawn({"first": first}, experiment, drive("d", 1), TrialSpec(random=asked))
+    assert list(drawn) == [f"random {k + 1}" for k in range(len(found))]
+    assert {tuple(one.channels) for one in drawn.values()} == {("v", name) for name in found}
 
 
 def test_mistakes_are_told(source, experiment, tmp_path):

@@ -277,9 +277,8 @@ def _notes(evidence: Evidence, flags: Sequence[Flag], horizon: int) -> tuple[str
         notes.append(f"the best lag of {', '.join(edge)} is the end of the search; raise max_lag")
     leaks = [flag.channel for flag in flags if flag.kind == FlagKind.LEAK]
     if leaks:
-        notes.append(
-            f"{len(leaks)} channels know the future: a model fed with them does well in tests and fails on the machine"
-        )
+        known = "a channel knows" if len(leaks) == 1 else f"{len(leaks)} channels know"
+        notes.append(f"{known} the future: a model fed with it does well in tests and fails on the machine")
     if table.left_out:
         notes.append(f"too short to be looked at and left out: {', '.join(table.left_out)}; lower max_lag to see them")
     if horizon == 0:

@@ -96,7 +96,17 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
         '[model.backbone]\nkind = "lstm"\nunits = 4\n[judge]\nhistory = 5\n'
     )
     out = tmp_path / "screen"
-    trials = ["--trials", "--random", "1", "--config", tmp_path / "tiny.toml", "--features", tmp_path / "mine.toml"]
+    trials = [
+        "--trusted",
+        "lever",
+        "--trials",
+        "--random",
+        "1",
+        "--config",
+        tmp_path / "tiny.toml",
+        "--features",
+        tmp_path / "mine.toml",
+    ]
     monkeypatch.setattr("edp.cli.screen.Steps", lambda quiet: Steps(quiet, every_s=0.0))
     first = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", *QUICK, *trials)
     assert first.code == 0, first.err
