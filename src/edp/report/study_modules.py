@@ -184,7 +184,7 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet 
     )
     return (
         Sheet("modules", caption, first, tuple(rows), frozenset(marked)),
-        Sheet("tests", "Every metric", second, tuple(every)),
+        Sheet("tests", "The thesis's gates on every metric", second, tuple(every)),
     )
 
 

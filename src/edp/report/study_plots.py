@@ -130,7 +130,7 @@ def pareto_plot(points: Sequence[PointView], unit: str) -> Plot | None:
         picked = [p for p in points if p.picked and cost in p.costs]
         figure.add_scatter(
             x=[p.costs[cost] for p in picked], y=[p.score for p in picked], mode="text",
-            text=[html.escape(p.picked) for p in picked], textposition="top right", cliponaxis=False,
+            text=[f"\u00a0\u00a0{html.escape(p.picked)}" for p in picked], textposition="top right", cliponaxis=False,
             textfont={"size": 11, "color": INK}, showlegend=False, hoverinfo="skip", **shared,
         )  # fmt: skip
     styled(figure, 480)

@@ -137,6 +137,8 @@ def caveats(study: StudyFacts) -> list[str]:
         "p-values speak of sessions like these, not of another machine.",
         *_power(study),
         "Modules are tried on one baseline with one feature set; on another network they may do otherwise.",
+        f"Winners were tuned further than the baseline ({_count(int(spec['joint_trials']), 'more question')} in phase "
+        f"4, {whole(int(spec['free_trials']))} in phase 5), so part of their gain may be tuning and not modules.",
         "The best of many questions is the best partly by chance, so scores of winners on development sessions are too "
         "good. Only test sessions and fresh folds count.",
     ]

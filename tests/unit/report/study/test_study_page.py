@@ -150,6 +150,7 @@ def test_words_follow_the_settings(sound):
     assert "400 updates" in text
     assert "2,000 updates" in text
     assert "9 that train and judge in turn, 3 set apart" in text
+    assert "6 more questions in phase 4, 12 in phase 5" in text
     sound["spec"]["final_updates"] = 400
     assert "no longer (400 updates)" in " ".join(caveats(facts_of(sound)))
     sentences = dict(decided(facts_of(sound)))["Phase 3: confirmation"]
