@@ -58,6 +58,7 @@ def run(
     ] = [],  # noqa: B006
     phase: Annotated[str | None, typer.Option(help="The last phase to run now; all, where not given.")] = None,
     workers: Annotated[int, typer.Option(help="Trainings side by side; 0: as many as cores.")] = 0,
+    cluster: Annotated[str, typer.Option(help="Address of a Ray cluster that trains instead, or auto.")] = "",
     threads: Annotated[int, typer.Option(help="Of each training; another number is another training.")] = 1,
     seconds: Annotated[float | None, typer.Option(help="Cap on the time of a training.")] = None,
     memory: Annotated[float | None, typer.Option(help="Cap on the memory of a training, MB.")] = None,
@@ -78,10 +79,10 @@ def run(
 
     changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
     plan = load_plan(config, preset, changes)
-    crew = Crew(workers=workers, threads=threads, seconds=seconds, memory_mb=memory)
+    crew = Crew(workers=workers, threads=threads, seconds=seconds, memory_mb=memory, cluster=cluster)
     source = source_of(data, signal_map, repair)
     with progress(as_json) as shown:
-        display = SearchDisplay(shown, Steps(as_json), crew.size, as_json)
+        display = SearchDisplay(shown, Steps(as_json), as_json)
         watchers = Watchers(
             on_note=display.on_note,
             on_phase=display.on_phase,
@@ -124,8 +125,8 @@ def export(
 class SearchDisplay:
     """Shows phases, trainings and the time left; decisions as sentences."""
 
-    def __init__(self, shown: Progress, steps: Steps, workers: int, quiet: bool) -> None:
-        self.shown, self.steps, self.workers, self.quiet = shown, steps, workers, quiet
+    def __init__(self, shown: Progress, steps: Steps, quiet: bool) -> None:
+        self.shown, self.steps, self.quiet = shown, steps, quiet
         self.bar = shown.add_task("search", total=1.0, note="reading recordings")
         self.title = ""
 
@@ -143,8 +144,8 @@ class SearchDisplay:
 
     def on_progress(self, diary: Diary) -> None:
         """Show how far it is."""
-        counts, left = diary.counts(), diary.seconds_left(self.workers)
-        running = min(self.workers, counts["asked"] - counts["done"])
+        counts, left = diary.counts(), diary.seconds_left()
+        running = min(diary.workers, counts["asked"] - counts["done"])
         note = f"{self.title}: {counts['done']} trainings, {running} running, {counts['total'] - counts['done']} left"
         self.shown.update(self.bar, completed=counts["done"] / max(1, counts["total"]), note=note)
         self.steps.say(f"search: {note}" + ("" if left is None else f", at most {duration(left)}"))

@@ -37,6 +37,7 @@ class Diary:
         decisions: of the phases that have ended.
         openings: looks into the lock-box.
         state: ``running``, ``stopped`` or ``finished``.
+        workers: trainings that run side by side.
     """
 
     def __init__(self, folder: Path, facts: Mapping[str, Any], ground: Ground) -> None:
@@ -48,6 +49,7 @@ class Diary:
         self.rows: dict[str, dict[str, Any]] = {}
         self.openings: list[Opening] = []
         self.trained = 0
+        self.workers = 1
         self._expected = {name: phase.trainings(ground) for name, phase in PHASES.items()}
         self._seconds = 0.0
         self._phase_began = 0.0
@@ -137,7 +139,7 @@ class Diary:
                 current = max(0, self._expected[phase["name"]] - phase["trainings"])
         return {"done": done, "asked": len(self.rows), "total": len(self.rows) + current + ahead}
 
-    def seconds_left(self, workers: int) -> float | None:
+    def seconds_left(self) -> float | None:
         """From the trainings of this sitting, or else of earlier ones; None before the first."""
         counts = self.counts()
         if self.trained:
@@ -146,7 +148,7 @@ class Diary:
             each = sum(row.get("seconds") or 0.0 for row in self.rows.values()) / counts["done"]
         else:
             return None
-        return (counts["total"] - counts["done"]) * each / workers
+        return (counts["total"] - counts["done"]) * each / self.workers
 
     def to_json(self) -> Table:
         """The whole, plain."""

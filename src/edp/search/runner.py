@@ -44,15 +44,17 @@ class Crew:
         threads: of each training; another number gives other bits, and is another training.
         seconds: cap on the time of a training.
         memory_mb: cap on its memory.
+        cluster: address of a Ray cluster that does them instead; empty for this machine.
 
     Raises:
-        ConfigError: a number out of range.
+        ConfigError: a number out of range, or workers of this machine and a cluster.
     """
 
     workers: int = 0
     threads: int = 1
     seconds: float | None = None
     memory_mb: float | None = None
+    cluster: str = ""
 
     def __post_init__(self) -> None:
         caps = [cap for cap in (self.seconds, self.memory_mb) if cap is not None]
@@ -61,15 +63,19 @@ class Crew:
                 f"workers = {self.workers}, threads = {self.threads}, caps {self.seconds} s and {self.memory_mb} MB; "
                 "workers >= 0, threads >= 1 and caps above 0 must hold"
             )
-
-    @property
-    def size(self) -> int:
-        """Processes."""
-        return self.workers or max(1, len(os.sched_getaffinity(0)) // self.threads)
+        if self.cluster and self.workers:
+            raise ConfigError(
+                f"workers = {self.workers} and the cluster '{self.cluster}' came; a cluster has its own number of "
+                "workers, as many as its cores hold: give one of the two"
+            )
 
     def gather(self) -> Executor:
         """What does the trainings."""
-        return LocalPool(self.size, self.threads)
+        if self.cluster:
+            from edp.search.cluster import RayPool  # Ray takes seconds to import, and few have it
+
+            return RayPool(self.cluster, self.threads)
+        return LocalPool(self.workers or max(1, len(os.sched_getaffinity(0)) // self.threads), self.threads)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +155,7 @@ def run_search(
         ground = Ground(plan.spec, settings_of(plan.experiment), source.to_plain(), development, test, data.channels)
         diary = Diary(target, _facts(plan, data, source, ground), ground)
         executor = open_things.enter_context(crew.gather())
+        diary.workers = executor.workers
         work = _Work(ledger, diary, ground, watchers)
         doing = Doing(
             ledger, executor, data.digest, crew.threads, crew.seconds, crew.memory_mb, work.on_record, work.on_orders

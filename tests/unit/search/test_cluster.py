@@ -1,0 +1,158 @@
+"""A real Ray cluster of three nodes on this machine: the same study, the same result, with a node killed meanwhile."""
+
+import contextlib
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from edp.errors import ConfigError
+from edp.ledger import Ledger, Status
+from edp.search.batch import complete
+from edp.search.local import LocalPool
+from edp.search.plan import load_plan
+from edp.search.runner import Crew, Watchers, run_search
+
+TOKEN = secrets.token_hex(16)
+RAY = Path(sys.executable).with_name("ray")
+needs_ray = pytest.mark.skipif(not RAY.exists(), reason="the extra 'cluster' (Ray) is not installed")
+CHANGES = (
+    'task={targets=["speed"], horizons=[1]}',
+    'model={backbone={kind="lstm", units=4}, window=5, head={hidden=4}}',
+    "training.chunks={length=20, batch=4, burn_in=5}",
+    'search={horizon=1, backbones=["lstm"], features=["all"], updates=3, final_updates=4, folds=2, variance_runs=4}',
+    "search={variance_seeds=2, trials=3}",
+    "search.space={units=[2, 4], kernel=false}",
+)
+
+
+class Nodes:
+    """Nodes of a cluster, a process group each."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.address = f"127.0.0.1:{self.port}"
+        self.groups = []
+
+    def start(self, *options):
+        command = [
+            RAY,
+            "start",
+            *options,
+            "--node-ip-address=127.0.0.1",
+            "--num-cpus=1",
+            "--object-store-memory=80000000",
+            "--block",
+        ]
+        with (self.folder / f"node{len(self.groups)}.log").open("wb") as log:
+            node = subprocess.Popen(
+                [*command, "--disable-usage-stats"], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        self.groups.append(node)
+
+    def kill(self, number):
+        """kill -9 of a whole node, as when its plug is pulled."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.groups[number].pid, signal.SIGKILL)
+        self.groups[number].wait()
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # before Ray is imported, which reads them once
+    monkeypatch.setenv("RAY_AUTH_TOKEN", TOKEN)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)]))
+    import ray
+
+    folder = Path(tempfile.mkdtemp(prefix="edp-ray-"))  # not the test's own: paths of sockets must be short
+    nodes = Nodes(folder)
+    try:
+        nodes.start("--head", f"--port={nodes.port}", "--include-dashboard=false", f"--temp-dir={folder / 'head'}")
+        until = time.monotonic() + 300
+        while time.monotonic() < until:
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", nodes.port), 1):
+                break
+            time.sleep(0.2)
+        for _ in range(2):
+            nodes.start(f"--address={nodes.address}")
+        ray.init(address=nodes.address, log_to_driver=False)
+        while len([node for node in ray.nodes() if node["Alive"]]) < 3 and time.monotonic() < until:
+            time.sleep(0.5)
+        ray.shutdown()
+        yield nodes
+    finally:
+        ray.shutdown()
+        for number in reversed(range(len(nodes.groups))):
+            nodes.kill(number)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_finds(cluster, lever_sessions, tmp_path):
+    plan = load_plan(None, "quick", CHANGES)
+    done = []
+
+    def kill_one(diary):
+        if diary.trained == 4 and not done:
+            done.append(diary.workers)
+            cluster.kill(2)
+
+    crew = Crew(cluster=cluster.address)
+    there = run_search(lever_sessions, plan, tmp_path / "there", crew, "calibration", Watchers(on_progress=kill_one))
+    assert done == [3]
+    here = run_search(lever_sessions, plan, tmp_path / "here", Crew(workers=1), "calibration")
+    assert there.digest == here.digest
+    assert there.trained == here.trained == 11
+    assert there.ground.decided == here.ground.decided
+    again = run_search(lever_sessions, plan, tmp_path / "there", crew, "calibration")
+    assert again.trained == 0
+
+
+@needs_ray
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_caps_failures_and_cancelling_are_those_of_the_local_pool(cluster, job_of, tmp_path):
+    from edp.search.cluster import RayPool
+
+    jobs = [job_of(0), job_of(1, "raises", how="error"), job_of(2, seconds=1.0, sleep=60)]
+    with RayPool(cluster.address) as pool, Ledger(tmp_path / "ledger") as ledger:
+        found = [str(record.status) for record in complete(ledger, pool, jobs).values()]
+        assert found == [Status.DONE, Status.FAILED, Status.TIMEOUT]
+        pool.submit(job_of(3, sleep=600))
+        with pytest.raises(ConfigError, match="submitted twice"):
+            pool.submit(job_of(3, sleep=600))
+        pool.cancel(job_of(3, sleep=600).key)
+        assert pool.wait_any(0.1) is None
+        pool.submit(job_of(4))
+        assert pool.wait_any().status is Status.DONE  # the cancelled one holds no core
+
+
+@needs_ray
+def test_no_cluster_at_an_address_is_told_at_once():
+    with pytest.raises(ConfigError, match=r"nothing answers at '127\.0\.0\.1:9'.*ray start --head"):
+        Crew(cluster="127.0.0.1:9").gather()
+
+
+def test_without_ray_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConfigError, match=r"\[cluster\]"):
+        Crew(cluster="auto").gather()
+
+
+def test_workers_of_two_kinds_are_refused():
+    with pytest.raises(ConfigError, match="give one of the two"):
+        Crew(cluster="auto", workers=2)
+    assert isinstance(Crew(workers=1).gather(), LocalPool)
