@@ -57,7 +57,7 @@ def helper(monkeypatch):
     ],
 )
 def test_whatever_a_file_does_to_its_library_is_one_error(log, helper, fault, message):
-    helper(f"child.WALK_S = 0.3; child.matio.load_from_mat = lambda *_, **__: {fault}")
+    helper(f"child.START_S = 0.3; child.matio.load_from_mat = lambda *_, **__: {fault}")
     for _ in range(2):
         with pytest.raises(DataError, match=f"a.mat'.*{message}"):
             read_recording(log)
@@ -160,6 +160,20 @@ def test_the_same_is_found_in_this_process_and_apart(tmp_path, version):
                 np.testing.assert_array_equal(mine.time, theirs.time)
         assert str(here.scalars) == str(apart_.scalars)
         assert (here.repeated, here.names, here.info) == (apart_.repeated, apart_.names, apart_.info)
+
+
+def test_limits_grow_with_what_a_file_holds(tmp_path):
+    columns = {f"c{k}": np.zeros((1000, 1)) for k in range(30)}
+    told = {}
+    for count in (1, 30):
+        path = tmp_path / f"{count}.mat"
+        scipy.io.savemat(path, dict(list(columns.items())[:count]))
+        told[count] = []
+        open_file(path, None, lambda *limits, count=count: told[count].append(limits))
+    (walk, load), (long_walk, long_load) = told[1], told[30]
+    assert long_walk[0] > walk[0]
+    assert long_load[0] > load[0]
+    assert long_load[1] - load[1] > 29 * 8000 * 8
 
 
 def test_equal_times_are_one_array(tmp_path):

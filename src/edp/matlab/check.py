@@ -26,23 +26,23 @@ _UNSTORED_BYTES = 1 << 20
 _ADVICE = "it may be damaged, or was made to exhaust memory; else save fewer variables, or Parquet or MDF, in a file"
 
 
-def check_size(path: Path) -> int:
+def check_size(path: Path) -> tuple[int, int]:
     """Add up what the variables of a file take.
 
     Returns:
-        bytes when unpacked.
+        bytes when unpacked, and the number of HDF5 objects (v7.3) or of variables (v5).
 
     Raises:
         DataError: the file is cut off or damaged, or its variables do not fit into memory.
     """
     # The text of the header does not tell: some writers leave that of v5 before HDF5.
-    total = _announced_v73(path) if h5py.is_hdf5(path) else _announced_v5(path)
+    total, objects = _announced_v73(path) if h5py.is_hdf5(path) else _announced_v5(path)
     check_memory(path, _COPIES * total, "the variables of this MAT file", _ADVICE)
-    return total
+    return total, objects
 
 
-def _announced_v5(path: Path) -> int:
-    size, total = path.stat().st_size, 0
+def _announced_v5(path: Path) -> tuple[int, int]:
+    size, total, objects = path.stat().st_size, 0, 0
     with path.open("rb") as stream:
         head = stream.read(_HEADER)
         order = ">" if head[126:128] == b"MI" else "<"
@@ -59,8 +59,9 @@ def _announced_v5(path: Path) -> int:
             if held > _DEFLATE_RATIO * (length + 64):
                 raise _impossible(path, f"the variable at byte {at}", held, length)
             total += held
+            objects += 1
             at += 8 + length
-    return total
+    return total, objects
 
 
 def _unpacked(start: bytes, order: str) -> int:
@@ -75,11 +76,12 @@ def _unpacked(start: bytes, order: str) -> int:
     return int(length) if kind == _MATRIX else 0
 
 
-def _announced_v73(path: Path) -> int:
-    total = 0
+def _announced_v73(path: Path) -> tuple[int, int]:
+    total = objects = 0
 
     def add(name: str, part: h5py.HLObject) -> None:
-        nonlocal total
+        nonlocal total, objects
+        objects += 1
         if isinstance(part, h5py.Dataset):
             held, stored = part.size * part.dtype.itemsize, part.id.get_storage_size()
             if held > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
@@ -97,7 +99,7 @@ def _announced_v73(path: Path) -> int:
             f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {error}); it may be truncated or damaged: "
             "copy or export it again"
         ) from error
-    return total
+    return total, objects
 
 
 def _impossible(path: Path, what: str, held: int, stored: int) -> DataError:

@@ -30,17 +30,19 @@ from edp.matlab.wire import pack, refuse, send
 
 IDLE_S = 60.0
 """After so long without an order the process ends; the next file starts another."""
-WALK_BYTES = 512 << 20
+START_BYTES = 512 << 20
 """Address space that walking through a structure may take."""
 COPIES = 8
 """Address space a byte of unpacked variables: the libraries copy them several times."""
-WALK_S = 2.0
-FILE_BYTES_PER_S = 1e6
-"""Processor time that the structure of a file may take; the limits are some ten times what sound files take."""
-BYTES_PER_S = 5e6
-"""Processor time that unpacking may take."""
+OBJECT_BYTES = 8192
+START_S = 2.0
+"""Processor time that any file may take; the limits below are several times what sound files take."""
+WALK_BYTES_PER_S = 2e5
+BYTES_PER_S = 2e6
+OBJECT_S = 0.01
 WALL = 30
 """Longest time by the clock, in allowed processor times: a process may also wait for ever."""
+Limit = Callable[[float, int], None]
 SIGNAL_CODE = 128
 """Exit code of this process where a signal ended a forked one, less the number of the signal."""
 
@@ -107,11 +109,10 @@ def _answer(line: bytes, answers: int) -> None:
         send(ready, write)
 
 
-def _limit(size: int, unpacked: int) -> None:
-    """Limit memory and time from here on, for a file of `size` bytes that takes `unpacked` bytes of memory."""
-    _limit_memory(WALK_BYTES + COPIES * unpacked)
+def _limit(seconds: float, more: int) -> None:
+    """Limit processor time and further memory from here on."""
+    _limit_memory(more)
     if hasattr(signal, "setitimer"):
-        seconds = WALK_S + size / FILE_BYTES_PER_S + unpacked / BYTES_PER_S
         signal.setitimer(signal.ITIMER_PROF, seconds)
         signal.setitimer(signal.ITIMER_REAL, WALL * seconds)
 
@@ -128,13 +129,13 @@ def _limit_memory(more: int) -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def open_file(path: Path, variable: str | None, limit: Callable[[int, int], None] = lambda *_: None) -> Found:
+def open_file(path: Path, variable: str | None, limit: Limit = lambda *_: None) -> Found:
     """Everything in a file, or in one variable of it.
 
     Args:
         path: the file.
         variable: read this one only.
-        limit: called with the file's size and the bytes that are about to be unpacked.
+        limit: called with the processor time in s and the bytes that may be taken from then on.
 
     Raises:
         DataError: the file is damaged or holds more than this machine's memory.
@@ -152,14 +153,15 @@ def open_file(path: Path, variable: str | None, limit: Callable[[int, int], None
     return found
 
 
-def _load(path: Path, limit: Callable[[int, int], None]) -> dict[str, Any]:
+def _load(path: Path, limit: Limit) -> dict[str, Any]:
     with path.open("rb") as stream:
         head = stream.read(128)
     if any(magic.startswith(head[: len(magic)]) for magic in MAGIC) and len(head) < 128:
         raise DataError(f"'{path}' is a MAT file that ends inside its header (truncated); copy or export it again")
     size = path.stat().st_size
-    limit(size, 0)
-    limit(size, size if is_v4(head) else check_size(path))
+    limit(START_S + size / WALK_BYTES_PER_S, START_BYTES)
+    held, objects = (size, 1) if is_v4(head) else check_size(path)
+    limit(START_S + held / BYTES_PER_S + objects * OBJECT_S, START_BYTES + COPIES * held + objects * OBJECT_BYTES)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
