@@ -90,7 +90,8 @@ def run(
             on_decision=display.on_decision,
         )
         found = run_search(source, plan, study, crew, phase, watchers)
-    emit(as_json, _facts(found), lambda: _show(found, data))
+        page = _write_report(study, None, pictures=found.state == "finished")
+    emit(as_json, _facts(found) | {"report": str(page)}, lambda: _show(found, data, page))
 
 
 @app.command("status")
@@ -103,6 +104,23 @@ def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
 
     held = look_at(study)
     emit(as_json, held, lambda: _show_status(held))
+
+
+@app.command("report")
+def report(
+    study: StudyArgument,
+    output: Annotated[
+        Path | None, typer.Option("--out", help="Folder of page, tables and pictures; default: DIR.")
+    ] = None,
+    pictures: Annotated[bool, typer.Option(help="Write the pictures as SVG and PNG too.")] = True,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write the report of a study, finished or under way: page, tables (CSV, Markdown), pictures.
+
+    Example: `edp search report studies/first --out report`
+    """
+    page = _write_report(study, output, pictures)
+    emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {page}"))
 
 
 @app.command("export")
@@ -160,6 +178,13 @@ class SearchDisplay:
                 out.print("  " + sentence.replace("[", r"\["))
 
 
+def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
+    from edp.report import write_study_page
+    from edp.search.diary import read_study
+
+    return write_study_page(read_study(study), study if output is None else output, pictures).page
+
+
 def _facts(found: Found) -> dict[str, Any]:
     return {
         "study": str(found.folder),
@@ -172,8 +197,9 @@ def _facts(found: Found) -> dict[str, Any]:
     }
 
 
-def _show(found: Found, data: Path) -> None:
+def _show(found: Found, data: Path, page: Path) -> None:
     out.print(f"study: {found.folder}, {found.state}; {found.trained} trainings now")
+    out.print(f"report: {page}")
     if found.teacher is None:
         out.print("next: the same command without --phase, or with a later one")
     else:

@@ -36,6 +36,10 @@ def test_a_study_its_state_and_its_export(edp, command, tmp_path):
     assert "nobody now" in shown.out
     held = edp("search", "status", study, "--json").json
     assert [phase["trained"] for phase in held["phases"]] == [8, 2]
+    assert "FG2" in (study / "report.html").read_text(encoding="utf-8")
+    page = edp("search", "report", study, "--out", tmp_path / "page", "--no-pictures", "--json").json["report"]
+    assert page == str(tmp_path / "page" / "report.html")
+    assert not (tmp_path / "page" / "pictures").exists()
     export = edp("search", "export", study, "--json").json
     assert export["studies"] == ["calibration lstm"]
 
@@ -76,7 +80,7 @@ def test_wrong_words_are_told_in_one_line_and_nothing_is_begun(edp, command, tmp
 
 
 def test_state_and_export_of_no_study(edp, tmp_path):
-    for name in ("status", "export"):
+    for name in ("status", "export", "report"):
         ended = edp("search", name, tmp_path)
         assert ended.code == 1
         assert "holds no study" in ended.err
