@@ -206,7 +206,7 @@ def update_cost(data: Prepared, experiment: Experiment) -> float:
 
 
 def chosen_rivals(league: League, arguments: argparse.Namespace) -> list[Contender]:
-    """Each of the thesis's networks with the rate that validates better at the first horizon."""
+    """Each of the thesis's networks with the rate that validates better at one horizon, with the first seed."""
     first = [arguments.rate_at]
     cells = {rival: league.cell(rival, first, arguments.budget) for rival in arguments.rivals}
     families = sorted({rival.family for rival in cells})
@@ -309,9 +309,12 @@ def run(arguments: argparse.Namespace, folder: Path) -> None:
     limits = limits_of(data, order, sorted(horizons), quick)
     joints: list[dict[str, float]] = []
     rounds: list[dict[int, dict[str, Any]]] = []
-    for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-        league = League(DataSource.of(data), make_folder(folder / "cells"), seed, 2 if quick else LOOKS)
-        rivals = chosen_rivals(league, arguments)
+    leagues = [
+        League(DataSource.of(data), make_folder(folder / "cells"), seed, 2 if quick else LOOKS)
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds)
+    ]
+    rivals = chosen_rivals(leagues[0], arguments)
+    for league in leagues:
         found = {k: equal_time(league, k, rivals, arguments, limits[k]) for k in horizons}
         if len(horizons) > 1:
             alone = league.cell(OURS, sorted(horizons), arguments.budget)["mae"]
