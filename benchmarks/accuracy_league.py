@@ -138,7 +138,8 @@ class League:
         experiment = contender.experiment(horizons, self.seed)
         data = prepare_data(self.source, experiment)
         data = dataclasses.replace(data, validation=data.validation[:VALIDATED])
-        cost = self.cost(contender, len(horizons))
+        # Costs are measured at different moments: an update for several horizons is not cheaper than for one.
+        cost = max(self.cost(contender, outputs) for outputs in {1, len(horizons)})
         looks = 4 * self.looks if patience else self.looks
         updates = max(1, int(budget_s / looks / cost))
         training = dataclasses.replace(experiment.training, updates=updates, epochs=looks, patience=patience)
