@@ -84,11 +84,11 @@ def cluster(monkeypatch):
             with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", nodes.port), 1):
                 break
             time.sleep(0.2)
-        for _ in range(2):
-            nodes.start(f"--address={nodes.address}")
         ray.init(address=nodes.address, log_to_driver=False)
-        while len([node for node in ray.nodes() if node["Alive"]]) < 3 and time.monotonic() < until:
-            time.sleep(0.5)
+        for size in (2, 3):  # one after the other: two that start at once may take the same ports
+            nodes.start(f"--address={nodes.address}")
+            while ray.cluster_resources().get("CPU", 0) < size and time.monotonic() < until:
+                time.sleep(0.5)
         ray.shutdown()
         yield nodes
     finally:
