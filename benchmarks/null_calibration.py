@@ -86,7 +86,12 @@ def composite(scores: Array) -> Array:
 def thesis_design(source: Source, repetition: int) -> tuple[Mask, NDArray[np.int64]]:
     """Cells and splits of the thesis's runs."""
     splits = np.repeat(np.arange(SPLITS), SEEDS)
-    return repeated_splits(source.sessions, HELD_OUT, SPLITS, repetition)[splits], splits
+    return repeated_splits(source.sessions, HELD_OUT, SPLITS, drawn_as(source, repetition))[splits], splits
+
+
+def drawn_as(source: Source, repetition: int) -> int:
+    """Number of the folds of a study; where scores are trained, studies share folds, as trainings are dear."""
+    return repetition % source.designs if source.designs else repetition
 
 
 def thesis_studies(source: Source, effects: Array, repetition: int) -> dict[str, Outcome]:
@@ -112,7 +117,7 @@ def thesis_studies(source: Source, effects: Array, repetition: int) -> dict[str,
 
 def sound_studies(source: Source, effects: Array, repetition: int) -> dict[str, Outcome]:
     """One study in our design: the whole decision, and the same without the practical gate."""
-    tested = repeated_folds(source.sessions, FOLDS, REPEATS, repetition)
+    tested = repeated_folds(source.sessions, FOLDS, REPEATS, drawn_as(source, repetition))
     scores = composite(source.scores(tested, np.arange(len(tested)), effects, repetition))
     names = [str(i) for i in range(source.modules)]
     found = confirm(scores, names, names, tested, Rule(alpha=ALPHA))
@@ -150,9 +155,11 @@ def rates(
     return found
 
 
-def null_table(sources: Sequence[Source], studies: int, seed: int) -> dict[str, dict[str, Rates]]:
+def null_table(
+    sources: Sequence[Source], studies: int, seed: int, ways: Sequence[Way] = (thesis_studies, sound_studies)
+) -> dict[str, dict[str, Rates]]:
     """Rates under the exact null, printed."""
-    found = {source.name: rates(source, 0.0, studies, seed) for source in sources}
+    found = {source.name: rates(source, 0.0, studies, seed, ways) for source in sources}
     print(f"exact null, {studies} studies of {sources[0].modules} modules, level {ALPHA}")
     rows = [
         [world, name, one.significant, one.false, one.any_false, deviation(one.any_false, studies), one.trainings]

@@ -26,6 +26,7 @@ class Source(Protocol):
         name: for the tables.
         sessions: development sessions.
         modules: registered modules.
+        designs: how many draws of folds studies take turns with; 0 for one of its own each.
     """
 
     @property
@@ -36,6 +37,9 @@ class Source(Protocol):
 
     @property
     def modules(self) -> int: ...
+
+    @property
+    def designs(self) -> int: ...
 
     def scores(self, tested: Mask, splits: NDArray[np.int64], effects: Array, repetition: int) -> Array:
         """Errors of one study, ``(metric, 1 + module, run, session)`` in the order of `METRICS`.
@@ -66,6 +70,7 @@ class World:
         cell: of the rest.
         shared: share of every variance that the four metrics have in common.
         sessions, modules: their numbers; the thesis's by default.
+        designs: see `Source`.
     """
 
     name: str
@@ -80,6 +85,7 @@ class World:
     shared: float = 0.8
     sessions: int = 25
     modules: int = 14
+    designs: int = 0
 
     def scores(self, tested: Mask, splits: NDArray[np.int64], effects: Array, repetition: int) -> Array:
         """See `Source`."""
