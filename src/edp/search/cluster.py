@@ -135,18 +135,23 @@ class RayPool:
                 asked[f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"] = remote.remote(self.threads)
         if not asked:
             raise ConfigError(f"the cluster has no node with {self.threads} free cores; add one, or take fewer threads")
-        here = _state_there(self.threads)
+        here, errors, answered = _state_there(self.threads), self.ray.exceptions, 0
         for name, reference in asked.items():
             try:
                 there = self.ray.get(reference, timeout=HOUR_S)
-            except self.ray.exceptions.RayError as error:
+            except (errors.TaskUnschedulableError, errors.NodeDiedError):
+                continue  # it was killed a moment ago, and the cluster had not noticed; nothing will run there
+            except errors.RayError as error:
                 raise ConfigError(
                     f"node {name} cannot run EDP: {_line(error)}; install the same version of it there"
                 ) from error
+            answered += 1
             other = sorted(part for part in here if here[part] != there.get(part))
             if other:
                 told = ", ".join(f"{part} {there.get(part)} (here {here[part]})" for part in other)
                 raise ConfigError(f"node {name} has other code or versions: {told}; install the same there")
+        if not answered:
+            raise ConfigError("no node of the cluster answers; start one, then give the same command again")
 
 
 def _perform_there(job: Job, threads: int) -> bytes:
