@@ -22,7 +22,6 @@ from edp.data.splits import SPLITS, ByRecording, SplitSpec
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, StorageError, closest
 from edp.evaluation.judge import JudgeSpec
-from edp.logs.repair import Repair
 from edp.losses import LOSSES, TERMS
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES
@@ -34,7 +33,6 @@ from edp.models.physics import PHYSICS, PhysicsSpec
 from edp.models.plain import options
 from edp.models.predictor import ModelSpec
 from edp.registry import Registry
-from edp.signals import ChannelMap, SignalMap
 from edp.training.averages import AVERAGES
 from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
@@ -135,32 +133,6 @@ class Experiment:
     judge: JudgeSpec = field(default_factory=JudgeSpec)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordingEntry:
-    """One recording of a data-set file.
-
-    Attributes:
-        path: the log, relative to the data-set file; ``${NAME}`` is replaced by that environment variable.
-        name: unique name; the file's stem by default.
-        rows: ``[start, stop]`` to use a part of the log.
-        map: signal map for this log: a table, or the path of a map file; the data set's map by default.
-    """
-
-    path: str
-    name: str | None = None
-    rows: tuple[int, int] | None = None
-    map: str | SignalMap | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class DataSetSettings:
-    """A data-set file: its recordings, the map that they share, and allowed repairs."""
-
-    recordings: tuple[RecordingEntry, ...] = ()
-    map: str | SignalMap | None = None
-    repair: Repair = field(default_factory=Repair)
-
-
 def load_experiment(
     path: str | Path | None = None, preset: str | None = "standard", overrides: Sequence[str] = ()
 ) -> Experiment:
@@ -193,33 +165,6 @@ def preset_table(name: str) -> Table:
     if name not in PRESETS:
         raise ConfigError(f"there is no preset '{name}'{closest(name, PRESETS)}")
     return tomllib.loads(resources.files("edp").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8"))
-
-
-def load_signal_map(path: str | Path) -> SignalMap:
-    """A signal map from a TOML file.
-
-    Raises:
-        ConfigError: unknown keys or wrong values, all at once.
-    """
-    return build(SignalMap, _map_table(read_toml(path)), f"'{path}'")
-
-
-def load_data_set(path: str | Path) -> DataSetSettings:
-    """A data-set file; `map` entries that name files are left as paths relative to it."""
-    table = read_toml(path)
-    listed = table.get("recordings", [])
-    if not isinstance(listed, list):
-        raise ConfigError(
-            f"'{path}': recordings = {listed!r} is no list of [[recordings]]; a scenario file is simulated first, "
-            "with `edp simulate FOLDER --scenario`, and then the folder is read"
-        )
-    for entry in [table, *listed]:
-        if isinstance(entry, dict) and isinstance(entry.get("map"), dict):
-            entry["map"] = _map_table(entry["map"])
-    settings = build(DataSetSettings, table, f"'{path}'")
-    if not settings.recordings:
-        raise ConfigError(f"'{path}' lists no [[recordings]]; give at least one with its path")
-    return settings
 
 
 def experiment_toml(experiment: Experiment) -> str:
@@ -300,18 +245,6 @@ def override(text: str) -> Table:
             return tomllib.loads(f'{key.strip()} = "{value.strip()}"')
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"--set '{text}' is not understood: {error}") from error
-
-
-def _map_table(table: Table) -> Table:
-    """The user's form ``[channels.NAME] column = ...`` as a list of entries."""
-    channels = table.get("channels")
-    if not isinstance(channels, dict):
-        return table
-    entries = [
-        {"name": name, "column": name} | (dict(entry) if isinstance(entry, dict) else {"column": entry})
-        for name, entry in channels.items()
-    ]
-    return {**table, "channels": entries}
 
 
 T = typing.TypeVar("T")
@@ -404,6 +337,3 @@ def _tagged(name: str, table: Any, path: str, problems: list[str]) -> Any:
 
 def _join(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
-
-
-__all__ = ["ChannelMap", "DataSetSettings", "Experiment", "load_data_set", "load_experiment", "load_signal_map"]

@@ -1,19 +1,45 @@
-"""Where recordings come from: a log, a folder of logs, or a data-set file that lists them."""
+"""Where recordings come from: a log, a folder of logs, or a data-set file that lists them; maps of their columns."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from edp.config import build, load_data_set, load_signal_map, plain_tree
+from edp.config import Table, build, plain_tree, read_toml
 from edp.errors import ConfigError, DataError
 from edp.logs import DataQuality, compare, find_recordings, look_into, read_data_set, read_recording, unique_names
 from edp.logs.repair import Repair
 from edp.recording import Recording
 from edp.signals import SignalMap
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingEntry:
+    """One recording of a data-set file.
+
+    Attributes:
+        path: the log, relative to the data-set file; ``${NAME}`` is replaced by that environment variable.
+        name: unique name; the file's stem by default.
+        rows: ``[start, stop]`` to use a part of the log.
+        map: signal map for this log: a table, or the path of a map file; the data set's map by default.
+    """
+
+    path: str
+    name: str | None = None
+    rows: tuple[int, int] | None = None
+    map: str | SignalMap | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSetSettings:
+    """A data-set file: its recordings, the map that they share, and allowed repairs."""
+
+    recordings: tuple[RecordingEntry, ...] = ()
+    map: str | SignalMap | None = None
+    repair: Repair = field(default_factory=Repair)
 
 
 @dataclass(frozen=True)
@@ -92,7 +118,7 @@ class DataSource:
 
 @dataclass(frozen=True)
 class Log:
-    """One log of a source, with what is needed to read it; see `edp.config.RecordingEntry`."""
+    """One log of a source, with what is needed to read it; see `RecordingEntry`."""
 
     path: Path
     signal_map: SignalMap | None = None
@@ -103,6 +129,33 @@ class Log:
     def read(self) -> Recording:
         """The recording."""
         return read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
+
+
+def load_signal_map(path: str | Path) -> SignalMap:
+    """A signal map from a TOML file.
+
+    Raises:
+        ConfigError: unknown keys or wrong values, all at once.
+    """
+    return build(SignalMap, _map_table(read_toml(path)), f"'{path}'")
+
+
+def load_data_set(path: str | Path) -> DataSetSettings:
+    """A data-set file; `map` entries that name files are left as paths relative to it."""
+    table = read_toml(path)
+    listed = table.get("recordings", [])
+    if not isinstance(listed, list):
+        raise ConfigError(
+            f"'{path}': recordings = {listed!r} is no list of [[recordings]]; a scenario file is simulated first, "
+            "with `edp simulate FOLDER --scenario`, and then the folder is read"
+        )
+    for entry in [table, *listed]:
+        if isinstance(entry, dict) and isinstance(entry.get("map"), dict):
+            entry["map"] = _map_table(entry["map"])
+    settings = build(DataSetSettings, table, f"'{path}'")
+    if not settings.recordings:
+        raise ConfigError(f"'{path}' lists no [[recordings]]; give at least one with its path")
+    return settings
 
 
 def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
@@ -140,3 +193,15 @@ def _expanded(entry: str, path: Path) -> str:
             "logs, or write the path out"
         )
     return full
+
+
+def _map_table(table: Table) -> Table:
+    """The user's form ``[channels.NAME] column = ...`` as a list of entries."""
+    channels = table.get("channels")
+    if not isinstance(channels, dict):
+        return table
+    entries = [
+        {"name": name, "column": name} | (dict(entry) if isinstance(entry, dict) else {"column": entry})
+        for name, entry in channels.items()
+    ]
+    return {**table, "channels": entries}

@@ -13,7 +13,7 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
-from edp.config import TAGGED, RecordingEntry, TaskSettings, load_data_set, load_experiment, load_signal_map
+from edp.config import TAGGED, TaskSettings, load_experiment
 from edp.data.chunks import ChunkSpec
 from edp.data_sets import SimulationOrder, simulate_data_set
 from edp.evaluation.judge import JudgeSpec
@@ -22,10 +22,12 @@ from edp.losses import AdaptiveWeights
 from edp.models.predictor import ModelSpec
 from edp.recording import Recording
 from edp.screening import ForestSpec, ScreeningSpec
+from edp.search.ground import Ground
 from edp.search.phases import PHASES
 from edp.search.plan import load_plan
 from edp.search.settings import SearchSpec
 from edp.signals import TABLE_A1
+from edp.sources import RecordingEntry, load_data_set, load_signal_map
 from edp.training import TrainingSpec
 
 ROOT = Path(__file__).parents[2]
@@ -132,6 +134,15 @@ def test_search_page_names_every_phase_and_key_and_shows_the_examples():
     (shown,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     for line in shown.strip().splitlines():
         assert line.strip() in whole, line
+
+
+@pytest.mark.parametrize("preset", ["quick", "standard", "thesis"])
+def test_search_page_tells_how_much_a_preset_trains(preset):
+    page = (ROOT / "docs" / "search.md").read_text(encoding="utf-8")
+    spec = load_plan(preset=preset).spec
+    ground = Ground(spec, {}, {}, tuple(f"session {i}" for i in range(20)), ())
+    trainings = sum(phase.trainings(ground) for phase in PHASES.values())
+    assert f"| `{preset}` | {trainings:,} | {spec.updates:,}, {spec.final_updates:,} |" in page
 
 
 @pytest.mark.slow

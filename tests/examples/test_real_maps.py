@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.config import load_data_set, load_experiment, read_toml
+from edp.config import load_experiment, read_toml
 from edp.errors import ConfigError
+from edp.sources import load_data_set
 from edp.workflow import DataSource
 
 ROOT = Path(__file__).parents[2]

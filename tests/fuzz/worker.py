@@ -24,7 +24,7 @@ from edp.matlab import end
 from edp.recording import Recording
 
 MEMORY_BYTES = 6 << 30
-SECONDS = 60
+SECONDS = 20
 
 
 def damaged(whole: bytes, rng: np.random.Generator) -> bytes:

@@ -7,12 +7,9 @@ import pytest
 from edp.config import (
     PRESETS,
     TAGGED,
-    DataSetSettings,
     build,
     experiment_toml,
-    load_data_set,
     load_experiment,
-    load_signal_map,
     merged,
     plain_tree,
 )
@@ -23,6 +20,7 @@ from edp.models.heads import GluHead, MlpHead
 from edp.models.plain import model_from_plain, model_to_plain
 from edp.models.predictor import ModelSpec
 from edp.signals import Kind
+from edp.sources import DataSetSettings, load_data_set, load_signal_map
 
 
 def saved(tmp_path, text, name="settings.toml"):

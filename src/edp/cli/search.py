@@ -50,7 +50,7 @@ app = typer.Typer(
 def run(
     data: Annotated[Path, typer.Argument(help="A folder of logs, or a data-set file (.toml); each log is a session.")],
     study: Annotated[Path, typer.Option("--study", help="Folder of the study; goes on where it stopped.")],
-    preset: Annotated[str, typer.Option(help="quick (minutes), standard (hours) or thesis (days).")] = "quick",
+    preset: Annotated[str, typer.Option(help="quick, standard or thesis: how much is trained.")] = "quick",
     mode: Annotated[str | None, typer.Option(help="sound, or thesis: its tests and rules to the letter.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset, with [search].")] = None,
     changes: Annotated[
@@ -179,8 +179,7 @@ class SearchDisplay:
 
 
 def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
-    from edp.report import write_study_page
-    from edp.search.diary import read_study
+    from edp.report import read_study, write_study_page
 
     return write_study_page(read_study(study), study if output is None else output, pictures).page
 

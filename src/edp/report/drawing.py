@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edp.storage import write_bytes
+from edp.storage import make_folder, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,8 +35,17 @@ _STYLE: Any = {
 }
 
 
-def write_drawing(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path]:
-    """One drawing in every format; the same content gives the same bytes."""
+def write_drawings(folder: str | Path, drawings: Mapping[str, Callable[[Figure], None]]) -> list[Path]:
+    """Every drawing in every format, in order, in a folder that is made; the same content gives the same bytes.
+
+    Raises:
+        StorageError: the folder or a file cannot be written.
+    """
+    target = make_folder(folder)
+    return [path for name, draw in drawings.items() for path in _write(target, name, draw)]
+
+
+def _write(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path]:
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from edp.report.drawing import BLUE, DROPPED, INK, RULE, SOFT, file_name, write_drawing
+from edp.report.drawing import BLUE, DROPPED, INK, RULE, SOFT, file_name, write_drawings
 from edp.report.screening_views import (
     METRICS,
     UNITS,
@@ -24,7 +24,6 @@ from edp.report.screening_views import (
     value_views,
 )
 from edp.screening import Screening
-from edp.storage import make_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,8 +49,7 @@ def write_pictures(found: Screening, folder: str | Path) -> list[Path]:
     Raises:
         StorageError: the folder or a file cannot be written.
     """
-    target = make_folder(folder)
-    return [path for name, draw in _drawings(found).items() for path in write_drawing(target, name, draw)]
+    return write_drawings(folder, _drawings(found))
 
 
 def _drawings(found: Screening) -> dict[str, Callable[[Figure], None]]:

@@ -145,7 +145,12 @@ def read_study(path: str | Path) -> Mapping[str, Any]:
         StorageError: missing, unreadable, of another schema, or no study.
     """
     file = Path(path)
-    file = file / "study.json" if file.is_dir() else file
+    if file.is_dir() or file.suffix != ".json":
+        file = file / "study.json"
+        if not file.is_file():
+            raise StorageError(
+                f"'{path}' holds no study (study.json is missing); give the folder of edp search --study"
+            )
     study = read_json(file)
     _check(study, str(file))
     checked: Mapping[str, Any] = study
@@ -169,7 +174,7 @@ def _facts_of(study: Mapping[str, Any]) -> StudyFacts:
         state=study["state"],
         mode=study["mode"],
         preset=str(study["preset"]),
-        unit=str(study.get("unit", "mm/s")),
+        unit=str(study["unit"]),
         data=data | {"path": str(data["path"]), "sessions": int(data["sessions"]), "hours": real(data["hours"])},
         spec={str(key): value for key, value in study["spec"].items()} | {"horizon": int(study["spec"]["horizon"])},
         development=tuple(map(str, sessions["development"])),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edp.report.drawing import BLUE, DROPPED, INK, RULE, SOFT, file_name, write_drawing
+from edp.report.drawing import BLUE, DROPPED, INK, RULE, SOFT, file_name, write_drawings
 from edp.report.study_facts import StudyFacts
 from edp.report.study_plots import SHADES, TICKS, arm_caption, outside, short, spread_over, tests_of
 from edp.report.study_views import (
@@ -26,7 +26,6 @@ from edp.report.study_views import (
     top_of,
     tracks,
 )
-from edp.storage import make_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,8 +47,7 @@ def write_study_pictures(study: StudyFacts, folder: str | Path) -> list[Path]:
     Raises:
         StorageError: the folder or a file cannot be written.
     """
-    target = make_folder(folder)
-    return [path for name, draw in drawings(study).items() for path in write_drawing(target, name, draw)]
+    return write_drawings(folder, drawings(study))
 
 
 def drawings(study: StudyFacts) -> dict[str, Callable[[Figure], None]]:

@@ -9,12 +9,12 @@ import contextlib
 import socket
 from collections import deque
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any
 
 from edp.errors import ConfigError, LostError
 from edp.ledger import Record, Status, code_version
 from edp.runs import environment
-from edp.search.executor import RETRIES, Job, ended, refuse_twice
+from edp.search.executor import RETRIES, ClosedAtExit, Job, ended, refuse_twice
 from edp.search.local import LocalPool
 
 NAMESPACE = "edp"
@@ -24,7 +24,7 @@ _pool: dict[int, LocalPool] = {}
 """Of a process of Ray, which does one training after the other: its worker stays warm between them."""
 
 
-class RayPool:
+class RayPool(ClosedAtExit):
     """Runs jobs on the nodes of a Ray cluster; see `edp.search.executor.Executor`.
 
     Caps on time and memory, and retries of a training whose process is killed, are those of `LocalPool`, which runs on
@@ -57,14 +57,6 @@ class RayPool:
     def workers(self) -> int:
         """How many trainings the cores of the cluster hold side by side now."""
         return max(1, int(self.ray.cluster_resources().get("CPU", 1.0)) // self.threads)
-
-    def __enter__(self) -> Self:
-        """The pool itself; leaving the block stops it."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop everything and leave the cluster."""
-        self.close()
 
     def submit(self, job: Job) -> None:
         """Take a job; see `Executor.submit`."""

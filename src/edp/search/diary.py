@@ -10,6 +10,7 @@ from typing import Any
 from edp.config import Table
 from edp.errors import StorageError
 from edp.ledger import Opening, Record
+from edp.report import read_study
 from edp.search.ground import Decision, Ground, Outcome
 from edp.search.modules import MODULES
 from edp.search.phases import PHASES
@@ -177,31 +178,13 @@ class Diary:
         return list(self.phases.values())[-1]
 
 
-def read_study(folder: str | Path) -> Table:
-    """What a study has written down.
-
-    Raises:
-        StorageError: no study is there, it cannot be read, or it is of another version.
-    """
-    file = Path(folder, FILE)
-    if not file.is_file():
-        raise StorageError(f"'{folder}' holds no study ({FILE} is missing); give the folder of edp search --study")
-    held: Table = read_json(file)
-    if held.get("schema") != SCHEMA:
-        raise StorageError(
-            f"'{file}' is of schema {held.get('schema')}, this version reads {SCHEMA}; run edp search on the folder "
-            "again, which writes it anew from the ledger"
-        )
-    return held
-
-
 def look_at(folder: str | Path) -> Table:
     """What a study has written down, and who works on it: ``holder`` (process, None for nobody), ``running``.
 
     Raises:
-        StorageError: as `read_study`.
+        StorageError: as `edp.report.read_study`.
     """
-    held = read_study(folder)
+    held = dict(read_study(folder))
     ledger = Path(folder, "ledger")
     holder = held_by(ledger / ".lock")
     claims = list((ledger / "claims").glob("*.lock")) if holder else []

@@ -82,6 +82,22 @@ class Executor(Protocol):
         ...
 
 
+class ClosedAtExit:
+    """What both pools do at the end of a ``with`` block: they stop everything."""
+
+    def close(self) -> None:
+        """Stop everything."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        """The pool itself; leaving the block stops it."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop everything."""
+        self.close()
+
+
 def ended(job: Job, status: Status, message: str, **measured: Any) -> Record:
     """The record of a job that could not say itself how it ended."""
     return Record(job.identity, status, None, message, {"host": os.uname().nodename, **measured})

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
-from edp.search.diary import read_study
+from edp.report import read_study
 from edp.search.plan import space_of
 from edp.search.space import Choice, Range, Space
 from edp.search.study import Told, write_journal
@@ -43,25 +43,28 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
 
 def told(held: Mapping[str, Any]) -> list[Told]:
     """The studies of phases 1, 4 and 5 that have ended."""
-    space, cost = space_of(held["spec"]["space"]), held["spec"]["cost"]
+    space = space_of(held["spec"]["space"])
     found = []
     for decision in held["decisions"]:
         phase, facts = decision["phase"], decision["facts"]
         if phase == "calibration":
             for backbone, own in facts["backbones"].items():
-                found.append(_told(f"{phase} {backbone}", own["trials"], space, [], cost))
+                found.append(_told(f"{phase} {backbone}", own["trials"], space, [], held))
         elif phase in ("synthesis", "exploration"):
-            found.append(_told(phase, facts["trials"], space, list(facts["on"]), cost))
+            found.append(_told(phase, facts["trials"], space, list(facts["on"]), held))
     return found
 
 
-def _told(name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], cost: str) -> Told:
+def _told(
+    name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], held: Mapping[str, Any]
+) -> Told:
+    cost, score = held["spec"]["cost"], f"composite, {held['unit']}"
     full: dict[str, Range] = dict(space) | {module: Choice((0, 1)) for module in modules}
-    objectives = ("composite, mm/s",) if cost == "none" else ("composite, mm/s", cost)
+    objectives = (score,) if cost == "none" else (score, cost)
     rows = []
     for trial in trials:
         values = dict(trial["values"]) | {module: int(module in trial.get("modules", ())) for module in modules}
-        score = trial["score"]
-        told_values = None if score is None else [score] if cost == "none" else [score, trial[cost]]
-        rows.append((values, told_values, {key: value for key, value in trial.items() if key not in NO_VALUES}))
+        found = trial["score"]
+        answer = None if found is None else [found] if cost == "none" else [found, trial[cost]]
+        rows.append((values, answer, {key: value for key, value in trial.items() if key not in NO_VALUES}))
     return Told(name, full, rows, objectives)

@@ -85,6 +85,7 @@ class Ground:
         development: names of the sessions that train and judge in all phases.
         test: names of the sessions set apart.
         channels: of the recordings.
+        unit: of the scores, for sentences.
         decided: what earlier phases decided, by name.
     """
 
@@ -94,6 +95,7 @@ class Ground:
     development: tuple[str, ...]
     test: tuple[str, ...]
     channels: tuple[str, ...] = ()
+    unit: str = "mm/s"
     decided: Mapping[str, Decision] = field(default_factory=dict)
 
     def folds(self, runs: int) -> NDArray[np.bool_]:

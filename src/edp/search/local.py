@@ -19,11 +19,11 @@ from collections import deque
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any
 
 from edp.errors import ConfigError
 from edp.ledger import Record, Status
-from edp.search.executor import RETRIES, Job, ended, refuse_twice
+from edp.search.executor import RETRIES, ClosedAtExit, Job, ended, refuse_twice
 from edp.search.worker import BEGUN
 
 TICK_S = 0.1
@@ -102,7 +102,7 @@ class _Worker:
         self.output.close()
 
 
-class LocalPool:
+class LocalPool(ClosedAtExit):
     """Runs jobs in processes of this machine; see `edp.search.executor.Executor`.
 
     Use it from one thread that lives as long as the pool: on Linux a worker dies with the thread that started it.
@@ -125,14 +125,6 @@ class LocalPool:
         self._queue: deque[_Turn] = deque()
         self._jobs: dict[str, Job] = {}
         self._ready: deque[Record] = deque()
-
-    def __enter__(self) -> Self:
-        """The pool itself; leaving the block stops it."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop everything."""
-        self.close()
 
     def submit(self, job: Job) -> None:
         """Take a job; see `Executor.submit`."""

@@ -27,6 +27,7 @@ from edp.search.local import LocalPool
 from edp.search.phases import PHASES
 from edp.search.plan import SearchPlan, plain_spec
 from edp.search.trainings import Order, settings_of
+from edp.signals import KINDS
 from edp.sources import DataSource
 from edp.storage import make_folder, write_bytes
 
@@ -144,15 +145,17 @@ def run_search(
     crew, watchers = crew or Crew(), watchers or Watchers()
     if until is not None:
         _ = PHASES[until]
+    data = _Data.read(source, plan)  # before anything is made on disk
+    development, test = set_apart(data.names, data.families, plan.spec)
     target = make_folder(folder)
     with ExitStack() as open_things:
         ledger = open_things.enter_context(Ledger(target / "ledger"))
         if ledger.damaged:
             watchers.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
-        data = _Data.read(source, plan)
         ledger.bind({"data": data.digest, **plan.to_plain()})
-        development, test = set_apart(data.names, data.families, plan.spec)
-        ground = Ground(plan.spec, settings_of(plan.experiment), source.to_plain(), development, test, data.channels)
+        ground = Ground(
+            plan.spec, settings_of(plan.experiment), source.to_plain(), development, test, data.channels, data.unit
+        )
         diary = Diary(target, _facts(plan, data, source, ground), ground)
         executor = open_things.enter_context(crew.gather())
         diary.workers = executor.workers
@@ -185,12 +188,13 @@ class _Data:
     channels: tuple[str, ...]
     digest: str
     hours: float
+    unit: str
 
     @staticmethod
     def read(source: DataSource, plan: SearchPlan) -> _Data:
         recordings = source.read()
         _refuse_twice(recordings)
-        _check_channels(recordings, plan)
+        unit = _check_channels(recordings, plan)
         names = tuple(recording.name for recording in recordings)
         # Names such as m22_003_dig say what a session is of; a kind with one session is no kind.
         kinds = {name: re.sub(r"\d+", "", name) for name in names}
@@ -200,7 +204,7 @@ class _Data:
         for recording in recordings:
             state.update(f"{recording.name}\0{recording.digest}\0".encode())
         hours = sum(recording.duration_s for recording in recordings) / 3600
-        return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours)
+        return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit)
 
 
 class _Work:
@@ -263,8 +267,9 @@ def _refuse_twice(recordings: Sequence[Recording]) -> None:
         seen[recording.digest] = recording.name
 
 
-def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> None:
-    """Every feature set can be had of every recording."""
+def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> str:
+    """See that every feature set can be had of every recording; the unit of the scores."""
+    units: set[str] = set()
     kinds: dict[tuple[str, ...], Recording] = {}
     for recording in recordings:
         kinds.setdefault(recording.channel_names, recording)
@@ -277,16 +282,19 @@ def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> None:
                 names = recordings[0].channel_names
                 task = experiment.task.resolve(recording.rate_hz, names, experiment.model.physics)
                 task.series(recording)
+                units |= {KINDS[kind].report_unit for kind in task.kinds(recording)}
             except (ConfigError, DataError) as error:
                 raise DataError(
                     f"feature set {name} cannot be had of '{recording.name}': {error}; name others with --set "
                     "search.features=[...] (a file of edp screen is one)"
                 ) from error
+    return units.pop() if len(units) == 1 else "mixed units"
 
 
 def _facts(plan: SearchPlan, data: _Data, source: DataSource, ground: Ground) -> Table:
     return {
         "mode": plan.spec.mode,
+        "unit": data.unit,
         "preset": plan.preset,
         "data": {
             "path": str(source.path),

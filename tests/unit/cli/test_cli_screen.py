@@ -10,7 +10,8 @@ import pytest
 
 from edp.cli.console import Steps
 from edp.cli.screen import ScreeningDisplay
-from edp.config import load_experiment, load_signal_map
+from edp.config import load_experiment
+from edp.sources import load_signal_map
 from edp.training import Event
 
 QUICK = [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edp.report import build_screening_page, pictures, write_pictures
-from edp.report.drawing import write_drawing
+from edp.report.drawing import write_drawings
 from edp.report.screening_page import headline, render_screening, sentence, verdict
 from edp.report.screening_plots import screening_plots
 from edp.report.screening_views import lag_ranges, lag_views, matrix_views, stability_views
@@ -25,7 +25,6 @@ from edp.screening import (
     Stability,
     Value,
 )
-from edp.storage import make_folder
 
 NAMES = ("v", "u<b>", "late", "noise")
 LAGS = np.arange(-20, 21)
@@ -178,8 +177,7 @@ def test_names_that_mean_something_elsewhere(tmp_path, odd):
     drawings = pictures._drawings(found)
     (lags,) = [name for name in drawings if name.startswith("lags_")]
     first, again = (
-        [path.read_bytes() for path in write_drawing(make_folder(tmp_path / part), lags, drawings[lags])]
-        for part in "ab"
+        [path.read_bytes() for path in write_drawings(tmp_path / part, {lags: drawings[lags]})] for part in "ab"
     )
     assert first == again
     assert len(list(tmp_path.rglob("*.svg"))) == 2

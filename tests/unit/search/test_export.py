@@ -28,7 +28,14 @@ def study(folder, cost="none", decisions=True):
         {"phase": "calibration", "facts": {"backbones": {"lstm": {"trials": TRIALS}}}},
         {"phase": "synthesis", "facts": {"trials": JOINT, "on": {"stanh": 1.0, "zoneout": 0.0}}},
     ]
-    held = {"schema": 1, "spec": {"space": SPACE, "cost": cost}, "decisions": found if decisions else found[:1]}
+    held = {
+        "schema": 1,
+        "state": "finished",
+        "mode": "sound",
+        "unit": "bar",
+        "spec": {"space": SPACE, "cost": cost},
+        "decisions": found if decisions else found[:1],
+    }
     (folder / "study.json").write_text(json.dumps(held))
     return folder
 
@@ -46,7 +53,7 @@ def test_questions_and_answers_come_back(tmp_path):
     assert second.state is TrialState.FAIL
     (joint,) = loaded(file, "synthesis").trials
     assert joint.params == {"learning_rate": 1e-3, "stanh": 1, "zoneout": 0}
-    assert loaded(file, "synthesis").user_attrs["objectives"] == ["composite, mm/s"]
+    assert loaded(file, "synthesis").user_attrs["objectives"] == ["composite, bar"]
 
 
 def test_a_second_export_replaces_the_first_and_leaves_nothing_beside_it(tmp_path):
@@ -61,7 +68,7 @@ def test_a_cost_is_a_second_objective(tmp_path):
     file, _ = export_study(study(tmp_path, cost="parameters"), tmp_path / "copy.journal")
     held = loaded(file, "calibration lstm")
     assert held.trials[0].values == [12.5, 100.0]
-    assert held.user_attrs["objectives"] == ["composite, mm/s", "parameters"]
+    assert held.user_attrs["objectives"] == ["composite, bar", "parameters"]
 
 
 def test_a_study_that_has_asked_nothing_and_a_folder_without_one(tmp_path):

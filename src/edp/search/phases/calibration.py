@@ -47,7 +47,7 @@ class Calibration:
             facts["backbones"][backbone] = _plain(ground, picked) | {"trials": [_plain(ground, held) for held in own]}
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
-            text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} mm/s with {size} parameters"
+            text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} {ground.unit} with {size} parameters"
             if lowest is not None and lowest is not picked:
                 size = f"{lowest.costs['parameters']:,.0f}"
                 text += f"; the lowest, {lowest.score:.3g}, has {size} and does not repay the difference"

@@ -92,7 +92,7 @@ class Isolation:
         sentences = [
             f"Feature set {chosen} goes on: mean composite score "
             + ", ".join(f"{name} {value:.3g}" for name, value in means.items())
-            + " mm/s over all backbones."
+            + f" {ground.unit} over all backbones."
         ]
         for backbone, found in facts["comparisons"].items():
             sentences.append(

@@ -42,7 +42,7 @@ def _sound(ground: Ground) -> Decision:
         most=spec.most_runs,
     )
     runs = plan.runs or spec.most_runs - spec.most_runs % spec.folds
-    sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} mm/s: {plan.reason}."]
+    sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} {ground.unit}: {plan.reason}."]
     if plan.runs is None:
         sentences.append(f"{runs} runs are made nevertheless; effects below what they can show will be missed.")
     return Decision("planning", {**asdict(plan), "runs": runs, "enough": plan.runs}, tuple(sentences))

@@ -114,8 +114,9 @@ def _thesis(ground: Ground) -> Course:
     table = {name: _gain(own, reference) for name, own in zip(free, answers, strict=True)}
     passed = [name for name, held in table.items() if held["gain"] is not None and held["gain"] > 0]
     sentences = (
-        f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {reference:.3g} mm/s and go "
-        f"on; by chance alone most do, since the best of {spec.module_trials} is compared with a median.",
+        f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {reference:.3g} "
+        f"{ground.unit} and go on; by chance alone most do, since the best of {spec.module_trials} is compared with a "
+        "median.",
     )
     return Decision("screening", {"passed": passed, "registered": list(free), "modules": table}, sentences)
 

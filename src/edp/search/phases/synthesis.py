@@ -43,12 +43,12 @@ class Synthesis:
         """What stays, what works against the others, and what the test sessions say."""
         facts["antagonistic"] = [name for name in confirmed if name not in facts["modules"]]
         names = ", ".join(MODULES[name].title for name in facts["modules"]) or "no module"
-        sentences = [f"Best together: {names}; {facts['score']:.3g} mm/s on development sessions."]
+        sentences = [f"Best together: {names}; {facts['score']:.3g} {ground.unit} on development sessions."]
         if facts["antagonistic"]:
             left = ", ".join(MODULES[name].title for name in facts["antagonistic"])
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
         test = facts["test"]
-        ours, base = (_shown(test[arm]["composite"]) for arm in ("synthesis", "baseline"))
+        ours, base = (_shown(test[arm]["composite"], ground.unit) for arm in ("synthesis", "baseline"))
         gain = facts["test_gain"]
         interval = "" if gain is None else f"; {100 * gain['change']:+.2f} %, p {gain['p']:.2g}"
         sentences.append(
@@ -96,8 +96,8 @@ def gained(ground: Ground, outcomes: Sequence[Outcome]) -> dict[str, float] | No
     return changed(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
 
 
-def _shown(score: float | None) -> str:
-    return "no score, since a training failed" if score is None else f"{score:.3g} mm/s"
+def _shown(score: float | None, unit: str) -> str:
+    return "no score, since a training failed" if score is None else f"{score:.3g} {unit}"
 
 
 PHASES.register("synthesis")(Synthesis())

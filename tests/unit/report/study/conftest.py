@@ -106,6 +106,7 @@ def study_of(spec):
         "state": "finished",
         "mode": spec.mode,
         "preset": "quick",
+        "unit": "mm/s",
         "data": {"path": "m22.toml", "sessions": len(SESSIONS), "hours": 1.2, "hash": "0123abcd"},
         "spec": dataclasses.asdict(spec),
         "sessions": {"development": list(SESSIONS[:9]), "test": list(SESSIONS[9:])},
