@@ -85,6 +85,32 @@ def test_a_warm_start_is_asked_first_and_counts():
     assert [trial.number for trial in made.ask(2)] == [1, 2]
 
 
+@pytest.mark.parametrize("kind", sorted(SAMPLERS))
+def test_an_option_is_asked_where_its_switch_is_on_and_comes_again(kind):
+    def asked():
+        made = study(kind, options={"a": {"a.heads": Choice((2, 4))}, "b": {"b.form": Choice(("x", "y"))}})
+        found = run(made, [3, 3, 3])
+        return [(trial.flags, dict(trial.options)) for trial in found]
+
+    found = asked()
+    for flags, options in found:
+        assert set(options) == {name for name in ("a.heads", "b.form") if name[0] in flags}
+    assert {value for _, options in found for value in options.values()} <= {2, 4, "x", "y"}
+    assert any(options for _, options in found)
+    assert asked() == found
+
+
+def test_a_warm_start_may_name_options_of_what_is_on():
+    made = study(options={"a": {"a.heads": Choice((2, 4))}})
+    made.suggest({"units": 16}, ["a"], {"a.heads": 4})
+    (first,) = made.ask(1)
+    assert (first.flags, dict(first.options)) == (("a",), {"a.heads": 4})
+    with pytest.raises(ConfigError, match="no option 'a.heads' of what is on"):
+        made.suggest({}, ["b"], {"a.heads": 4})
+    with pytest.raises(ConfigError, match=r"a\.heads = 3 is not in"):
+        made.suggest({}, ["a"], {"a.heads": 3})
+
+
 def test_failed_trials_are_passed_over():
     made = study()
     for trial in made.ask(8):

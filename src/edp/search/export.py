@@ -51,7 +51,8 @@ def told(held: Mapping[str, Any]) -> list[Told]:
             for backbone, own in facts["backbones"].items():
                 found.append(_told(f"{phase} {backbone}", own["trials"], space, [], held))
         elif phase in ("synthesis", "exploration"):
-            found.append(_told(phase, facts["trials"], space, list(facts["on"]), held))
+            options = {key: Choice(tuple(values)) for key, values in facts.get("options", {}).items()}
+            found.append(_told(phase, facts["trials"], {**space, **options}, list(facts["on"]), held))
     return found
 
 

@@ -6,12 +6,15 @@ import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
+from typing import Any, cast
 
-from edp.config import Experiment, Table, build, merged
+from edp.blocks import BLOCKS, BlockSpec
+from edp.config import Experiment, Table, build, merged, plain_tree
 from edp.errors import ConfigError
+from edp.models.heads import GluHead
 from edp.models.predictor import check_combination
 from edp.registry import Registry
+from edp.search.space import Choice, Value
 
 
 @dataclass(frozen=True)
@@ -22,22 +25,29 @@ class Module:
         title: what the thesis calls it.
         change: settings laid over the baseline's.
         block: a block that is appended to the baseline's; None for none.
+        options: values worth searching where the module is on, by the place of the setting: keys joined by points, or
+            the name of an option of the block.
     """
 
     title: str
     change: Mapping[str, Any] = field(default_factory=dict)
     block: Mapping[str, Any] | None = None
+    options: Mapping[str, Sequence[Any]] = field(default_factory=dict)
 
 
 MODULES: Registry[Module] = Registry("module")
 
 
-def _block(name: str, title: str, **options: Any) -> None:
-    MODULES.register(name)(Module(title, block={"kind": name, **options}))
+def _block(name: str, title: str, **fixed: Any) -> None:
+    free = {key: values for key, values in cast(type[BlockSpec], BLOCKS[name]).space.items() if key not in fixed}
+    MODULES.register(name)(Module(title, block={"kind": name, **fixed}, options=free))
 
 
-def _change(name: str, title: str, part: str, options: Mapping[str, Any]) -> None:
-    MODULES.register(name)(Module(title, {"model": {part: options}}))
+def _change(
+    name: str, title: str, part: str, change: Mapping[str, Any], options: Mapping[str, Sequence[Any]] | None = None
+) -> None:
+    placed = {f"model.{part}.{key}": values for key, values in (options or {}).items()}
+    MODULES.register(name)(Module(title, {"model": {part: change}}, options=placed))
 
 
 _block("cylinder_gate", "Cyl Gate Diagonal", form="diagonal")
@@ -46,32 +56,104 @@ _block("cross_cylinder_attention", "Cross Cyl Attn")
 _change("gru", "GRU Backbone", "backbone", {"cell": {"kind": "gru"}})
 _change("layer_norm_lstm", "LayerNorm LSTM", "backbone", {"cell": {"kind": "layer_norm_lstm"}})
 _block("multi_scale_tcn", "Multiscale TCN")
-_change("zoneout", "Zoneout", "backbone", {"zoneout": 0.1})
+_change("zoneout", "Zoneout", "backbone", {"zoneout": 0.1}, {"zoneout": (0.05, 0.1, 0.2)})
 _block("attention_bridge", "Attention Bridge")
 _block("global_average_pooling", "Global Avg Pool")
 _block("squeeze_excitation", "Squeeze-Excitation")
 _change("physics_residual", "Physics Residual", "physics", {"kind": "force"})
-_change("deeper_head", "Deeper Head", "head", {"layers": 2})
-_change("glu_head", "GLU Head", "head", {"kind": "glu"})
+_change("deeper_head", "Deeper Head", "head", {"layers": 2}, {"layers": (2, 3)})
+_change("glu_head", "GLU Head", "head", {"kind": "glu"}, {"hidden": GluHead.space["hidden"]})
 _change("stanh", "STanh Activation", "activation", {"kind": "stanh"})
 
 
-def with_modules(settings: Table, names: Iterable[str], channels: Sequence[str] = ()) -> Table:
+def with_modules(
+    settings: Table, names: Iterable[str], channels: Sequence[str] = (), options: Mapping[str, Value] | None = None
+) -> Table:
     """Settings with these modules added, in the order of the registry, so that equal sets give equal settings.
 
     Args:
         settings: a whole experiment as plain tables (`edp.config.plain_tree`).
         names: registered modules.
         channels: of the recordings, for the feature set ``all``.
+        options: values of `options_of` for some of the modules; those that a module has anyway change nothing.
 
     Raises:
-        ConfigError: an unknown module, or modules that contradict one another or the network; every reason.
+        ConfigError: an unknown module or option, or modules that contradict one another or the network; every reason.
     """
     wanted = set(names)
     reasons = conflicts(settings, wanted, channels)
     if reasons:
         raise ConfigError("modules: " + "; ".join(reasons))
-    return _added(settings, wanted)
+    made = _added(settings, wanted)
+    for name in (name for name in MODULES if name in wanted):
+        for key, option in _options(settings, name).items():
+            label = (options or {}).get(key, option.present)
+            if label not in option.values:
+                raise ConfigError(f"modules: {key} = {label!r}; one of {list(option.values)} must hold")
+            if label != option.present:
+                option.put(made, option.values[label])
+    return made
+
+
+def options_of(settings: Table, name: str) -> dict[str, Choice]:
+    """What may be varied of a module where it is on, as dimensions ``module.option``.
+
+    Args:
+        settings: to which the module would be added; what it would have there is one of the values.
+        name: of the module.
+    """
+    found = {key: tuple(option.values) for key, option in _options(settings, name).items()}
+    return {key: Choice(values) for key, values in found.items() if len(values) > 1}
+
+
+def present_options(settings: Table, names: Iterable[str]) -> dict[str, Value]:
+    """What these modules have of their options where nothing is chosen."""
+    return {key: option.present for name in names for key, option in _options(settings, name).items()}
+
+
+@dataclass(frozen=True)
+class _Option:
+    """A setting of a module: its values by the label that a sampler sees, the label of the present one, where it is."""
+
+    values: Mapping[Value, Any]
+    present: Value
+    keys: tuple[str, ...]
+    kind: str | None
+
+    def put(self, settings: Table, value: Any) -> None:
+        """Set it, in place."""
+        held = settings
+        if self.kind is not None:
+            held = next(block for block in settings["model"]["blocks"] if block["kind"] == self.kind)
+        for key in self.keys[:-1]:
+            held = held[key]
+        held[self.keys[-1]] = list(value) if isinstance(value, tuple) else value
+
+
+def _options(settings: Table, name: str) -> dict[str, _Option]:
+    module, made = MODULES[name], {}
+    plain = plain_tree(build(Experiment, _added(settings, {name}), f"with {name}"))
+    for place, values in module.options.items():
+        keys, held = tuple(place.split(".")), plain
+        kind = None if module.block is None else str(module.block["kind"])
+        if kind is not None:
+            held = next(block for block in plain["model"]["blocks"] if block["kind"] == kind)
+        for key in keys:
+            held = held[key]
+        present = _label(held)
+        labelled = {_label(value): value for value in values}
+        if present not in labelled:
+            labelled = {present: held, **labelled}
+        made[f"{name}.{keys[-1]}"] = _Option(labelled, present, keys, kind)
+    return made
+
+
+def _label(value: Any) -> Value:
+    """What a sampler can hold: a list as text."""
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value))
+    held: Value = value
+    return held
 
 
 def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = ()) -> list[str]:

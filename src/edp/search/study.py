@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,11 +34,13 @@ class Trial:
         number: from 0 in the order of asking.
         values: of the dimensions of the space.
         flags: names of the switches that are on.
+        options: of the switches that are on.
     """
 
     number: int
     values: Candidate
     flags: tuple[str, ...] = ()
+    options: Candidate = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,7 @@ class Study:
         objectives: how many values are told.
         bounds: how many costs are told that must not exceed zero; a trial that exceeds may be told by its costs alone,
             so that what cannot be used need not be trained. With bounds TPE stands in for the Gaussian process.
+        options: further dimensions of a switch, asked where it is on.
     """
 
     space: Space
@@ -86,6 +89,7 @@ class Study:
     barred: frozenset[frozenset[str]] = frozenset()
     objectives: int = 1
     bounds: int = 0
+    options: Mapping[str, Mapping[str, Choice]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         import optuna
@@ -104,15 +108,16 @@ class Study:
         self._told = 0
         self._waiting: dict[int, tuple[Sequence[float] | None, Sequence[float]]] = {}
 
-    def suggest(self, values: Candidate, flags: Sequence[str] | None = None) -> None:
+    def suggest(self, values: Candidate, flags: Sequence[str] | None = None, options: Candidate | None = None) -> None:
         """Have this asked next: a warm start. What is not given, the sampler chooses.
 
         Args:
             values: of some or all dimensions.
             flags: switches that are on, the others being off; None leaves them all to the sampler.
+            options: of switches that are on.
 
         Raises:
-            ConfigError: a value outside the space, or an unknown dimension or switch.
+            ConfigError: a value outside the space, or an unknown dimension, switch or option.
         """
         unknown = [name for name in values if name not in self.space]
         if unknown:
@@ -121,8 +126,15 @@ class Study:
         strange = [name for name in flags or () if name not in self.flags]
         if strange:
             raise ConfigError(f"study: there is no switch '{strange[0]}' (it has {', '.join(self.flags)})")
+        own: dict[str, Range] = {}
+        for name in flags or ():
+            own |= self.options.get(name, {})
+        odd = [name for name in options or () if name not in own]
+        if odd:
+            raise ConfigError(f"study: there is no option '{odd[0]}' of what is on (there are {', '.join(own)})")
+        check({name: own[name] for name in options or ()}, options or {})
         switched = {} if flags is None else {name: int(name in flags) for name in self.flags}
-        self._study.enqueue_trial(dict(values) | switched)
+        self._study.enqueue_trial(dict(values) | switched | dict(options or {}))
 
     def ask(self, count: int) -> list[Trial]:
         """The next questions, `count` of them; those asked before count as unanswered until they are told."""
@@ -137,8 +149,13 @@ class Study:
         asked = self._study.ask(self._distributions)
         self._open[asked.number] = asked
         values = {name: asked.params[name] for name in names(self.space)}
-        on = tuple(name for name in self.flags if asked.params[name])
-        return Trial(asked.number, values, self._allowed(on))
+        on = self._allowed(tuple(name for name in self.flags if asked.params[name]))
+        chosen: dict[str, Any] = {
+            name: asked.suggest_categorical(name, held.options)
+            for flag in on
+            for name, held in self.options.get(flag, {}).items()
+        }
+        return Trial(asked.number, values, on, chosen)
 
     def _allowed(self, on: tuple[str, ...]) -> tuple[str, ...]:
         kept: tuple[str, ...] = ()

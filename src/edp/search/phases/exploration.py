@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from edp.search.ground import Decision, Ground, Outcome
-from edp.search.modules import MODULES, fitting
+from edp.search.modules import MODULES, fitting, options_of
 from edp.search.phases.base import PHASES, Course, changed
 from edp.search.phases.joint import ask_together, winner_of
 from edp.search.phases.screening import baseline_of
@@ -26,13 +26,16 @@ class Exploration:
         return ground.spec.free_trials * ground.spec.trial_runs + 2 * len(fresh_runs(ground))
 
     def run(self, ground: Ground) -> Course:
-        """Ask about all modules; then both winners on fresh folds with the same seeds."""
+        """Ask about all modules and options of those that are on; then both winners on fresh folds, same seeds."""
         spec = ground.spec
-        free = fitting(baseline_of(ground)[0], ground.channels)
+        base = baseline_of(ground)[0]
+        free = fitting(base, ground.channels)
         earlier = ground.decided["synthesis"].facts
         starts = [(earlier["values"], earlier["modules"])]
-        answers = yield from ask_together(ground, "exploration", free, spec.free_trials, starts)
+        options = {name: options_of(base, name) for name in free}
+        answers = yield from ask_together(ground, "exploration", free, spec.free_trials, starts, options)
         facts = winner_of(ground, "exploration", free, answers)
+        facts["options"] = {key: list(held.options) for own in options.values() for key, held in own.items()}
         runs = fresh_runs(ground)
         arms = (earlier["settings"], facts["settings"])
         outcomes = yield [order for settings in arms for order in ground.orders(settings, runs)]

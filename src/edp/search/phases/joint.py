@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import Any
 
 from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Ground, Outcome
-from edp.search.modules import contradicting, with_modules
+from edp.search.modules import contradicting, present_options, with_modules
 from edp.search.phases.base import Answer, Quest, answer_all, best, mean_of, new_study
 from edp.search.phases.screening import baseline_of
-from edp.search.space import Candidate, Real, Space, apply
-from edp.search.study import pareto
+from edp.search.space import Candidate, Choice, Real, Space, apply
+from edp.search.study import Trial, pareto
 from edp.search.trainings import Order
 
 Asked = Generator[list[Order], list[Outcome], list[Answer]]
 
 
 def ask_together(
-    ground: Ground, name: str, modules: Sequence[str], trials: int, starts: Sequence[tuple[Candidate, Sequence[str]]]
+    ground: Ground,
+    name: str,
+    modules: Sequence[str],
+    trials: int,
+    starts: Sequence[tuple[Candidate, Sequence[str]]],
+    options: Mapping[str, Mapping[str, Choice]] | None = None,
 ) -> Asked:
     """Questions about modules on or off and rates inside the window, with warm starts first.
 
@@ -29,14 +34,16 @@ def ask_together(
         modules: that may be on.
         trials: how many questions, the warm starts among them.
         starts: values and modules to begin with.
+        options: what is varied of a module where it is on.
     """
     base, _, window = baseline_of(ground)
     study = new_study(ground, name, window, modules, contradicting(base, modules, ground.channels))
+    study.options = options or {}
     for values, flags in starts[:trials]:
-        study.suggest(_inside(window, values), flags)
+        study.suggest(_inside(window, values), flags, present_options(base, flags) if options else None)
 
-    def settings(trial: Any) -> Table:
-        return with_modules(apply(base, trial.values), trial.flags, ground.channels)
+    def settings(trial: Trial) -> Table:
+        return with_modules(apply(base, trial.values), trial.flags, ground.channels, trial.options)
 
     (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)])
     return answers
@@ -54,7 +61,7 @@ def winner_of(ground: Ground, name: str, modules: Sequence[str], answers: list[A
     done = [answer for answer in answers if answer.score is not None]
     facts: dict[str, Any] = {
         "settings": found.settings,
-        "values": dict(found.trial.values),
+        "values": {**found.trial.values, **found.trial.options},
         "modules": list(found.trial.flags),
         "score": found.score,
         "costs": found.costs,
@@ -62,7 +69,7 @@ def winner_of(ground: Ground, name: str, modules: Sequence[str], answers: list[A
         "trials": [
             {
                 "number": answer.trial.number,
-                "values": dict(answer.trial.values),
+                "values": {**answer.trial.values, **answer.trial.options},
                 "modules": list(answer.trial.flags),
                 "score": answer.score,
                 "mae": mean_of(ground, answer.outcomes, "mae"),
