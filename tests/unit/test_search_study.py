@@ -105,7 +105,7 @@ def test_a_warm_start_may_name_options_of_what_is_on():
     made.suggest({"units": 16}, ["a"], {"a.heads": 4})
     (first,) = made.ask(1)
     assert (first.flags, dict(first.options)) == (("a",), {"a.heads": 4})
-    with pytest.raises(ConfigError, match="no option 'a.heads' of what is on"):
+    with pytest.raises(ConfigError, match=r"no option 'a.heads' of what is on"):
         made.suggest({}, ["b"], {"a.heads": 4})
     with pytest.raises(ConfigError, match=r"a\.heads = 3 is not in"):
         made.suggest({}, ["a"], {"a.heads": 3})
