@@ -90,6 +90,17 @@ def test_phase_0_takes_the_better_feature_set_and_says_how_sure_it_is(found):
     assert facts["variance"]["run"] >= 0
 
 
+def test_phase_0_holds_the_best_backbone_against_the_others():
+    def hybrid_gains(settings):
+        return by_rate(settings) * (0.9 if settings["model"]["backbone"]["kind"] == "hybrid" else 1.0)
+
+    facts = conduct(ground(), World(hybrid_gains), until="isolation").decided["isolation"].facts
+    (held,) = facts["backbones"].values()
+    assert held["best"] == "hybrid"
+    assert list(facts["backbones"]) == ["lstm"]
+    assert held["low"] < held["change"] < held["high"] < 0
+
+
 def test_phase_0_pairs_all_arms_on_the_same_folds_and_seeds():
     world = World(by_rate)
     conduct(ground(), world, until="isolation")

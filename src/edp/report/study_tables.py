@@ -54,8 +54,8 @@ def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) 
 
 @of_phase("isolation", None)
 def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
-    """The chosen feature set against the next best, by backbone."""
-    rows = tuple(
+    """The chosen feature set against the next best, by backbone; the best backbone with it against the others."""
+    rows: tuple[tuple[Value, ...], ...] = tuple(
         (
             titled(backbone),
             f"{facts['features']} against {held['rival']}",
@@ -65,14 +65,25 @@ def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
         )
         for backbone, held in facts["comparisons"].items()
     )
+    # No p-value of these: which is the best was seen first.
+    rows += tuple(
+        (
+            titled(held["best"]),
+            f"against {titled(backbone)}, both {facts['features']}",
+            100 * real(held["change"]),
+            span(held),
+            None,
+        )
+        for backbone, held in facts["backbones"].items()
+    )
     columns = (
         Column("Architecture"),
-        Column("Feature sets"),
+        Column("Compared"),
         Column("Change of the score", "%", figures([row[2] for row in rows], signed=True, decimals=2)),
         Column("95 % interval", "%"),
         Column("p", "one-sided", chance),
     )
-    return Sheet("features", "Feature sets on the same folds with the same seeds", columns, rows)
+    return Sheet("features", "Feature sets and architectures on the same folds with the same seeds", columns, rows)
 
 
 @of_phase("calibration", None)

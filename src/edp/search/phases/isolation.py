@@ -88,6 +88,9 @@ class Isolation:
         }
         chosen = min(means, key=lambda name: means[name])
         facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(ground, tables, chosen)}
+        facts["backbones"] = _backbones(
+            ground, {name: t for (name, f), t in zip(arms, tables, strict=True) if f == chosen}
+        )
         facts["variance"] = _proxy(ground, tables, arms)
         sentences = [
             f"Feature set {chosen} goes on: mean composite score "
@@ -98,6 +101,11 @@ class Isolation:
             sentences.append(
                 f"{backbone}: {chosen} against {found['rival']} {100 * found['change']:+.2f} % "
                 f"(one-sided p {found['p']:.2g}, two-way clustered t over {spec.variance_runs} runs)."
+            )
+        for backbone, found in facts["backbones"].items():
+            sentences.append(
+                f"With {chosen}, {found['best']} against {backbone} {100 * found['change']:+.2f} % "
+                f"({100 * found['low']:+.2f} to {100 * found['high']:+.2f} %); phase 1 tunes each before one is chosen."
             )
         return Decision("isolation", facts, tuple(sentences))
 
@@ -116,6 +124,18 @@ class Isolation:
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
             found[backbone] = {"rival": rival, **changed(test, float(np.nanmean(second)))}
         return found
+
+
+def _backbones(ground: Ground, tables: dict[str, Array]) -> dict[str, Any]:
+    """The backbone with the lowest mean score against each of the others, all with the same feature set."""
+    means = {name: held.mean(axis=0) for name, held in tables.items()}
+    best = min(means, key=lambda name: float(np.nanmean(means[name])))
+    mask, _ = _judged(ground)
+    found = {}
+    for name in (name for name in means if name != best):
+        test = clustered_t(np.where(mask, means[best] - means[name], 0.0), mask)
+        found[name] = {"best": best, **changed(test, float(np.nanmean(means[name])))}
+    return found
 
 
 def _tables(ground: Ground, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
