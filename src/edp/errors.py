@@ -28,6 +28,10 @@ class BundleError(EdpError):
     """A bundle on disk is missing, damaged, or of an unknown schema."""
 
 
+class ExportError(EdpError):
+    """A network cannot be written in the form asked for."""
+
+
 class StorageError(EdpError):
     """Writing or reading a file failed (disk full, read-only folder, missing path)."""
 

@@ -11,6 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from edp.errors import ExportError
+from edp.graph.builder import Builder
+
 State = Any
 """A tree (tuple, dict) of tensors whose first dimension is the batch; ``()`` for a module without memory."""
 
@@ -92,6 +95,24 @@ class Streaming(nn.Module, ABC):
     def costs(self) -> list[Cost]:
         """Analytic costs, a row for each part."""
 
+    def lower(self, build: Builder, x: str) -> str:
+        """Add the layers that compute this part tick by tick to a graph, as in evaluation.
+
+        Args:
+            build: takes the layers.
+            x: name of the value that the part reads.
+
+        Returns:
+            The name of the value that it gives.
+
+        Raises:
+            ExportError: it has no such form.
+        """
+        raise ExportError(
+            f"the part '{type(self).__name__}' of the network has no form as a list of streaming layers; train "
+            "without it, or write its method `lower`"
+        )
+
     def __call__(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Run the module (typed shadow of ``nn.Module.__call__``)."""
         result: tuple[Tensor, State] = super().__call__(x, state)
@@ -117,6 +138,11 @@ class Chain(Streaming):
             x, part_state = part(x, old)
             new.append(part_state)
         return x, tuple(new)
+
+    def lower(self, build: Builder, x: str) -> str:
+        for part in self._streams():
+            x = part.lower(build, x)
+        return x
 
     def costs(self) -> list[Cost]:
         return [cost for part in self._streams() for cost in part.costs()]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from edp.graph import Builder
+from edp.graph.memory import TrailingMean as TrailingMeanLayer
 from edp.streaming import Cost, State, Streaming
 
 
@@ -29,6 +31,9 @@ class TrailingMean(Streaming):
         passed = torch.arange(1, ticks + 1, device=x.device, dtype=x.dtype)[:, None]
         count = (seen + passed).clamp(max=self.window)
         return _sums(history, self.window) / count, (history[:, ticks:], count[:, -1:])
+
+    def lower(self, build: Builder, x: str) -> str:
+        return build.add(TrailingMeanLayer, "mean", x, size=self.width, window=self.window)
 
     def costs(self) -> list[Cost]:
         """Additions only: no multiply-accumulates."""

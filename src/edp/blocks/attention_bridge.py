@@ -12,10 +12,11 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, Slot
 from edp.errors import ConfigError
+from edp.graph import Builder
+from edp.graph.layers import Activate, Add, Dense, Function, LayerNorm
+from edp.graph.memory import UNSEEN, WindowAttention
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
-# A score that no softmax notices; finite, because inf - inf is NaN.
-UNSEEN = -1e30
 # Query rows per block of the banded softmax: memory stays linear in the sequence length, and little of a block is idle.
 BLOCK = 64
 
@@ -103,6 +104,22 @@ class _Bridge(Streaming):
         scores = torch.baddbmm(offset, q, k.transpose(1, 2), alpha=1.0 / math.sqrt(q.shape[-1]))
         return (scores.softmax(dim=-1) @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
 
+    def lower(self, build: Builder, x: str) -> str:
+        wide = self.width
+        with build.inside("bridge"):
+            calm = _norm(build, "norm1", x, self.norm_attention)
+            parts = zip(self.project.weight.chunk(3), self.project.bias.chunk(3), strict=True)
+            names = ("query", "key", "value")
+            qkv = [build.add(Dense, names[i], calm, weight=w, bias=b) for i, (w, b) in enumerate(parts)]
+            seen = build.add(WindowAttention, "attention", *qkv, size=wide, heads=self.heads, window=self.window)
+            seen = build.add(Dense, "gather", seen, weight=self.gather.weight, bias=self.gather.bias)
+            y = build.add(Add, "sum1", x, seen, size=wide)
+            fed = _norm(build, "norm2", y, self.norm_feed)
+            fed = build.add(Dense, "widen", fed, weight=self.widen.weight, bias=self.widen.bias)
+            fed = build.add(Activate, "gelu", fed, function=Function.GELU, size=2 * wide)
+            fed = build.add(Dense, "narrow", fed, weight=self.narrow.weight, bias=self.narrow.bias)
+            return build.add(Add, "sum2", y, fed, size=wide)
+
     def costs(self) -> list[Cost]:
         """Scores and weighted values cost ``2 W C`` a tick; a window of W ticks costs the thesis's ``2 W^2 C``."""
         wide, attention = self.width, nn.ModuleList([self.norm_attention, self.project, self.gather])
@@ -123,3 +140,7 @@ class _Bridge(Streaming):
                 width_out=2 * wide,
             ),
         ]
+
+
+def _norm(build: Builder, name: str, x: str, norm: nn.LayerNorm) -> str:
+    return build.add(LayerNorm, name, x, gain=norm.weight, shift=norm.bias, epsilon=norm.eps)

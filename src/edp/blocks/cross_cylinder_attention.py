@@ -9,6 +9,8 @@ from typing import Any, ClassVar
 from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, ModelView, Slot, TaskView
+from edp.graph import Builder
+from edp.graph.layers import Add, Dense, LayerNorm, RowAttention
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
 
@@ -56,6 +58,22 @@ class _Across(Streaming):
         query, key, value = self.project(x).chunk(3, dim=-1)
         weights = (query @ key.transpose(-2, -1) / math.sqrt(self.hidden)).softmax(dim=-1)
         return self.norm(x + self.gather(weights @ value)), state
+
+    def lower(self, build: Builder, x: str) -> str:
+        rows, wide = self.outputs, self.hidden
+        size = rows * wide
+        with build.inside("across"):
+            qkv = [
+                build.add(Dense, name, x, weight=weight, bias=bias, rows=rows)
+                for name, weight, bias in zip(
+                    ("query", "key", "value"), self.project.weight.chunk(3), self.project.bias.chunk(3), strict=True
+                )
+            ]
+            seen = build.add(RowAttention, "attention", *qkv, rows=rows, size=wide)
+            seen = build.add(Dense, "gather", seen, weight=self.gather.weight, bias=self.gather.bias, rows=rows)
+            total = build.add(Add, "sum", x, seen, size=size)
+            gain, shift, epsilon = self.norm.weight, self.norm.bias, self.norm.eps
+            return build.add(LayerNorm, "norm", total, gain=gain, shift=shift, epsilon=epsilon, rows=rows)
 
     def costs(self) -> list[Cost]:
         rows, wide = self.outputs, self.hidden

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, Slot
 from edp.errors import ConfigError, closest
+from edp.graph import Builder
+from edp.graph.layers import Activate, Dense, Function, Multiply, ScaleShift
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
 OPEN_BIAS = 4.0  # sigmoid(4) = 0.98: transparent at the start of training (thesis 3.2.2.2)
@@ -56,6 +58,15 @@ class _DiagonalGate(Streaming):
         h = x.unsqueeze(-2)
         return torch.sigmoid(self.scale * h + self.bias) * h, state
 
+    def lower(self, build: Builder, x: str) -> str:
+        outputs, width = self.scale.shape
+        wide = outputs * width
+        with build.inside("gate"):
+            every = build.pick("repeated", x, list(range(width)) * outputs)
+            gate = build.add(ScaleShift, "scaled", every, gain=self.scale.flatten(), shift=self.bias.flatten())
+            gate = build.add(Activate, "sigmoid", gate, function=Function.SIGMOID, size=wide)
+            return build.add(Multiply, "gated", gate, every, size=wide)
+
     def costs(self) -> list[Cost]:
         outputs, width = self.scale.shape
         wide = outputs * width
@@ -77,6 +88,14 @@ class _LinearGate(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         gate = torch.sigmoid(self.gate(x)).unflatten(-1, (self.outputs, self.width))
         return gate * x.unsqueeze(-2), state
+
+    def lower(self, build: Builder, x: str) -> str:
+        wide = self.outputs * self.width
+        with build.inside("gate"):
+            gate = build.add(Dense, "linear", x, weight=self.gate.weight, bias=self.gate.bias)
+            gate = build.add(Activate, "sigmoid", gate, function=Function.SIGMOID, size=wide)
+            every = build.pick("repeated", x, list(range(self.width)) * self.outputs)
+            return build.add(Multiply, "gated", gate, every, size=wide)
 
     def costs(self) -> list[Cost]:
         wide = self.outputs * self.width

@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, Slot
+from edp.graph import Builder
+from edp.graph.layers import Dense
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 from edp.trailing import TrailingMean
 
@@ -46,6 +48,11 @@ class _Pooling(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         mean, state = self.mean(x, state)
         return self.project(mean), state
+
+    def lower(self, build: Builder, x: str) -> str:
+        with build.inside("average"):
+            mean = self.mean.lower(build, x)
+            return build.add(Dense, "projection", mean, weight=self.project.weight, bias=self.project.bias)
 
     def costs(self) -> list[Cost]:
         into, out = self.project.in_features, self.project.out_features

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, OutputSpace, Slot
 from edp.errors import ConfigError, closest
+from edp.graph import Builder
+from edp.graph.memory import Convolution
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
 STARTS = ("ridge", "crossed", "zero")
@@ -69,6 +71,9 @@ class Bypass(Streaming):
         history = torch.cat([state, x], dim=1)
         y = functional.conv1d(history.transpose(1, 2), self.weight, self.bias).transpose(1, 2)
         return y.unflatten(-1, (self.horizons, self.outputs)), history[:, x.shape[1] :]
+
+    def lower(self, build: Builder, x: str) -> str:
+        return build.add(Convolution, "bypass", x, weight=self.weight.transpose(1, 2), bias=self.bias)
 
     def costs(self) -> list[Cost]:
         wide = self.horizons * self.outputs

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, BranchMaker, Slot
 from edp.errors import ConfigError
+from edp.graph import Builder
 from edp.streaming import Cost, State, Streaming
 
 
@@ -57,6 +58,13 @@ class _Parallel(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         results = [branch(x, old) for branch, old in zip(self._streams(), state, strict=True)]
         return torch.cat([y for y, _ in results], dim=-1), tuple(new for _, new in results)
+
+    def lower(self, build: Builder, x: str) -> str:
+        made = []
+        for number, branch in enumerate(self._streams(), start=1):
+            with build.inside(f"scale{number}"):
+                made.append(branch.lower(build, x))
+        return build.join("scales", *made)
 
     def costs(self) -> list[Cost]:
         return [cost for branch in self._streams() for cost in branch.costs()]

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, Slot
 from edp.errors import ConfigError
+from edp.graph import Builder
+from edp.graph.layers import Activate, Dense, Function, Multiply
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 from edp.trailing import TrailingMean
 
@@ -58,6 +60,15 @@ class _SqueezeExcitation(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         mean, state = self.mean(x, state)
         return torch.sigmoid(self.excite(torch.relu(self.squeeze(mean)))) * x, state
+
+    def lower(self, build: Builder, x: str) -> str:
+        down, up = self.squeeze.weight, self.excite.weight
+        with build.inside("squeeze_excitation"):
+            s = build.add(Dense, "squeeze", self.mean.lower(build, x), weight=down, bias=down.new_zeros(len(down)))
+            s = build.add(Activate, "relu", s, function=Function.RELU, size=len(down))
+            s = build.add(Dense, "excite", s, weight=up, bias=up.new_zeros(len(up)))
+            s = build.add(Activate, "sigmoid", s, function=Function.SIGMOID, size=self.width)
+            return build.add(Multiply, "weighted", s, x, size=self.width)
 
     def costs(self) -> list[Cost]:
         """Per column, because every tick has its own weights."""

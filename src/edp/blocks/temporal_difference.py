@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from edp.blocks.base import BLOCKS, Slot
+from edp.graph import Builder
+from edp.graph.memory import Difference
 from edp.streaming import Cost, State, Streaming
 
 
@@ -40,6 +42,9 @@ class _Difference(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         before = torch.cat([state, x[:, :-1]], dim=1)
         return x - before, x[:, -1:]
+
+    def lower(self, build: Builder, x: str) -> str:
+        return build.add(Difference, "change", x, factor=torch.ones(self.width), from_zero=True)
 
     def costs(self) -> list[Cost]:
         return [Cost("temporal difference", 0, width_in=self.width, width_out=self.width, per_time_step=False)]

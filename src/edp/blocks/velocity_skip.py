@@ -9,6 +9,8 @@ from torch import Tensor
 
 from edp.blocks.base import BLOCKS, ModelView, OutputSpace, Slot, TaskView
 from edp.errors import ConfigError
+from edp.graph import Builder
+from edp.graph.layers import ScaleShift
 from edp.streaming import Cost, State, Streaming
 
 
@@ -73,6 +75,11 @@ class _Skip(Streaming):
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         return x[..., None, self.columns] * self.gain + self.shift, state
+
+    def lower(self, build: Builder, x: str) -> str:
+        with build.inside("skip"):
+            present = build.pick("present", x, self.columns * len(self.gain))
+            return build.add(ScaleShift, "scaled", present, gain=self.gain.flatten(), shift=self.shift.flatten())
 
     def costs(self) -> list[Cost]:
         wide = self.gain.numel()

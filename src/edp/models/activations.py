@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from edp.errors import ConfigError
+from edp.graph import Builder
+from edp.graph.layers import Activate, Function, ScaleShift
 from edp.registry import Registry
 from edp.streaming import Operation
 
@@ -17,7 +19,7 @@ class ActivationSpec(Protocol):
     """Options of an output activation."""
 
     def build(self, outputs: int) -> nn.Module:
-        """A module on ``(..., output)``."""
+        """A module on ``(..., output)``; ``lower(build, x)`` adds it to a graph, on ``horizon * output`` numbers."""
         ...
 
     def bound(self) -> float | None:
@@ -35,11 +37,16 @@ class Identity:
 
     def build(self, outputs: int) -> nn.Module:
         """A module that changes nothing."""
-        return nn.Identity()
+        return _Identity()
 
     def bound(self) -> float | None:
         """No limit."""
         return None
+
+
+class _Identity(nn.Identity):
+    def lower(self, build: Builder, x: str) -> str:
+        return x
 
 
 @ACTIVATIONS.register("tanh")
@@ -58,6 +65,9 @@ class Tanh:
 
 class _Tanh(nn.Tanh):
     operations = frozenset({Operation.TANH})
+
+    def lower(self, build: Builder, x: str) -> str:
+        return build.add(Activate, "tanh", x, function=Function.TANH, size=build.width(x))
 
 
 @ACTIVATIONS.register("stanh")
@@ -111,3 +121,9 @@ class _ScaledTanh(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.amplitude() * torch.tanh(x)
+
+    def lower(self, build: Builder, x: str) -> str:
+        size, amplitude = build.width(x), self.amplitude()
+        y = build.add(Activate, "tanh", x, function=Function.TANH, size=size)
+        gain = amplitude.repeat(size // len(amplitude))
+        return build.add(ScaleShift, "amplitude", y, gain=gain, shift=torch.zeros_like(gain))

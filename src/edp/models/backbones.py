@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from edp.blocks.base import BranchMaker, Slot
 from edp.errors import ConfigError
+from edp.graph import Builder
 from edp.models.cells import CellSpec, GruCell, LstmCell, Stack
 from edp.models.cells.base import check_cell
 from edp.models.convolution import ConvolutionStack, receptive_field
@@ -221,6 +222,14 @@ class RecurrentBackbone(Streaming):
         h = self.dropout(h)
         results = [part(h, old) for part, old in zip(self._tail(), tail, strict=True)]
         return torch.cat([y for y, _ in results], dim=-1), (first, recurrent, tuple(new for _, new in results))
+
+    def lower(self, build: Builder, x: str) -> str:
+        if self.encoder is not None:
+            with build.inside("encoder"):
+                x = self.encoder.lower(build, x)
+        h = self.recurrent.lower(build, x)
+        parts = [part.lower(build, h) for part in self._tail()]
+        return build.join("representation", *parts)
 
     def costs(self) -> list[Cost]:
         encoder = [] if self.encoder is None else self.encoder.costs()

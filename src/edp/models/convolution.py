@@ -8,6 +8,9 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
+from edp.graph import Builder
+from edp.graph.layers import Activate, Add, Dense, Function
+from edp.graph.memory import Convolution
 from edp.streaming import Cost, Operation, State, Streaming
 
 
@@ -47,6 +50,10 @@ class CausalConv(Streaming):
         y = functional.conv1d(history.transpose(1, 2), self.weight(), self.bias, dilation=self.dilation)
         return y.transpose(1, 2), history[:, x.shape[1] :]
 
+    def lower(self, build: Builder, x: str) -> str:
+        weight = self.weight().transpose(1, 2)
+        return build.add(Convolution, "convolution", x, weight=weight, bias=self.bias, dilation=self.dilation)
+
     def costs(self) -> list[Cost]:
         out, into, kernel = self.direction.shape
         return [
@@ -80,6 +87,15 @@ class TemporalBlock(Streaming):
         y, second = self.second(self.dropout(torch.relu(y)), state[1])
         y = self.dropout(torch.relu(y))
         return y + (x if self.shortcut is None else self.shortcut(x)), (first, second)
+
+    def lower(self, build: Builder, x: str) -> str:
+        y, size = x, self.second.direction.shape[0]
+        for name, part in (("first", self.first), ("second", self.second)):
+            with build.inside(name):
+                y = build.add(Activate, "relu", part.lower(build, y), function=Function.RELU, size=size)
+        if self.shortcut is not None:
+            x = build.add(Dense, "shortcut", x, weight=self.shortcut.weight, bias=self.shortcut.bias)
+        return build.add(Add, "sum", y, x, size=size)
 
     def costs(self) -> list[Cost]:
         rows = self.first.costs() + self.second.costs()
@@ -116,6 +132,12 @@ class ConvolutionStack(Streaming):
             x, block_state = block(x, old)
             new.append(block_state)
         return x, tuple(new)
+
+    def lower(self, build: Builder, x: str) -> str:
+        for number, block in enumerate(self._blocks(), start=1):
+            with build.inside(f"level{number}"):
+                x = block.lower(build, x)
+        return x
 
     def costs(self) -> list[Cost]:
         return [cost for block in self._blocks() for cost in block.costs()]

@@ -5,9 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from edp.data.features import DERIVATIONS
+from edp.data.features import DERIVATIONS, derivative, difference
 from edp.data.scaling import Scaler
 from edp.data.task import Task
+from edp.errors import ExportError
+from edp.graph import Builder
+from edp.graph.layers import Add, ScaleShift, Standardise, Subtract
+from edp.graph.memory import Difference, Starting
 from edp.streaming import Cost, State, Streaming
 
 
@@ -62,8 +66,37 @@ class FrontEnd(Streaming):
         """Standardised features."""
         return (features - self.offset) / self.width
 
+    def lower(self, build: Builder, x: str) -> str:
+        """Physical features."""
+        parts = [build.pick("logged", x, range(self.logged))]
+        if self.derived:
+            factors = [_factor(how, self.rate_hz) for how, _ in self.derived]
+            sources = build.pick("sources", x, [source for _, source in self.derived])
+            parts.append(build.add(Difference, "derived", sources, factor=torch.tensor(factors), from_zero=False))
+        if self.starting:
+            mean = self.offset[self.lasting : self.lasting + len(self.starting)]
+            read = build.pick("start", x, self.starting)
+            parts.append(build.add(Starting, "starting", read, mean=mean, ticks=self.starting_ticks))
+        return build.join("features", *parts)
+
+    def lower_scale(self, build: Builder, features: str) -> str:
+        """Standardised features."""
+        return build.add(Standardise, "scaled", features, offset=self.offset, scale=self.width)
+
     def costs(self) -> list[Cost]:
         return [Cost("features and scaling", 0, width_in=self.inputs, width_out=int(self.offset.numel()))]
+
+
+def _factor(how: object, rate_hz: float) -> float:
+    """What a derivation multiplies a difference with."""
+    if how is difference:
+        return 1.0
+    if how is derivative:
+        return rate_hz
+    name = DERIVATIONS.name_of(how)
+    raise ExportError(
+        f"derivation '{name}' has no form as a layer; 'difference' and 'derivative' have: use one of them"
+    )
 
 
 class TargetCode(nn.Module):
@@ -98,3 +131,24 @@ class TargetCode(nn.Module):
     def decode(self, code: Tensor, features: Tensor) -> Tensor:
         """SI predictions from the network's output, same shape."""
         return code * self.width + self.offset + self._base(features)
+
+    def lower_base(self, build: Builder, features: str) -> str | None:
+        """Present target values, ``horizon * target``, in delta mode; None in absolute mode."""
+        return build.pick("present", features, self.present * len(self.width)) if self.delta else None
+
+    def lower_encode(self, build: Builder, future: str, base: str | None) -> str:
+        """Standardised targets from future SI values."""
+        if base is not None:
+            future = build.add(Subtract, "change", future, base, size=self.width.numel())
+        return build.add(Standardise, "encoded", future, offset=self.offset.flatten(), scale=self.width.flatten())
+
+    def lower_decode(self, build: Builder, name: str, code: str, base: str | None) -> str:
+        """SI values from one or several sets of standardised ones, ``set * horizon * target``."""
+        one = self.width.numel()
+        sets = build.width(code) // one
+        gain, shift = self.width.flatten().repeat(sets), self.offset.flatten().repeat(sets)
+        value = build.add(ScaleShift, f"{name}.decoded", code, gain=gain, shift=shift)
+        if base is None:
+            return value
+        bases = build.pick(f"{name}.present", base, list(range(one)) * sets)
+        return build.add(Add, name, value, bases, size=one * sets)

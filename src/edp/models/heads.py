@@ -12,6 +12,8 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from edp.errors import ConfigError
+from edp.graph import Builder
+from edp.graph.layers import Activate, Dense, Function, Glu, GroupedDense
 from edp.registry import Registry
 from edp.streaming import Cost, Operation, State, Streaming
 
@@ -96,6 +98,13 @@ class Unit:
     apply: Callable[[Tensor], Tensor]
     operation: Operation
 
+    def lower(self, build: Builder, x: str, rows: int) -> str:
+        """Add it to a graph, on each of `rows` rows."""
+        size = build.width(x)
+        if self.operation is Operation.GLU:
+            return build.add(Glu, "gated", x, rows=rows, size=size // rows)
+        return build.add(Activate, "relu", x, function=Function.RELU, size=size)
+
 
 RELU = Unit(1, torch.relu, Operation.RELU)
 GATED = Unit(2, functional.glu, Operation.GLU)
@@ -145,6 +154,24 @@ class Heads(Streaming):
     def _layer(self, layer: int, x: Tensor) -> Tensor:
         """``(batch, time, output, in)`` to ``(batch, time, output, out)``."""
         return torch.einsum("btci,cio->btco", x, self.weights[layer]) + self.biases[layer]
+
+    def lower(self, build: Builder, x: str) -> str:
+        weights = [weight.transpose(1, 2) for weight in self.weights]
+        if build.width(x) == self.widths[0]:
+            first, bias = weights[0].flatten(0, 1), self.biases[0].flatten()
+            x = build.add(Dense, "layer1", x, weight=first, bias=bias)
+        else:
+            x = build.add(GroupedDense, "layer1", x, weight=weights[0], bias=self.biases[0])
+        x = self.units[0].lower(build, x, self.outputs)
+        for number, unit in enumerate(self.units[1:], start=1):
+            x = build.add(GroupedDense, f"layer{number + 1}", x, weight=weights[number], bias=self.biases[number])
+            x = unit.lower(build, x, self.outputs)
+        if self.mix is not None:
+            x = self.mix.lower(build, x)
+        last = f"layer{len(self.weights)}"
+        x = build.add(GroupedDense, last, x, weight=weights[-1], bias=self.biases[-1])
+        values = self.widths[-1]
+        return build.pick("by_value", x, [c * values + v for v in range(values) for c in range(self.outputs)])
 
     def costs(self) -> list[Cost]:
         own = Cost(

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from edp.errors import ConfigError
+from edp.graph import Builder
+from edp.graph.memory import PrefixCorrection
 from edp.registry import Registry
 from edp.streaming import Cost, Operation, State, Streaming, map_state, parameters_of, state_numbers
 
@@ -88,6 +90,12 @@ class LearnedConstant(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         return self.recurrent(x, state)
 
+    def lower(self, build: Builder, x: str) -> str:
+        before = len(build.layers)
+        y = self.recurrent.lower(build, x)
+        build.start_from(build.slots_since(before), self.constant)
+        return y
+
     def costs(self) -> list[Cost]:
         return [*self.recurrent.costs(), Cost("state at reset", self.constant.numel(), width_out=self.constant.numel())]
 
@@ -134,6 +142,22 @@ class LearnedFromPrefix(Streaming):
         correction = self.second(torch.tanh(self.first(seen)))
         used = correction.masked_fill(~(young & (age >= self.ticks)), 0.0)
         return y, (map_state(torch.add, inner, spread_over(inner, used)), total, age)
+
+    def lower(self, build: Builder, x: str) -> str:
+        before = len(build.layers)
+        y = self.recurrent.lower(build, x)
+        build.add(
+            PrefixCorrection,
+            "prefix",
+            x,
+            first_weight=self.first.weight,
+            first_bias=self.first.bias,
+            second_weight=self.second.weight,
+            second_bias=self.second.bias,
+            ticks=self.ticks,
+            corrects=tuple((layer, slot.name) for layer, slot in build.slots_since(before)),
+        )
+        return y
 
     def costs(self) -> list[Cost]:
         macs = self.first.weight.numel() + self.second.weight.numel()

@@ -11,7 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from edp.errors import ConfigError
+from edp.errors import ConfigError, ExportError
+from edp.graph import Builder
+from edp.graph.layers import Accumulate, Activate, Add, Function, ScaleShift, Subtract
 from edp.losses import Answer
 from edp.registry import Registry
 from edp.streaming import Operation
@@ -77,6 +79,36 @@ class Output(nn.Module):
         """Lower and upper bound of interval `which`, standardised, ``(..., horizon, output)``."""
         below, above = self.reach(answer, which)
         return answer.center - self.stretch[which] * below, answer.center + self.stretch[which] * above
+
+    def lower(self, build: Builder, center: str, y: str) -> tuple[str, str] | None:
+        """Lower and upper bounds, ``coverage * horizon * output`` standardised numbers each; None for a point.
+
+        Args:
+            build: takes the layers.
+            center: the prediction, ``horizon * output``.
+            y: what the heads give, ``horizon * value * output``.
+        """
+        if not self.coverages:
+            return None
+        with build.inside("interval"):
+            below, above = self.lower_reach(build, y)
+            size, stretch = self.stretch.numel(), self.stretch.flatten()
+            centers = build.pick("center", center, list(range(build.width(center))) * len(self.coverages))
+            zeros = torch.zeros_like(stretch)
+            down = build.add(ScaleShift, "below", below, gain=stretch, shift=zeros)
+            up = down if above == below else build.add(ScaleShift, "above", above, gain=stretch, shift=zeros)
+            return build.add(Subtract, "lower", centers, down, size=size), build.add(
+                Add, "upper", centers, up, size=size
+            )
+
+    def lower_reach(self, build: Builder, y: str) -> tuple[str, str]:
+        """`reach` of all coverages as layers, ``coverage * horizon * output`` numbers below and above."""
+        raise ExportError(f"the output '{type(self).__name__}' has no form as a list of streaming layers")
+
+    def rows(self, values: int, numbers: Sequence[int]) -> list[int]:
+        """Where the heads' `numbers` of `values` are, in the order ``number, horizon, output``."""
+        _, horizons, outputs = self.stretch.shape
+        return [(h * values + v) * outputs + c for v in numbers for h in range(horizons) for c in range(outputs)]
 
     def place(self, coverage: float) -> int:
         """Which interval has this coverage.
@@ -194,6 +226,19 @@ class _Quantiles(Output):
     def reach(self, answer: Answer, which: int) -> tuple[Tensor, Tensor]:
         return -answer.spread[..., which, :], answer.spread[..., -1 - which, :]
 
+    def lower_reach(self, build: Builder, y: str) -> tuple[str, str]:
+        pairs, (_, horizons, outputs) = self.pairs, self.stretch.shape
+        size = horizons * outputs
+        ones, found = torch.ones(pairs * size), []
+        for side, first in (("down", 1), ("up", 1 + pairs)):
+            raw = build.pick(side, y, self.rows(1 + 2 * pairs, range(first, first + pairs)))
+            gap = build.add(Activate, f"{side}_softplus", raw, function=Function.SOFTPLUS, size=pairs * size)
+            gap = build.add(ScaleShift, f"{side}_gap", gap, gain=ones, shift=SMALLEST * ones)
+            total = build.add(Accumulate, f"{side}_total", gap, rows=pairs, size=size)
+            widest_first = [row * size + i for row in reversed(range(pairs)) for i in range(size)]
+            found.append(build.pick(f"{side}_ordered", total, widest_first))
+        return found[0], found[1]
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Law:
@@ -261,4 +306,17 @@ class _Spread(Output):
 
     def reach(self, answer: Answer, which: int) -> tuple[Tensor, Tensor]:
         distance = self.sizes[which] * torch.exp(0.5 * answer.spread[..., 0, :])
+        return distance, distance
+
+    def lower_reach(self, build: Builder, y: str) -> tuple[str, str]:
+        ones = torch.ones(self.stretch[0].numel())
+        size, low = len(ones), LOW_LOG_VARIANCE
+        raw = build.pick("raw", y, self.rows(2, [1]))
+        raised = build.add(ScaleShift, "raised", raw, gain=ones, shift=-low * ones)
+        soft = build.add(Activate, "softplus", raised, function=Function.SOFTPLUS, size=size)
+        half = build.add(ScaleShift, "half", soft, gain=0.5 * ones, shift=0.5 * low * ones)
+        sigma = build.add(Activate, "sigma", half, function=Function.EXP, size=size)
+        every = build.pick("repeated", sigma, list(range(size)) * len(self.sizes))
+        gain = torch.tensor(self.sizes).repeat_interleave(size)
+        distance = build.add(ScaleShift, "distance", every, gain=gain, shift=torch.zeros_like(gain))
         return distance, distance

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from edp.graph import Builder
+from edp.graph.memory import UNSEEN, AttentionPool
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
-# A score that no softmax notices; finite, because inf - inf is NaN.
-UNSEEN = -1e30
 # Query rows per block of the banded softmax: memory stays linear in the sequence length.
 BLOCK = 128
 
@@ -48,6 +48,11 @@ class AttentionPooling(Streaming):
         band = (lag >= 0) & (lag < self.window)
         weights = scores[:, None, keys].masked_fill(~band, 2 * UNSEEN).softmax(dim=-1)
         return weights @ states[:, keys]
+
+    def lower(self, build: Builder, x: str) -> str:
+        score, bias = self.score.weight[0], self.score.bias
+        pooled = build.add(AttentionPool, "pooling", x, score=score, bias=bias, window=self.window)
+        return build.join("pooled_and_last", pooled, x)
 
     def costs(self) -> list[Cost]:
         return [

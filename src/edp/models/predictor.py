@@ -10,7 +10,10 @@ from torch import Tensor, nn
 from edp.blocks.base import BLOCKS, OUTPUT_SLOTS, SHARED_SLOTS, OutputSpace, Particular, Slot
 from edp.data.scaling import Scaler
 from edp.data.task import Task
-from edp.errors import ConfigError
+from edp.errors import ConfigError, ExportError
+from edp.graph import Builder, Graph
+from edp.graph.base import INPUT
+from edp.graph.layers import Add, ScaleShift
 from edp.losses import Answer
 from edp.models.activations import ACTIVATIONS, ActivationSpec, Identity
 from edp.models.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
@@ -160,6 +163,56 @@ class Predictor(Streaming):
             for which in range(len(self.output.coverages))
         ]
         return torch.stack(bounds, dim=2), new
+
+    def lower(self, build: Builder, x: str) -> str:
+        """Predictions in SI units, ``horizon * target`` numbers."""
+        return self._lower(build, x)["prediction"]
+
+    def graph(self) -> Graph:
+        """The network as a list of streaming layers with float32 constants, from SI inputs to SI predictions.
+
+        Raises:
+            ExportError: a part of it has no such form; it is named.
+        """
+        with torch.no_grad():
+            build = Builder(len(self.task.inputs))
+            return build.graph(self._lower(build, INPUT), self.spec.window)
+
+    def _lower(self, build: Builder, x: str) -> dict[str, str]:
+        with build.inside("front"):
+            features = self.front.lower(build, x)
+            base = self.code.lower_base(build, features)
+            scaled = self.front.lower_scale(build, features)
+        with build.inside("backbone"):
+            y = self.backbone.lower(build, scaled)
+        with build.inside("heads"):
+            y = self.heads.lower(build, y if self.gate is None else self.gate.lower(build, y))
+        with build.inside("output"):
+            center = self._lower_center(build, x, scaled, base, y)
+            bounds = self.output.lower(build, center, y)
+        results = {"prediction": self.code.lower_decode(build, "prediction", center, base)}
+        for name, bound in zip(("lower", "upper"), bounds or (), strict=False):
+            results[name] = self.code.lower_decode(build, name, bound, base)
+        return results
+
+    def _lower_center(self, build: Builder, x: str, scaled: str, base: str | None, y: str) -> str:
+        """The standardised prediction, ``horizon * target``."""
+        horizons, outputs, values = len(self.task.horizons), len(self.task.targets), self.spec.output.values
+        first = [(h * values) * outputs + c for h in range(horizons) for c in range(outputs)]
+        act = getattr(self.activation, "lower", None)
+        if act is None:
+            name = ACTIVATIONS.name_of(self.spec.activation)
+            raise ExportError(f"activation '{name}' has no form as a layer; give its module a method `lower`")
+        center: str = act(build, build.pick("center", y, first))
+        if self.bypass is not None:
+            direct = self.bypass.lower(build, scaled)
+            center = build.add(Add, "with_bypass", center, direct, size=horizons * outputs)
+        if self.physics is not None:
+            ahead = self.code.lower_encode(build, self.physics.lower(build, x), base)
+            known = self.physics.known.repeat(horizons)
+            ahead = build.add(ScaleShift, "known", ahead, gain=known, shift=torch.zeros_like(known))
+            center = build.add(Add, "with_physics", center, ahead, size=horizons * outputs)
+        return center
 
     def costs(self) -> list[Cost]:
         """Analytic costs of every part."""

@@ -8,6 +8,7 @@ from typing import ClassVar, Protocol
 from torch import Tensor, nn
 
 from edp.errors import ConfigError
+from edp.graph import Builder
 from edp.registry import Registry
 from edp.streaming import Cost, State, Streaming
 
@@ -77,6 +78,12 @@ class Stack(Streaming):
             x, layer_state = layer(self.dropout(x) if number else x, old)
             new.append(layer_state)
         return x, tuple(new)
+
+    def lower(self, build: Builder, x: str) -> str:
+        for number, layer in enumerate(self._layers(), start=1):
+            with build.inside(f"recurrent{number}"):
+                x = layer.lower(build, x)
+        return x
 
     def costs(self) -> list[Cost]:
         return [cost for layer in self._layers() for cost in layer.costs()]

@@ -11,6 +11,9 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from edp.errors import ConfigError
+from edp.graph import Builder
+from edp.graph.layers import Dense, Glu
+from edp.graph.memory import Rotation
 from edp.models.cells.base import CELLS
 from edp.models.cells.scan import linear_scan
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
@@ -81,6 +84,14 @@ class DiagonalSsm(Streaming):
         )
         y = functional.glu(self.out(h.flatten(-2)), dim=-1)
         return y.transpose(0, 1), h[-1]
+
+    def lower(self, build: Builder, x: str) -> str:
+        factor, scale = self.factor()
+        weight = (self.into.weight.unflatten(0, (self.states, 2)) * scale.unsqueeze(-1)).flatten(0, 1)
+        driven = build.add(Dense, "drive", x, weight=weight, bias=weight.new_zeros(2 * self.states))
+        h = build.add(Rotation, "rotation", driven, factor=factor)
+        both = build.add(Dense, "out", h, weight=self.out.weight, bias=self.out.bias)
+        return build.add(Glu, "gated", both, rows=1, size=2 * self.units)
 
     def costs(self) -> list[Cost]:
         states, units = 2 * self.states, self.units

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from edp.graph import Builder
+from edp.graph.memory import Gru as GruLayer
 from edp.models.cells.base import CELLS
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
 
@@ -52,6 +54,10 @@ class Gru(Streaming):
         projected = nn.functional.linear(x.transpose(0, 1), self.weight_ih, self.bias_ih)
         y: Tensor = _Steps.apply(projected, self.weight_hh, self.bias_hh, state)  # type: ignore[no-untyped-call]
         return y.transpose(0, 1), y[-1]
+
+    def lower(self, build: Builder, x: str) -> str:
+        weights = {"weight_x": self.weight_ih, "weight_h": self.weight_hh}
+        return build.add(GruLayer, "gru", x, **weights, bias_x=self.bias_ih, bias_h=self.bias_hh)
 
     def costs(self) -> list[Cost]:
         width, units = self.width_in, self.units

@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
+from edp.graph import Builder
+from edp.graph.memory import LayerNormLstm as LayerNormLstmLayer
 from edp.models.cells.base import CELLS
 from edp.models.cells.lstm import lstm_costs, zoneout_share
 from edp.models.cells.lstm_steps import EPSILON, lstm_steps, output_first
@@ -64,6 +66,22 @@ class LayerNormLstm(Streaming):
         norm = (output_first(self.norm_gain_hh), self.norm_gain_c, self.norm_shift_c)
         y, state = lstm_steps(projected, output_first(self.weight_hh), norm, state, share)
         return y.transpose(0, 1), state
+
+    def lower(self, build: Builder, x: str) -> str:
+        return build.add(
+            LayerNormLstmLayer,
+            "lstm",
+            x,
+            weight_x=self.weight_ih,
+            weight_h=self.weight_hh,
+            bias=self.bias + self.norm_shift_ih + self.norm_shift_hh,
+            gain_x=self.norm_gain_ih,
+            gain_h=self.norm_gain_hh,
+            gain_c=self.norm_gain_c,
+            shift_c=self.norm_shift_c,
+            epsilon=EPSILON,
+            share=1.0 - self.rate,
+        )
 
     def costs(self) -> list[Cost]:
         name = "layer-norm LSTM with zoneout" if self.rate else "layer-norm LSTM"

@@ -9,6 +9,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from edp.graph import Builder
+from edp.graph.memory import Lstm as LstmLayer
 from edp.models.cells.base import CELLS
 from edp.models.cells.lstm_steps import Shares, lstm_steps, output_first
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
@@ -47,6 +49,12 @@ class Lstm(Streaming):
         y, (h, c) = self.cell(x, (state[0].unsqueeze(0), state[1].unsqueeze(0)))
         return y, (h.squeeze(0), c.squeeze(0))
 
+    def lower(self, build: Builder, x: str) -> str:
+        part = self.cell.get_parameter
+        bias = part("bias_ih_l0") + part("bias_hh_l0")
+        weight_x, weight_h = part("weight_ih_l0"), part("weight_hh_l0")
+        return build.add(LstmLayer, "lstm", x, weight_x=weight_x, weight_h=weight_h, bias=bias)
+
     def costs(self) -> list[Cost]:
         return lstm_costs("LSTM", self.cell.input_size, self.cell.hidden_size, parameters_of(self))
 
@@ -82,6 +90,11 @@ class ZoneoutLstm(Streaming):
         share = zoneout_share(projected, self.units, self.rate, self.training)
         y, state = lstm_steps(projected, recurrent, None, state, share)
         return y.transpose(0, 1), state
+
+    def lower(self, build: Builder, x: str) -> str:
+        weights = {"weight_x": self.weight_ih_l0, "weight_h": self.weight_hh_l0}
+        bias = self.bias_ih_l0 + self.bias_hh_l0
+        return build.add(LstmLayer, "lstm", x, **weights, bias=bias, share=1.0 - self.rate)
 
     def costs(self) -> list[Cost]:
         return lstm_costs("LSTM with zoneout", self.width_in, self.units, parameters_of(self))

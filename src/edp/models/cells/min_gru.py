@@ -8,6 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from edp.graph import Builder
+from edp.graph.layers import Dense
+from edp.graph.memory import MinGru as MinGruLayer
 from edp.models.cells.base import CELLS
 from edp.models.cells.scan import linear_scan
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
@@ -52,6 +55,11 @@ class MinGru(Streaming):
         z = torch.sigmoid(gate)
         h = linear_scan(1 - z, z * candidate, state)
         return h.transpose(0, 1), h[-1]
+
+    def lower(self, build: Builder, x: str) -> str:
+        both = self.gate_and_candidate
+        mapped = build.add(Dense, "gate_and_candidate", x, weight=both.weight, bias=both.bias)
+        return build.add(MinGruLayer, "minimal_gru", mapped, units=self.units)
 
     def costs(self) -> list[Cost]:
         width, units = self.width_in, self.units

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from edp.blocks.base import ModelView, TaskView
 from edp.data.task import Task
-from edp.errors import ConfigError, closest
+from edp.errors import ConfigError, ExportError, closest
+from edp.graph import Builder
 from edp.models.physics.geometry import AXES, Geometry, Pose, inverse
 from edp.registry import Registry
 from edp.streaming import Cost, Operation, State, Streaming
@@ -166,6 +167,12 @@ class PhysicsBase(Streaming):
     @abstractmethod
     def arithmetic(self) -> int:
         """Multiplications, divisions, roots, sines and the like of one tick, beyond those of the pose."""
+
+    def lower(self, build: Builder, x: str) -> str:
+        raise ExportError(
+            f"physics base '{PHYSICS.name_of(self.spec)}' has no form as a list of streaming layers yet; train "
+            "without model.physics for what is to be exported"
+        )
 
     def costs(self) -> list[Cost]:
         count = (52 if self.spec.pose == "angles" else 101) + AXES + self.arithmetic()

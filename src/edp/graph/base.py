@@ -1,0 +1,128 @@
+"""What a layer of the list is, what it remembers, and the list itself."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+INPUT = "input"
+"""The value that holds the inputs of the tick, SI units, in the order in which they are fed."""
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Numbers that a layer carries from tick to tick.
+
+    Attributes:
+        name: within the layer.
+        shape: for a ring, ticks first, the oldest one in row 0.
+        fill: every number's value after a reset, unless the graph says otherwise.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    fill: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """How many numbers."""
+        return int(np.prod(self.shape))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Layer(ABC):
+    """One computation of a tick: vectors in, one vector out.
+
+    Attributes:
+        name: of the layer and of the value that it gives; unique in its graph, lower case, parts joined by dots.
+        inputs: values that it reads.
+    """
+
+    name: str
+    inputs: tuple[str, ...]
+
+    @property
+    @abstractmethod
+    def width(self) -> int:
+        """Numbers that it gives."""
+
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        """What it remembers."""
+        return ()
+
+    @property
+    def macs(self) -> int:
+        """Multiply-accumulates of one tick with weights or with what it remembers; element-wise work is not counted."""
+        return 0
+
+    def tensors(self) -> dict[str, Array]:
+        """Its constant arrays by name within the layer."""
+        held = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {name: value for name, value in held.items() if isinstance(value, np.ndarray)}
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """Layers in the order in which a tick computes them.
+
+    Attributes:
+        inputs: numbers fed at each tick.
+        layers: every layer reads `INPUT` and layers before it.
+        results: values that are given back, by what they mean: ``prediction``, and ``lower`` and ``upper`` bounds.
+        initial: values of slots after a reset that are not all one number, by ``(layer, slot)``.
+        window: ticks after a reset until predictions rest on a whole window.
+    """
+
+    inputs: int
+    layers: tuple[Layer, ...]
+    results: Mapping[str, str]
+    initial: Mapping[tuple[str, str], Array] = field(default_factory=dict)
+    window: int = 1
+
+    def layer(self, name: str) -> Layer:
+        """A layer by name.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for layer in self.layers:
+            if layer.name == name:
+                return layer
+        raise KeyError(name)
+
+    def width_of(self, value: str) -> int:
+        """How many numbers a value has."""
+        return self.inputs if value == INPUT else self.layer(value).width
+
+    def tensors(self) -> Iterator[tuple[str, str, Array]]:
+        """Every constant array: layer, name within it, values."""
+        for layer in self.layers:
+            for name, values in layer.tensors().items():
+                yield layer.name, name, values
+
+    def slots(self) -> Iterator[tuple[str, Slot]]:
+        """Everything carried from tick to tick: layer and slot."""
+        for layer in self.layers:
+            for slot in layer.slots:
+                yield layer.name, slot
+
+    def start(self, layer: str, slot: Slot) -> Array:
+        """Values of a slot after a reset."""
+        return self.initial.get((layer, slot.name), np.full(slot.shape, slot.fill, dtype=np.float32))
+
+    @property
+    def parameters(self) -> int:
+        """Numbers in all constant arrays."""
+        return sum(values.size for _, _, values in self.tensors())
+
+    @property
+    def macs(self) -> int:
+        """Multiply-accumulates of one tick."""
+        return sum(layer.macs for layer in self.layers)

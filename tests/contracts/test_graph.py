@@ -1,0 +1,99 @@
+"""Every network that the registries allow, as a list of streaming layers that means the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from edp.errors import ExportError
+from edp.graph import base, layers, memory
+from edp.graph.reference import STEPS, Reference
+from edp.models.physics import PHYSICS
+from edp.streaming import parameters_of, state_numbers
+from edp.training.bundle import blank_scaler
+
+TICKS = 24
+
+
+def stream(predictor, ticks=TICKS, seed=0):
+    """Inputs ``(time, input)``, predictions and, where there are any, bounds, as PyTorch streams them."""
+    draw = torch.Generator().manual_seed(seed)
+    x = torch.randn(1, ticks, predictor.front.inputs, generator=draw).double()
+    with torch.no_grad():
+        found = {"prediction": predictor.predict(x, predictor.initial_state(1, x))[0][0].flatten(1)}
+        if predictor.output.coverages:
+            bounds, _ = predictor.intervals(x, predictor.initial_state(1, x))
+            found |= {"lower": bounds[0, :, :, 0].flatten(1), "upper": bounds[0, :, :, 1].flatten(1)}
+    return x[0].numpy(), {meaning: values.numpy() for meaning, values in found.items()}
+
+
+def single(predictor):
+    """The predictor with the float32 weights that a graph holds."""
+    return predictor.float().double()
+
+
+def test_the_list_means_what_the_network_computes(structure, predictor_of):
+    predictor = single(predictor_of(structure))
+    if predictor.physics is not None:
+        with pytest.raises(ExportError, match=f"'{PHYSICS.name_of(predictor.spec.physics)}'"):
+            predictor.graph()
+        return
+    graph = predictor.graph()
+    inputs, wanted = stream(predictor)
+    run = Reference(graph)
+    found = [run.results(row) for row in inputs]
+    assert set(found[0]) == set(wanted)
+    for meaning, values in wanted.items():
+        # Folding rounds once more, in single precision.
+        near = 1e-5 * max(1.0, np.median(np.abs(values)))
+        np.testing.assert_allclose([row[meaning] for row in found], values, rtol=1e-5, atol=near, err_msg=meaning)
+    run.reset()
+    np.testing.assert_array_equal(run.results(inputs[0])["prediction"], found[0]["prediction"])
+
+
+def test_the_list_counts_what_the_network_counts(structure, predictor_of):
+    predictor = predictor_of(structure)
+    if predictor.physics is not None:
+        return
+    graph = predictor.graph()
+    costs = predictor.costs()
+    assert graph.macs == sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)
+    carried = sum(slot.size for _, slot in graph.slots())
+    assert carried <= 1.1 * state_numbers(predictor.initial_state(1, torch.zeros(1))) + 8  # counters differ
+    assert graph.parameters <= parameters_of(predictor) * 1.1 + 200
+
+
+def test_names_are_unique_and_values_are_made_before_they_are_read(structure, predictor_of):
+    predictor = predictor_of(structure)
+    if predictor.physics is not None:
+        return
+    graph = predictor.graph()
+    made = {base.INPUT: graph.inputs}
+    for layer in graph.layers:
+        assert layer.name not in made
+        assert layer.name == layer.name.lower()
+        assert all(name in made for name in layer.inputs)
+        made[layer.name] = layer.width
+    assert set(graph.results.values()) <= set(made)
+    assert all(np.isfinite(values).all() and values.dtype == np.float32 for _, _, values in graph.tensors())
+
+
+def test_every_kind_of_layer_has_a_reference():
+    kinds = {
+        kind
+        for module in (layers, memory)
+        for kind in vars(module).values()
+        if isinstance(kind, type) and issubclass(kind, base.Layer) and kind is not base.Layer
+    }
+    assert kinds - {memory.PrefixCorrection} == set(STEPS)
+    assert len(kinds) == 25
+
+
+def test_weights_that_are_not_finite_are_refused(predictor_of):
+    predictor = predictor_of("lstm")
+    broken = type(predictor)(predictor.task, predictor.spec, blank_scaler(predictor.task))
+    with torch.no_grad():
+        next(iter(broken.heads.weights))[0, 0, 0] = torch.nan
+    with pytest.raises(ExportError, match="NaN or infinite"):
+        broken.graph()
