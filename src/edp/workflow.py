@@ -13,6 +13,7 @@ import torch
 from safetensors.numpy import save
 
 from edp import __version__
+from edp.compress import student
 from edp.config import (
     Experiment,
     experiment_toml,
@@ -26,7 +27,8 @@ from edp.data.splits import SPLITS
 from edp.data_sets import SimulationOrder, simulate_data_set
 from edp.errors import DataError, StorageError
 from edp.evaluation.conditional import collinear
-from edp.evaluation.footprint import Budget, Footprint, footprint
+from edp.evaluation.controller import Budget
+from edp.evaluation.footprint import Footprint, check_possible, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
 from edp.evaluation.worth import Worths, WorthSpec
 from edp.evaluation.worth import channel_worths as measure_worths
@@ -274,19 +276,27 @@ def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) 
     return judge(bundle.predictor, data, spec or JudgeSpec(), describe(bundle.predictor.spec))
 
 
-def footprint_of(path: str | Path) -> tuple[Footprint, str]:
+def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footprint, str]:
     """Footprint of a bundle, a run folder, or a settings file, and what it is called.
 
     Raises:
-        EdpError: neither a bundle nor valid settings.
+        EdpError: neither a bundle nor valid settings, or a budget that no network of these inputs and targets meets.
     """
+    predictor, name = _predictor_of(path)
+    if budget is not None:
+        alone = replace(predictor.spec, blocks=(), physics=None)
+        check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
+    return footprint(predictor), name
+
+
+def _predictor_of(path: str | Path) -> tuple[Predictor, str]:
     source = Path(path)
     if source.suffix == ".toml":
         experiment = load_experiment(source)
         task = experiment.task.resolve(100.0, physics=experiment.model.physics)
-        return footprint(_untrained(experiment.model, task)), source.stem
+        return _untrained(experiment.model, task), source.stem
     bundle = load_bundle(source)
-    return footprint(bundle.predictor), describe(bundle.predictor.spec)
+    return bundle.predictor, describe(bundle.predictor.spec)
 
 
 def _untrained(model: ModelSpec, task: Any) -> Predictor:

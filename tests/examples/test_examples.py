@@ -13,9 +13,11 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
+from edp.compress import DistillationSpec
 from edp.config import TAGGED, TaskSettings, load_experiment
 from edp.data.chunks import ChunkSpec
 from edp.data_sets import SimulationOrder, simulate_data_set
+from edp.evaluation.controller import Budget
 from edp.evaluation.judge import JudgeSpec
 from edp.logs import write_recording
 from edp.losses import AdaptiveWeights
@@ -33,7 +35,7 @@ from edp.training import TrainingSpec
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 OTHER = {"leagues.toml"}  # figures to compare with, read by a benchmark
-SETTINGS = sorted(path for path in EXAMPLES.rglob("*.toml") if path.name not in OTHER)
+SETTINGS = sorted(path for path in EXAMPLES.rglob("*.toml") if path.name not in OTHER and path.parent.name != "budgets")
 SMALL = (
     "training.epochs=1",
     "training.updates=3",
@@ -120,6 +122,19 @@ def test_screening_page_names_every_option_and_its_default():
     for (name, text), entry in zip(shown, entries):
         if entry.default not in (dataclasses.MISSING, ()):
             assert text == f"`{round(entry.default, 3)}`", name
+
+
+def test_compression_page_names_every_option_and_shows_the_budget_of_the_examples():
+    page = (ROOT / "docs" / "compress.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\| `(\w+)` \| (.+?) \|", page, re.MULTILINE)
+    entries = [*dataclasses.fields(Budget), *dataclasses.fields(DistillationSpec)]
+    assert [name for name, _ in shown] == [entry.name for entry in entries]
+    for (name, text), entry in zip(shown, entries):
+        if name not in ("name", "soft"):
+            assert text.strip("`") == str(entry.default).removesuffix(".0"), name
+    (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    whole = (EXAMPLES / "budgets" / "small_controller.toml").read_text(encoding="utf-8")
+    assert whole.endswith(example)
 
 
 def test_search_page_names_every_phase_and_key_and_shows_the_examples():

@@ -79,3 +79,20 @@ def test_a_label_names_what_is_not_plain():
     b1 = load_experiment(FOLDER / "table_b1.toml", "thesis").model
     assert describe(b1) == "hybrid + multi_scale_tcn + cylinder_gate + stanh activation"
     assert describe(ModelSpec()) == "hybrid"
+
+
+def test_a_budget_file_is_held_against_and_an_impossible_one_is_refused(monkeypatch, capsys, tmp_path):
+    budget = FOLDER.parent / "budgets" / "small_controller.toml"
+    settings = str(FOLDER / "k10_student_u32.toml")
+    monkeypatch.setattr(sys, "argv", ["edp", "footprint", settings, "--budget", str(budget), "--json"])
+    assert run_app(app) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["budget"]["cycles"] == 360_000
+    fits = {row["what"]: row["fits"] for row in facts["verdict"]}
+    assert fits["cycles per tick, w8a16"]
+    assert not fits["cycles per prediction, windowed"]
+
+    (tmp_path / "none.toml").write_text("cycles = 100")
+    monkeypatch.setattr(sys, "argv", ["edp", "footprint", settings, "--budget", str(tmp_path / "none.toml")])
+    assert run_app(app) == 1
+    assert "cycles = 100 can be met by no network" in " ".join(capsys.readouterr().err.split())

@@ -88,7 +88,7 @@ class TimeWarp:
     """Time runs faster and slower along the stretch, for inputs and targets alike; both ends stay.
 
     The speed is one plus three sines of random phase, whose periods lie between a quarter of the stretch and the whole.
-    Values are interpolated, not scaled: what changes is how fast the plant answers.
+    Values are interpolated, not scaled: what changes is how fast the plant answers. So is what a lesson says.
 
     Attributes:
         strength: largest change of the speed.
@@ -120,7 +120,8 @@ class TimeWarp:
         def read(values: NDArray[np.float32]) -> NDArray[np.float32]:
             return values[below] + share * (values[below + 1] - values[below])
 
-        return replace(part, inputs=read(part.inputs), targets=read(part.targets))
+        taught = None if part.taught is None else read(part.taught)
+        return replace(part, inputs=read(part.inputs), targets=read(part.targets), taught=taught)
 
 
 def input_deviation(series: list[Series]) -> NDArray[np.float32]:

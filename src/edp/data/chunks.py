@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -79,12 +79,14 @@ class Batch:
         future: ``(batch, time, horizon, target)``: the target channels at t + k, SI units.
         valid: ``(batch, time)``: where a loss is taken.
         reset: ``(batch,)``: streams that start anew with this chunk.
+        taught: ``(batch, time, column)``: what a lesson says of each tick; None without one.
     """
 
     inputs: NDArray[np.float32]
     future: NDArray[np.float32]
     valid: NDArray[np.bool_]
     reset: NDArray[np.bool_]
+    taught: NDArray[np.float32] | None = None
 
     @property
     def targets_seen(self) -> int:
@@ -220,29 +222,35 @@ class ChunkSampler:
         if rng is None or self.deviation is None:
             return part, 0
         stop = min(stop + max(self.horizons), part.samples)
-        part = Series(part.name, part.inputs[start:stop], part.targets[start:stop])
+        taught = None if part.taught is None else part.taught[start:stop]
+        part = replace(part, inputs=part.inputs[start:stop], targets=part.targets[start:stop], taught=taught)
         for augmentation in self.augmentations:
             part = augmentation.apply(part, self.deviation, rng)
         return part, start
 
-    def _cut(self, part: Series, at: int, age: int, burn_in: int) -> tuple[Any, Any, Any]:
-        """Inputs, future targets and validity of one chunk; rows past the end repeat the last and count nothing."""
+    def _cut(self, part: Series, at: int, age: int, burn_in: int) -> tuple[Any, Any, Any, Any]:
+        """Inputs, future targets, validity and lesson of a chunk; rows past the end repeat the last, count nothing."""
         length = self.spec.length
         inside = at + length + max(self.horizons) <= part.samples
         rows = np.arange(at, at + length)
         valid = (rows - at + age >= burn_in) & (rows + max(self.horizons) < part.samples)
         if inside:
             future = np.stack([part.targets[at + k : at + k + length] for k in self.horizons], axis=1)
-            return part.inputs[at : at + length], future, valid
+            return part.inputs[at : at + length], future, valid, _rows(part.taught, rows)
         last = part.samples - 1
         future = np.stack([part.targets[np.minimum(rows + k, last)] for k in self.horizons], axis=1)
-        return part.inputs[np.minimum(rows, last)], future, valid
+        return part.inputs[np.minimum(rows, last)], future, valid, _rows(part.taught, np.minimum(rows, last))
+
+
+def _rows(taught: NDArray[np.float32] | None, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
+    return None if taught is None else taught[rows]
 
 
 def _ticks(lane: list[tuple[int, int, int]]) -> int:
     return sum(stop - start for _, start, stop in lane)
 
 
-def _stack(rows: list[tuple[Any, Any, Any]], resets: list[bool]) -> Batch:
-    inputs, future, valid = (np.stack(parts) for parts in zip(*rows, strict=True))
-    return Batch(inputs, future, valid, np.array(resets))
+def _stack(rows: list[tuple[Any, Any, Any, Any]], resets: list[bool]) -> Batch:
+    *columns, taught = zip(*rows, strict=True)
+    inputs, future, valid = (np.stack(parts) for parts in columns)
+    return Batch(inputs, future, valid, np.array(resets), None if taught[0] is None else np.stack(taught))

@@ -7,27 +7,10 @@ from typing import Any
 
 import torch
 
+from edp.errors import ConfigError
+from edp.evaluation.controller import CORES, FORMATS, Budget, Estimate, estimate
 from edp.models.predictor import Predictor
 from edp.streaming import Cost, state_numbers
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What a controller grants (thesis 3.5.2 by default).
-
-    Attributes:
-        name: how reports call it.
-        cycles: processor cycles per prediction: a 4 ms slice of a 180 MHz core.
-        parameter_bytes: memory for parameters.
-        ram_bytes: memory in all.
-        flash_bytes: program memory.
-    """
-
-    name: str = "thesis 3.5.2: 180 MHz, 4 ms of a 10 ms task"
-    cycles: int = 720_000
-    parameter_bytes: int = 100_000
-    ram_bytes: int = 500_000
-    flash_bytes: int = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -47,6 +30,7 @@ class Footprint:
         state_bytes: state carried from tick to tick, float32.
         window: W in samples.
         rows: costs by part.
+        estimates: cycles, flash and memory of a stream in each number format.
     """
 
     parameters: int
@@ -60,25 +44,35 @@ class Footprint:
     state_bytes: int
     window: int
     rows: tuple[dict[str, Any], ...]
+    estimates: tuple[Estimate, ...]
 
     def to_json(self, budget: Budget) -> dict[str, Any]:
         """Plain values with the verdict against `budget`."""
         plain = asdict(self)
-        plain["rows"] = list(self.rows)
+        plain["rows"], plain["estimates"] = list(self.rows), [entry.to_json() for entry in self.estimates]
         return plain | {"budget": asdict(budget), "verdict": self.verdict(budget)}
 
     def verdict(self, budget: Budget) -> list[dict[str, Any]]:
         """A row for each limit: value, limit, unit, whether it fits, and what the figure means."""
-        ram = self.weight_bytes_fp32 + self.state_bytes + self.peak_activation_bytes
-        bound = "a lower bound: at least one cycle per MAC on a scalar core, cycles are not measured here"
-        rows = [
-            ("cycles per tick, streaming", self.macs_tick, budget.cycles, "cycles", bound),
-            ("cycles per prediction, windowed", self.macs_window, budget.cycles, "cycles", bound),
-            ("parameters, FP32", self.weight_bytes_fp32, budget.parameter_bytes, "bytes", "folded weights"),
-            ("parameters, INT8", self.weight_bytes_int8, budget.parameter_bytes, "bytes", "if quantised"),
-            ("RAM, FP32", ram, budget.ram_bytes, "bytes", "weights, state and peak activation"),
-            ("flash, FP32 weights", self.weight_bytes_fp32, budget.flash_bytes, "bytes", "without program code"),
-        ]
+        bound = "a lower bound: at least one cycle per MAC on a scalar core"
+        rows = [("cycles per prediction, windowed", self.macs_window, budget.cycles, "cycles", bound)]
+        for entry in self.estimates:
+            label = entry.number_format
+            low, typical, high = entry.cycles[budget.core]
+            range_text = f"high estimate for a {CORES[budget.core].label}; low {low:,}, typical {typical:,}"
+            weights = FORMATS[label].weight_bytes * self.parameters_folded
+            rows += [
+                (f"cycles per tick, {label}", high, budget.cycles, "cycles", range_text),
+                (f"parameters, {label}", weights, budget.parameter_bytes, "bytes", "folded weights"),
+                (
+                    f"RAM, {label}",
+                    weights + entry.ram_bytes,
+                    budget.ram_bytes,
+                    "bytes",
+                    "weights too, as in the thesis",
+                ),
+                (f"flash, {label}", entry.flash_bytes, budget.flash_bytes, "bytes", "estimate, with the program"),
+            ]
         return [
             {"what": what, "value": value, "limit": limit, "unit": unit, "fits": value <= limit, "note": note}
             for what, value, limit, unit, note in rows
@@ -88,10 +82,10 @@ class Footprint:
 def footprint(predictor: Predictor) -> Footprint:
     """Count a predictor's parameters, multiply-accumulates, activations and state."""
     costs, window = predictor.costs(), predictor.spec.window
+    state = state_numbers(predictor.initial_state(1, torch.zeros(1)))
     column = sum(cost.per_column for cost in costs)
     once = sum(cost.per_prediction for cost in costs)
     folded = sum(cost.parameters - cost.foldable for cost in costs)
-    like = torch.zeros(1)
     return Footprint(
         parameters=sum(cost.parameters for cost in costs),
         parameters_folded=folded,
@@ -101,10 +95,36 @@ def footprint(predictor: Predictor) -> Footprint:
         weight_bytes_int8=folded,
         peak_activation_bytes=4 * max(cost.width_in + cost.width_out for cost in costs),
         peak_activation_bytes_window=4 * max(_window_width(cost, window) for cost in costs),
-        state_bytes=4 * state_numbers(predictor.initial_state(1, like)),
+        state_bytes=4 * state,
         window=window,
         rows=tuple(_row(cost, window) for cost in costs),
+        estimates=tuple(estimate(costs, state, name) for name in FORMATS),
     )
+
+
+def check_possible(budget: Budget, least: Footprint) -> None:
+    """Refuse a budget that not even the smallest network meets.
+
+    Args:
+        budget: what the controller grants.
+        least: of the narrowest network for the same inputs and targets.
+
+    Raises:
+        ConfigError: each limit that is too small, and what the smallest network needs.
+    """
+    needs = {
+        "cycles": min(entry.cycles[budget.core][2] for entry in least.estimates),
+        "parameter_bytes": least.weight_bytes_int8,
+        "ram_bytes": least.weight_bytes_int8 + min(entry.ram_bytes for entry in least.estimates),
+        "flash_bytes": min(entry.flash_bytes for entry in least.estimates),
+    }
+    short = [f"{what} = {getattr(budget, what):,}" for what, need in needs.items() if getattr(budget, what) < need]
+    if short:
+        least_text = ", ".join(f"{what} {need:,}" for what, need in needs.items())
+        raise ConfigError(
+            f"budget '{budget.name}': {', '.join(short)} can be met by no network of these inputs and targets; one "
+            f"of a single unit, with integer weights, takes {least_text}: raise the limits, or read fewer channels"
+        )
 
 
 def _window_width(cost: Cost, window: int) -> int:

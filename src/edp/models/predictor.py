@@ -128,10 +128,16 @@ class Predictor(Streaming):
 
     def run(self, x: Tensor, state: State) -> tuple[Answer, Tensor, State]:
         """What the network says, standardised; physical features ``(batch, time, feature)``; and the next state."""
+        answer, features, _, new = self.expose(x, state)
+        return answer, features, new
+
+    def expose(self, x: Tensor, state: State) -> tuple[Answer, Tensor, Tensor, State]:
+        """As `run`, with the backbone's representation ``(batch, time, width)`` before the state."""
         new: dict[str, State] = {}
         features, new["front"] = self.front(x, state["front"])
         scaled = self.front.scale(features)
-        y, new["backbone"] = self.backbone(scaled, state["backbone"])
+        hidden, new["backbone"] = self.backbone(scaled, state["backbone"])
+        y = hidden
         if self.gate is not None:
             y, new["gate"] = self.gate(y, state["gate"])
         y, new["heads"] = self.heads(y, state["heads"])
@@ -145,7 +151,7 @@ class Predictor(Streaming):
             # Outside g, so that the bound of g limits the correction and not the physics.
             ahead, new["physics"] = self.physics(x, state["physics"])
             center = center + self.physics.known * self.code.encode(ahead, features)
-        return self.output.answer(center, values[..., 1:, :]), features, new
+        return self.output.answer(center, values[..., 1:, :]), features, hidden, new
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""

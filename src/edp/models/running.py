@@ -51,6 +51,16 @@ def stream_answers(predictor: Predictor, series: Sequence[Series], batch: int = 
     return [Answer(every[..., 0, :], every[..., 1:, :], levels, law) for every in values]
 
 
+def stream_hidden(predictor: Predictor, series: Sequence[Series], batch: int = 4) -> list[NDArray[np.float32]]:
+    """The backbone's representation at every tick of every series, float32 ``(time, width)``, each from reset."""
+
+    def run(x: Tensor, state: State) -> tuple[Tensor, State]:
+        _, _, hidden, new = predictor.expose(x, state)
+        return hidden, new
+
+    return _stream(predictor, run, series, batch)
+
+
 def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int) -> list[NDArray[np.float32]]:
     order = sorted(range(len(series)), key=lambda i: series[i].samples)
     results: dict[int, NDArray[np.float32]] = {}

@@ -18,6 +18,7 @@ from edp.models.predictor import ModelSpec, Predictor, build_model, trainable
 from edp.runs import RunFolder
 from edp.streaming import State, detach_state, reset_where
 from edp.training.checkpoint import FILE, REFIT, Progress, Weights, load_checkpoint, save_checkpoint
+from edp.training.lesson import Lesson, Moment
 from edp.training.objective import Objective
 from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, check_training
@@ -82,6 +83,7 @@ def fit(
     spec: TrainingSpec,
     run: tuple[RunFolder, str] | None = None,
     on_event: Callable[[Event], None] | None = None,
+    lesson: Lesson | None = None,
 ) -> Fitted:
     """Train on ``data.train``, choose by ``data.validation``; ``data.test`` is not touched.
 
@@ -91,6 +93,7 @@ def fit(
         spec: how to train.
         run: folder and key of the run; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
+        lesson: weights to begin with, or a teacher; it is part of what the key of `run` must tell apart.
 
     Raises:
         ConfigError: settings that contradict one another.
@@ -99,12 +102,12 @@ def fit(
     """
     torch.set_num_threads(thread_count(spec))
     tell = on_event or (lambda event: None)
-    fitted = _Loop(data, model, spec, run).fit(tell)
+    fitted = _Loop(data, model, spec, run, lesson).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:
         return fitted
     try:
-        again = _Loop(data, model, spec, run, _rows_of_refit(fitted.history, best, spec)).fit(tell)
+        again = _Loop(data, model, spec, run, lesson, _rows_of_refit(fitted.history, best, spec)).fit(tell)
     except Diverged as end:
         raise Diverged(str(end), fitted, end.facts) from end
     again.predictor.output.load_state_dict(fitted.predictor.output.state_dict())
@@ -136,15 +139,17 @@ class _Loop:
         model: ModelSpec,
         spec: TrainingSpec,
         run: tuple[RunFolder, str] | None,
+        lesson: Lesson | None = None,
         refitted: list[dict[str, Any]] | None = None,
     ) -> None:
-        self.data, self.spec, self.run, self.refitted = data, spec, run, refitted
+        self.data, self.spec, self.run, self.lesson, self.refitted = data, spec, run, lesson, refitted
         self.epochs = spec.epochs if refitted is None else len(refitted)
         self.file = run[0].path / (FILE if refitted is None else REFIT) if run else None
         self.device = _device(spec.device)
         check_training(data.task, model, spec)
         known = data.train if refitted is None else [*data.train, *data.validation]
-        self.sampler = ChunkSampler(known, data.task.horizons, spec.chunks, spec.seed, spec.augmentations)
+        lessons = known if lesson is None else lesson.series(data.task, known)
+        self.sampler = ChunkSampler(lessons, data.task.horizons, spec.chunks, spec.seed, spec.augmentations)
         for part in data.validation:
             if part.samples <= spec.chunks.burn_in + data.task.reach:
                 raise DataError(
@@ -155,6 +160,8 @@ class _Loop:
         if self.net.physics is not None:
             self.net.physics.settle([torch.from_numpy(part.inputs) for part in data.train])
         started = start_bypass(self.net, data.train, data.validation)
+        if lesson is not None:
+            started = lesson.begin(self.net, spec) or started
         self.net.to(self.device)
         named = [(name, parameter) for name, parameter in self.net.named_parameters() if parameter.requires_grad]
         self.optimizer = spec.optimizer.build(named)
@@ -274,9 +281,13 @@ class _Loop:
             state = reset_where(reset, initial, state)
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * self._factor()
-        answer, features, state = self.net.run(x, state)
+        answer, features, hidden, state = self.net.expose(x, state)
         future, valid = (torch.from_numpy(part).to(self.device) for part in (batch.future, batch.valid))
-        loss = self.objective.evaluate(answer, future, features, valid)
+        if self.lesson is None or batch.taught is None:
+            loss = self.objective.evaluate(answer, future, features, valid)
+        else:
+            taught = torch.from_numpy(batch.taught).to(self.device)
+            loss = self.lesson.loss(self.objective, Moment(answer, future, features, hidden, valid, taught))
         self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):

@@ -1,0 +1,68 @@
+"""Hidden-feature hints: how well a student's hidden features tell those of its teachers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+RIDGE = 1e-3  # of the student's mean square: keeps the map small where features repeat one another
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Principal components of hidden features, all scaled alike so that their mean square is one on average.
+
+    Attributes:
+        mean: ``(width,)``.
+        map: ``(width, component)``.
+    """
+
+    mean: NDArray[np.float64]
+    map: NDArray[np.float64]
+
+    @classmethod
+    def fitted(cls, parts: Iterable[NDArray[np.float32]], components: int) -> Components:
+        """From the features ``(time, width)`` of the training series; no more components than features."""
+        count, total, squares = 0, np.zeros(()), np.zeros(())
+        for part in parts:
+            values = part.astype(np.float64)
+            count, total, squares = count + len(values), total + values.sum(axis=0), squares + values.T @ values
+        mean = total / count
+        variances, vectors = np.linalg.eigh(squares / count - np.outer(mean, mean))
+        kept = np.argsort(variances)[::-1][:components]
+        scale = np.sqrt(max(float(variances[kept].mean()), 1e-12))
+        return cls(mean, vectors[:, kept] / scale)
+
+    def project(self, values: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Components ``(time, component)`` of features ``(time, width)``."""
+        return (values - self.mean) @ self.map
+
+
+def hint_error(hidden: Tensor, wanted: Tensor, valid: Tensor) -> Tensor:
+    """Mean square of what the best linear map of the student's hidden features leaves of the wanted ones.
+
+    The map (ridge regression with a constant) is found anew in each batch and held fixed for the gradient, which is
+    then that of the error with the best map; it adds nothing to train or to store. Zero where fewer than four ticks a
+    feature count.
+
+    Args:
+        hidden: of the student, ``(batch, time, width)``.
+        wanted: components of the teachers' features, ``(batch, time, component)``.
+        valid: ``(batch, time)``.
+    """
+    rows = hidden[valid]
+    if len(rows) < 4 * rows.shape[1]:
+        return hidden.sum() * 0.0
+    rows = torch.cat([rows, rows.new_ones(len(rows), 1)], dim=1)
+    goal = wanted[valid]
+    with torch.no_grad():
+        known = rows.double()
+        gram = known.T @ known
+        gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
+        best = torch.linalg.solve(gram, known.T @ goal.double()).to(rows)
+    return (rows @ best - goal).square().mean()

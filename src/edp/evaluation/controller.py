@@ -1,0 +1,165 @@
+"""What a controller grants, and what a network is estimated to take of it: cycles, flash and memory."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from edp.errors import ConfigError, closest
+from edp.streaming import Cost
+
+# Flash of the prototype beside one byte a weight: program and tables, and scale and bias of each output.
+PROGRAM_BYTES, OUTPUT_BYTES = 22_000, 9
+# All its static memory against the numbers that it carries from tick to tick.
+WORKING_SHARE = 1.12
+STACK_BYTES = 2_048  # an allowance, not a measurement: the depth of calls is fixed and small
+# Published boards against zero-wait memory (flash wait states): the best, and the slowest, which decides.
+BOARD_TYPICAL, BOARD_SLOW = 1.26, 1.43
+
+
+@dataclass(frozen=True)
+class NumberFormat:
+    """Numbers of a deployed network, with cycles of a step of them on a Cortex-M4F with zero-wait memory.
+
+    The step of the prototype for five networks of 47 K to 542 K parameters is met within 3.5 %.
+
+    Attributes:
+        weight_bytes: of a weight.
+        activation_bytes: of an activation or a number of the state.
+        per_mac: cycles of a multiply-accumulate.
+        per_output: cycles of a feature that a part writes.
+    """
+
+    weight_bytes: int
+    activation_bytes: int
+    per_mac: float
+    per_output: float
+
+
+FORMATS = {"float32": NumberFormat(4, 4, 3.65, 87.6), "w8a16": NumberFormat(1, 2, 1.61, 68.2)}
+
+
+@dataclass(frozen=True)
+class Core:
+    """A processor core, by its cycles against those of a Cortex-M4F.
+
+    Attributes:
+        label: how tables call it.
+        low: at best.
+        typical: as a rule.
+    """
+
+    label: str
+    low: float
+    typical: float
+
+
+# The M33 has the instructions of the M4F. The M7 can issue two at a time: half the cycles at best; as a rule the ratio
+# of the CoreMark figures 3.40 and 5.01 per MHz. In the high estimate no core is faster than an M4F.
+CORES = {
+    "cortex_m4f": Core("Cortex-M4F", 1.0, 1.0),
+    "cortex_m7": Core("Cortex-M7", 0.5, 0.68),
+    "cortex_m33": Core("Cortex-M33", 1.0, 1.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """What a controller grants (thesis 3.5.2 by default).
+
+    Attributes:
+        name: how reports call it.
+        core: a name of `CORES`.
+        cycles: processor cycles per prediction: a 4 ms slice of a 180 MHz core.
+        parameter_bytes: memory for parameters.
+        ram_bytes: memory in all.
+        flash_bytes: program memory.
+
+    Raises:
+        ConfigError: an unknown core, or a limit below 1.
+    """
+
+    name: str = "thesis 3.5.2: 180 MHz, 4 ms of a 10 ms task"
+    core: str = "cortex_m4f"
+    cycles: int = 720_000
+    parameter_bytes: int = 100_000
+    ram_bytes: int = 500_000
+    flash_bytes: int = 2_000_000
+
+    def __post_init__(self) -> None:
+        if self.core not in CORES:
+            raise ConfigError(f"budget: core = '{self.core}' is not known{closest(self.core, CORES)}")
+        for limit in ("cycles", "parameter_bytes", "ram_bytes", "flash_bytes"):
+            if getattr(self, limit) < 1:
+                raise ConfigError(f"budget: {limit} = {getattr(self, limit)}; at least 1 must hold")
+
+
+def load_budget(path: str | Path) -> Budget:
+    """A budget from a TOML file with the fields of `Budget`; what is left out is as in the thesis.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds something else than a budget.
+    """
+    try:
+        held = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"budget '{path}' cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"budget '{path}' is not valid TOML: {error}") from error
+    known = [entry.name for entry in fields(Budget)]
+    wrong = [f"unknown key '{key}'{closest(key, known)}" for key in held if key not in known]
+    for key in set(held) & set(known):
+        wanted = str if key in ("name", "core") else int
+        if type(held[key]) is not wanted:
+            kind = "text" if wanted is str else "a whole number"
+            wrong.append(f"{key} = {held[key]!r}; {kind} must hold")
+    if wrong:
+        raise ConfigError(f"budget '{path}': {'; '.join(wrong)}")
+    return Budget(**({"name": Path(path).stem} | held))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a network takes as a stream, in one number format; estimates, not measurements.
+
+    Attributes:
+        number_format: a name of `FORMATS`.
+        cycles: low, typical and high estimate of a tick by core; the high one decides.
+        parameter_bytes: folded weights, with scale and bias of each output.
+        flash_bytes: the same with the program.
+        ram_bytes: state, working memory and an allowance of `STACK_BYTES` for the stack.
+    """
+
+    number_format: str
+    cycles: dict[str, tuple[int, int, int]]
+    parameter_bytes: int
+    flash_bytes: int
+    ram_bytes: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str) -> Estimate:
+    """Estimate a network in one number format.
+
+    Args:
+        costs: of all its parts.
+        state_numbers: how many numbers it carries from tick to tick.
+        number_format: a name of `FORMATS`.
+    """
+    form = FORMATS[number_format]
+    macs = sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)
+    outputs = sum(cost.width_out for cost in costs)
+    step = macs * form.per_mac + outputs * form.per_output
+    cycles = {
+        name: (round(step * core.low), round(step * core.typical * BOARD_TYPICAL), round(step * BOARD_SLOW))
+        for name, core in CORES.items()
+    }
+    weights = form.weight_bytes * sum(cost.parameters - cost.foldable for cost in costs) + OUTPUT_BYTES * outputs
+    working = round(WORKING_SHARE * form.activation_bytes * state_numbers)
+    return Estimate(number_format, cycles, weights, PROGRAM_BYTES + weights, working + STACK_BYTES)

@@ -1,0 +1,60 @@
+"""What a training may have besides its data: weights to begin with, and a teacher."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.losses import Answer
+from edp.models.predictor import Predictor
+from edp.training.objective import Objective
+from edp.training.spec import TrainingSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A batch as a lesson sees it.
+
+    Attributes:
+        answer: what the network says, standardised.
+        future: targets, SI units, ``(batch, time, horizon, output)``.
+        features: physical, ``(batch, time, feature)``.
+        hidden: representation of the backbone, ``(batch, time, width)``.
+        valid: ``(batch, time)``: ticks that count.
+        taught: ``(batch, time, column)``: what the lesson said of these ticks.
+    """
+
+    answer: Answer
+    future: Tensor
+    features: Tensor
+    hidden: Tensor
+    valid: Tensor
+    taught: Tensor
+
+
+class Lesson(Protocol):
+    """Weights to begin with, series to learn from, and the loss of a batch of them."""
+
+    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+        """The training series with what is taught about them, and further series.
+
+        Either all of them have `taught` or none; where none has, `loss` is not asked.
+        """
+        ...
+
+    def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
+        """Set weights before the first update; whether the network is a candidate as it then is.
+
+        Raises:
+            ConfigError: the lesson does not fit the network or the way of training.
+        """
+        ...
+
+    def loss(self, objective: Objective, moment: Moment) -> Tensor:
+        """The loss of a batch; `objective` gives that of the truth."""
+        ...

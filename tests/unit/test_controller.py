@@ -1,0 +1,108 @@
+"""Estimates of what a controller spends on a network, and budgets from files."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edp.data.features import FG2
+from edp.data.scaling import Scaler
+from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError
+from edp.evaluation.controller import CORES, FORMATS, Budget, load_budget
+from edp.evaluation.footprint import check_possible, footprint
+from edp.models.backbones import HybridSpec
+from edp.models.heads import MlpHead
+from edp.models.predictor import ModelSpec, build_model
+
+BUDGETS = sorted((Path(__file__).parents[2] / "examples" / "budgets").glob("*.toml"))
+
+
+def network(channels, units, hidden=64):
+    task = Task(FG2, ("CylVels_1", "CylVels_2", "CylVels_3"), (10,), TargetMode.DELTA, 100.0)
+    scaler = Scaler(np.zeros(30), np.ones(30), np.zeros((1, 3)), np.ones((1, 3)))
+    backbone = HybridSpec(channels=(channels,) * 4, kernel=3, units=units)
+    return build_model(task, ModelSpec(backbone=backbone, head=MlpHead(hidden=hidden), window=50), scaler, seed=0)
+
+
+# The prototype: thousands of cycles of a step (w8a16, float32), flash and static memory in kB of w8a16.
+PROTOTYPE = {
+    (32, 32): (116, 223, 74, 8),
+    (32, 64): (178, 358, 104, 12),
+    (64, 64): (312, 641, 183, 16),
+    (64, 128): (487, 1030, 276, 23),
+    (128, 128): (984, 2113, 580, 31),
+}
+
+
+@pytest.mark.parametrize(("channels", "units"), PROTOTYPE)
+def test_estimates_are_those_of_the_prototype(channels, units):
+    by_format = {entry.number_format: entry for entry in footprint(network(channels, units)).estimates}
+    integer, real, flash, static = PROTOTYPE[channels, units]
+    for name, kilocycles in (("w8a16", integer), ("float32", real)):
+        low, typical, high = by_format[name].cycles["cortex_m4f"]
+        assert low == pytest.approx(1000 * kilocycles, rel=0.035)
+        assert (typical, high) == (pytest.approx(1.26 * low, abs=2), pytest.approx(1.43 * low, abs=2))
+    assert by_format["w8a16"].flash_bytes == pytest.approx(1000 * flash, rel=0.01)
+    assert by_format["w8a16"].ram_bytes - 2048 == pytest.approx(1000 * static, rel=0.04)
+
+
+def test_estimates_rise_from_low_to_high_and_no_core_is_promised_to_beat_an_m4():
+    for entry in footprint(network(16, 16)).estimates:
+        assert set(entry.cycles) == set(CORES)
+        for low, typical, high in entry.cycles.values():
+            assert low <= typical <= high
+            assert high == entry.cycles["cortex_m4f"][2]
+
+
+def test_the_verdict_is_that_of_the_high_estimate():
+    counts = footprint(network(64, 64))
+    low, _, high = counts.estimates[1].cycles["cortex_m4f"]
+    for cycles, fits in ((low, False), (high - 1, False), (high, True)):
+        rows = {row["what"]: row for row in counts.verdict(Budget(cycles=cycles))}
+        assert rows["cycles per tick, w8a16"]["fits"] is fits
+    assert {f"{what}, {name}" for what in ("parameters", "RAM", "flash") for name in FORMATS} < set(rows)
+    assert rows["parameters, w8a16"]["value"] == counts.weight_bytes_int8
+
+
+@pytest.mark.parametrize("path", BUDGETS, ids=lambda path: path.stem)
+def test_budgets_of_the_examples_are_read(path):
+    assert load_budget(path) != Budget()
+
+
+def test_what_a_budget_leaves_out_is_as_in_the_thesis(tmp_path):
+    (tmp_path / "small.toml").write_text("cycles = 360_000\n")
+    assert load_budget(tmp_path / "small.toml") == Budget(name="small", cycles=360_000)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cycle = 5", "unknown key 'cycle'; did you mean 'cycles'"),
+        ("cycles = 0", "cycles = 0; at least 1 must hold"),
+        ("cycles = true", "cycles = True; a whole number must hold"),
+        ("cycles = 1.5\nname = 3", "a whole number must hold; name = 3; text must hold|text must hold; cycles"),
+        ("core = 'cortex_m5'", "core = 'cortex_m5' is not known; did you mean"),
+        ("cycles = ", "is not valid TOML"),
+    ],
+)
+def test_budgets_that_cannot_be_are_refused(tmp_path, text, message):
+    path = tmp_path / "budget.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_budget(path)
+
+
+def test_a_budget_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.toml' cannot be read: No such file"):
+        load_budget(tmp_path / "none.toml")
+
+
+def test_a_budget_that_nobody_can_meet_is_refused_with_what_the_smallest_network_takes():
+    least = footprint(network(1, 1, hidden=1))
+    needed = min(entry.cycles["cortex_m4f"][2] for entry in least.estimates)
+    check_possible(Budget(cycles=needed), least)
+    impossible = dataclasses.replace(Budget(), cycles=needed - 1, flash_bytes=20_000)
+    with pytest.raises(ConfigError, match=f"cycles = {needed - 1:,}, flash_bytes = 20,000 can be met by no network"):
+        check_possible(impossible, least)
