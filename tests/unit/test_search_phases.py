@@ -124,6 +124,37 @@ def test_phase_1_finds_the_rate_and_the_smallest_size_that_is_not_bettered(found
     assert units == [4, 8, 16]  # the warm round asks every size once
 
 
+class OneFoldMisleads(World):
+    """The sessions of the first fold are easy for the LSTM, which is worse on all others."""
+
+    def _train(self, order):
+        found = super()._train(order)
+        easy = order.judged == ground().orders({}, [0])[0].judged
+        if easy and order.settings["model"]["backbone"]["kind"] == "lstm":
+            for scores in found.result["sessions"].values():
+                scores["10"] = {name: value - 2.0 for name, value in scores["10"].items()}
+        return found
+
+
+@pytest.mark.parametrize("mode", ["sound", "thesis"])
+def test_backbones_are_chosen_on_all_folds_but_in_the_thesis_by_one(mode):
+    def hybrid_gains(settings):
+        return by_rate(settings) - 0.7 * (settings["model"]["backbone"]["kind"] == "hybrid")
+
+    spec = dataclasses.replace(SPEC, mode=mode)
+    facts = conduct(ground(spec), OneFoldMisleads(hybrid_gains), until="calibration").decided["calibration"].facts
+    kept = {name: held["score"] for name, held in facts["backbones"].items()}
+    if mode == "sound":
+        assert kept["lstm"] < kept["hybrid"]
+        assert facts["final"]["runs"] == 3
+        assert facts["final"]["scores"]["hybrid"] < facts["final"]["scores"]["lstm"]
+        assert facts["final"]["against"]["lstm"]["best"] == "hybrid"
+        assert facts["backbone"] == facts["settings"]["model"]["backbone"]["kind"] == "hybrid"
+    else:
+        assert "final" not in facts
+        assert facts["backbone"] == min(kept, key=lambda name: kept[name])
+
+
 def test_decisions_are_plain_and_come_again_without_a_training(found):
     world = World(by_rate)
     first = conduct(ground(), world, until="calibration")

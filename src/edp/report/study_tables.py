@@ -90,6 +90,7 @@ def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
 def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     """Table 4.4: scores of all questions of each architecture, and what the efficiency rule takes."""
     rows = []
+    final = facts["final"]["scores"] if "final" in facts else {}
     for backbone, held in facts["backbones"].items():
         done = [trial for trial in held["trials"] if trial["score"] is not None]
         scores = [real(trial["score"]) for trial in done]
@@ -102,16 +103,18 @@ def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | No
                 min(scores, default=None),
                 *_spread(errors),
                 real(held["score"]),
+                known(final.get(backbone)),
                 real(held["parameters"]),
             )
         )
     heads = [
         *(("Score, mean", study.unit), ("± σ", study.unit), ("Least", study.unit)),
         *(("MAE, mean", study.unit), ("± σ", study.unit), ("Taken", study.unit)),
+        ("Taken, on all folds", study.unit),
     ]
     columns = (
         *(Column("Architecture"), Column("Questions", "done")),
-        *_numbers(heads, [row[2:8] for row in rows]),
+        *_numbers(heads, [row[2:9] for row in rows]),
         Column("Parameters", "of the taken", _count),
     )
     marked = frozenset(i for i, name in enumerate(facts["backbones"]) if name == facts["backbone"])

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
+
+import numpy as np
 
 from edp.config import Table
 from edp.errors import DataError
-from edp.search.ground import Decision, Ground
+from edp.search.ground import Decision, Ground, Outcome
 from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, mean_of, new_study, possible
-from edp.search.phases.isolation import arm_settings
+from edp.search.phases.isolation import arm_settings, lowest_against_others
 from edp.search.space import Choice, Space, applicable, apply
 from edp.search.study import pareto
 from edp.stats.efficiency import Candidate, most_efficient
+from edp.stats.paired import fill_worst
 
 
 class Calibration:
@@ -20,30 +24,44 @@ class Calibration:
     title = "calibration"
 
     def trainings(self, ground: Ground) -> int:
-        """Every question of every backbone, were none too costly."""
-        return len(ground.spec.backbones) * ground.spec.trials * ground.spec.trial_runs
+        """Every question of every backbone, were none too costly, and the final between them."""
+        spec = ground.spec
+        final = spec.folds if spec.mode == "sound" and len(spec.backbones) > 1 else 0
+        return len(spec.backbones) * (spec.trials * spec.trial_runs + final)
 
     def run(self, ground: Ground) -> Course:
-        """All backbones side by side; first every size in turn, then what the sampler asks."""
+        """All backbones side by side: every size in turn, then what the sampler asks; the best of each on all folds."""
         features = ground.spec.feature_sets[ground.decided["isolation"].facts["features"]]
         arms = {backbone: arm_settings(ground.base, backbone, features) for backbone in ground.spec.backbones}
         spaces = {name: possible(ground, applicable(ground.spec.space, arm), arm) for name, arm in arms.items()}
         quests = [_quest(ground, name, arm, spaces[name][0]) for name, arm in arms.items()]
         answers = yield from answer_all(ground, quests)
         notes = [f"{name}: {note}." for name, (_, some) in spaces.items() for note in some]
-        return self.decide(ground, dict(zip(arms, answers, strict=True)), notes)
+        asked = dict(zip(arms, answers, strict=True))
+        chosen = {name: picked for name, own in asked.items() if (picked := _efficient(own)) is not None}
+        final: list[Outcome] = []
+        # One fold may be easy for one of them; the thesis decides by it.
+        if ground.spec.mode == "sound" and len(chosen) > 1:
+            runs = range(ground.spec.folds)
+            final = yield [order for picked in chosen.values() for order in ground.orders(picked.settings, runs)]
+        return self.decide(ground, asked, chosen, final, notes)
 
-    def decide(self, ground: Ground, answers: dict[str, list[Answer]], notes: list[str]) -> Decision:
-        """Of each backbone the smallest size that no larger one repays; of these the lowest score."""
+    def decide(
+        self,
+        ground: Ground,
+        answers: dict[str, list[Answer]],
+        chosen: dict[str, Answer],
+        final: Sequence[Outcome],
+        notes: list[str],
+    ) -> Decision:
+        """Of each backbone the smallest size that no larger one repays; of these the lowest score in the final."""
         facts: dict[str, Any] = {"backbones": {}}
-        chosen: dict[str, Answer] = {}
         sentences = list(notes)
         for backbone, own in answers.items():
-            picked = _efficient(own)
+            picked = chosen.get(backbone)
             if picked is None:
                 sentences.append(f"{backbone}: no training of {len(own)} ended well; it is left out.")
                 continue
-            chosen[backbone] = picked
             facts["backbones"][backbone] = _plain(ground, picked) | {"trials": [_plain(ground, held) for held in own]}
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
@@ -57,7 +75,18 @@ class Calibration:
                 "phase 1: no training of any backbone ended well; see the messages of the trainings, and lower the "
                 "learning rates of the space or loosen the limits"
             )
-        winner = min(chosen, key=lambda name: chosen[name].score or 0.0)
+        scores = {name: picked.score or 0.0 for name, picked in chosen.items()}
+        if final:
+            facts["final"] = _final(ground, list(chosen), final)
+            scores = facts["final"]["scores"]
+            listed = ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
+            against = "".join(
+                f"; {held['best']} against {name} {100 * held['change']:+.2f} % ({100 * held['low']:+.2f} to "
+                f"{100 * held['high']:+.2f} %)"
+                for name, held in facts["final"]["against"].items()
+            )
+            sentences.append(f"Each on all {ground.spec.folds} folds: {listed} {ground.unit}{against}.")
+        winner = min(scores, key=lambda name: scores[name])
         facts |= {"backbone": winner, "baseline": dict(chosen[winner].trial.values)}
         facts["settings"] = chosen[winner].settings
         sentences.append(f"The baseline of all later phases is {winner}.")
@@ -74,6 +103,16 @@ def _quest(ground: Ground, backbone: str, arm: Table, space: Space) -> Quest:
         for size in sizes.options if isinstance(sizes, Choice) else ():
             study.suggest({"units": size})
     return Quest(study, lambda trial: apply(arm, trial.values), spec.trials)
+
+
+def _final(ground: Ground, backbones: list[str], outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Mean score of each backbone over the folds, and the lowest against each of the others."""
+    mask = ground.folds(ground.spec.folds)
+    parts = np.split(np.arange(len(outcomes)), len(backbones))
+    raw = np.stack([ground.table([outcomes[place] for place in part]) for part in parts])
+    tables = dict(zip(backbones, fill_worst(raw, mask), strict=True))
+    scores = {name: float(held[mask].mean()) for name, held in tables.items()}
+    return {"runs": ground.spec.folds, "scores": scores, "against": lowest_against_others(tables, mask)}
 
 
 def _efficient(answers: list[Answer]) -> Answer | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,9 +88,8 @@ class Isolation:
         }
         chosen = min(means, key=lambda name: means[name])
         facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(ground, tables, chosen)}
-        facts["backbones"] = _backbones(
-            ground, {name: t for (name, f), t in zip(arms, tables, strict=True) if f == chosen}
-        )
+        own = {name: held.mean(axis=0) for (name, f), held in zip(arms, tables, strict=True) if f == chosen}
+        facts["backbones"] = lowest_against_others(own, _judged(ground)[0])
         facts["variance"] = _proxy(ground, tables, arms)
         sentences = [
             f"Feature set {chosen} goes on: mean composite score "
@@ -126,16 +125,20 @@ class Isolation:
         return found
 
 
-def _backbones(ground: Ground, tables: dict[str, Array]) -> dict[str, Any]:
-    """The backbone with the lowest mean score against each of the others, all with the same feature set."""
-    means = {name: held.mean(axis=0) for name, held in tables.items()}
-    best = min(means, key=lambda name: float(np.nanmean(means[name])))
-    mask, _ = _judged(ground)
-    found = {}
-    for name in (name for name in means if name != best):
-        test = clustered_t(np.where(mask, means[best] - means[name], 0.0), mask)
-        found[name] = {"best": best, **changed(test, float(np.nanmean(means[name])))}
-    return found
+def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """The arm with the lowest mean score against each of the others.
+
+    Args:
+        tables: scores ``(run, session)`` by the name of the arm.
+        mask: cells that are judged.
+    """
+    means = {name: float(held[mask].mean()) for name, held in tables.items()}
+    best = min(means, key=lambda name: means[name])
+    return {
+        name: {"best": best, **changed(clustered_t(np.where(mask, tables[best] - held, 0.0), mask), means[name])}
+        for name, held in tables.items()
+        if name != best
+    }
 
 
 def _tables(ground: Ground, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
