@@ -1,4 +1,4 @@
-"""Make a trained network smaller: students, distillation, pruning."""
+"""Make a trained network smaller: students, distillation, pruning, dynamic INT8."""
 
 from edp.compress.distillation import (
     Distillation,
@@ -7,6 +7,7 @@ from edp.compress.distillation import (
     continue_from,
     unlabelled,
 )
+from edp.compress.int8 import Quantised, dynamic_int8
 from edp.compress.pruning import prune
 from edp.compress.students import student, width_of
 from edp.compress.taylor import Importance, importance
@@ -15,8 +16,10 @@ __all__ = [
     "Distillation",
     "DistillationSpec",
     "Importance",
+    "Quantised",
     "SoftmaxDivergence",
     "continue_from",
+    "dynamic_int8",
     "importance",
     "prune",
     "student",

@@ -82,7 +82,12 @@ class Predictor(Streaming):
     ``forward`` maps inputs ``(batch, time, input)`` to standardised predictions ``(batch, time, horizon, target)``;
     ``predict`` gives them in SI units. Both obey the streaming contract. Where the output says more than a point,
     ``intervals`` gives lower and upper bounds too.
+
+    Attributes:
+        number_format: of what it computes with; a bundle holds float32 only.
     """
+
+    number_format = "float32"
 
     def __init__(self, task: Task, spec: ModelSpec, scaler: Scaler) -> None:
         super().__init__()
@@ -178,8 +183,10 @@ class Predictor(Streaming):
         """The network as a list of streaming layers with float32 constants, from SI inputs to SI predictions.
 
         Raises:
-            ExportError: a part of it has no such form; it is named.
+            ExportError: a part of it has no such form; it is named. Or it computes with other numbers than float32.
         """
+        if self.number_format != "float32":
+            raise ExportError(f"a network in {self.number_format} has no list of float32 layers; take the float one")
         with torch.no_grad():
             build = Builder(len(self.task.inputs))
             return build.graph(self._lower(build, INPUT), self.spec.window)

@@ -73,7 +73,14 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
 
     Raises:
         StorageError: the folder cannot be written.
+        BundleError: the network computes with other numbers than float32, which a bundle would not tell.
     """
+    form = bundle.predictor.number_format
+    if form != "float32":
+        raise BundleError(
+            f"a network in {form} cannot be saved as a bundle, which would be read as one in float32; save the network "
+            "that it was made of, and quantise that after loading"
+        )
     path = make_folder(folder)
     data = _weights_bytes(bundle.predictor)
     digest = hashlib.blake2b(data, digest_size=16).hexdigest()
