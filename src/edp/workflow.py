@@ -32,6 +32,7 @@ from edp.evaluation.footprint import Footprint, check_possible, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
 from edp.evaluation.worth import Worths, WorthSpec
 from edp.evaluation.worth import channel_worths as measure_worths
+from edp.export import TARGETS
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination, describe
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
@@ -299,6 +300,16 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str]:
     return bundle.predictor, describe(bundle.predictor.spec)
 
 
+def export_bundle(path: str | Path, to: str, folder: str | Path, name: str = "predictor") -> list[Path]:
+    """Write a bundle or the bundle of a run folder in the form `to`; returns the files, the one to read first in front.
+
+    Raises:
+        EdpError: not a bundle, an unknown form, or a network or name that this form cannot hold.
+    """
+    target = TARGETS[to]()
+    return target.write(load_bundle(path), name, Path(folder))
+
+
 def _untrained(model: ModelSpec, task: Any) -> Predictor:
     return build_model(task, model, blank_scaler(task), seed=0)
 
@@ -310,6 +321,7 @@ __all__ = [
     "channel_worths",
     "coverage",
     "evaluate",
+    "export_bundle",
     "footprint_of",
     "judge_bundle",
     "prepare_data",

@@ -14,7 +14,7 @@ from edp.signals import TABLE_A1
 from edp.storage import read_json
 
 COMMANDS = [command.name for command in app.registered_commands]
-EXPECTED = ["demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "footprint", "report"]
+EXPECTED = ["demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "footprint", "export", "report"]
 
 
 def test_all_commands_are_known_here():
@@ -82,6 +82,13 @@ def test_output_for_people_names_the_next_command(edp, logs, trained, tmp_path, 
     assert f"edp report {trained}" in judged
     assert "report.html" in edp("report", trained).out
     assert "MACs per tick" in edp("footprint", trained).out
+    assert "read predictor.h first" in edp("export", trained, "--to", "c", "--out", tmp_path / "c").out
+
+
+def test_export_lists_its_files(edp, trained, tmp_path):
+    made = edp("export", trained / "bundle", "--to", "c", "--out", tmp_path / "c", "--name", "arm", "--json").json
+    assert sorted(made["files"]) == sorted(str(file) for file in (tmp_path / "c").iterdir())
+    assert str(tmp_path / "c" / "arm_golden.h") in made["files"]
 
 
 def test_json_of_a_process_is_all_of_standard_output(trained):

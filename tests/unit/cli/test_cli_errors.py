@@ -143,6 +143,8 @@ def test_unknown_preset_machine_format_and_paths(edp, logs, tmp_path):
     refused(edp("evaluate", tmp_path), "not a bundle", "edp train")
     refused(edp("report", tmp_path), str(tmp_path))
     refused(edp("footprint", tmp_path / "none.toml"), "none.toml")
+    refused(edp("export", tmp_path, "--to", "c", "--out", run), "not a bundle", "edp train")
+    refused(edp("export", tmp_path, "--to", "see", "--out", run), "unknown export target 'see'", "known: c")
     assert not run.exists()
 
 

@@ -1,0 +1,111 @@
+"""What does a tick of an exported network cost: executed instructions on a Cortex-M4F, time on this computer?
+
+Networks as in the thesis's setting (30 features, 3 targets, window of 50, four residual blocks of kernel 3, LSTM) with
+weights as drawn: costs do not depend on them. Instructions are counted by QEMU, the same at every run. The rival of the
+time is the same network in PyTorch, a tick at a time, as `Stream.step` runs it.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from common import finish, parser, table, verdict
+from edp.data.features import FG2
+from edp.data.scaling import Scaler
+from edp.data.task import TargetMode, Task
+from edp.export.c.target import CTarget, random_inputs
+from edp.models import ModelSpec, Stream, build_model
+from edp.models.backbones import HybridSpec
+from edp.signals import TABLE_A1, Kind
+from edp.training.bundle import Bundle
+
+BOARD = Path(__file__).parents[1] / "tests/export/board"
+MODEL = ("predictor.c", "edp_runtime.c", "edp_memory.c")
+M4 = ("-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "--specs=rdimon.specs", "-nostartfiles")
+QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-icount", "shift=0")
+SIZES = ((32, 32), (32, 64), (64, 64), (64, 128))
+
+
+def make(channels: int, units: int, seed: int) -> Bundle:
+    task = Task(FG2, ("CylVels_1", "CylVels_2", "CylVels_3"), (10,), TargetMode.DELTA, 100.0)
+    backbone = HybridSpec(channels=(channels,) * 4, kernel=3, units=units)
+    features = len(FG2.features)
+    scaler = Scaler(np.zeros(features), np.ones(features), np.zeros((1, 3)), np.ones((1, 3)))
+    predictor = build_model(task, ModelSpec(backbone=backbone), scaler, seed).eval()
+    inputs = tuple(TABLE_A1[name] for name in task.inputs)
+    return Bundle(predictor, inputs, (Kind.VELOCITY,) * 3, task.targets)
+
+
+def run(command: list[str], folder: Path) -> str:
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+def instructions(folder: Path, flags: str) -> int:
+    """Executed instructions of a tick, the mean over 200."""
+    sources = [*MODEL, str(BOARD / "count.c"), str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
+    given = ["-std=gnu99", flags, "-ffp-contract=off", *M4, "-I.", "-DCLOCK_HZ=25000000u", "-T", str(BOARD / "mps2.ld")]
+    run(["arm-none-eabi-gcc", *given, *sources], folder)
+    printed = run([*QEMU, "-semihosting-config", "enable=on,target=native", "-kernel", "image.elf"], folder)
+    return int(printed.split()[0])
+
+
+def code_bytes(folder: Path) -> int:
+    """Program code of model and runtime on the M4, without constants."""
+    run(["arm-none-eabi-gcc", "-std=c99", "-O2", "-ffp-contract=off", *M4[:4], "-c", *MODEL], folder)
+    objects = [name.replace(".c", ".o") for name in MODEL]
+    lines = run(["arm-none-eabi-size", "-A", *objects], folder).splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith(".text"))
+
+
+def host_us(folder: Path, bundle: Bundle, ticks: int) -> float:
+    """Microseconds a tick on this computer, the best of three runs, reading and writing files included."""
+    run(["gcc", "-std=c99", "-O2", "-ffp-contract=off", *MODEL, "host_test.c", "-lm", "-o", "program"], folder)
+    feed, best = random_inputs(bundle.predictor, ticks, 1).tobytes(), float("inf")
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([str(folder / "program"), "stream"], input=feed, check=True, stdout=subprocess.DEVNULL)
+        best = min(best, time.perf_counter() - start)
+    return 1e6 * best / ticks
+
+
+def torch_us(bundle: Bundle, ticks: int) -> float:
+    stream, rows = Stream(bundle.predictor), random_inputs(bundle.predictor, ticks, 1)
+    best = float("inf")
+    for _ in range(3):
+        stream.reset()
+        start = time.perf_counter()
+        for row in rows:
+            stream.step(row)
+        best = min(best, time.perf_counter() - start)
+    return 1e6 * best / ticks
+
+
+def main() -> None:
+    arguments = parser(__doc__ or "").parse_args()
+    sizes = SIZES[:1] if arguments.quick else SIZES
+    rows, details, verdicts = [], [], []
+    for channels, units in sizes:
+        bundle = make(channels, units, arguments.seed)
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            CTarget().write(bundle, "predictor", folder)
+            counted, code = instructions(folder, "-O2"), code_bytes(folder)
+            host, torch = host_us(folder, bundle, 5_000 if arguments.quick else 20_000), torch_us(bundle, 300)
+        graph = bundle.predictor.graph()
+        row = (f"{channels}/{units}", graph.parameters, graph.macs, counted, counted / graph.macs, code, host, torch)
+        rows.append(row)
+        details.append(row)
+        name = f"time of a tick, {channels}/{units}, C against PyTorch"
+        verdicts.append(verdict(name, host, torch, "<= 0.05", "us", arguments.quick))
+    heads = ["channels/units", "constants", "MACs", "M4 instructions", "per MAC", "code bytes", "C us", "PyTorch us"]
+    table(heads, rows)
+    finish("embedded_step", verdicts, arguments.seed, [dict(zip(heads, row)) for row in details])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,229 @@
+"""The C calls of each kind of layer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from edp.errors import ExportError
+from edp.export.c.plan import Plan
+from edp.export.c.text import call, identifier, number
+from edp.graph import Graph, Layer, layers, memory
+from edp.graph.base import INPUT
+
+MOST_COPIES = 8
+"""Runs of neighbouring columns up to which copies are written; beyond, a table of columns."""
+
+
+class Calls:
+    """Writes the calls of a graph's layers.
+
+    Args:
+        graph: the layers.
+        plan: where their values lie.
+    """
+
+    def __init__(self, graph: Graph, plan: Plan) -> None:
+        self.graph, self.plan = graph, plan
+
+    def value(self, name: str, offset: int = 0) -> str:
+        """Where a value lies, as a C expression."""
+        base, at = ("in", offset) if name == INPUT else ("work", self.plan.values[name] + offset)
+        return f"{base} + {at}" if at else base
+
+    def scratch(self, layer: Layer, offset: int = 0) -> str:
+        """Where a layer's scratch numbers lie."""
+        return f"work + {self.plan.scratch[layer.name] + offset}"
+
+    def of(self, layer: Layer) -> list[str]:
+        """The statements that compute a layer.
+
+        Raises:
+            ExportError: this kind of layer has no C function.
+        """
+        write = CALLS.get(type(layer))
+        if write is None:
+            raise ExportError(
+                f"layer '{layer.name}' is a {type(layer).__name__}, which has no C function; "
+                f"these have: {', '.join(kind.__name__ for kind in CALLS)}"
+            )
+        return write(self, layer)
+
+    def simple(self, layer: Layer, function: str, *sizes: object) -> list[str]:
+        """``function(inputs, constants, sizes, y)``: the order of arguments of most functions."""
+        constants = [constant(layer, name) for name in layer.tensors()]
+        inputs = [self.value(name) for name in layer.inputs]
+        return [call(function, *inputs, *constants, *sizes, self.value(layer.name))]
+
+
+Write = Callable[[Calls, Any], list[str]]
+
+
+def constant(layer: Layer, name: str) -> str:
+    """The C array of a layer's constant."""
+    return f"{identifier(layer.name)}_{name}"
+
+
+def slot(layer: Layer | str, name: str) -> str:
+    """The C array of what a layer remembers."""
+    return f"s->{identifier(layer if isinstance(layer, str) else layer.name)}_{name}"
+
+
+def ring(layer: Layer) -> str:
+    """The address of a layer's ring or counter."""
+    return f"&s->{identifier(layer.name)}_ring_at"
+
+
+def runs(calls: Calls, layer: layers.Gather) -> Iterator[tuple[str, int, int]]:
+    """Runs of neighbouring columns: the value they come from, the first column in it, their number."""
+    origin = [(name, column) for name in layer.inputs for column in range(calls.graph.width_of(name))]
+    start = 0
+    picked = [origin[column] for column in layer.columns]
+    for at in range(1, len(picked) + 1):
+        name, column = picked[at - 1]
+        if at == len(picked) or picked[at] != (name, column + 1):
+            yield (*picked[start], at - start)
+            start = at
+
+
+def needs_columns(calls: Calls, layer: Layer) -> bool:
+    """Whether a layer's columns are written as a table."""
+    return isinstance(layer, layers.Gather) and len(layer.inputs) == 1 and len(list(runs(calls, layer))) > MOST_COPIES
+
+
+def _gather(calls: Calls, layer: layers.Gather) -> list[str]:
+    if needs_columns(calls, layer):
+        given, columns = calls.value(layer.inputs[0]), constant(layer, "columns")
+        return [call("edp_gather", given, columns, layer.width, calls.value(layer.name))]
+    lines, at = [], 0
+    for name, first, length in runs(calls, layer):
+        lines.append(call("edp_copy", calls.value(name, first), length, calls.value(layer.name, at)))
+        at += length
+    return lines
+
+
+def _difference(calls: Calls, layer: memory.Difference) -> list[str]:
+    kind = "true" if layer.from_zero else "false"
+    return calls.simple(layer, "edp_difference", layer.width, kind, slot(layer, "before"), ring(layer))
+
+
+def _convolution(calls: Calls, layer: memory.Convolution) -> list[str]:
+    out, taps, into = layer.weight.shape
+    if taps == 1:
+        return calls.simple(layer, "edp_dense", 1, out, into)
+    sizes = (out, taps, into, layer.dilation)
+    return calls.simple(layer, "edp_convolution", *sizes, slot(layer, "ring"), ring(layer))
+
+
+def _lstm(calls: Calls, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
+    name = identifier(layer.name)
+    normed = isinstance(layer, memory.LayerNormLstm)
+    into, units = layer.weight_x.shape[1], layer.width
+    states = (slot(layer, "h"), slot(layer, "c"), calls.scratch(layer), calls.value(layer.name))
+    weights = (f"&{name}_weights", f"&{name}_norms") if normed else (f"&{name}_weights",)
+    function = "edp_layer_norm_lstm" if normed else "edp_lstm"
+    return [call(function, calls.value(layer.inputs[0]), *weights, into, units, *states)]
+
+
+def _gru(calls: Calls, layer: memory.Gru) -> list[str]:
+    given, into = calls.value(layer.inputs[0]), layer.weight_x.shape[1]
+    rest = (slot(layer, "h"), calls.scratch(layer), calls.value(layer.name))
+    return [call("edp_gru", given, f"&{identifier(layer.name)}_weights", into, layer.width, *rest)]
+
+
+def _pool(calls: Calls, layer: memory.AttentionPool) -> list[str]:
+    score, bias = constant(layer, "score"), f"{constant(layer, 'bias')}[0]"
+    held = (slot(layer, "ring"), slot(layer, "scores"), ring(layer), calls.scratch(layer))
+    sizes = (layer.width, layer.window)
+    given = calls.value(layer.inputs[0])
+    return [call("edp_attention_pool", given, score, bias, *sizes, *held, calls.value(layer.name))]
+
+
+def _window(calls: Calls, layer: memory.WindowAttention) -> list[str]:
+    held = (slot(layer, "keys"), slot(layer, "values"), ring(layer), calls.scratch(layer))
+    return calls.simple(layer, "edp_window_attention", layer.size, layer.heads, layer.window, *held)
+
+
+def _prefix(calls: Calls, layer: memory.PrefixCorrection) -> list[str]:
+    hidden, seen = layer.first_weight.shape
+    correction = calls.scratch(layer, seen + hidden)
+    held = (slot(layer, "total"), ring(layer), calls.scratch(layer), correction)
+    weights = f"&{identifier(layer.name)}_weights"
+    asked = call("edp_prefix", calls.value(layer.inputs[0]), weights, seen // 2, *held).removesuffix(";")
+    sizes = {(name, part.name): part.size for name, part in calls.graph.slots()}
+    lines, at = [f"if ({asked}) {{"], seen + hidden
+    for name, part in layer.corrects:
+        old = slot(name, part)
+        lines.append("    " + call("edp_add", old, calls.scratch(layer, at), sizes[name, part], old))
+        at += sizes[name, part]
+    return [*lines, "}"]
+
+
+def _norm(calls: Calls, layer: layers.LayerNorm) -> list[str]:
+    return calls.simple(layer, "edp_layer_norm", number(layer.epsilon), layer.rows, len(layer.gain))
+
+
+def _dense(calls: Calls, layer: layers.Dense) -> list[str]:
+    return calls.simple(layer, "edp_dense", layer.rows, *layer.weight.shape)
+
+
+def _mean(calls: Calls, layer: memory.TrailingMean) -> list[str]:
+    return calls.simple(layer, "edp_trailing_mean", layer.size, layer.window, slot(layer, "ring"), ring(layer))
+
+
+CALLS: dict[type[Layer], Write] = {
+    layers.Gather: _gather,
+    layers.Standardise: lambda c, x: c.simple(x, "edp_standardise", x.width),
+    layers.ScaleShift: lambda c, x: c.simple(x, "edp_scale_shift", x.width),
+    layers.Add: lambda c, x: c.simple(x, "edp_add", x.size),
+    layers.Subtract: lambda c, x: c.simple(x, "edp_subtract", x.size),
+    layers.Multiply: lambda c, x: c.simple(x, "edp_multiply", x.size),
+    layers.Activate: lambda c, x: c.simple(x, f"edp_map_{x.function}", x.size),
+    layers.Glu: lambda c, x: c.simple(x, "edp_glu", x.rows, x.size // 2),
+    layers.Accumulate: lambda c, x: c.simple(x, "edp_accumulate", x.rows, x.size),
+    layers.Dense: _dense,
+    layers.GroupedDense: lambda c, x: c.simple(x, "edp_grouped_dense", *x.weight.shape),
+    layers.LayerNorm: _norm,
+    layers.RowAttention: lambda c, x: c.simple(x, "edp_row_attention", x.rows, x.size, c.scratch(x)),
+    memory.Difference: _difference,
+    memory.Starting: lambda c, x: c.simple(x, "edp_starting", len(x.mean), x.ticks, ring(x)),
+    memory.Convolution: _convolution,
+    memory.Lstm: _lstm,
+    memory.LayerNormLstm: _lstm,
+    memory.Gru: _gru,
+    memory.MinGru: lambda c, x: c.simple(x, "edp_min_gru", x.units, slot(x, "h")),
+    memory.Rotation: lambda c, x: c.simple(x, "edp_rotation", len(x.factor), slot(x, "h")),
+    memory.TrailingMean: _mean,
+    memory.AttentionPool: _pool,
+    memory.WindowAttention: _window,
+    memory.PrefixCorrection: _prefix,
+}
+"""By kind of layer."""
+
+
+def structs(layer: Layer) -> list[str]:
+    """Constant structs that a layer's function reads, one a line."""
+    name = identifier(layer.name)
+    at = {key: constant(layer, key) for key in layer.tensors()}
+    if isinstance(layer, memory.Lstm | memory.LayerNormLstm):
+        held = f"{at['weight_x']}, {at['weight_h']}, {at['bias']}, {number(layer.share)}"
+        made = [f"static const edp_lstm_weights {name}_weights = {{{held}}};"]
+        if isinstance(layer, memory.LayerNormLstm):
+            norms = [at[key] for key in ("gain_x", "gain_h", "gain_c", "shift_c")] + [number(layer.epsilon)]
+            made.append(f"static const edp_lstm_norms {name}_norms = {{{', '.join(norms)}}};")
+        return made
+    if isinstance(layer, memory.Gru):
+        held = ", ".join(at[key] for key in ("weight_x", "weight_h", "bias_x", "bias_h"))
+        return [f"static const edp_gru_weights {name}_weights = {{{held}}};"]
+    if isinstance(layer, memory.PrefixCorrection):
+        parts = [at[key] for key in ("first_weight", "first_bias", "second_weight", "second_bias")]
+        sizes = [f"{len(layer.first_bias)}u", f"{len(layer.second_bias)}u", f"{layer.ticks}u"]
+        return [f"static const edp_prefix_weights {name}_weights = {{{', '.join([*parts, *sizes])}}};"]
+    return []
+
+
+def describe(layer: Layer) -> str:
+    """A comment on what a layer is: its name, kind and shapes."""
+    shapes = [f"{name} {' x '.join(map(str, values.shape))}" for name, values in layer.tensors().items()]
+    size = f"{layer.width} numbers" if layer.width else "no value"
+    return f"/* {layer.name}: {type(layer).__name__}, {'; '.join([size, *shapes])} */"

@@ -1,0 +1,255 @@
+"""A model's header, source and constants as text, from the graph and what is known of its two ends."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from importlib import resources
+from string import Template
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp import __version__
+from edp.export.c.calls import Calls, constant, describe, needs_columns, slot, structs
+from edp.export.c.plan import Plan, plan
+from edp.export.c.text import array, filled, identifiers, indented, number
+from edp.graph import Graph, Layer, memory
+from edp.models.predictor import Predictor
+from edp.models.predictor import describe as describe_network
+from edp.training.bundle import Bundle
+
+HOLD_TICKS = 5
+"""Missed or bad ticks in a row that are held."""
+LIMIT = 1e6
+"""Standard widths beyond which an input is rejected: far from any signal, and no sum of float32 overflows."""
+LARGEST = 3.0e38
+COUNTED = (
+    memory.Difference,
+    memory.Starting,
+    memory.Convolution,
+    memory.TrailingMean,
+    memory.AttentionPool,
+    memory.WindowAttention,
+    memory.PrefixCorrection,
+)
+"""Layers with a ring or a counter."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What the templates of one model are filled with.
+
+    Attributes:
+        name: C prefix of the model.
+        bundle: the trained network.
+        graph: its layers.
+        plan: places in the work memory.
+    """
+
+    name: str
+    bundle: Bundle
+    graph: Graph
+    plan: Plan
+
+    def weights(self) -> str:
+        """The file of constants."""
+        parts = [f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */"]
+        calls = Calls(self.graph, self.plan)
+        for layer in self.graph.layers:
+            for name, values in layer.tensors().items():
+                note = " x ".join(map(str, values.shape))
+                parts.append(array("float", constant(layer, name), map(number, values.ravel()), note))
+            if needs_columns(calls, layer):
+                parts.append(array("uint16_t", constant(layer, "columns"), (f"{c}u" for c in layer.columns)))  # type: ignore[attr-defined]
+            parts += structs(layer)
+        for (name, part), values in self.graph.initial.items():
+            start = slot(name, part).removeprefix("s->") + "_start"
+            parts.append(array("float", start, map(number, values.ravel())))
+        tables = [
+            f"{{{constant(layer, n)}, {v.size}u}}" for layer in self.graph.layers for n, v in layer.tensors().items()
+        ]
+        parts.append(array("edp_table", "tables", tables))
+        return "\n".join(parts) + "\n"
+
+    def fill(self, template: str) -> str:
+        """A template with everything in its place."""
+        text = resources.files("edp.export.c").joinpath(f"templates/{template}").read_text()
+        return Template(text).substitute(self._values())
+
+    def _values(self) -> dict[str, object]:
+        task, predictor = self.bundle.task, self.bundle.predictor
+        centre, spread = ends(predictor)
+        low, high = (np.clip(centre + side * LIMIT * spread, -LARGEST, LARGEST) for side in (-1.0, 1.0))
+        return {
+            "name": self.name,
+            "NAME": self.name.upper(),
+            "title": describe_network(predictor.spec),
+            "version": __version__,
+            "model_hash": model_hash(self.graph),
+            "scale_hash": scale_hash(predictor),
+            "marker": int(model_hash(self.graph)[:8], 16) | 1,
+            "crc": crc(self.graph),
+            "inputs": self.graph.inputs,
+            "horizons": len(task.horizons),
+            "targets": len(task.targets),
+            "intervals": len(predictor.output.coverages),
+            "rate": number(task.rate_hz),
+            "tick_ms": f"{1000 / task.rate_hz:g}",
+            "window": self.graph.window,
+            "hold": HOLD_TICKS,
+            "limit": f"{LIMIT:.0f}",
+            "macs": self.graph.macs,
+            "flash": 4 * self.graph.parameters,
+            "ram": 4 * self._state_words(),
+            "work": self.plan.size,
+            "low": filled(map(number, low)),
+            "high": filled(map(number, high)),
+            "what": self._what(),
+            **self._enums(),
+            **self._state(),
+            **self._code(),
+        }
+
+    def _what(self) -> str:
+        task = self.bundle.task
+        when = ", ".join(f"{k} ticks ({1000 * k / task.rate_hz:g} ms)" for k in task.horizons)
+        lines = [f" *   prediction[h][t]  {', '.join(task.targets)}, SI units, for each of {when} ahead"]
+        covered = ", ".join(f"{100 * c:g} %" for c in self.bundle.predictor.output.coverages)
+        if covered:
+            lines.append(f" *   lower, upper[i][h][t]  bounds of intervals meant to hold {covered} of the true values")
+        return "\n".join(lines)
+
+    def _enums(self) -> dict[str, str]:
+        task, upper = self.bundle.task, self.name.upper()
+        inputs = [
+            (f"{upper}_IN_{name} = {i},", f"{channel.unit}; {channel.description}")
+            for i, (name, channel) in enumerate(
+                zip(identifiers([c.name for c in self.bundle.inputs]), self.bundle.inputs, strict=True)
+            )
+        ]
+        targets = [
+            (f"{upper}_OUT_{name} = {i},", text)
+            for i, (name, text) in enumerate(zip(identifiers(task.targets), self.bundle.descriptions, strict=True))
+        ]
+        ahead = [
+            (f"{upper}_AHEAD_{k} = {i},", f"{k} ticks, {1000 * k / task.rate_hz:g} ms")
+            for i, k in enumerate(task.horizons)
+        ]
+        return {"input_enum": _listed(inputs), "target_enum": _listed(targets), "horizon_enum": _listed(ahead)}
+
+    def _state(self) -> dict[str, str]:
+        declared, cleared = [], []
+        for layer in self.graph.layers:
+            for part in layer.slots:
+                if part.name == "age":
+                    continue
+                where, size = slot(layer, part.name), max(1, part.size)
+                field = where.removeprefix("s->")
+                declared.append(f"float {field}[{size}];")
+                learned = (layer.name, part.name) in self.graph.initial
+                start = f"edp_copy({field}_start, {size}u, {where});"
+                cleared.append(start if learned else f"edp_fill({number(part.fill)}, {size}u, {where});")
+            if has_ring(layer):
+                field = slot(layer, "ring_at").removeprefix("s->")
+                declared.append(f"edp_ring {field};")
+                cleared += [f"s->{field}.at = 0u;", f"s->{field}.seen = 0u;"]
+        return {"state_fields": indented(declared), "forget": indented(cleared)}
+
+    def _state_words(self) -> int:
+        slots = sum(max(1, part.size) for _, part in self.graph.slots() if part.name != "age")
+        rings = sum(has_ring(layer) for layer in self.graph.layers)
+        return 7 + self.graph.inputs + slots + 2 * rings + self.plan.size
+
+    def _code(self) -> dict[str, str]:
+        calls = Calls(self.graph, self.plan)
+        lines = [line for layer in self.graph.layers for line in ("", describe(layer), *calls.of(layer))]
+        checks: list[str] = []
+        copies, members = [], []
+        shape = "[{0}_HORIZONS][{0}_TARGETS]".format(self.name.upper())
+        for meaning, value in self.graph.results.items():
+            size, at = self.graph.width_of(value), calls.value(value)
+            first = f"edp_all_finite({at}, {size}u)"
+            checks.append(f"finite = {first} && finite;" if checks else f"bool finite = {first};")
+            more = "" if meaning == "prediction" else f"[{self.name.upper()}_INTERVALS]"
+            members.append(f"float {meaning}{more}{shape};")
+            zero = "[0][0][0]" if more else "[0][0]"
+            copies.append(f"    edp_copy({at}, {size}u, &out->{meaning}{zero});")
+        end = [*checks, "if (finite) {", *copies, "}", "return finite;"]
+        return {"compute": indented(lines[1:]), "finish": indented(end), "output_fields": indented(members)}
+
+
+def _listed(entries: Sequence[tuple[str, str]]) -> str:
+    """Lines of an enumeration with a comment each."""
+    wide = max(len(entry) for entry, _ in entries)
+    return "\n".join(f"    {entry:<{wide}} /* {text.replace('*/', '* /')} */" for entry, text in entries)
+
+
+def make_model(name: str, bundle: Bundle) -> Model:
+    """A model ready to be written.
+
+    Raises:
+        ExportError: a part of the network has no form as a layer.
+    """
+    graph = bundle.predictor.graph()
+    return Model(name, bundle, graph, plan(graph))
+
+
+def has_ring(layer: Layer) -> bool:
+    """Whether the C state of a layer has a ring or a counter."""
+    return isinstance(layer, COUNTED) and bool(layer.slots)
+
+
+def ends(predictor: Predictor) -> tuple[Array, Array]:
+    """Middle and width of each input's usual range in SI units, as the scaler tells them.
+
+    A channel that only a derived one reads has the width of that one's change; one that only a physics base reads has
+    no scale, and 1e6.
+    """
+    front, features = predictor.front, predictor.task.features
+    offset, width = (part.detach().cpu().double().numpy() for part in (front.offset, front.width))
+    centre, spread = np.zeros(front.inputs), np.full(front.inputs, 1e6)
+    logged, hidden = len(features.channels), len(features.hidden)
+    centre[:logged], spread[:logged] = offset[:logged], width[:logged]
+    for number_, entry in enumerate(features.derived):
+        source = features.inputs.index(entry.source)
+        change = width[logged + number_] / (predictor.task.rate_hz if entry.how == "derivative" else 1.0)
+        if source >= logged:
+            spread[source] = min(spread[source], change)
+    first, count = logged + hidden, len(features.starting)
+    at = slice(front.lasting, front.lasting + count)
+    centre[first : first + count], spread[first : first + count] = offset[at], width[at]
+    return centre, spread
+
+
+def crc(graph: Graph) -> int:
+    """CRC-32 of all constants, little-endian float32, in the order of the layers."""
+    value = 0
+    for _, _, values in graph.tensors():
+        value = zlib.crc32(values.astype("<f4").tobytes(), value)
+    return value
+
+
+def model_hash(graph: Graph) -> str:
+    """Content address of layers, options and constants."""
+    state = hashlib.blake2b(digest_size=16)
+    for layer in graph.layers:
+        arrays = layer.tensors()
+        rest = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in arrays}
+        state.update(repr((type(layer).__name__, rest)).encode())
+        for name, values in arrays.items():
+            state.update(repr((name, values.shape)).encode() + values.astype("<f4").tobytes())
+    for key, values in graph.initial.items():
+        state.update(repr(key).encode() + values.astype("<f4").tobytes())
+    return state.hexdigest()
+
+
+def scale_hash(predictor: Predictor) -> str:
+    """Content address of the scaling between SI units and the network's numbers."""
+    state = hashlib.blake2b(digest_size=16)
+    for part in (predictor.front.offset, predictor.front.width, predictor.code.offset, predictor.code.width):
+        state.update(part.detach().cpu().float().numpy().astype("<f4").tobytes())
+    return state.hexdigest()

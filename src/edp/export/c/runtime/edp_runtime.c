@@ -1,0 +1,299 @@
+/* Element-wise functions, checks and linear maps; what has a memory is in edp_memory.c. */
+#include "edp_runtime.h"
+
+#include <math.h>
+#include <string.h>
+
+/* ---- checks ---------------------------------------------------------------------------------------------------- */
+
+static uint32_t bits_of(float x) {
+    uint32_t bits;
+    (void)memcpy(&bits, &x, sizeof bits);
+    return bits;
+}
+
+bool edp_finite(float x) { return (bits_of(x) & 0x7F800000u) != 0x7F800000u; }
+
+bool edp_valid(const float *x, const float *low, const float *high, uint32_t n) {
+    bool valid = true;
+    for (uint32_t i = 0; i < n; i++) {
+        if (!edp_finite(x[i]) || (x[i] < low[i]) || (x[i] > high[i])) {
+            valid = false;
+        }
+    }
+    return valid;
+}
+
+bool edp_all_finite(const float *x, uint32_t n) {
+    bool finite = true;
+    for (uint32_t i = 0; i < n; i++) {
+        if (!edp_finite(x[i])) {
+            finite = false;
+        }
+    }
+    return finite;
+}
+
+uint32_t edp_crc(const edp_table *tables, uint32_t count) {
+    uint32_t crc = 0xFFFFFFFFu;
+    for (uint32_t t = 0; t < count; t++) {
+        for (uint32_t i = 0; i < tables[t].count; i++) {
+            uint32_t bits = bits_of(tables[t].values[i]);
+            for (uint32_t bit = 0; bit < 32u; bit++) {
+                const uint32_t low = (crc ^ bits) & 1u;
+                crc = (crc >> 1) ^ (0xEDB88320u & (0u - low));
+                bits >>= 1;
+            }
+        }
+    }
+    return crc ^ 0xFFFFFFFFu;
+}
+
+/* ---- element by element ---------------------------------------------------------------------------------------- */
+
+/* exp(r) - 1 for |r| <= ln 2 / 2: its series; what is left out is below 1e-8 of r. */
+static float small_expm1(float r) {
+    const float tail =
+        1.0f / 6.0f + r * (1.0f / 24.0f + r * (1.0f / 120.0f + r * (1.0f / 720.0f + r * (1.0f / 5040.0f))));
+    return r + r * r * (0.5f + r * tail);
+}
+
+/* 2^n e^r with n a whole number; relative error about 2e-7. Beyond the range of float32 the nearest end of it. */
+float edp_exp(float x) {
+    const float limited = (x > 88.0f) ? 88.0f : ((x < -87.0f) ? -87.0f : x);
+    const float turns = limited * 1.44269504f;
+    const int32_t n = (int32_t)((turns >= 0.0f) ? (turns + 0.5f) : (turns - 0.5f));
+    /* ln 2 in two parts, of which n times the first is exact. */
+    const float r = (limited - (float)n * 0.693359375f) - (float)n * -2.12194440e-4f;
+    const uint32_t bits = (uint32_t)(n + 127) << 23;
+    float power;
+    (void)memcpy(&power, &bits, sizeof power);
+    return (1.0f + small_expm1(r)) * power;
+}
+
+float edp_tanh(float x) {
+    const float size = fabsf(x);
+    float y;
+    if (size < 0.17f) {
+        const float e = small_expm1(2.0f * size);
+        y = e / (e + 2.0f);
+    } else if (size < 10.0f) {
+        y = 1.0f - 2.0f / (edp_exp(2.0f * size) + 1.0f);
+    } else {
+        y = 1.0f;
+    }
+    return (x < 0.0f) ? -y : y;
+}
+
+float edp_sigmoid(float x) {
+    const float small = edp_exp(-fabsf(x));
+    return ((x >= 0.0f) ? 1.0f : small) / (1.0f + small);
+}
+
+void edp_fill(float value, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = value;
+    }
+}
+
+void edp_copy(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = x[i];
+    }
+}
+
+void edp_gather(const float *x, const uint16_t *columns, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = x[columns[i]];
+    }
+}
+
+void edp_standardise(const float *x, const float *offset, const float *scale, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = (x[i] - offset[i]) / scale[i];
+    }
+}
+
+void edp_scale_shift(const float *x, const float *gain, const float *shift, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = x[i] * gain[i] + shift[i];
+    }
+}
+
+void edp_add(const float *a, const float *b, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = a[i] + b[i];
+    }
+}
+
+void edp_subtract(const float *a, const float *b, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = a[i] - b[i];
+    }
+}
+
+void edp_multiply(const float *a, const float *b, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = a[i] * b[i];
+    }
+}
+
+void edp_map_relu(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = (x[i] > 0.0f) ? x[i] : 0.0f;
+    }
+}
+
+void edp_map_sigmoid(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = edp_sigmoid(x[i]);
+    }
+}
+
+void edp_map_tanh(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = edp_tanh(x[i]);
+    }
+}
+
+void edp_map_gelu(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = 0.5f * x[i] * (1.0f + erff(x[i] * 0.707106781f));
+    }
+}
+
+void edp_map_softplus(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = ((x[i] > 0.0f) ? x[i] : 0.0f) + log1pf(edp_exp(-fabsf(x[i])));
+    }
+}
+
+void edp_map_exp(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = edp_exp(x[i]);
+    }
+}
+
+/* ---- rows ------------------------------------------------------------------------------------------------------ */
+
+void edp_glu(const float *x, uint32_t rows, uint32_t n, float *y) {
+    for (uint32_t row = 0; row < rows; row++) {
+        for (uint32_t i = 0; i < n; i++) {
+            y[row * n + i] = x[2u * row * n + i] * edp_sigmoid(x[(2u * row + 1u) * n + i]);
+        }
+    }
+}
+
+void edp_accumulate(const float *x, uint32_t rows, uint32_t n, float *y) {
+    edp_copy(x, n, y);
+    for (uint32_t i = n; i < rows * n; i++) {
+        y[i] = y[i - n] + x[i];
+    }
+}
+
+/* Four rows at a time: each x is read once for four products. */
+void edp_product(const float *x, const float *weight, uint32_t stride, uint32_t out, uint32_t in, float *y) {
+    uint32_t o = 0;
+    for (; o + 4u <= out; o += 4u) {
+        const float *w0 = weight + o * stride;
+        const float *w1 = w0 + stride;
+        const float *w2 = w1 + stride;
+        const float *w3 = w2 + stride;
+        float a0 = y[o];
+        float a1 = y[o + 1u];
+        float a2 = y[o + 2u];
+        float a3 = y[o + 3u];
+        for (uint32_t i = 0; i < in; i++) {
+            const float value = x[i];
+            a0 += w0[i] * value;
+            a1 += w1[i] * value;
+            a2 += w2[i] * value;
+            a3 += w3[i] * value;
+        }
+        y[o] = a0;
+        y[o + 1u] = a1;
+        y[o + 2u] = a2;
+        y[o + 3u] = a3;
+    }
+    for (; o < out; o++) {
+        float a = y[o];
+        for (uint32_t i = 0; i < in; i++) {
+            a += weight[o * stride + i] * x[i];
+        }
+        y[o] = a;
+    }
+}
+
+
+void edp_dense(const float *x, const float *weight, const float *bias, uint32_t rows, uint32_t out, uint32_t in,
+               float *y) {
+    for (uint32_t row = 0; row < rows; row++) {
+        edp_copy(bias, out, y + row * out);
+        edp_product(x + row * in, weight, in, out, in, y + row * out);
+    }
+}
+
+void edp_grouped_dense(const float *x, const float *weight, const float *bias, uint32_t rows, uint32_t out, uint32_t in,
+                       float *y) {
+    for (uint32_t row = 0; row < rows; row++) {
+        edp_copy(bias + row * out, out, y + row * out);
+        edp_product(x + row * in, weight + row * out * in, in, out, in, y + row * out);
+    }
+}
+
+void edp_layer_norm(const float *x, const float *gain, const float *shift, float epsilon, uint32_t rows, uint32_t n,
+                    float *y) {
+    for (uint32_t row = 0; row < rows; row++) {
+        const float *from = x + row * n;
+        float *to = y + row * n;
+        float mean = 0.0f;
+        float spread = 0.0f;
+        for (uint32_t i = 0; i < n; i++) {
+            mean += from[i];
+        }
+        mean /= (float)n;
+        for (uint32_t i = 0; i < n; i++) {
+            spread += (from[i] - mean) * (from[i] - mean);
+        }
+        const float scale = 1.0f / sqrtf(spread / (float)n + epsilon);
+        for (uint32_t i = 0; i < n; i++) {
+            to[i] = (from[i] - mean) * scale * gain[i] + shift[i];
+        }
+    }
+}
+
+void edp_softmax(float *scores, uint32_t n) {
+    float most = scores[0];
+    float total = 0.0f;
+    for (uint32_t i = 1; i < n; i++) {
+        most = (scores[i] > most) ? scores[i] : most;
+    }
+    for (uint32_t i = 0; i < n; i++) {
+        scores[i] = edp_exp(scores[i] - most);
+        total += scores[i];
+    }
+    for (uint32_t i = 0; i < n; i++) {
+        scores[i] /= total;
+    }
+}
+
+void edp_row_attention(const float *q, const float *k, const float *v, uint32_t rows, uint32_t n, float *scores,
+                       float *y) {
+    const float root = sqrtf((float)n);
+    for (uint32_t row = 0; row < rows; row++) {
+        for (uint32_t other = 0; other < rows; other++) {
+            float sum = 0.0f;
+            for (uint32_t i = 0; i < n; i++) {
+                sum += q[row * n + i] * k[other * n + i];
+            }
+            scores[other] = sum / root;
+        }
+        edp_softmax(scores, rows);
+        edp_fill(0.0f, n, y + row * n);
+        for (uint32_t other = 0; other < rows; other++) {
+            for (uint32_t i = 0; i < n; i++) {
+                y[row * n + i] += scores[other] * v[other * n + i];
+            }
+        }
+    }
+}

@@ -1,0 +1,115 @@
+"""``--to c``: the folder of a model with its runtime, test and example."""
+
+from __future__ import annotations
+
+import copy
+import re
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edp.errors import ExportError
+from edp.export.base import TARGETS
+from edp.export.c.model import Model, ends, make_model
+from edp.export.c.text import KEYWORDS, filled, number
+from edp.models.predictor import Predictor
+from edp.storage import make_folder, write_bytes
+from edp.training.bundle import Bundle
+
+RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
+GOLDEN_TICKS = 200
+Rows = NDArray[np.float32]
+SHARE = 1e-5
+"""How far the C code may be from PyTorch, in standard deviations of the target and as a share of the value."""
+
+
+@TARGETS.register("c")
+@dataclass(frozen=True)
+class CTarget:
+    """C99, float32: ``NAME.h``, ``NAME.c``, constants, runtime, test on a computer, example task, CMake file."""
+
+    def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
+        """See `edp.export.ExportTarget`."""
+        _check(name)
+        model = make_model(name, bundle)
+        made = {
+            f"{name}.h": model.fill("model.h.in"),
+            f"{name}.c": model.fill("model.c.in"),
+            f"{name}_weights.h": model.weights(),
+            f"{name}_golden.h": golden(model),
+            "host_test.c": model.fill("host_test.c.in"),
+            "example_task.c": model.fill("example_task.c.in"),
+            "CMakeLists.txt": model.fill("CMakeLists.txt.in"),
+        }
+        for file in RUNTIME:
+            made[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
+        path = make_folder(folder)
+        for file, text in made.items():
+            write_bytes(path / file, text.encode())
+        return [path / file for file in made]
+
+
+def _check(name: str) -> None:
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in KEYWORDS or name.startswith("edp_"):
+        raise ExportError(
+            f"name '{name}' is the prefix of C functions and files: up to 31 lower-case letters, digits, underscores, "
+            "a letter first, no word of C, not beginning with edp_; give another one with --name"
+        )
+
+
+def golden(model: Model) -> str:
+    """Inputs, and what PyTorch makes of them, as a header for the test on a computer."""
+    predictor = model.bundle.predictor
+    inputs = random_inputs(predictor, GOLDEN_TICKS, seed=0)
+    outputs = stream(predictor, inputs)
+    allowed = tolerance(predictor, inputs, outputs)
+    text = [f"/* Random inputs of {model.name} and the network's predictions, bounds behind them. */"]
+    text.append(f"#define GOLDEN_TICKS {len(inputs)}u")
+    for name, rows in (("inputs", inputs), ("outputs", outputs)):
+        body = ",\n".join("    {\n" + filled(map(number, row), "     ") + "}" for row in rows)
+        text.append(f"static const float golden_{name}[{len(rows)}][{rows.shape[1]}] = {{\n{body}\n}};")
+    text.append(f"static const float golden_tolerance[{len(allowed)}] = {{\n{filled(map(number, allowed))}\n}};")
+    return "\n".join(text) + "\n"
+
+
+def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
+    """How far C code may be from `outputs`, PyTorch's in single precision, for each number of a tick.
+
+    `SHARE` of a standard deviation and of the largest value; where PyTorch in single precision is farther than that
+    from itself in double precision (a layer norm of a cell near zero), twice that distance.
+    """
+    exact = stream(copy.deepcopy(predictor).double(), inputs)
+    sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
+    widths = np.tile(sigma, outputs.shape[1] // len(sigma))
+    own = np.abs(outputs - exact).max(axis=0)
+    return np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
+
+
+def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:
+    """Smooth random inputs ``(tick, input)`` in the usual range of each channel, SI units."""
+    centre, spread = ends(predictor)
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(ticks, len(centre)))
+    value = rng.normal(size=len(centre))
+    rows = []
+    for kick in noise:
+        value = 0.9 * value + 0.4 * kick
+        rows.append(centre + spread * value)
+    return np.asarray(rows, dtype=np.float32)
+
+
+def stream(predictor: Predictor, inputs: Rows) -> Rows:
+    """What PyTorch predicts from reset, ``(tick, number)``: predictions, then lower and upper bounds, SI units."""
+    like = next(predictor.parameters())
+    x = torch.from_numpy(inputs).to(like).unsqueeze(0)
+    with torch.inference_mode():
+        prediction, _ = predictor.predict(x, predictor.initial_state(1, x))
+        parts = [prediction[0].flatten(1)]
+        if predictor.output.coverages:
+            bounds, _ = predictor.intervals(x, predictor.initial_state(1, x))
+            parts += [bounds[0, :, :, side].flatten(1) for side in (0, 1)]
+        return torch.cat(parts, dim=1).float().cpu().numpy()

@@ -1,0 +1,87 @@
+"""Networks as C programs, and what runs them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from edp.export.c.target import RUNTIME, CTarget
+from edp.signals import Channel, Kind
+from edp.training.bundle import Bundle
+
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-ffp-contract=off")
+NEEDED = {
+    "gcc": "gcc libc6-dev",
+    "clang": "clang",
+    "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
+    "qemu-system-arm": "qemu-system-arm",
+}
+
+
+def need(*programs: str) -> None:
+    """Skip where a program is missing, with the Debian packages that have it."""
+    missing = [NEEDED[name] for name in programs if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"needs the Debian packages {' '.join(missing)} (make system-packages)")
+
+
+def run(*command: object, folder: Path | None = None, feed: bytes = b"") -> bytes:
+    """Standard output of a program that must end well."""
+    done = subprocess.run([str(part) for part in command], cwd=folder, input=feed, capture_output=True)
+    assert done.returncode == 0, (done.stdout + done.stderr).decode()[-3000:]
+    return done.stdout
+
+
+def stream_c(program: Path, inputs: np.ndarray) -> np.ndarray:
+    """What an exported program predicts, ``(tick, number)``."""
+    found = run(program, "stream", feed=np.ascontiguousarray(inputs, dtype=np.float32).tobytes())
+    return np.frombuffer(found, dtype=np.float32).reshape(len(inputs), -1)
+
+
+@pytest.fixture(scope="session")
+def c() -> SimpleNamespace:
+    """What tests need of compilers and programs."""
+    return SimpleNamespace(flags=FLAGS, need=need, run=run, stream=stream_c)
+
+
+@pytest.fixture(scope="session")
+def bundle_of(predictor_of) -> Callable[[str], Bundle]:
+    """The bundle of a small network of the registries, single precision."""
+
+    def make(structure: str) -> Bundle:
+        predictor = predictor_of(structure, dtype=torch.float32)
+        task = predictor.task
+        inputs = tuple(Channel(name, Kind.GENERIC, "an input") for name in task.inputs)
+        return Bundle(predictor, inputs, (Kind.GENERIC,) * len(task.targets), tuple(f"{n} */" for n in task.targets))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def program_of(bundle_of, tmp_path_factory) -> Callable[..., Path]:
+    """The test program of an exported network; the runtime is compiled once for each set of flags."""
+    runtimes: dict[tuple[str, ...], Path] = {}
+
+    def make(structure: str, compiler: str = "gcc", *more: str) -> Path:
+        need(compiler)
+        folder = tmp_path_factory.mktemp("exported")
+        CTarget().write(bundle_of(structure), "predictor", folder)
+        flags = (*FLAGS, *(more or ("-O1",)))
+        key = (compiler, *flags)
+        if key not in runtimes:
+            runtimes[key] = tmp_path_factory.mktemp("runtime")
+            sources = [folder / name for name in RUNTIME if name.endswith(".c")]
+            run(compiler, *flags, "-c", *sources, folder=runtimes[key])
+        objects = sorted(runtimes[key].glob("*.o"))
+        sources = ["predictor.c", "host_test.c"]
+        run(compiler, *flags, *sources, *objects, "-lm", "-o", "program", folder=folder)
+        return folder / "program"
+
+    return make
