@@ -21,6 +21,7 @@ NEEDED = {
     "gcc": "gcc libc6-dev",
     "clang": "clang",
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
+    "cppcheck": "cppcheck",
     "qemu-system-arm": "qemu-system-arm",
 }
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -116,6 +119,18 @@ def test_headers_say_what_an_engineer_needs(c, bundle_of, tmp_path):
     assert {file.name: file.read_bytes() for file in files} == made  # the same model gives the same bytes
     c.need("gcc")
     c.run("gcc", *c.flags, "-c", "example_task.c", folder=tmp_path)
+
+
+def test_deviations_from_misra_are_the_ones_that_the_docs_list(c, bundle_of, tmp_path):
+    c.need("cppcheck")
+    CTarget().write(bundle_of("hybrid"), "predictor", tmp_path)
+    files = ("edp_runtime.c", "edp_memory.c", "predictor.c")
+    options = ("--std=c99", "--addon=misra", "--enable=style", "--quiet", "--output-file=found.txt")
+    c.run("cppcheck", *options, *files, folder=tmp_path)
+    found = set(re.findall(r"\[misra-c2012-([\d.]+)\]", (tmp_path / "found.txt").read_text()))
+    listed = Path(__file__).parents[2] / "docs/export.md"
+    rules = "".join(line for line in listed.read_text().splitlines() if line.startswith("| ") and "." in line[:8])
+    assert found == set(re.findall(r"(?<=[ |])\d{1,2}\.\d{1,2}(?=[ ,|])", rules))
 
 
 def test_values_do_not_lie_over_values_that_are_still_read(structure, bundle_of):

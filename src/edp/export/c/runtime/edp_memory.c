@@ -2,6 +2,7 @@
 #include "edp_runtime.h"
 
 #include <math.h>
+#include <stddef.h>
 
 static float dot(const float *a, const float *b, uint32_t n) {
     float sum = 0.0f;
@@ -55,7 +56,7 @@ static void lstm_cell(const float *gates, uint32_t units, float share, const edp
         work[i] = forget * c[i] + input * edp_tanh(gates[2u * units + i]);
         c[i] += share * (work[i] - c[i]);
     }
-    if (norms != 0) {
+    if (norms != NULL) {
         edp_layer_norm(work, norms->gain_c, norms->shift_c, norms->epsilon, 1u, units, work);
     }
     for (uint32_t i = 0; i < units; i++) {
@@ -68,7 +69,7 @@ void edp_lstm(const float *x, const edp_lstm_weights *w, uint32_t in, uint32_t u
     edp_copy(w->bias, 4u * units, gates);
     edp_product(x, w->weight_x, in, 4u * units, in, gates);
     edp_product(h, w->weight_h, units, 4u * units, units, gates);
-    lstm_cell(gates, units, w->share, 0, y, h, c);
+    lstm_cell(gates, units, w->share, NULL, y, h, c);
     edp_copy(h, units, y);
 }
 
@@ -139,9 +140,9 @@ void edp_trailing_mean(const float *x, uint32_t n, uint32_t window, float *past,
             y[i] += past[row * n + i];
         }
     }
-    const float count = (float)(ring->seen + 1u);
+    const uint32_t count = ring->seen + 1u;
     for (uint32_t i = 0; i < n; i++) {
-        y[i] /= count;
+        y[i] /= (float)count;
     }
     if (window > 1u) {
         edp_copy(x, n, past + ring->at * n);

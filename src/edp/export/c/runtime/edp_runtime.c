@@ -62,10 +62,12 @@ static float small_expm1(float r) {
 float edp_exp(float x) {
     const float limited = (x > 88.0f) ? 88.0f : ((x < -87.0f) ? -87.0f : x);
     const float turns = limited * 1.44269504f;
-    const int32_t n = (int32_t)((turns >= 0.0f) ? (turns + 0.5f) : (turns - 0.5f));
+    const float nearest = (turns >= 0.0f) ? (turns + 0.5f) : (turns - 0.5f);
+    const int32_t n = (int32_t)nearest;
     /* ln 2 in two parts, of which n times the first is exact. */
     const float r = (limited - (float)n * 0.693359375f) - (float)n * -2.12194440e-4f;
-    const uint32_t bits = (uint32_t)(n + 127) << 23;
+    const int32_t exponent = n + 127;
+    const uint32_t bits = (uint32_t)exponent << 23;
     float power;
     (void)memcpy(&power, &bits, sizeof power);
     return (1.0f + small_expm1(r)) * power;
