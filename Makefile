@@ -40,6 +40,7 @@ bench: $(READY) ## every benchmark, quick
 	@for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python $$file --quick || exit 1; done
 
 system-packages: ## packages of the system that only some checks need: chromium for pages, ffmpeg for films, octave for MAT fixtures, compilers and QEMU for exported C
+	-$(if $(filter 0,$(shell id -u)),,sudo) apt-get update --quiet --quiet
 	$(if $(filter 0,$(shell id -u)),,sudo) apt-get install --yes --no-install-recommends chromium ffmpeg octave \
 		gcc libc6-dev clang cmake cppcheck gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 
