@@ -1,4 +1,4 @@
-"""Checkpoints: the whole state of a training after an epoch, as safetensors with a JSON header, never a pickle."""
+"""Checkpoints: the whole state of a training, as safetensors with a JSON header, never a pickle."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import load, save
 from torch import Tensor
 
 from edp.errors import StorageError
 from edp.storage import write_bytes
+from edp.streaming import State
 from edp.training.schedules import ScheduleState
 
 FILE = "checkpoint.safetensors"
@@ -34,6 +35,26 @@ class Progress:
 
 
 @dataclass
+class Within:
+    """Where a training stands inside an epoch.
+
+    Attributes:
+        given: updates of the epoch so far.
+        total: sum of their losses.
+        stream: state of the net that the next chunk goes on from.
+    """
+
+    given: int = 0
+    total: float = 0.0
+    stream: State | None = None
+
+    @property
+    def loss(self) -> float:
+        """Mean loss so far."""
+        return self.total / max(1, self.given)
+
+
+@dataclass
 class Weights:
     """Named tensors of the net itself, its average, and the best so far; and the running errors of its outputs."""
 
@@ -51,7 +72,7 @@ def save_checkpoint(
     for group, named in (("current", weights.current), ("average", weights.average), ("best", weights.best)):
         tensors |= {f"{group}/{name}": tensor.detach().cpu().contiguous() for name, tensor in named.items()}
     state = optimizer.state_dict()
-    structure = {"state": _strip(state["state"], "optimizer", tensors), "param_groups": state["param_groups"]}
+    structure = _strip(state, "optimizer", tensors)
     header = {"key": key, "progress": asdict(progress), "optimizer": structure}
     data = save(tensors, metadata={"edp": json.dumps(header)})
     write_bytes(path, data)
@@ -80,12 +101,29 @@ def load_checkpoint(path: Path, key: str) -> tuple[Progress, Weights, dict[str, 
         group, _, rest = name.partition("/")
         if group in groups:
             groups[group][rest] = tensor
-    state = _restore(header["optimizer"]["state"], tensors)
-    optimizer = {
-        "state": {int(index): value for index, value in state.items()},
-        "param_groups": header["optimizer"]["param_groups"],
-    }
+    optimizer = optimizer_state(_restore(header["optimizer"], tensors))
     return progress, Weights(**groups, running=tensors["running"]), optimizer
+
+
+def optimizer_state(plain: dict[str, Any]) -> dict[str, Any]:
+    """What an optimiser loads, from its form with text as keys."""
+    return {**plain, "state": {int(index): value for index, value in plain["state"].items()}}
+
+
+def pack(tree: Any) -> bytes:
+    """A tree of tables, lists, tuples, tensors and plain values as safetensors; keys become text."""
+    tensors: dict[str, Tensor] = {}
+    plain = _strip(tree, "", tensors)
+    # Parts of one tensor may share their memory, which the format refuses.
+    copies = {name: tensor.clone() for name, tensor in tensors.items()}
+    return save(copies, metadata={"edp": json.dumps(plain)})
+
+
+def unpack(data: bytes) -> Any:
+    """The tree that `pack` was given, to the bit."""
+    size = int.from_bytes(data[:8], "little")
+    plain = json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["edp"])
+    return _restore(plain, load(data))
 
 
 def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
@@ -97,7 +135,8 @@ def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
     if isinstance(value, dict):
         return {str(key): _strip(item, f"{path}/{key}", tensors) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_strip(item, f"{path}/{i}", tensors) for i, item in enumerate(value)]
+        parts = [_strip(item, f"{path}/{i}", tensors) for i, item in enumerate(value)]
+        return {"tuple": parts} if isinstance(value, tuple) else parts
     return value
 
 
@@ -106,6 +145,8 @@ def _restore(value: Any, tensors: dict[str, Tensor]) -> Any:
         if set(value) == {"tensor", "stride"}:
             held = tensors[value["tensor"]]
             return torch.empty_strided(held.shape, value["stride"], dtype=held.dtype).copy_(held)
+        if set(value) == {"tuple"}:
+            return tuple(_restore(item, tensors) for item in value["tuple"])
         return {key: _restore(item, tensors) for key, item in value.items()}
     if isinstance(value, list):
         return [_restore(item, tensors) for item in value]

@@ -6,75 +6,25 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import torch
 
 from edp.data.chunks import Batch, ChunkSampler
 from edp.data.prepared import Prepared
-from edp.errors import ConfigError, DataError, EdpError, NotFiniteError
-from edp.models.predictor import ModelSpec, Predictor, build_model, trainable
+from edp.errors import ConfigError, DataError
+from edp.models.predictor import ModelSpec, build_model, trainable
 from edp.runs import RunFolder
 from edp.streaming import State, detach_state, reset_where
-from edp.training.checkpoint import FILE, REFIT, Progress, Weights, load_checkpoint, save_checkpoint
+from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, load_checkpoint, save_checkpoint
 from edp.training.lesson import Lesson, Moment
 from edp.training.objective import Objective
+from edp.training.outcome import Diverged, Event, Fitted, TrainingError
 from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, check_training
 from edp.training.validation import calibrate, validation_scores
-
-
-class TrainingError(EdpError):
-    """Training cannot go on."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """Progress of a training, for displays: after every few updates and after each epoch."""
-
-    epoch: int
-    epochs: int
-    update: int
-    updates: int
-    targets_per_s: float
-    seconds_left: float
-    row: dict[str, Any] | None = None
-    refit: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A trained predictor with its history.
-
-    Attributes:
-        predictor: with the best weights, in evaluation mode.
-        history: a row per epoch.
-        seconds: training time over all sittings.
-        targets_per_s: ticks with a loss per second of the update loop in this sitting.
-        resumed_at: epoch at which this sitting began.
-    """
-
-    predictor: Predictor
-    history: list[dict[str, Any]]
-    seconds: float
-    targets_per_s: float
-    resumed_at: int
-
-
-class Diverged(TrainingError, NotFiniteError):
-    """The loss or the validation score is not finite any more.
-
-    Attributes:
-        fitted: the best weights before that, None where no epoch was finished.
-        facts: where it happened, plain values.
-    """
-
-    exit_code = 4
-
-    def __init__(self, message: str, fitted: Fitted | None, facts: dict[str, Any]) -> None:
-        super().__init__(message)
-        self.fitted, self.facts = fitted, facts
 
 
 def fit(
@@ -102,12 +52,12 @@ def fit(
     """
     torch.set_num_threads(thread_count(spec))
     tell = on_event or (lambda event: None)
-    fitted = _Loop(data, model, spec, run, lesson).fit(tell)
+    fitted = Loop(data, model, spec, run, lesson).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:
         return fitted
     try:
-        again = _Loop(data, model, spec, run, lesson, _rows_of_refit(fitted.history, best, spec)).fit(tell)
+        again = Loop(data, model, spec, run, lesson, _rows_of_refit(fitted.history, best, spec)).fit(tell)
     except Diverged as end:
         raise Diverged(str(end), fitted, end.facts) from end
     again.predictor.output.load_state_dict(fitted.predictor.output.state_dict())
@@ -126,7 +76,7 @@ def _rows_of_refit(history: list[dict[str, Any]], best: int, spec: TrainingSpec)
     return history + history[-1:] * (spec.epochs - len(history))
 
 
-class _Loop:
+class Loop:
     """One training: the net, its average, the optimiser, and where it stands.
 
     Where `refitted` holds the rows of an earlier training, all stretches train, for as many epochs as there are rows;
@@ -171,7 +121,7 @@ class _Loop:
         self.rates = [group["lr"] for group in self.optimizer.param_groups]
         self.average = {name: tensor.detach().clone() for name, tensor in self.net.named_parameters()}
         self.best = {name: tensor.clone() for name, tensor in self.average.items()}
-        self.progress = Progress()
+        self.progress, self.within = Progress(), Within()
         self.objective = Objective(spec, self.net.code)
         self.updates = spec.updates or max(1, self.sampler.updates())
         if (
@@ -185,10 +135,9 @@ class _Loop:
         seen, busy = 0, 0.0
         while self.progress.epoch < self.epochs and not self._stalled():
             began = time.perf_counter()
-            loss, targets = self._epoch(on_event)
+            seen += self.advance(self.updates, on_event)
             busy += time.perf_counter() - began
-            seen += targets
-            row = self._close_epoch(loss, time.perf_counter() - began)
+            row = self._close_epoch(self.within.loss, time.perf_counter() - began)
             self.rate = seen / busy
             on_event(self._event(self.progress.epoch, self.updates, self.rate, time.perf_counter() - began, row))
         return self._fitted()
@@ -255,21 +204,30 @@ class _Loop:
                     return
             passes += 1
 
-    def _epoch(self, on_event: Callable[[Event], None]) -> tuple[float, int]:
-        # Dropout must not depend on how often the run was stopped: each epoch has its own seed.
-        torch.manual_seed(self.spec.seed * 100_003 + self.progress.epoch)
+    def advance(self, until: int, on_event: Callable[[Event], None]) -> int:
+        """Go on to an update of this epoch; ticks with a loss that were seen on the way."""
+        within = self.within
+        if not within.given:
+            # Dropout must not depend on how often the run was stopped: each epoch has its own seed.
+            torch.manual_seed(self.spec.seed * 100_003 + self.progress.epoch)
         self.net.train()
-        state: State | None = None
-        total, seen, began, shown = 0.0, 0, time.perf_counter(), time.perf_counter()
-        for number, batch in enumerate(self._batches(), start=1):
-            loss, state = self._update(batch, state)
-            total += loss
+        seen, began, shown = 0, time.perf_counter(), time.perf_counter()
+        for batch in islice(self._batches(), within.given, until):
+            loss, within.stream = self._update(batch, within.stream)
+            within.total += loss
+            within.given += 1
             seen += batch.targets_seen
             now = time.perf_counter()
             if now - shown > 0.5:
                 shown = now
-                on_event(self._event(self.progress.epoch + 1, number, seen / (now - began), now - began, None))
-        return total / self.updates, seen
+                on_event(self._event(self.progress.epoch + 1, within.given, seen / (now - began), now - began, None))
+        return seen
+
+    def pause(self) -> Fitted:
+        """What a training that ends here gives; this one is over with it."""
+        self.resumed_at, self.rate = self.progress.epoch, 0.0
+        self.progress.history.append(self._judge_epoch(self.within.loss))
+        return self._fitted()
 
     def _update(self, batch: Batch, state: State | None) -> tuple[float, State]:
         x = torch.from_numpy(batch.inputs).to(self.device)
@@ -325,6 +283,7 @@ class _Loop:
             self.spec.schedule.observe(score, progress.schedule)
         progress.epoch += 1
         progress.seconds += seconds
+        self.within = Within()
         if row is not None:
             row["seconds"] = round(progress.seconds, 3)
             progress.history.append(row)

@@ -1,0 +1,61 @@
+"""What a training tells on its way and gives at its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from edp.errors import EdpError, NotFiniteError
+from edp.models.predictor import Predictor
+
+
+class TrainingError(EdpError):
+    """Training cannot go on."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Progress of a training, for displays: after every few updates and after each epoch."""
+
+    epoch: int
+    epochs: int
+    update: int
+    updates: int
+    targets_per_s: float
+    seconds_left: float
+    row: dict[str, Any] | None = None
+    refit: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A trained predictor with its history.
+
+    Attributes:
+        predictor: with the best weights, in evaluation mode.
+        history: a row per epoch.
+        seconds: training time over all sittings.
+        targets_per_s: ticks with a loss per second of the update loop in this sitting.
+        resumed_at: epoch at which this sitting began.
+    """
+
+    predictor: Predictor
+    history: list[dict[str, Any]]
+    seconds: float
+    targets_per_s: float
+    resumed_at: int
+
+
+class Diverged(TrainingError, NotFiniteError):
+    """The loss or the validation score is not finite any more.
+
+    Attributes:
+        fitted: the best weights before that, None where no epoch was finished.
+        facts: where it happened, plain values.
+    """
+
+    exit_code = 4
+
+    def __init__(self, message: str, fitted: Fitted | None, facts: dict[str, Any]) -> None:
+        super().__init__(message)
+        self.fitted, self.facts = fitted, facts
