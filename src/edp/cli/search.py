@@ -214,13 +214,14 @@ def _show_status(held: dict[str, Any]) -> None:
         (
             phase["title"],
             f"{phase['trained']}/{phase['trainings']}",
+            phase.get("pruned", 0),
             phase["failed"],
             duration(phase["seconds"]),
             "decided" if phase["ended"] else "under way",
         )
         for phase in held["phases"]
     ]
-    table("phases", ["phase", "trainings", "failed", "training time", "state"], rows)
+    table("phases", ["phase", "trainings", "pruned", "failed", "training time", "state"], rows)
     out.print(f"{counts['done']} trainings done, {held['running']} running, {counts['total'] - counts['done']} left")
     for decision in held["decisions"]:
         for sentence in decision["sentences"]:

@@ -6,6 +6,7 @@ again, and a search that starts anew reads here what was done.
 
 from edp.ledger.claims import Claim, claim, known, leave_arrival
 from edp.ledger.record import FINAL, Identity, Record, Status, canonical, code_version, digest_of
+from edp.ledger.states import WithState, leave_state, left_state, read_state
 from edp.ledger.store import Damage, Ledger, Opening, read_records
 
 __all__ = [
@@ -17,11 +18,15 @@ __all__ = [
     "Opening",
     "Record",
     "Status",
+    "WithState",
     "canonical",
     "claim",
     "code_version",
     "digest_of",
     "known",
     "leave_arrival",
+    "leave_state",
+    "left_state",
     "read_records",
+    "read_state",
 ]

@@ -14,6 +14,7 @@ from typing import Any
 from edp.errors import BusyError, ConfigError, StorageError
 from edp.ledger.claims import free_dead_claims, whole
 from edp.ledger.record import FINAL, SCHEMA, Record, Status, body_of, canonical, digest_of
+from edp.ledger.states import SUFFIX, left_state, read_state
 from edp.storage import hold, make_folder, read_json, remove_unfinished, storage_error, write_bytes, write_json
 
 
@@ -70,7 +71,8 @@ class Ledger:
     """A ledger that this process, the coordinator, writes; a second one is refused.
 
     Folders in it: ``records``, one file a training; ``arrived``, what workers left that is not entered yet; ``claims``,
-    trainings under way; ``quarantine``, damaged files; ``set_aside``, records of trainings to be tried again.
+    trainings under way; ``states``, what trainings go on from that are not over yet; ``quarantine``, damaged files;
+    ``set_aside``, records of trainings to be tried again.
 
     Args:
         folder: made when absent.
@@ -93,7 +95,7 @@ class Ledger:
                 f"'{self.path}' is coordinated by process {holder}; wait for it, stop it, or choose another folder"
             ) from None
         try:
-            for part in ("records", "arrived"):
+            for part in ("records", "arrived", "states"):
                 remove_unfinished(make_folder(self.path / part))
             free_dead_claims(self.path)
             self._enter_arrivals()
@@ -140,7 +142,7 @@ class Ledger:
         return record if record is not None and record.status in FINAL else None
 
     def put(self, record: Record) -> None:
-        """Enter a training; on disk when this returns.
+        """Enter a training, and the state that it left; on disk when this returns.
 
         Raises:
             StorageError: the disk is full (earlier records stay, nothing half written is left), or the ledger holds
@@ -152,10 +154,27 @@ class Ledger:
                 f"training {record.key} is in '{self.path}' as {held.status} and came again, {record.status}, with "
                 "another result; equal trainings must give equal results: is something not in its key?"
             )
+        self._take_state(record.key)
         if held is None:
             write_bytes(self.path / "records" / f"{record.key}.json", record.to_bytes())
             self._records[record.key] = record
         (self.path / "arrived" / f"{record.key}.json").unlink(missing_ok=True)
+
+    def state(self, key: str) -> Path | None:
+        """The file with the state that a training left, where it is whole; a damaged one is set apart."""
+        file = self.path / "states" / f"{key}{SUFFIX}"
+        if not file.exists():
+            return None
+        if read_state(file) is None:
+            self._move(file, "quarantine")
+            return None
+        return file
+
+    def keep_states(self, keys: Collection[str]) -> None:
+        """Remove all states but those of some trainings; records stay."""
+        for file in (self.path / "states").glob(f"*{SUFFIX}"):
+            if file.stem not in keys:
+                file.unlink(missing_ok=True)
 
     def digest(self) -> str:
         """Hash over all results; what is measured, such as seconds, is left out."""
@@ -231,11 +250,24 @@ class Ledger:
                 file.replace(target)
             else:
                 file.unlink()
+        for file in (self.path / "arrived").glob(f"*{SUFFIX}"):
+            if whole(self.path / "records" / f"{file.stem}.json") is None:  # it will be trained again
+                file.unlink()
+            else:
+                self._take_state(file.stem)
+
+    def _take_state(self, key: str) -> None:
+        file = left_state(self.path, key)
+        try:
+            if file.exists():
+                file.replace(self.path / "states" / file.name)
+        except OSError as error:
+            raise storage_error(file, error, "move") from error
 
     def _move(self, file: Path, folder: str) -> None:
         target = make_folder(self.path / folder)
         number = len(list(target.glob(f"{file.stem}.*")))
         try:
-            file.replace(target / f"{file.stem}.{number}.json")
+            file.replace(target / f"{file.stem}.{number}{file.suffix}")
         except OSError as error:
             raise storage_error(file, error, "move") from error

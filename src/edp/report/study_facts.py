@@ -40,6 +40,7 @@ class PhaseFacts:
         trainings: that it asked for, and that no earlier phase had.
         trained: of these, those that have ended.
         failed: of these, those that did not end well.
+        pruned: of these, those that were ended at a rung.
         seconds: of training, summed over workers.
         wall_s: by the clock.
         began, ended: moments in ISO 8601; empty where it has not.
@@ -50,6 +51,7 @@ class PhaseFacts:
     trainings: int = 0
     trained: int = 0
     failed: int = 0
+    pruned: int = 0
     seconds: float = 0.0
     wall_s: float = 0.0
     began: str = ""
@@ -69,8 +71,8 @@ class Training:
     Attributes:
         phase: that asked for it.
         test: whether it was judged on the sessions set apart.
-        status: ``done``, or how it ended.
-        score: None where it failed.
+        status: ``done``, ``pruned``, or how it failed.
+        score: None where it was pruned or failed.
         seconds: that it took.
         parameters, macs_tick: None where they were not counted.
         label: what it was.
@@ -203,6 +205,7 @@ def _phase(held: Mapping[str, Any]) -> PhaseFacts:
         trainings=int(held["trainings"] or 0),
         trained=int(held["trained"] or 0),
         failed=int(held["failed"] or 0),
+        pruned=int(held.get("pruned") or 0),
         seconds=known(held["seconds"]) or 0.0,
         wall_s=known(held["wall_s"]) or 0.0,
         began=str(held["began"] or ""),

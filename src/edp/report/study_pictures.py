@@ -159,8 +159,8 @@ def _history(figure: Figure, views: Sequence[PhaseTrack], unit: str) -> None:
         axes.step(view.places, view.best, where="post", color=BLUE, lw=1.4)
         if place:
             axes.axvline(view.places[0] - 0.5, color=RULE, lw=1)
-    above, failed = outside(views, top)
-    for marks, symbol, word in ((above, "^", "above the scale"), (failed, "x", "failed")):
+    above, pruned, failed = outside(views, top)
+    for marks, symbol, word in ((above, "^", "above the scale"), (pruned, "_", "pruned"), (failed, "x", "failed")):
         if marks:
             axes.plot(
                 [place for place, _ in marks], [top] * len(marks), symbol, color=SOFT, ms=4, label=word, clip_on=False

@@ -242,8 +242,9 @@ def history_plot(views: Sequence[PhaseTrack], unit: str) -> Plot | None:
         )  # fmt: skip
         if place:
             figure.add_vline(x=view.places[0] - 0.5, line={"color": RULE, "width": 1.5})
-    above, failed = outside(views, top)
-    for marks, symbol, word in ((above, "triangle-up", "above the scale"), (failed, "x", "failed")):
+    above, pruned, failed = outside(views, top)
+    kinds = ((above, "triangle-up", "above the scale"), (pruned, "line-ew-open", "pruned"), (failed, "x", "failed"))
+    for marks, symbol, word in kinds:
         if marks:
             figure.add_scatter(
                 x=[number for number, _ in marks], y=[edge] * len(marks), mode="markers", name=word, cliponaxis=False,
@@ -258,16 +259,18 @@ def history_plot(views: Sequence[PhaseTrack], unit: str) -> Plot | None:
     return Plot("history", figure)
 
 
-def outside(views: Sequence[PhaseTrack], top: float) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
-    """Trainings above the scale, and those that failed: number and what they were."""
-    above, failed = [], []
+def outside(views: Sequence[PhaseTrack], top: float) -> tuple[list[tuple[int, str]], ...]:
+    """Trainings above the scale, those that were pruned, and those that failed: number and what they were."""
+    above, pruned, failed = [], [], []
     for view in views:
         for place, score, label in zip(view.places, view.scores, view.labels):
-            if not math.isfinite(score):
+            if place in view.pruned:
+                pruned.append((place, label))
+            elif not math.isfinite(score):
                 failed.append((place, label))
             elif score > top:
                 above.append((place, f"{label}: {score:.4g}"))
-    return above, failed
+    return above, pruned, failed
 
 
 def _inside(value: float, top: float) -> float | None:

@@ -222,10 +222,12 @@ def openings_sheet(study: StudyFacts) -> Sheet | None:
 def phases_sheet(study: StudyFacts) -> Sheet | None:
     """Trainings and time of each phase, and their sums."""
     rows: list[tuple[Value, ...]] = [
-        (p.heading, p.trainings, p.trained, p.failed, p.seconds, p.wall_s, _status(study, p.name)) for p in study.phases
+        (p.heading, p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s, _status(study, p.name))
+        for p in study.phases
     ]
     sums = (
-        sum(counts) for counts in zip(*((p.trainings, p.trained, p.failed, p.seconds, p.wall_s) for p in study.phases))
+        sum(counts)
+        for counts in zip(*((p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s) for p in study.phases))
     )
     if rows:
         rows.append(("All", *sums, None))
@@ -234,6 +236,7 @@ def phases_sheet(study: StudyFacts) -> Sheet | None:
         Column("Phase"),
         Column("Asked for", "trainings", count),
         Column("Ended", "trainings", count),
+        Column("Pruned", "trainings", count),
         Column("Failed", "trainings", count),
         Column("Training", "all workers", _time),
         Column("By the clock", "", _time),

@@ -290,9 +290,10 @@ class PhaseTrack:
     Attributes:
         name, heading: of the track.
         places: numbers of its trainings in the study, from 1.
-        scores: NaN where one failed.
+        scores: NaN where one was pruned or failed.
         labels: what each was.
         best: lowest score of the phase so far.
+        pruned: those of the places whose training was ended at a rung.
     """
 
     name: str
@@ -301,6 +302,7 @@ class PhaseTrack:
     scores: tuple[float, ...]
     labels: tuple[str, ...]
     best: tuple[float, ...]
+    pruned: frozenset[int] = frozenset()
 
 
 def tracks(study: StudyFacts) -> tuple[PhaseTrack, ...]:
@@ -315,7 +317,8 @@ def tracks(study: StudyFacts) -> tuple[PhaseTrack, ...]:
         heading += ", test sessions" if test else ""
         labels = tuple(f"{held.label}, {held.status}" for _, held in own)
         key = f"{name} test" if test else name
-        made.append(PhaseTrack(key, heading, tuple(p for p, _ in own), tuple(scores), labels, tuple(best.tolist())))
+        places, pruned = tuple(p for p, _ in own), frozenset(p for p, held in own if held.status == "pruned")
+        made.append(PhaseTrack(key, heading, places, tuple(scores), labels, tuple(best.tolist()), pruned))
     return tuple(made)
 
 

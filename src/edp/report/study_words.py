@@ -105,9 +105,11 @@ def _teacher(study: StudyFacts, facts: Mapping[str, Any]) -> str:
 
 def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what."""
-    failed = sum(held.status != "done" for held in study.history)
+    pruned = sum(held.status == "pruned" for held in study.history)
+    failed = sum(held.status not in ("done", "pruned") for held in study.history)
     trained = sum(phase.seconds for phase in study.phases)
-    made = [(whole(len(study.history)), "", "trainings" + (f", {failed} of them failed" if failed else ""))]
+    said = [f"{count} of them {what}" for count, what in ((pruned, "pruned"), (failed, "failed")) if count]
+    made = [(whole(len(study.history)), "", ", ".join(["trainings", *said]))]
     if trained:
         clock = duration(sum(phase.wall_s for phase in study.phases))
         value, _, unit = duration(trained).partition(" ")

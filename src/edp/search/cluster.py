@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import tempfile
 from collections import deque
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, LostError
-from edp.ledger import Record, Status, code_version
+from edp.ledger import Record, Status, code_version, left_state
 from edp.runs import environment
-from edp.search.executor import RETRIES, ClosedAtExit, Job, ended, refuse_twice
+from edp.search.executor import RETRIES, START, ClosedAtExit, Job, ended, refuse_twice
 from edp.search.local import LocalPool
+from edp.storage import write_bytes
 
 NAMESPACE = "edp"
 HOUR_S = 3600.0
@@ -62,8 +65,12 @@ class RayPool(ClosedAtExit):
         """Take a job; see `Executor.submit`."""
         refuse_twice(job, self._jobs)
         self._jobs[job.key] = job
-        # The ledger may not be reachable from a node, and only the coordinator writes it.
-        reference = self._function.options(name=job.key).remote(replace(job, folder=None), self.threads)
+        # The ledger may not be reachable from a node, and only the coordinator writes it: states travel with the job.
+        where = dict(job.where)
+        file = Path(where.pop(START)) if START in where else None
+        start = None if file is None else (file.name, file.read_bytes())
+        sent = replace(job, folder=None, where=where)
+        reference = self._function.options(name=job.key).remote(sent, self.threads, start)
         self._refs[reference] = job.key
 
     def running(self) -> list[str]:
@@ -103,7 +110,10 @@ class RayPool(ClosedAtExit):
         job = self._jobs[self._refs.pop(reference)]
         errors = self.ray.exceptions
         try:
-            record = Record.from_bytes(self.ray.get(reference))
+            data, state = self.ray.get(reference)
+            record = Record.from_bytes(data)
+            if state is not None and job.folder is not None:
+                write_bytes(left_state(job.folder, job.key), state)
         except errors.OutOfMemoryError as error:
             record = ended(job, Status.OOM, f"the node was out of memory: {_line(error)}")
         except (errors.WorkerCrashedError, errors.NodeDiedError, errors.ObjectLostError) as error:
@@ -146,19 +156,35 @@ class RayPool(ClosedAtExit):
             raise ConfigError("no node of the cluster answers; start one, then give the same command again")
 
 
-def _perform_there(job: Job, threads: int) -> bytes:
-    """Do a training in a process of Ray on some node: through a pool of one, whose process stays for the next."""
+def _perform_there(job: Job, threads: int, start: tuple[str, bytes] | None) -> tuple[bytes, bytes | None]:
+    """Do a training in a process of Ray on some node: through a pool of one, whose process stays for the next.
+
+    Args:
+        job: to do.
+        threads: of it.
+        start: name and content of the file of the state that it goes on from.
+
+    Returns:
+        The record, and the file of the state that it left, both as they are in a ledger.
+    """
     pool = _pool.get(threads)
     if pool is None:
         pool = _pool[threads] = LocalPool(1, threads)
-    pool.submit(job)
-    try:
-        record = pool.wait_any()
-    finally:
-        pool.cancel(job.key)
-    if record is None:
-        raise RuntimeError("the pool of a node gave a training up without a word")
-    return record.to_bytes()
+    with tempfile.TemporaryDirectory(prefix="edp-training-") as folder:  # stands for the ledger
+        where = dict(job.where)
+        if start is not None:
+            file = Path(folder, start[0])
+            file.write_bytes(start[1])
+            where[START] = str(file)
+        pool.submit(replace(job, folder=folder, where=where))
+        try:
+            record = pool.wait_any()
+        finally:
+            pool.cancel(job.key)
+        if record is None:
+            raise RuntimeError("the pool of a node gave a training up without a word")
+        left = left_state(folder, job.key)
+        return record.to_bytes(), left.read_bytes() if left.exists() else None
 
 
 def _state_there(threads: int) -> dict[str, str]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from edp.config import Table
 from edp.errors import StorageError
-from edp.ledger import Opening, Record
+from edp.ledger import Opening, Record, digest_of
 from edp.report import read_study
 from edp.search.ground import Decision, Ground, Outcome
 from edp.search.modules import MODULES
@@ -26,7 +26,8 @@ class Diary:
     """Writes down what happens, at most every two seconds but for decisions and the end.
 
     Rows of trainings stand in the order in which they were asked for, whatever order they ended in, so that a search
-    that was stopped and went on writes what one that was not would have written, times apart.
+    that was stopped and went on writes what one that was not would have written, times apart. A training
+    that is done in parts is one row; one whose next part is not asked for with the others of its batch was pruned.
 
     Args:
         folder: of the study.
@@ -51,6 +52,10 @@ class Diary:
         self.openings: list[Opening] = []
         self.trained = 0
         self.workers = 1
+        self._row_of: dict[str, str] = {}
+        self._paused: dict[str, None] = {}
+        self._now: set[str] = set()
+        self._heard: set[str] = set()
         self._expected = {name: phase.trainings(ground) for name, phase in PHASES.items()}
         self._seconds = 0.0
         self._phase_began = 0.0
@@ -71,6 +76,7 @@ class Diary:
             "trainings": 0,
             "trained": 0,
             "failed": 0,
+            "pruned": 0,
             "seconds": 0.0,
             "wall_s": 0.0,
             "began": held.get("began", _now()),
@@ -83,24 +89,27 @@ class Diary:
     def on_orders(self, keys: Sequence[str], orders: Sequence[Order]) -> None:
         """A batch of trainings is asked for; those that were asked for before are no new ones."""
         phase = self._phase
+        self._row_of = {key: digest_of(order.whole.to_json()) for key, order in zip(keys, orders, strict=True)}
+        self._end_paused(self._row_of.values())
         for key, order in zip(keys, orders, strict=True):
-            if key not in self.rows:
+            if self._row_of[key] not in self.rows:
                 phase["trainings"] += 1
-                label = label_of(order.settings)
-                self.rows[key] = {"phase": phase["name"], "number": len(self.rows), "label": label, "status": "waiting"}
+                row = {"phase": phase["name"], "number": len(self.rows), "label": label_of(order.settings)}
+                self.rows[self._row_of[key]] = row | {"status": "waiting", "seconds": 0.0}
 
     def on_record(self, record: Record, order: Order, trained: bool) -> None:
-        """A training is in the ledger."""
-        row = self.rows[record.key]
-        if row["status"] != "waiting":
+        """A training, or a part of one, is in the ledger."""
+        if record.key in self._heard:
             return
+        self._heard.add(record.key)
+        which = self._row_of[record.key]
+        row = self.rows[which]
         outcome = Outcome(order, str(record.status), record.result, record.message)
         score, result = outcome.mean(self.horizon), record.result or {}
         seconds = float(record.measured.get("seconds", 0.0))
         row |= {
-            "status": outcome.status,
             "score": score if score == score else None,
-            "seconds": round(seconds, 3),
+            "seconds": round(row["seconds"] + seconds, 3),
             "parameters": result.get("parameters"),
             "macs_tick": result.get("macs_tick"),
         }
@@ -108,16 +117,46 @@ class Diary:
             row["message"] = record.message
         phase = self.phases[row["phase"]]
         phase["seconds"] = round(phase["seconds"] + seconds, 3)
-        phase["trained"] += 1
-        phase["failed"] += outcome.status != "done"
         if trained:
-            self.trained += 1
+            self._now.add(which)
             self._seconds += seconds
+        if order.until is None or outcome.status != "done":
+            self._paused.pop(which, None)
+            self._end_row(which, outcome.status)
+        elif row["status"] == "waiting":
+            self._paused[which] = None
+            row["rung"] = order.until
         self.write()
+
+    def _end_row(self, which: str, status: str) -> None:
+        """A training is over; one that was pruned may be asked for again, and trained to its end."""
+        row = self.rows[which]
+        phase = self.phases[row["phase"]]
+        if row["status"] == "pruned":
+            phase["pruned"] -= 1
+        else:
+            phase["trained"] += 1
+        phase["pruned"] += status == "pruned"
+        phase["failed"] += status not in ("done", "pruned")
+        row["status"] = status
+        if status == "pruned":
+            row["score"] = None  # that of a rung is not to be held against those of whole trainings
+        else:
+            row.pop("rung", None)
+        if which in self._now:
+            self._now.discard(which)
+            self.trained += 1
+
+    def _end_paused(self, going_on: Collection[str]) -> None:
+        """What was judged at a rung and is not among what goes on was pruned."""
+        for which in [one for one in self._paused if one not in going_on]:
+            del self._paused[which]
+            self._end_row(which, "pruned")
 
     def on_decision(self, decision: Decision) -> None:
         """A phase ends."""
         phase, held = self._phase, self._before.get(decision.phase, {})
+        self._end_paused(())
         spent = time.monotonic() - self._phase_began
         phase["wall_s"] = round(max(spent, float(held.get("wall_s", 0.0))), 1)
         phase["ended"] = held.get("ended") or _now()

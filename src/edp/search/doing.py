@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from edp.ledger import Ledger, Record
+from edp.ledger import FINAL, Ledger, Record
 from edp.search.batch import complete
-from edp.search.executor import Executor
+from edp.search.executor import START, Executor, Job
 from edp.search.ground import Outcome
 from edp.search.jobs import job_of
 from edp.search.trainings import Order
@@ -38,10 +38,31 @@ class Doing:
     on_orders: Callable[[list[str], list[Order]], None] | None = None
 
     def __call__(self, orders: list[Order]) -> list[Outcome]:
-        """Outcomes in the order of the orders; equal orders are done once."""
-        jobs = [job_of(order, self.data, self.threads, self.seconds, self.memory_mb) for order in orders]
+        """Outcomes in the order of the orders; equal orders are done once.
+
+        Parts of trainings go on from the latest part before them whose state is still there. Once a batch is trained,
+        states of other batches are not needed any more and removed.
+        """
+        jobs = [self._job(order) for order in orders]
         if self.on_orders is not None:
             self.on_orders([job.key for job in jobs], orders)
-        found = complete(self.ledger, self.executor, jobs, self.on_record)
+        new = any(self.ledger.finished(job.key) is None for job in jobs)
+        found = complete(self.ledger, self.executor, [self._begun(*pair) for pair in zip(jobs, orders)], self.on_record)
+        # A search that goes on comes by earlier batches first, and one that stops here needs what it had.
+        if new and all(record.status in FINAL for record in found.values()):
+            self.ledger.keep_states([job.key for job in jobs])
         records = [found[job.key] for job in jobs]
         return [Outcome(o, str(r.status), r.result, r.message) for o, r in zip(orders, records)]
+
+    def _job(self, order: Order) -> Job:
+        return job_of(order, self.data, self.threads, self.seconds, self.memory_mb)
+
+    def _begun(self, job: Job, order: Order) -> Job:
+        """The job with the state from which it goes on, where there is one."""
+        if self.ledger.finished(job.key):
+            return job
+        for stop in reversed(order.stops):
+            file = self.ledger.state(self._job(replace(order, until=stop, stops=())).key)
+            if file is not None:
+                return replace(job, where={**job.where, START: str(file)})
+        return job

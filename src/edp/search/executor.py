@@ -10,6 +10,7 @@ from typing import Any, Protocol, Self
 from edp.errors import ConfigError
 from edp.ledger import Identity, Record, Status
 
+START = "start"
 RETRIES = 2
 """How often a training whose process was killed starts again before it counts as lost."""
 
@@ -18,15 +19,16 @@ RETRIES = 2
 class Job:
     """A training to be done.
 
-    The function ``identity.job`` is called as ``function(identity, where)`` and returns plain values. What decides its
-    result is in `identity`, so that its key covers it.
+    The function ``identity.job`` is called as ``function(identity, where)`` and returns plain values, or these with a
+    state (`edp.ledger.WithState`). What decides its result is in `identity`, so that its key covers it.
 
     Attributes:
         identity: what to train.
-        where: what the function needs and the result does not depend on, such as where the recordings lie.
+        where: what the function needs and the result does not depend on, such as where the recordings lie. Under
+            `START` the file of a state that it may go on from (`edp.ledger.read_state`).
         seconds: cap on its time, from the call of the function on.
         memory_mb: cap on the memory of its process.
-        folder: of the ledger; where given, the process claims the training there and leaves its record.
+        folder: of the ledger; where given, the process claims the training there and leaves its record, and its state.
     """
 
     identity: Identity

@@ -10,10 +10,10 @@ from edp.errors import StorageError
 from edp.report import read_study
 from edp.search.plan import space_of
 from edp.search.space import Choice, Range, Space
-from edp.search.study import Told, write_journal
+from edp.search.study import Told, ToldTrial, write_journal
 
 JOURNAL = "optuna.journal"
-NO_VALUES = ("number", "values", "modules", "score", "statuses")
+NO_VALUES = ("number", "values", "modules", "score", "statuses", "rungs", "pruned")
 
 
 def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Path, list[str]]:
@@ -67,5 +67,7 @@ def _told(
         values = dict(trial["values"]) | {module: int(module in trial.get("modules", ())) for module in modules}
         found = trial["score"]
         answer = None if found is None else [found] if cost == "none" else [found, trial[cost]]
-        rows.append((values, answer, {key: value for key, value in trial.items() if key not in NO_VALUES}))
+        known = {key: value for key, value in trial.items() if key not in NO_VALUES}
+        reports = {int(step): float(value) for step, value in trial.get("rungs", ())}
+        rows.append(ToldTrial(values, answer, known, reports, bool(trial.get("pruned"))))
     return Told(name, full, rows, objectives)

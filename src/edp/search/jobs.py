@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from edp.ledger import Identity, code_version
+from edp.ledger import Identity, WithState, code_version, read_state
 from edp.runs import environment
-from edp.search.executor import Job
-from edp.search.trainings import Order, experiment_of, train_order
+from edp.search.executor import START, Job
+from edp.search.trainings import Order, experiment_of, train_part
 
 
 def job_of(
@@ -29,6 +29,8 @@ def job_of(
     """
     settings = {**order.settings, "training": {**order.settings.get("training", {}), "threads": threads}}
     config: dict[str, Any] = {"settings": settings, "updates": order.updates}
+    if order.until is not None:
+        config["until"] = order.until
     if settings.get("model", {}).get("physics"):
         physics = experiment_of(order).model.physics
         config["machine"] = None if physics is None else physics.digest()  # its file may change, and its name stays
@@ -48,13 +50,15 @@ def job_of(
 _environment = cache(environment)  # looking up versions takes as long as a record
 
 
-def train(identity: Identity, where: Mapping[str, Any]) -> dict[str, Any]:
+def train(identity: Identity, where: Mapping[str, Any]) -> dict[str, Any] | WithState:
     """Do the order; what differs from repeat to repeat is left to the record's measures.
 
+    Where the file of a state cannot be read any more, it is trained from the beginning.
+
     Raises:
-        EdpError: as `edp.search.trainings.train_order`.
+        EdpError: as `edp.search.trainings.train_part`.
     """
     plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
-    found = train_order(plain)
+    found, state = train_part(plain, read_state(where[START]) if START in where else None)
     del found["seconds"]
-    return found
+    return found if state is None else WithState(found, state)

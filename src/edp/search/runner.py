@@ -166,12 +166,9 @@ def run_search(
         state = "stopped"
         try:
             ground = conduct(
-                ground,
-                lambda orders: _whole(doing(orders)),
-                until,
-                on_decision=work.on_decision,
-                on_phase=work.on_phase,
+                ground, lambda orders: _whole(doing(orders)), until, work.on_decision, on_phase=work.on_phase
             )
+            ledger.keep_states(())
             state = "finished" if len(ground.decided) == len(PHASES) else "stopped"
         finally:
             diary.openings = ledger.openings()

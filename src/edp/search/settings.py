@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 from edp.config import FeatureSettings, plain_tree
 from edp.errors import ConfigError
 from edp.search.space import ELASTIC, THESIS, Space
-from edp.search.study import SamplerSpec
+from edp.search.study import PRUNERS, SamplerSpec
 
 MODES = ("sound", "thesis")
 COSTS = ("parameters", "macs_tick")
@@ -49,6 +50,9 @@ class SearchSpec:
         space: dimensions and ranges of phase 1.
         elastic: reach of the window around the baseline in later phases.
         sampler: how questions are chosen.
+        rungs: shares of the steps at which a question of phases 1, 4 and 5 is judged before its end; none without any.
+        pruner: which questions end at a rung: ``none``, or ``median``: those worse than the median of the questions of
+            earlier batches, once five of them were trained to the end (Optuna's median rule with its defaults).
         cost: ``none``, or a cost that is made small beside the score in phases 1, 4 and 5: a Pareto front comes out.
         limits: the most that a cost may be; what exceeds it is not trained.
 
@@ -86,6 +90,8 @@ class SearchSpec:
     space: Space = field(default_factory=lambda: dict(THESIS))
     elastic: dict[str, float] = field(default_factory=lambda: dict(ELASTIC))
     sampler: SamplerSpec = field(default_factory=SamplerSpec)
+    rungs: tuple[float, ...] = ()
+    pruner: str = "none"
     cost: str = "none"
     limits: dict[str, float] = field(default_factory=dict)
 
@@ -100,6 +106,7 @@ class SearchSpec:
             wrong.append(f"mode = '{self.mode}' ({' or '.join(MODES)})")
         if self.cost not in ("none", *COSTS):
             wrong.append(f"cost = '{self.cost}' (none, {' or '.join(COSTS)})")
+        wrong += self._wrong_rungs()
         wrong += [f"limits.{name} ({' or '.join(COSTS)})" for name in self.limits if name not in COSTS]
         wrong += [f"limits.{name} = {most} (above 0)" for name, most in self.limits.items() if not most > 0]
         if self.folds < 2 or self.variance_runs < 2 * self.folds or self.variance_runs % self.folds:
@@ -124,6 +131,27 @@ class SearchSpec:
             held if isinstance(held, str) else held.name: held if isinstance(held, str) else plain_tree(held)
             for held in self.features
         }
+
+    @property
+    def stops(self) -> tuple[int, ...]:
+        """The rungs as steps of a training; those that are the same step count once."""
+        steps = sorted({max(1, round(share * self.updates)) for share in self.rungs})
+        return tuple(step for step in steps if step < self.updates)
+
+    def _wrong_rungs(self) -> list[str]:
+        wrong = []
+        if any(not 0 < share < 1 for share in self.rungs) or any(a >= b for a, b in pairwise(self.rungs)):
+            wrong.append(f"rungs = {list(self.rungs)} (shares between 0 and 1, each above the one before)")
+        if self.pruner not in PRUNERS:
+            wrong.append(f"pruner = '{self.pruner}' ({' or '.join(PRUNERS)})")
+        elif self.pruner != "none" and not self.rungs:
+            wrong.append(f"pruner = '{self.pruner}' with rungs = [] (at least one rung, such as rungs = [0.25, 0.5])")
+        if self.pruner != "none" and self.cost != "none":
+            wrong.append(
+                f"pruner = '{self.pruner}' with cost = '{self.cost}' (one of them 'none': the rule knows one score and "
+                "would end the cheap ones of a front; a cost can be held by limits instead)"
+            )
+        return wrong
 
     def _shares(self) -> list[tuple[str, float]]:
         names = ("test_share", "least_effect", "power", "alpha")

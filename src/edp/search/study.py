@@ -77,6 +77,8 @@ class Study:
         flags: switches that may be on or off.
         barred: sets of switches that cannot be on together: of each the later one in `flags` is switched off.
         objectives: how many values are told.
+        pruner: ``none``, or ``median``, which says of a reported trial whether it is worse than the median of those
+            that were told before, at the same step; only with one objective.
         bounds: how many costs are told that must not exceed zero; a trial that exceeds may be told by its costs alone,
             so that what cannot be used need not be trained. With bounds TPE stands in for the Gaussian process.
         options: further dimensions of a switch, asked where it is on.
@@ -89,6 +91,7 @@ class Study:
     barred: frozenset[frozenset[str]] = frozenset()
     objectives: int = 1
     bounds: int = 0
+    pruner: str = "none"
     options: Mapping[str, Mapping[str, Choice]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -97,16 +100,22 @@ class Study:
         both = sorted(set(self.flags) & set(self.space))
         if both:
             raise ConfigError(f"study: {', '.join(both)} would be a dimension and a switch; rename one of them")
+        if self.pruner != "none" and self.objectives > 1:
+            raise ConfigError(
+                f"study: pruner '{self.pruner}' with {self.objectives} objectives; one of them, or no pruner, must hold"
+            )
         logging.getLogger("optuna").setLevel(logging.ERROR)
         self._study = optuna.create_study(
-            directions=["minimize"] * self.objectives, sampler=optuna.samplers.RandomSampler(seed=0)
+            directions=["minimize"] * self.objectives,
+            sampler=optuna.samplers.RandomSampler(seed=0),
+            pruner=PRUNERS[self.pruner](),
         )
         self._distributions = {name: _distribution(self.space[name]) for name in names(self.space)} | {
             name: _distribution(Choice((0, 1))) for name in self.flags
         }
         self._open: dict[int, optuna.Trial] = {}
         self._told = 0
-        self._waiting: dict[int, tuple[Sequence[float] | None, Sequence[float]]] = {}
+        self._waiting: dict[int, tuple[Sequence[float] | None, Sequence[float], bool]] = {}
 
     def suggest(self, values: Candidate, flags: Sequence[str] | None = None, options: Candidate | None = None) -> None:
         """Have this asked next: a warm start. What is not given, the sampler chooses.
@@ -164,35 +173,60 @@ class Study:
                 kept = (*kept, name)
         return kept
 
-    def tell(self, number: int, values: Sequence[float] | None, costs: Sequence[float] = ()) -> None:
+    def report(self, number: int, step: int, value: float) -> None:
+        """What a question that is not answered yet gives at a step of its training.
+
+        Raises:
+            ConfigError: a question that was not asked, a value that is not finite, or several objectives.
+        """
+        if number not in self._open or number in self._waiting:
+            raise ConfigError(f"study: trial {number} was not asked, or was told before; report before you tell")
+        if self.objectives > 1 or not math.isfinite(value):
+            raise ConfigError(
+                f"study: trial {number} reports {value} at step {step} of a study with {self.objectives} objectives; a "
+                "finite value and one objective must hold"
+            )
+        self._open[number].report(value, step)
+
+    def hopeless(self, number: int) -> bool:
+        """Whether the pruner would end a question after its last report, by what was told of earlier ones."""
+        return self.pruner != "none" and bool(self._open[number].should_prune())  # NumPy's would not be plain
+
+    def tell(
+        self, number: int, values: Sequence[float] | None, costs: Sequence[float] = (), pruned: bool = False
+    ) -> None:
         """What a question gave; told in any order, it counts in the order of numbers.
 
         Args:
             number: of the trial.
             values: of the objectives; None where the training failed, diverged or was not done.
             costs: each at most 0 where its bound is kept.
+            pruned: it was ended after its last report; it has no values.
 
         Raises:
-            ConfigError: a question that was not asked, a value that is not finite, or another count of them.
+            ConfigError: a question that was not asked, a value that is not finite, another count of them, or values of
+                one that was pruned.
         """
         if number not in self._open and number not in self._waiting:
             raise ConfigError(f"study: trial {number} was not asked, or was told before; tell each once")
+        if pruned and values is not None:
+            raise ConfigError(f"study: trial {number} is told as pruned, with values {list(values)}; none must hold")
         for what, wanted, given in (("values", self.objectives, values), ("costs", self.bounds, costs)):
             if given is not None and (len(given) != wanted or not all(map(math.isfinite, given))):
                 raise ConfigError(f"study: trial {number} is told {what} {list(given)}; {wanted} finite ones must hold")
-        self._waiting[number] = (values, costs)
+        self._waiting[number] = (values, costs, pruned)
         while self._told in self._waiting:
             self._pass_on(self._told, *self._waiting.pop(self._told))
             self._told += 1
 
-    def _pass_on(self, number: int, values: Sequence[float] | None, costs: Sequence[float]) -> None:
+    def _pass_on(self, number: int, values: Sequence[float] | None, costs: Sequence[float], pruned: bool) -> None:
         from optuna.trial import TrialState
 
         trial = self._open.pop(number)
         for place, cost in enumerate(costs):
             trial.set_constraint(f"bound {place}", cost)
         if values is None:  # Never as infinity: a sampler would model the wall.
-            beyond = any(cost > 0 for cost in costs)
+            beyond = pruned or any(cost > 0 for cost in costs)
             self._study.tell(trial, state=TrialState.PRUNED if beyond else TrialState.FAIL)
         else:
             self._study.tell(trial, list(values))
@@ -244,6 +278,22 @@ SAMPLERS: dict[str, Callable[[int, int], Any]] = {
 }
 
 
+def _no_pruner() -> Any:
+    from optuna.pruners import NopPruner
+
+    return NopPruner()
+
+
+def _median() -> Any:
+    """Optuna's defaults: after five whole trials; the first rung is the warm-up."""
+    from optuna.pruners import MedianPruner
+
+    return MedianPruner()
+
+
+PRUNERS: dict[str, Callable[[], Any]] = {"none": _no_pruner, "median": _median}
+
+
 def _distribution(held: Range) -> Any:
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
@@ -255,20 +305,38 @@ def _distribution(held: Range) -> Any:
 
 
 @dataclass(frozen=True)
+class ToldTrial:
+    """A question of a study that is over.
+
+    Attributes:
+        values: of its dimensions.
+        objectives: None where it was not trained to its end.
+        known: what else is known of it.
+        reports: values at steps before the end.
+        pruned: whether it was ended at the last of them.
+    """
+
+    values: Candidate
+    objectives: Sequence[float] | None
+    known: dict[str, Any]
+    reports: dict[int, float] = field(default_factory=dict)
+    pruned: bool = False
+
+
+@dataclass(frozen=True)
 class Told:
     """A study that is over: what was asked and what came of it, for a viewer.
 
     Attributes:
         name: of the study.
         space: dimensions and their ranges.
-        rows: of each question the values of its dimensions, its objectives (None where it was not trained to its end),
-            and what else is known of it.
+        rows: its questions.
         objectives: names of what was made small.
     """
 
     name: str
     space: Space
-    rows: Sequence[tuple[Candidate, Sequence[float] | None, dict[str, Any]]]
+    rows: Sequence[ToldTrial]
     objectives: tuple[str, ...]
 
 
@@ -288,45 +356,34 @@ def write_journal(path: str | Path, studies: Sequence[Told]) -> None:
             directions: list[Any] = ["minimize"] * len(held.objectives)
             study = optuna.create_study(storage=storage, study_name=held.name, directions=directions)
             study.set_user_attr("objectives", list(held.objectives))
-            study.add_trials([_frozen(held.space, *row) for row in held.rows])
+            study.add_trials([_frozen(held.space, row) for row in held.rows])
 
 
-def _frozen(
-    space: Space, values: Candidate, objectives: Sequence[float] | None, known: dict[str, Any]
-) -> optuna.trial.FrozenTrial:
+def _frozen(space: Space, row: ToldTrial) -> optuna.trial.FrozenTrial:
     from optuna.trial import TrialState, create_trial
 
+    answer, state = row.objectives, TrialState.FAIL if row.objectives is None else TrialState.COMPLETE
+    if row.pruned:  # Optuna, too, gives it the last value that it reported
+        answer, state = [row.reports[max(row.reports)]], TrialState.PRUNED
     return create_trial(
-        state=TrialState.FAIL if objectives is None else TrialState.COMPLETE,
-        values=None if objectives is None else list(objectives),
-        params=dict(values),
-        distributions={name: _distribution(space[name]) for name in values},
-        user_attrs=known,
+        state=state,
+        values=None if answer is None else list(answer),
+        params=dict(row.values),
+        distributions={name: _distribution(space[name]) for name in row.values},
+        user_attrs=row.known,
+        intermediate_values=row.reports,
     )
 
 
-def pareto(points: Sequence[Sequence[float]]) -> list[int]:
-    """Places of the points that no other one betters in one value without being worse in another, in order."""
-    kept = []
-    for place, point in enumerate(points):
-        better = (
-            all(a <= b for a, b in zip(other, point, strict=True))
-            and any(a < b for a, b in zip(other, point, strict=True))
-            for other in points
-        )
-        if not any(better):
-            kept.append(place)
-    return kept
-
-
 __all__ = [
+    "PRUNERS",
     "SAMPLERS",
     "Candidate",
     "SamplerSpec",
     "Study",
     "Told",
+    "ToldTrial",
     "Trial",
     "Value",
-    "pareto",
     "write_journal",
 ]

@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 from edp.config import Experiment, Table, build, plain_tree
@@ -18,8 +19,8 @@ from edp.evaluation.judge import JudgeSpec, judge
 from edp.models.predictor import build_model
 from edp.recording import Recording
 from edp.sources import DataSource
-from edp.training import fit
 from edp.training.bundle import blank_scaler
+from edp.training.parts import fit_part
 
 SCORES = ("mae", "rmse", "p95", "p99", "composite")
 
@@ -35,6 +36,9 @@ class Order:
         judged: names of the sessions that judge; none of them trains or chooses anything.
         seed: root of every random choice of the training.
         updates: training steps; there is no early stop, so that no session that judges has a say.
+        until: the step after which this part of the training ends and is judged; None for the end. A part goes on to
+            the same bits as a training without a stop.
+        stops: steps at which earlier parts may have ended; they decide nothing, and are not part of a key.
     """
 
     settings: Table
@@ -43,6 +47,8 @@ class Order:
     judged: tuple[str, ...]
     seed: int
     updates: int
+    until: int | None = None
+    stops: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         both = sorted(set(self.train) & set(self.judged))
@@ -54,6 +60,17 @@ class Order:
             )
         if self.updates < 1:
             raise ConfigError(f"order: updates = {self.updates}; at least 1 must hold")
+        steps = [*self.stops, self.updates if self.until is None else self.until]
+        if steps[0] < 1 or any(a >= b for a, b in pairwise(steps)) or (self.until or 0) >= self.updates:
+            raise ConfigError(
+                f"order: stops {list(self.stops)} and an end at {self.until} of {self.updates} updates; steps from 1 "
+                "on, each after the one before and all before the last, must hold"
+            )
+
+    @property
+    def whole(self) -> Order:
+        """The training that this is a part of."""
+        return replace(self, until=None, stops=())
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, from which `from_json` makes the same order."""
@@ -64,6 +81,8 @@ class Order:
             "judged": list(self.judged),
             "seed": self.seed,
             "updates": self.updates,
+            "until": self.until,
+            "stops": list(self.stops),
         }
 
     @staticmethod
@@ -76,15 +95,30 @@ class Order:
             tuple(plain["judged"]),
             plain["seed"],
             plain["updates"],
+            plain.get("until"),
+            tuple(plain.get("stops", ())),
         )
 
 
 def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """Train and judge an order given as plain values.
+    """Train and judge an order given as plain values; see `train_part`.
 
     Returns:
         ``sessions``: for each judging session its scores at each horizon, report units, mean over targets;
         ``scores``: their means over sessions; ``parameters``, ``macs_tick``; ``seconds``; ``train_loss``.
+    """
+    return train_part(plain)[0]
+
+
+def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[dict[str, Any], bytes | None]:
+    """Train and judge an order, which may be a part of a training.
+
+    Args:
+        plain: of `Order.to_json`.
+        start: what an earlier part left; it saves the time to come there, and changes nothing else.
+
+    Returns:
+        What `train_order` returns, and what the next part goes on from; None at the end of the training.
 
     Raises:
         ConfigError: settings that contradict one another or the data.
@@ -95,7 +129,7 @@ def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     experiment = experiment_of(order)
     data = _prepared(order, experiment)
-    fitted = fit(data, experiment.model, experiment.training)
+    fitted, state = fit_part(data, experiment.model, experiment.training, order.until, start)
     spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
     found = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
     sessions = {
@@ -103,7 +137,7 @@ def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
         for name, horizons in found.items()
     }
     counted = footprint(fitted.predictor)
-    return {
+    result = {
         "sessions": sessions,
         "scores": mean_scores(sessions),
         "parameters": counted.parameters,
@@ -111,6 +145,7 @@ def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
         "train_loss": fitted.history[-1]["train_loss"],
         "seconds": round(time.perf_counter() - began, 3),
     }
+    return result, state
 
 
 def experiment_of(order: Order) -> Experiment:

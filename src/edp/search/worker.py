@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from edp.errors import BusyError, ConfigError, EdpError, NotFiniteError, StorageError
-from edp.ledger import Identity, Record, Status, canonical, claim, known, leave_arrival
+from edp.ledger import Identity, Record, Status, WithState, canonical, claim, known, leave_arrival, leave_state
 
 PR_SET_PDEATHSIG = 1
 CLAIM_WAIT_S = 10.0
@@ -36,7 +36,7 @@ def perform(identity: Identity, where: Mapping[str, Any], folder: str | None, be
     Args:
         identity: what to train.
         where: see `edp.search.executor.Job`.
-        folder: of the ledger, to claim the training and leave its record.
+        folder: of the ledger, to claim the training and leave its state and its record.
         begun: called before the function of the training.
     """
     with contextlib.ExitStack() as stack:
@@ -48,8 +48,13 @@ def perform(identity: Identity, where: Mapping[str, Any], folder: str | None, be
             before = known(folder, identity.key)
             if before is not None:
                 return before
-        record = _end_of(identity, where, begun)
+        record, state = _end_of(identity, where, begun)
         if folder is not None:
+            try:
+                if state is not None:  # first: a record without it would have its successor begin anew
+                    leave_state(folder, identity.key, state)
+            except StorageError as error:
+                return Record(identity, Status.LOST, None, str(error))
             with contextlib.suppress(StorageError):  # a full disk: the coordinator meets it, too, and says so
                 leave_arrival(folder, record)
         return record
@@ -66,17 +71,19 @@ def _claimed(folder: str, key: str) -> Any:
             time.sleep(0.05)
 
 
-def _end_of(identity: Identity, where: Mapping[str, Any], begun: Callable[[], None]) -> Record:
+def _end_of(identity: Identity, where: Mapping[str, Any], begun: Callable[[], None]) -> tuple[Record, bytes | None]:
     started = time.monotonic()
-    status, result, message, trace = Status.DONE, None, "", ""
+    status, result, message, trace, state = Status.DONE, None, "", "", None
     try:
         function = resolve(identity.job)
         begun()
         started = time.monotonic()
-        result = function(identity, where)
+        given = function(identity, where)
+        result = given.result if isinstance(given, WithState) else given
         if not isinstance(result, Mapping):
             raise ConfigError(f"'{identity.job}' returned {type(result).__name__}; a training returns a table")
         canonical(result)
+        state = given.state if isinstance(given, WithState) else None
     except NotFiniteError as error:
         status, result, message = Status.DIVERGED, None, str(error)
     except EdpError as error:
@@ -91,7 +98,8 @@ def _end_of(identity: Identity, where: Mapping[str, Any], begun: Callable[[], No
         "host": os.uname().nodename,
         "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
-    return Record(identity, status, result, message, measured | ({"trace": trace} if trace else {}))
+    record = Record(identity, status, result, message, measured | ({"trace": trace} if trace else {}))
+    return record, state
 
 
 def resolve(name: str) -> Callable[[Identity, Mapping[str, Any]], Any]:

@@ -1,7 +1,9 @@
 """A real Ray cluster of three nodes on this machine: the same study, the same result, with a node killed meanwhile."""
 
 import contextlib
+import dataclasses
 import os
+import pickle
 import secrets
 import shutil
 import signal
@@ -11,12 +13,16 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+import edp.search.cluster
 from edp.errors import ConfigError
-from edp.ledger import Ledger, Status
+from edp.ledger import Ledger, Status, read_state
 from edp.search.batch import complete
+from edp.search.cluster import RayPool
+from edp.search.executor import START
 from edp.search.local import LocalPool
 from edp.search.plan import load_plan
 from edp.search.runner import Crew, Watchers, run_search
@@ -125,8 +131,6 @@ def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_fi
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_caps_failures_and_cancelling_are_those_of_the_local_pool(cluster, job_of, tmp_path):
-    from edp.search.cluster import RayPool
-
     jobs = [job_of(0), job_of(1, "raises", how="error"), job_of(2, seconds=1.0, sleep=60)]
     with RayPool(cluster.address) as pool, Ledger(tmp_path / "ledger") as ledger:
         found = [str(record.status) for record in complete(ledger, pool, jobs).values()]
@@ -156,3 +160,75 @@ def test_workers_of_two_kinds_are_refused():
     with pytest.raises(ConfigError, match="give one of the two"):
         Crew(cluster="auto", workers=2)
     assert isinstance(Crew(workers=1).gather(), LocalPool)
+
+
+class OneNode:
+    """Stands for Ray: does what is sent on the spot, and only what was pickled arrives."""
+
+    exceptions = SimpleNamespace(
+        **{name: type(name, (Exception,), {}) for name in ("OutOfMemoryError", "WorkerCrashedError", "NodeDiedError")},
+        **{name: type(name, (Exception,), {}) for name in ("ObjectLostError", "RaySystemError")},
+    )
+
+    def __init__(self):
+        self.sent, self.results = [], {}
+
+    def remote(self, **_):
+        def send(function, *arguments):
+            self.sent.append(pickle.dumps(arguments))
+            self.results[len(self.sent)] = function(*pickle.loads(self.sent[-1]))
+            return len(self.sent)
+
+        def wrap(function):
+            call = SimpleNamespace(remote=lambda *arguments: send(function, *arguments))
+            return SimpleNamespace(options=lambda name: call)
+
+        return wrap
+
+    def wait(self, references, num_returns, timeout):
+        return references[:num_returns], references[num_returns:]
+
+    def get(self, reference):
+        return self.results.pop(reference)
+
+    def cancel(self, reference, force):
+        self.results.pop(reference, None)
+
+    def shutdown(self):
+        for pool in edp.search.cluster._pool.values():
+            pool.close()
+        edp.search.cluster._pool.clear()
+
+
+@pytest.fixture
+def node(monkeypatch):
+    one = OneNode()
+    monkeypatch.setattr(edp.search.cluster, "_ray", lambda: one)
+    monkeypatch.setattr(edp.search.cluster, "_reach", lambda ray, address: None)
+    monkeypatch.setattr(RayPool, "_check_nodes", lambda self: None)
+    return one
+
+
+def test_states_travel_with_jobs_and_nodes_never_see_the_ledger(node, job_of, tmp_path):
+    folder = tmp_path / "ledger"
+    with RayPool("somewhere") as pool, Ledger(folder) as ledger:
+        first = job_of(1, "goes_on")
+        complete(ledger, pool, [first])
+        file = ledger.state(first.key)
+        assert read_state(file) == b" 1"
+        second = job_of(2, "goes_on")
+        begun = dataclasses.replace(second, where={**second.where, START: str(file)})
+        assert complete(ledger, pool, [begun])[second.key].result == {"before": " 1"}
+        assert read_state(ledger.state(second.key)) == b" 1 2"
+        assert list((folder / "arrived").iterdir()) == []
+    assert not any(os.fsencode(folder) in sent for sent in node.sent)
+
+
+def test_a_state_that_breaks_on_its_way_to_a_node_is_not_gone_on_from(node, job_of, tmp_path):
+    with RayPool("somewhere") as pool, Ledger(tmp_path / "ledger") as ledger:
+        broken = tmp_path / "0.state"
+        broken.write_bytes(b"edp state 1")
+        job = job_of(3, "tells_of_a_state")
+        found = complete(ledger, pool, [dataclasses.replace(job, where={**job.where, START: str(broken)})])
+        assert found[job.key].result == {"whole": False}
+        assert ledger.state(job.key) is None

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from edp.errors import ConfigError, NotFiniteError
-from edp.ledger import known
+from edp.ledger import WithState, known, read_state
 
 
 def _note(where, word, identity):
@@ -42,6 +42,18 @@ def hog(identity, where):
     held[::4096] = b"x" * len(held[::4096])
     time.sleep(20.0)
     return {"held": len(held)}
+
+
+def goes_on(identity, where):
+    """Adds its seed to the state that it goes on from, where it gets one."""
+    _note(where, "start", identity)
+    before = read_state(where["start"]) if "start" in where else b""
+    return WithState({"before": before.decode()}, before + b" %d" % identity.seed)
+
+
+def tells_of_a_state(identity, where):
+    """Whether the state that it gets is whole."""
+    return {"whole": read_state(where["start"]) is not None}
 
 
 def raises(identity, where):

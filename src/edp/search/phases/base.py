@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -51,8 +51,10 @@ class Answer:
         trial: the question.
         settings: the experiment that it stands for.
         costs: analytic costs of its network, by name; none where its values make no network.
-        score: mean over its runs; None where it was not trained for its costs, or failed.
-        outcomes: of its runs; none where it was not trained.
+        score: mean over its runs; None where it was not trained for its costs, was pruned, or failed.
+        outcomes: of its runs, of their last parts; none where it was not trained.
+        rungs: means over its runs at steps before the end.
+        pruned: whether it was ended at the last of these.
     """
 
     trial: Trial
@@ -60,6 +62,14 @@ class Answer:
     costs: dict[str, float]
     score: float | None
     outcomes: tuple[Outcome, ...]
+    rungs: Mapping[int, float] = field(default_factory=dict)
+    pruned: bool = False
+
+    def course(self) -> dict[str, Any]:
+        """Its rungs as plain values; nothing where it had none."""
+        if not self.rungs:
+            return {}
+        return {"rungs": [[step, value] for step, value in self.rungs.items()], "pruned": self.pruned}
 
 
 @dataclass(frozen=True)
@@ -77,32 +87,87 @@ class Quest:
     trials: int
 
 
-def answer_all(ground: Ground, quests: list[Quest]) -> Generator[list[Order], list[Outcome], list[list[Answer]]]:
+@dataclass
+class _Asked:
+    """A question of a batch while it is trained.
+
+    Attributes:
+        place: of its quest.
+        trial, settings, costs: see `Answer`.
+        orders: whole trainings, one a run; none where it is not trained.
+        outcomes: of the last part of each.
+        rungs: means over runs, by the step of the rung.
+        pruned: whether it ended at the last of these.
+    """
+
+    place: int
+    trial: Trial
+    settings: Table
+    costs: dict[str, float]
+    orders: list[Order]
+    outcomes: tuple[Outcome, ...] = ()
+    rungs: dict[int, float] = field(default_factory=dict)
+    pruned: bool = False
+
+
+def answer_all(
+    ground: Ground, quests: list[Quest], stops: Sequence[int] = ()
+) -> Generator[list[Order], list[Outcome], list[list[Answer]]]:
     """Ask all quests side by side, a batch each at a time, until each has all its answers.
 
     A question whose costs exceed the limits, or whose network cannot be, is told so and not trained.
+
+    Args:
+        ground: of the search.
+        quests: that are asked.
+        stops: steps at which trainings of a batch are judged and may end early. All of a batch are judged by what was
+            told of earlier batches, in the order of their numbers, so that who trained them has no say.
     """
     spec = ground.spec
     answers: list[list[Answer]] = [[] for _ in quests]
     while any(len(have) < quest.trials for have, quest in zip(answers, quests, strict=True)):
-        asked = [
-            (place, trial, quest.settings(trial))
+        batch = [
+            _asked(ground, place, trial, quest.settings(trial))
             for place, quest in enumerate(quests)
             for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[place])))
         ]
-        costs = [_costs(settings, ground) for _, _, settings in asked]
-        fit = [bool(cost) and all(cost[name] <= most for name, most in spec.limits.items()) for cost in costs]
-        orders = [
-            ground.orders(settings, range(spec.trial_runs)) if fits else []
-            for (_, _, settings), fits in zip(asked, fit, strict=True)
-        ]
-        outcomes = iter((yield [order for some in orders for order in some]))
-        for (place, trial, settings), cost, some in zip(asked, costs, orders, strict=True):
-            own = tuple(next(outcomes) for _ in some)
-            answer = Answer(trial, settings, cost, mean_of(ground, own), own)
-            answers[place].append(answer)
-            tell(ground, quests[place].study, answer)
+        alive = batch
+        for number, stop in enumerate([*stops, None]):
+            earlier = tuple(stops[:number])
+            some = [[replace(order, until=stop, stops=earlier) for order in one.orders] for one in alive]
+            outcomes = iter((yield [order for orders in some for order in orders]))
+            for one, orders in zip(alive, some, strict=True):
+                one.outcomes = tuple(next(outcomes) for _ in orders)
+            if stop is None:
+                break
+            alive = [one for one in alive if _goes_on(ground, quests[one.place].study, one, stop)]
+            if not alive:
+                break
+        for one in batch:
+            score = None if one.pruned else mean_of(ground, one.outcomes)
+            answer = Answer(one.trial, one.settings, one.costs, score, one.outcomes, one.rungs, one.pruned)
+            answers[one.place].append(answer)
+            tell(ground, quests[one.place].study, answer)
     return answers
+
+
+def _asked(ground: Ground, place: int, trial: Trial, settings: Table) -> _Asked:
+    spec = ground.spec
+    costs = _costs(settings, ground)
+    fits = bool(costs) and all(costs[name] <= most for name, most in spec.limits.items())
+    return _Asked(place, trial, settings, costs, ground.orders(settings, range(spec.trial_runs)) if fits else [])
+
+
+def _goes_on(ground: Ground, study: Study, one: _Asked, stop: int) -> bool:
+    """Whether a question is trained beyond a rung: it ended well there, and is not hopeless."""
+    found = mean_of(ground, one.outcomes)
+    if found is None:
+        return False
+    one.rungs[stop] = found
+    if ground.spec.pruner != "none":
+        study.report(one.trial.number, stop, found)
+        one.pruned = study.hopeless(one.trial.number)
+    return not one.pruned
 
 
 def _costs(settings: Table, ground: Ground) -> dict[str, float]:
@@ -137,7 +202,7 @@ def tell(ground: Ground, study: Study, answer: Answer) -> None:
     values = None
     if answer.score is not None:
         values = [answer.score] if spec.cost == "none" else [answer.score, answer.costs[spec.cost]]
-    study.tell(answer.trial.number, values, bounds)
+    study.tell(answer.trial.number, values, bounds, answer.pruned)
 
 
 def new_study(
@@ -151,7 +216,20 @@ def new_study(
     spec = ground.spec
     objectives = 1 if spec.cost == "none" else 2
     root = ground.seed("study", name)
-    return Study(space, root, spec.sampler, tuple(flags), barred, objectives, len(spec.limits))
+    return Study(space, root, spec.sampler, tuple(flags), barred, objectives, len(spec.limits), spec.pruner)
+
+
+def said_of_pruned(ground: Ground, answers: Sequence[Answer]) -> list[str]:
+    """A sentence on the questions that were ended at a rung; none where none was."""
+    pruned = [answer for answer in answers if answer.pruned]
+    if not pruned:
+        return []
+    saved = sum(1.0 - max(answer.rungs) / ground.spec.updates for answer in pruned)
+    share = saved / max(1, sum(bool(answer.outcomes) for answer in answers))
+    return [
+        f"{len(pruned)} of {len(answers)} questions were ended at a rung as worse than the median there, which spared "
+        f"{100 * share:.0f} % of the steps."
+    ]
 
 
 def best(answers: list[Answer]) -> Answer | None:

@@ -10,12 +10,23 @@ import numpy as np
 from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Decision, Ground, Outcome
-from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, best, mean_of, new_study, possible
+from edp.search.phases.base import (
+    PHASES,
+    Answer,
+    Course,
+    Quest,
+    answer_all,
+    best,
+    mean_of,
+    new_study,
+    possible,
+    said_of_pruned,
+)
 from edp.search.phases.isolation import arm_settings, lowest_against_others
 from edp.search.space import Choice, Space, applicable, apply
-from edp.search.study import pareto
 from edp.stats.efficiency import Candidate, most_efficient
 from edp.stats.paired import fill_worst
+from edp.stats.pareto import pareto
 
 
 class Calibration:
@@ -35,7 +46,7 @@ class Calibration:
         arms = {backbone: arm_settings(ground.base, backbone, features) for backbone in ground.spec.backbones}
         spaces = {name: possible(ground, applicable(ground.spec.space, arm), arm) for name, arm in arms.items()}
         quests = [_quest(ground, name, arm, spaces[name][0]) for name, arm in arms.items()]
-        answers = yield from answer_all(ground, quests)
+        answers = yield from answer_all(ground, quests, ground.spec.stops)
         notes = [f"{name}: {note}." for name, (_, some) in spaces.items() for note in some]
         asked = dict(zip(arms, answers, strict=True))
         chosen = {name: picked for name, own in asked.items() if (picked := _efficient(own)) is not None}
@@ -69,7 +80,7 @@ class Calibration:
             if lowest is not None and lowest is not picked:
                 size = f"{lowest.costs['parameters']:,.0f}"
                 text += f"; the lowest, {lowest.score:.3g}, has {size} and does not repay the difference"
-            sentences.append(f"{text}.")
+            sentences += [f"{text}.", *(f"{backbone}: {said}" for said in said_of_pruned(ground, own))]
         if not chosen:
             raise DataError(
                 "phase 1: no training of any backbone ended well; see the messages of the trainings, and lower the "
@@ -141,9 +152,10 @@ def _plain(ground: Ground, answer: Answer) -> dict[str, Any]:
         "number": answer.trial.number,
         "values": dict(answer.trial.values),
         "score": answer.score,
-        "mae": mean_of(ground, answer.outcomes, "mae"),
+        "mae": None if answer.pruned else mean_of(ground, answer.outcomes, "mae"),
         **answer.costs,
         "statuses": [outcome.status for outcome in answer.outcomes],
+        **answer.course(),
     }
 
 

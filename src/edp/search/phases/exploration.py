@@ -66,6 +66,7 @@ class Exploration:
             f"Best of {len(facts['trials'])} questions about all modules: {names}.",
             f"Against the winner of phase 4 on {size} fresh runs: {100 * found['change']:+.2f} % (one-sided p "
             f"{found['p']:.2g}); {verdict}.",
+            *facts["said_of_pruned"],
         )
         return Decision("exploration", facts, sentences)
 

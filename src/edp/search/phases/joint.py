@@ -9,11 +9,12 @@ from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Ground, Outcome
 from edp.search.modules import contradicting, present_options, with_modules
-from edp.search.phases.base import Answer, Quest, answer_all, best, mean_of, new_study
+from edp.search.phases.base import Answer, Quest, answer_all, best, mean_of, new_study, said_of_pruned
 from edp.search.phases.screening import baseline_of
 from edp.search.space import Candidate, Choice, Real, Space, apply
-from edp.search.study import Trial, pareto
+from edp.search.study import Trial
 from edp.search.trainings import Order
+from edp.stats.pareto import pareto
 
 Asked = Generator[list[Order], list[Outcome], list[Answer]]
 
@@ -45,7 +46,7 @@ def ask_together(
     def settings(trial: Trial) -> Table:
         return with_modules(apply(base, trial.values), trial.flags, ground.channels, trial.options)
 
-    (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)])
+    (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)], ground.spec.stops)
     return answers
 
 
@@ -72,12 +73,14 @@ def winner_of(ground: Ground, name: str, modules: Sequence[str], answers: list[A
                 "values": {**answer.trial.values, **answer.trial.options},
                 "modules": list(answer.trial.flags),
                 "score": answer.score,
-                "mae": mean_of(ground, answer.outcomes, "mae"),
+                "mae": None if answer.pruned else mean_of(ground, answer.outcomes, "mae"),
                 **answer.costs,
+                **answer.course(),
             }
             for answer in answers
         ],
     }
+    facts["said_of_pruned"] = said_of_pruned(ground, answers)
     if ground.spec.cost != "none":
         points = [(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done]
         facts["front"] = [done[place].trial.number for place in pareto(points)]

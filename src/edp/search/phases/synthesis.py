@@ -44,6 +44,7 @@ class Synthesis:
         facts["antagonistic"] = [name for name in confirmed if name not in facts["modules"]]
         names = ", ".join(MODULES[name].title for name in facts["modules"]) or "no module"
         sentences = [f"Best together: {names}; {facts['score']:.3g} {ground.unit} on development sessions."]
+        sentences += facts["said_of_pruned"]
         if facts["antagonistic"]:
             left = ", ".join(MODULES[name].title for name in facts["antagonistic"])
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")

@@ -14,7 +14,7 @@ from edp.report.study_page import render_study, study_text
 from edp.report.study_plots import study_plots
 from edp.report.study_tables import identifiers, sheets
 from edp.report.study_views import PointView, arm_views, forests, front, point_views, top_of, tracks
-from edp.report.study_words import caveats, decided, headline, missing, verdict
+from edp.report.study_words import caveats, decided, headline, missing, tiles, verdict
 
 PHASES = ("isolation", "calibration", "screening", "planning", "confirmation", "synthesis", "exploration")
 
@@ -188,6 +188,24 @@ def test_the_history_keeps_failures_apart(sound):
     assert top_of([]) is None
     assert top_of([2.0]) > 2.0
     assert len(arm_views(facts_of(sound))) == 4
+
+
+def test_what_was_pruned_is_no_failure(sound, tmp_path):
+    failed = sum(held["score"] is None for held in sound["history"])
+    place = next(
+        place for place, held in enumerate(sound["history"]) if held["phase"] == "calibration" and held["score"]
+    )
+    sound["history"][place] |= {"status": "pruned", "score": None, "rung": 50}
+    sound["phases"][1]["pruned"] = 1
+    facts = facts_of(sound)
+    named = {trace.name: trace for trace in study_plots(facts)["history"].figure.data}
+    assert named["pruned"].x == (place + 1,)
+    assert len(named["failed"].x) == failed
+    assert tiles(facts)[0][2] == f"trainings, 1 of them pruned, {failed} of them failed"
+    sheet = sheets(facts)["phases"]
+    assert [column.heading for column in sheet.columns].index("Pruned") == 3
+    assert [row[3] for row in sheet.rows] == [0, 1, 0, 0, 0, 0, 0, 1]
+    assert write_study_page(sound, tmp_path).pictures
 
 
 def test_names_that_mean_something_elsewhere(sound, tmp_path):
