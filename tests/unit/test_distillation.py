@@ -123,7 +123,7 @@ def test_chunks_and_windows_carry_the_lesson_of_their_own_ticks(tiny, teacher):
 def test_series_without_truth_teach_without_a_share_in_the_loss_of_the_truth(tiny, brief, teacher, small):
     """Whatever stands in the place of their targets, the bits are the same; scaling is that of what has truth."""
     part = tiny.train[0]
-    further = [dataclasses.replace(part, targets=np.full_like(part.targets, value)) for value in (0, 7)]
+    further = [dataclasses.replace(part, targets=np.full_like(part.targets, value)) for value in (0.5, np.nan)]
     lessons = [Distillation([teacher], further=[part]) for part in further]
     made = [fit(tiny, small, brief, lesson=lesson).predictor for lesson in lessons]
     assert same(*made)

@@ -168,7 +168,9 @@ class Distillation:
         columns = [np.full((part.samples, 1), truth), mean]
         if self.components is not None:
             columns.append(self.components.project(self._hidden(part)))
-        return replace(part, taught=np.concatenate(columns, axis=1).astype(np.float32))
+        # What stands in the place of targets without truth may be no number, and NaN times a mask of zero is NaN.
+        targets = part.targets if truth else np.zeros_like(part.targets)
+        return replace(part, targets=targets, taught=np.concatenate(columns, axis=1).astype(np.float32))
 
     def _hidden(self, part: Series) -> NDArray[np.float32]:
         """Hidden features of all teachers side by side, ``(time, width)``."""
