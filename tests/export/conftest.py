@@ -20,6 +20,7 @@ FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"
 NEEDED = {
     "gcc": "gcc libc6-dev",
     "clang": "clang",
+    "cmake": "cmake make",
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "cppcheck": "cppcheck",
     "qemu-system-arm": "qemu-system-arm",

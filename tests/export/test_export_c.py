@@ -121,6 +121,15 @@ def test_headers_say_what_an_engineer_needs(c, bundle_of, tmp_path):
     c.run("gcc", *c.flags, "-c", "example_task.c", folder=tmp_path)
 
 
+def test_its_cmake_file_builds_and_its_test_passes(c, bundle_of, tmp_path):
+    c.need("cmake", "gcc")
+    CTarget().write(bundle_of("hybrid"), "predictor", tmp_path)
+    build = tmp_path / "build"
+    c.run("cmake", "-S", tmp_path, "-B", build)
+    c.run("cmake", "--build", build)
+    assert b"100% tests passed" in c.run("ctest", "--test-dir", build)
+
+
 def test_deviations_from_misra_are_the_ones_that_the_docs_list(c, bundle_of, tmp_path):
     c.need("cppcheck")
     CTarget().write(bundle_of("hybrid"), "predictor", tmp_path)
