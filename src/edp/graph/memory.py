@@ -75,12 +75,8 @@ class Convolution(Layer):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Lstm(Layer):
-    """LSTM, gates in the order i, f, g, o: ``c~ = f c + i g``, ``h~ = o tanh(c~)``.
-
-    ``h = h_before + share (h~ - h_before)`` and c likewise; `share` is 1 without zoneout. `weight_x` ``(4 units, in)``,
-    `weight_h` ``(4 units, units)``, `bias` ``(4 units,)``.
-    """
+class _Gated(Layer):
+    """What both kinds of LSTM have; neither is the other, since they are told apart by their class."""
 
     weight_x: Array
     weight_h: Array
@@ -101,33 +97,26 @@ class Lstm(Layer):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LayerNormLstm(Layer):
+class Lstm(_Gated):
+    """LSTM, gates in the order i, f, g, o: ``c~ = f c + i g``, ``h~ = o tanh(c~)``.
+
+    ``h = h_before + share (h~ - h_before)`` and c likewise; `share` is 1 without zoneout. `weight_x` ``(4 units, in)``,
+    `weight_h` ``(4 units, units)``, `bias` ``(4 units,)``.
+    """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LayerNormLstm(_Gated):
     """LSTM whose gates see ``norm(W x) gain_x + norm(U h) gain_h + bias`` and whose output has ``tanh`` of a norm of c.
 
     Each norm is over all its numbers, ``h~ = o tanh(norm(c~) gain_c + shift_c)``; otherwise as `Lstm`.
     """
 
-    weight_x: Array
-    weight_h: Array
-    bias: Array
     gain_x: Array
     gain_h: Array
     gain_c: Array
     shift_c: Array
     epsilon: float
-    share: float = 1.0
-
-    @property
-    def width(self) -> int:
-        return self.weight_h.shape[1]
-
-    @property
-    def slots(self) -> tuple[Slot, ...]:
-        return Slot("h", (self.width,)), Slot("c", (self.width,))
-
-    @property
-    def macs(self) -> int:
-        return self.weight_x.size + self.weight_h.size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
