@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from edp.config import load_experiment
+from edp.config import Experiment, build, load_experiment
 from edp.data.scaling import Scaler
+from edp.errors import ConfigError
 from edp.models.predictor import build_model
+from edp.search.modules import MODULES, options_of, present_options, with_modules
+from edp.search.trainings import settings_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
 PRINTED = {
@@ -51,3 +54,16 @@ def test_each_is_reached_by_its_setting_and_takes_part(name, setting):
     assert changed.training == plain.training
     assert torch.isfinite(found).all()
     assert not torch.allclose(found, base, rtol=0, atol=1e-6), name
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_option_of_a_module_makes_another_network_and_its_present_value_the_same(name):
+    base = settings_of(load_experiment(None, "quick", ["model.blocks=[]"]))
+    plain = with_modules(base, [name])
+    assert with_modules(base, [name], options=present_options(base, [name])) == plain
+    for key, held in options_of(base, name).items():
+        made = [with_modules(base, [name], options={key: value}) for value in held.options]
+        models = [build(Experiment, settings, "of a test").model for settings in made]
+        assert len({repr(model) for model in models}) == len(held.options), key
+    with pytest.raises(ConfigError, match=r"= 'odd'; one of"):
+        with_modules(base, ["zoneout"], options={"zoneout.zoneout": "odd"})

@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from edp.config import Experiment, build, load_experiment, plain_tree
+from edp.config import load_experiment, plain_tree
 from edp.errors import ConfigError, DataError
 from edp.search.conduct import conduct
 from edp.search.ground import Ground, Outcome, set_apart
-from edp.search.modules import MODULES, options_of, present_options, with_modules
+from edp.search.modules import MODULES
 from edp.search.phases import PHASES
 from edp.search.settings import SearchSpec
 from edp.search.space import Choice, Real
@@ -391,19 +391,6 @@ def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
     assert {"squeeze_excitation", "temporal_difference"} <= set(facts["modules"])
     alone = found.decided["confirmation"].facts["confirmed"]
     assert facts["teacher"] == "exploration" or {"squeeze_excitation", "temporal_difference"} <= set(alone)
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_every_option_of_a_module_makes_another_network_and_its_present_value_the_same(name):
-    base = settings_of(load_experiment(None, "quick", ["model.blocks=[]"]))
-    plain = with_modules(base, [name])
-    assert with_modules(base, [name], options=present_options(base, [name])) == plain
-    for key, held in options_of(base, name).items():
-        made = [with_modules(base, [name], options={key: value}) for value in held.options]
-        models = [build(Experiment, settings, "of a test").model for settings in made]
-        assert len({repr(model) for model in models}) == len(held.options), key
-    with pytest.raises(ConfigError, match=r"= 'odd'; one of"):
-        with_modules(base, ["zoneout"], options={"zoneout.zoneout": "odd"})
 
 
 def test_module_names_are_those_of_the_registry(sound):
