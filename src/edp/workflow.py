@@ -30,6 +30,7 @@ from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import Footprint, check_possible, footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
+from edp.evaluation.traced import check_counted
 from edp.evaluation.worth import Worths, WorthSpec
 from edp.evaluation.worth import channel_worths as measure_worths
 from edp.export import TARGETS
@@ -281,9 +282,11 @@ def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footpr
     """Footprint of a bundle, a run folder, or a settings file, and what it is called.
 
     Raises:
-        EdpError: neither a bundle nor valid settings, or a budget that no network of these inputs and targets meets.
+        EdpError: neither a bundle nor valid settings, a budget that no network of these inputs and targets meets, or a
+            part that counts other work than it does.
     """
     predictor, name = _predictor_of(path)
+    check_counted(predictor)
     if budget is not None:
         alone = replace(predictor.spec, blocks=(), physics=None)
         check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))

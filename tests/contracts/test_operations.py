@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from collections import Counter, defaultdict
-from types import SimpleNamespace
-
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
+from edp.evaluation.traced import Trace, trace
 from edp.models.activations import ACTIVATIONS
 from edp.streaming import Operation, Streaming, operations_of
 
@@ -87,84 +83,6 @@ FREE = {
 }
 
 
-class Trace(TorchDispatchMode):
-    """Counts operations and multiply-accumulates under the innermost module that declares its operations."""
-
-    def __init__(self, network: torch.nn.Module) -> None:
-        super().__init__()
-        self.inside = [""]
-        self.operations: dict[str, Counter[str]] = defaultdict(Counter)
-        self.macs: Counter[str] = Counter()
-        self.hooks = []
-        for name, module in network.named_modules():
-            if hasattr(module, "operations"):
-                self.hooks.append(module.register_forward_pre_hook(lambda *_, name=name: self.inside.append(name)))
-                self.hooks.append(module.register_forward_hook(self._leave))
-        self._enter_answer(network, "output")
-
-    def _enter_answer(self, network: torch.nn.Module, name: str) -> None:
-        """An output is asked for its answer, not called as a module."""
-        output = getattr(network, name, None)
-        if output is None:
-            return
-        answer = output.answer
-
-        def traced(*args: object) -> object:
-            self.inside.append(name)
-            result = answer(*args)
-            self.inside.pop()
-            return result
-
-        output.answer = traced
-        self.hooks.append(SimpleNamespace(remove=lambda: delattr(output, "answer")))
-
-    def _leave(self, *_: object) -> None:
-        self.inside.pop()
-
-    def __exit__(self, *error: object) -> None:
-        for hook in self.hooks:
-            hook.remove()
-        super().__exit__(*error)
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        result = function(*args, **(kwargs or {}))
-        name = function._schema.name.removeprefix("aten::")
-        self.operations[self.inside[-1]][name if name.startswith("_") else name.rstrip("_")] += 1
-        self.macs[self.inside[-1]] += macs_of(name, args, result)
-        if self.inside[-1] == "physics":
-            self.macs["physics"] += arithmetic_of(name, args, result)
-        return result
-
-
-def macs_of(name, args, result):
-    if name in ("mm", "bmm"):
-        return result.numel() * args[0].shape[-1]
-    if name in ("addmm", "baddbmm"):
-        return result.numel() * args[1].shape[-1]
-    if name == "convolution":
-        return result.numel() * math.prod(args[1].shape[1:])
-    return 0
-
-
-def arithmetic_of(name, args, result):
-    """A physics base is arithmetic only: what makes numbers from inputs counts, sums and choices apart.
-
-    What the machine's numbers alone give, tensors of at most one dimension, is computed once.
-    """
-    counted = name in ("mul", "div", "sqrt", "pow", "reciprocal", "exp", "sin", "cos")
-    of_inputs = any(isinstance(entry, torch.Tensor) and entry.dim() > 1 for entry in args)
-    return result.numel() if counted and of_inputs else 0
-
-
-def trace(predictor, ticks, state=None):
-    """A traced call on `ticks` ticks from `state`, and the next state."""
-    x = torch.zeros(1, ticks, predictor.front.inputs, dtype=torch.float64)
-    state = predictor.initial_state(1, x) if state is None else state
-    with torch.no_grad(), Trace(predictor) as seen:
-        _, state = predictor(x, state)
-    return seen, state
-
-
 def complaints(network, seen):
     """Where the traced operations and the declared ones differ."""
     modules, found = dict(network.named_modules()), []
@@ -231,8 +149,8 @@ def test_the_counted_work_is_what_runs(structure, predictor_of):
         if ticks > 1:  # bands of several ticks overlap: more runs than a stream needs
             continue
         for name, module in streams.items():
-            inside = sum(macs for part, macs in seen.macs.items() if f"{part}.".startswith(f"{name}." if name else ""))
-            assert inside == cost(module.costs()), name
+            assert seen.within(name) == cost(module.costs()), name
+        assert not seen.opaque
     kept = {part: macs for part, macs in seen.macs.items() if not part.startswith(LEFT_OUT)}
     once = sum(macs for part, macs in kept.items() if part.startswith(ONCE))
     wanted = sum(window * row.per_column + row.per_prediction for row in predictor.costs())

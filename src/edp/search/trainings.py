@@ -16,6 +16,7 @@ from edp.data.splits import ByRecording
 from edp.errors import ConfigError, DataError
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import JudgeSpec, judge
+from edp.evaluation.traced import check_counted
 from edp.models.predictor import build_model
 from edp.recording import Recording
 from edp.sources import DataSource
@@ -191,10 +192,16 @@ def _recordings(source: str) -> Sequence[Recording]:
 
 
 def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
-    """Analytic costs of the network of some settings, before anything is trained: parameters, MACs of a tick."""
+    """Analytic costs of the network of some settings, before anything is trained: parameters, MACs of a tick.
+
+    Raises:
+        ConfigError: settings that cannot be, or a part that counts other work than it does.
+    """
     experiment = build(Experiment, settings, "of a search")
     task = experiment.task.resolve(100.0, channels, experiment.model.physics)
-    counted = footprint(build_model(task, experiment.model, blank_scaler(task), seed=0))
+    network = build_model(task, experiment.model, blank_scaler(task), seed=0)
+    check_counted(network)
+    counted = footprint(network)
     return {"parameters": float(counted.parameters), "macs_tick": float(counted.macs_tick)}
 
 
