@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -79,9 +79,12 @@ class Streaming(nn.Module, ABC):
 
     Attributes:
         operations: what the part itself computes, without the parts inside it.
+        matrices: weights of multiply-accumulates among its own parameters: name, and axes of its outputs. Those of
+            PyTorch's layers inside it are known.
     """
 
     operations: frozenset[Operation] = frozenset()
+    matrices: ClassVar[tuple[tuple[str, tuple[int, ...]], ...]] = ()
 
     @abstractmethod
     def initial_state(self, batch: int, like: Tensor) -> State:

@@ -57,6 +57,7 @@ class Bypass(Streaming):
     """Causal linear filter; ``weight`` has shape ``(horizon * output, feature, tap)``, the last tap is the present."""
 
     operations = frozenset({Operation.CONV1D})
+    matrices = (("weight", (0,)),)
 
     def __init__(self, features: int, horizons: int, outputs: int, spec: LinearBypass) -> None:
         super().__init__()

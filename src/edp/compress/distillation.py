@@ -157,6 +157,9 @@ class Distillation:
             loss = loss + spec.hint * hint_error(moment.hidden, taught[..., 1 + self.said :], moment.valid)
         return loss
 
+    def end(self, net: Predictor) -> None:
+        """Nothing was done to the network but to its weights."""
+
     def _taught(self, part: Series, truth: bool) -> Series:
         answers = [stream_predictions(teacher, [part])[0] for teacher in self.teachers]
         mean = np.mean(np.stack(answers), axis=0, dtype=np.float64).reshape(part.samples, -1)

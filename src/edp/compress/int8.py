@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from edp.compress.rounding import weight_levels
 from edp.models.convolution import TemporalBlock
 from edp.models.heads import Heads, Unit
 from edp.models.predictor import Predictor
@@ -77,8 +78,8 @@ def _round_input(module: nn.Module, given: tuple[Tensor, ...]) -> tuple[Tensor, 
 
 def _round_weight(weight: Tensor, dim: int) -> float:
     """Round in place to 255 levels, symmetric about zero, with a scale for each slice along `dim`; largest change."""
-    scale = weight.abs().amax(dim=dim, keepdim=True).clamp(min=1e-30) / 127
-    rounded = (weight / scale).round() * scale
+    levels, steps = weight_levels(weight, [axis for axis in range(weight.ndim) if axis != dim])
+    rounded = levels * steps
     error = float((rounded - weight).abs().max())
     weight.copy_(rounded)
     return error

@@ -22,6 +22,7 @@ class CausalConv(Streaming):
     """
 
     operations = frozenset({Operation.CONV1D})
+    matrices = (("direction", (0,)),)
 
     def __init__(self, channels_in: int, channels_out: int, kernel: int, dilation: int) -> None:
         super().__init__()

@@ -117,6 +117,8 @@ class Heads(Streaming):
     ``(batch, time, value, output)``.
     """
 
+    matrices = (("weights", (0, 2)),)
+
     def __init__(
         self, width: int, outputs: int, values: int, units: Sequence[Unit], hidden: int, mix: Streaming | None = None
     ) -> None:

@@ -149,6 +149,8 @@ class Loop:
                 parameter.copy_(self.best[name])
         if self.net.spec.output.calibrated and self.refitted is None:
             calibrate(self.net, self.data.validation, self.spec)
+        if self.lesson is not None:
+            self.lesson.end(self.net)
         return Fitted(self.net.eval(), self.progress.history, self.progress.seconds, self.rate, self.resumed_at)
 
     def _diverged(self, what: str, value: float) -> Diverged:

@@ -58,3 +58,7 @@ class Lesson(Protocol):
     def loss(self, objective: Objective, moment: Moment) -> Tensor:
         """The loss of a batch; `objective` gives that of the truth."""
         ...
+
+    def end(self, net: Predictor) -> None:
+        """Take back what `begin` did to the network beside its weights; it has the best ones now."""
+        ...

@@ -37,6 +37,7 @@ class Gru(Streaming):
     """GRU layer; the state is h ``(batch, units)``, zero at reset."""
 
     operations = frozenset({Operation.GRU})
+    matrices = (("weight_ih", (0,)), ("weight_hh", (0,)))
 
     def __init__(self, width_in: int, units: int) -> None:
         super().__init__()

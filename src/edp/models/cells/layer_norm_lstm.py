@@ -39,6 +39,7 @@ class LayerNormLstm(Streaming):
     """Layer-norm LSTM layer; the state is ``(h, c)``, each ``(batch, units)``, zero at reset."""
 
     operations = frozenset({Operation.LINEAR, Operation.SIGMOID, Operation.TANH, Operation.LAYER_NORM})
+    matrices = (("weight_ih", (0,)), ("weight_hh", (0,)))
 
     def __init__(self, width_in: int, units: int, zoneout: float) -> None:
         super().__init__()

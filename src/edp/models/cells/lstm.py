@@ -68,6 +68,7 @@ class ZoneoutLstm(Streaming):
     """
 
     operations = frozenset({Operation.LINEAR, Operation.SIGMOID, Operation.TANH})
+    matrices = (("weight_ih_l0", (0,)), ("weight_hh_l0", (0,)))
 
     def __init__(self, width_in: int, units: int, rate: float) -> None:
         super().__init__()
