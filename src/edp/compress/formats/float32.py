@@ -1,0 +1,30 @@
+"""Single precision, as trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import ClassVar
+
+from edp.compress.formats.base import FORMATS, Predict
+from edp.data.series import Series
+from edp.evaluation.footprint import Footprint
+from edp.models.predictor import Predictor
+from edp.models.running import stream_predictions
+
+
+@FORMATS.register("float32")
+class Float32:
+    """Everything in single precision; gains of weight norm are folded."""
+
+    label: ClassVar[str] = "FP32"
+    estimated: ClassVar[str] = "float32"
+    rounded: ClassVar[bool] = False
+
+    def parameter_bytes(self, predictor: Predictor, counts: Footprint) -> int:
+        """Four bytes each."""
+        return counts.weight_bytes_fp32
+
+    def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
+        """The network as it is."""
+        return partial(stream_predictions, predictor)

@@ -1,0 +1,100 @@
+"""The compressed variants of the thesis by name (Table 4.9), and ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from edp.compress.bench import Bench, Order
+from edp.compress.qat import RoundingSpec
+from edp.compress.rounding import matrices_of
+from edp.compress.students import width_of
+from edp.models.predictor import Predictor
+from edp.registry import Registry
+
+THESIS = RoundingSpec(activation_bits=8, recurrent=False)
+"""What fake quantisation of the thesis covers: convolutions and linear layers, 8 bits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A smaller network and the numbers it is to run with.
+
+    Attributes:
+        name: of the variant.
+        order: what made it.
+        network: in float32; it can be saved and exported.
+        number_format: a name of `edp.compress.formats.FORMATS`; it is judged in it.
+        parameter_bytes: as Table 4.9 counts them; None where the format says it.
+    """
+
+    name: str
+    order: Order
+    network: Predictor
+    number_format: str = "float32"
+    parameter_bytes: int | None = None
+
+
+Variant = Callable[[Bench], Candidate]
+VARIANTS: Registry[Variant] = Registry("variant")
+
+
+def _distilled(units: int) -> Order:
+    return Order(name=f"u{units}", units=units)
+
+
+def _rounded(bench: Bench, name: str, of: Order | None) -> Candidate:
+    units = width_of(bench.teacher.spec) if of is None else of.units
+    order = Order(name=name.lower(), units=units, rounding=THESIS, of=of)
+    network = bench.network(order)
+    folded = sum(cost.parameters - cost.foldable for cost in network.costs())
+    rounded = sum(matrix.values.numel() for matrix in matrices_of(network, recurrent=False))
+    return Candidate(name, order, network, "dynamic_int8", 4 * folded - 3 * rounded)
+
+
+@VARIANTS.register("A_u32")
+def a_u32(bench: Bench) -> Candidate:
+    """A distilled student of 32 units."""
+    return Candidate("A_u32", _distilled(32), bench.network(_distilled(32)))
+
+
+@VARIANTS.register("A_u64")
+def a_u64(bench: Bench) -> Candidate:
+    """A distilled student of 64 units."""
+    return Candidate("A_u64", _distilled(64), bench.network(_distilled(64)))
+
+
+@VARIANTS.register("B_LPTQ")
+def b_lptq(bench: Bench) -> Candidate:
+    """The student of 64 units with its linear layers in dynamic INT8, not trained again."""
+    return Candidate("B_LPTQ", _distilled(64), bench.network(_distilled(64)), "dynamic_int8")
+
+
+@VARIANTS.register("C_QAT")
+def c_qat(bench: Bench) -> Candidate:
+    """The teacher, trained on under its own guidance with rounded convolutions and linear layers."""
+    return _rounded(bench, "C_QAT", None)
+
+
+@VARIANTS.register("C_u64_QAT")
+def c_u64_qat(bench: Bench) -> Candidate:
+    """The student of 64 units, trained on with rounded convolutions and linear layers."""
+    return _rounded(bench, "C_u64_QAT", _distilled(64))
+
+
+def _ours(bench: Bench, units: int) -> Candidate:
+    pruned = Order(name=f"p{units}", units=units, pruned=True)
+    order = Order(name=f"d_u{units}", units=units, rounding=RoundingSpec(), of=pruned)
+    return Candidate(f"D_u{units}", order, bench.network(order), "w8a16")
+
+
+@VARIANTS.register("D_u32")
+def d_u32(bench: Bench) -> Candidate:
+    """Ours: the teacher pruned to 32 units, distilled, trained on with everything rounded, in W8A16."""
+    return _ours(bench, 32)
+
+
+@VARIANTS.register("D_u64")
+def d_u64(bench: Bench) -> Candidate:
+    """Ours: the teacher pruned to 64 units, distilled, trained on with everything rounded, in W8A16."""
+    return _ours(bench, 64)
