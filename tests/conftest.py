@@ -18,12 +18,14 @@ from edp.blocks.base import OUTPUT_SLOTS, SHARED_SLOTS
 from edp.data.features import Derived, FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
-from edp.errors import ConfigError
+from edp.errors import ConfigError, ExportError
+from edp.integer import calibrate
 from edp.models.activations import ACTIVATIONS
 from edp.models.backbones import BACKBONES, GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.models.cells import CELLS
 from edp.models.heads import HEADS, GluHead, MlpHead
 from edp.models.initial import INITIAL_STATES
+from edp.models.integer import IntegerPredictor
 from edp.models.outputs import OUTPUTS, Point
 from edp.models.physics import PHYSICS
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination
@@ -195,6 +197,45 @@ def predictor_of() -> Callable[..., Predictor]:
         return copy.deepcopy(_build(structure, chosen, shake)).to(dtype).eval()
 
     return make
+
+
+def smooth_rows(predictor: Predictor, ticks: int = 300, seed: int = 0) -> np.ndarray:
+    """Smooth random inputs ``(time, input)`` of unit size."""
+    noise = np.random.default_rng(seed).normal(size=(ticks, predictor.front.inputs))
+    rows = np.zeros_like(noise)
+    for tick in range(1, ticks):
+        rows[tick] = 0.9 * rows[tick - 1] + 0.4 * noise[tick]
+    return rows.astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def rows_of() -> Callable[..., np.ndarray]:
+    """Smooth random inputs of a predictor."""
+    return smooth_rows
+
+
+@pytest.fixture(scope="session")
+def integers_of(predictor_of) -> Callable[[str], IntegerPredictor]:
+    """Predictors in whole numbers by structure, calibrated on smooth random inputs.
+
+    Skips, with the reason that was given, where a network has no such form.
+    """
+
+    @cache
+    def make(structure: str) -> IntegerPredictor | str:
+        predictor = predictor_of(structure, dtype=torch.float32)
+        try:
+            return IntegerPredictor(predictor, calibrate(predictor.graph(), [smooth_rows(predictor)]))
+        except ExportError as error:
+            return str(error)
+
+    def given(structure: str) -> IntegerPredictor:
+        found = make(structure)
+        if isinstance(found, str):
+            pytest.skip(found)
+        return found
+
+    return given
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,19 @@ INPUT = "input"
 """The value that holds the inputs of the tick, SI units, in the order in which they are fed."""
 
 
+class Number(StrEnum):
+    """What a value or a slot is made of."""
+
+    FLOAT = "float"
+    INT16 = "int16"
+    INT32 = "int32"
+
+    @property
+    def bytes(self) -> int:
+        """Of one number."""
+        return 2 if self is Number.INT16 else 4
+
+
 @dataclass(frozen=True)
 class Slot:
     """Numbers that a layer carries from tick to tick.
@@ -23,11 +38,13 @@ class Slot:
         name: within the layer.
         shape: for a ring, ticks first, the oldest one in row 0.
         fill: every number's value after a reset, unless the graph says otherwise.
+        number: what they are.
     """
 
     name: str
     shape: tuple[int, ...]
     fill: float = 0.0
+    number: Number = Number.FLOAT
 
     @property
     def size(self) -> int:
@@ -53,6 +70,11 @@ class Layer(ABC):
         """Numbers that it gives."""
 
     @property
+    def number(self) -> Number:
+        """What its value is made of."""
+        return Number.FLOAT
+
+    @property
     def slots(self) -> tuple[Slot, ...]:
         """What it remembers."""
         return ()
@@ -62,7 +84,7 @@ class Layer(ABC):
         """Multiply-accumulates of one tick with weights or with what it remembers; element-wise work is not counted."""
         return 0
 
-    def tensors(self) -> dict[str, Array]:
+    def tensors(self) -> dict[str, NDArray[Any]]:
         """Its constant arrays by name within the layer."""
         held = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {name: value for name, value in held.items() if isinstance(value, np.ndarray)}
@@ -83,7 +105,7 @@ class Graph:
     inputs: int
     layers: tuple[Layer, ...]
     results: Mapping[str, str]
-    initial: Mapping[tuple[str, str], Array] = field(default_factory=dict)
+    initial: Mapping[tuple[str, str], NDArray[Any]] = field(default_factory=dict)
     window: int = 1
 
     def layer(self, name: str) -> Layer:
@@ -101,7 +123,7 @@ class Graph:
         """How many numbers a value has."""
         return self.inputs if value == INPUT else self.layer(value).width
 
-    def tensors(self) -> Iterator[tuple[str, str, Array]]:
+    def tensors(self) -> Iterator[tuple[str, str, NDArray[Any]]]:
         """Every constant array: layer, name within it, values."""
         for layer in self.layers:
             for name, values in layer.tensors().items():
@@ -113,7 +135,7 @@ class Graph:
             for slot in layer.slots:
                 yield layer.name, slot
 
-    def start(self, layer: str, slot: Slot) -> Array:
+    def start(self, layer: str, slot: Slot) -> NDArray[Any]:
         """Values of a slot after a reset."""
         return self.initial.get((layer, slot.name), np.full(slot.shape, slot.fill, dtype=np.float32))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
@@ -17,12 +18,17 @@ from edp.data.prepared import Prepared
 from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import BundleError, StorageError
+from edp.integer import Formats
+from edp.integer.quantise import weights_of
+from edp.models.integer import IntegerPredictor
 from edp.models.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain
 from edp.models.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, read_json, write_bytes, write_json
 
 SCHEMA = 2
+INTEGER_SCHEMA = 3
+"""Of a bundle in whole numbers, which older versions would read as one in float32."""
 HEADER = "bundle.json"
 
 
@@ -73,10 +79,11 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
 
     Raises:
         StorageError: the folder cannot be written.
-        BundleError: the network computes with other numbers than float32, which a bundle would not tell.
+        BundleError: the network computes with other numbers, which a bundle would not tell.
     """
-    form = bundle.predictor.number_format
-    if form != "float32":
+    predictor, form = bundle.predictor, bundle.predictor.number_format
+    whole = isinstance(predictor, IntegerPredictor)
+    if form != "float32" and not whole:
         raise BundleError(
             f"a network in {form} cannot be saved as a bundle, which would be read as one in float32; save the network "
             "that it was made of, and quantise that after loading"
@@ -87,8 +94,8 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     weights = f"weights-{digest[:12]}.safetensors"
     write_bytes(path / weights, data)
     task = bundle.task
-    header = {
-        "schema": SCHEMA,
+    header: dict[str, Any] = {
+        "schema": INTEGER_SCHEMA if whole else SCHEMA,
         "edp": __version__,
         "task": task_to_plain(task),
         "model": model_to_plain(bundle.predictor.spec),
@@ -103,11 +110,26 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         "provenance": dict(bundle.provenance),
         "scores": dict(bundle.scores),
     }
+    kept = {weights}
+    if isinstance(predictor, IntegerPredictor):
+        entry = _write_integers(predictor, path)
+        kept.add(entry["file"])
+        header |= {"number_format": form, "formats": dict(predictor.formats.fracs), "integers": entry}
     write_json(path / HEADER, header)
-    for old in path.glob("weights-*.safetensors"):
-        if old.name != weights:
+    for old in (*path.glob("weights-*.safetensors"), *path.glob("integers-*.safetensors")):
+        if old.name not in kept:
             old.unlink(missing_ok=True)
     return path
+
+
+def _write_integers(predictor: IntegerPredictor, path: Path) -> dict[str, str]:
+    """Write the 8-bit weights; returns file and digest."""
+    held = {name: torch.from_numpy(np.ascontiguousarray(x)) for name, x in weights_of(predictor.integers).items()}
+    data = save(held)
+    digest = hashlib.blake2b(data, digest_size=16).hexdigest()
+    file = f"integers-{digest[:12]}.safetensors"
+    write_bytes(path / file, data)
+    return {"file": file, "blake2b": digest}
 
 
 def load_bundle(folder: str | Path) -> Bundle:
@@ -130,6 +152,9 @@ def load_bundle(folder: str | Path) -> Bundle:
         texts = tuple(c["description"] for c in header["outputs"])
         predictor = Predictor(task, spec, blank_scaler(task))
         predictor.load_state_dict(load(data))
+        if header["schema"] == INTEGER_SCHEMA:
+            integers = {name: x.numpy() for name, x in load(_weights(path, header["integers"])).items()}
+            predictor = IntegerPredictor(predictor, Formats(header["formats"], integers))
         return Bundle(predictor.eval(), inputs, kinds, texts, header["provenance"], header["scores"])
     except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError, StorageError) as error:
         raise BundleError(f"bundle '{path}' is damaged: {error}; restore it or train again") from error
@@ -137,11 +162,12 @@ def load_bundle(folder: str | Path) -> Bundle:
 
 def _check_schema(header: Any, path: Path) -> None:
     schema = header.get("schema") if isinstance(header, dict) else None
-    if schema != SCHEMA:
-        newer = isinstance(schema, int) and schema > SCHEMA
+    if schema not in (SCHEMA, INTEGER_SCHEMA):
+        newer = isinstance(schema, int) and schema > INTEGER_SCHEMA
         older = isinstance(schema, int) and 0 < schema < SCHEMA
         raise BundleError(
-            f"bundle '{path}' has schema {schema}, this version of EDP ({__version__}) reads schema {SCHEMA}; "
+            f"bundle '{path}' has schema {schema}, this version of EDP ({__version__}) reads {SCHEMA} and "
+            f"{INTEGER_SCHEMA}; "
             + ("install a newer EDP" if newer else "train again" if older else "the header is not that of a bundle")
         )
 

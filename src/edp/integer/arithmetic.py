@@ -1,0 +1,148 @@
+"""Whole-number arithmetic of W8A16 networks, the same bits in NumPy and in C.
+
+A value is ``q 2^-frac`` with q a 16-bit number in [-32767, 32767]; `frac` may be negative or beyond 15. Accumulators
+are 32-bit, what they are multiplied by afterwards gives 64 bits. Every rounding is half up, every overflow saturates.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ExportError
+
+Whole = NDArray[np.int64]
+"""Whole numbers of any width; NumPy computes with 64 bits, and `saturated` keeps them in theirs."""
+
+LARGEST = 32767
+"""Of an activation."""
+WEIGHT = 127
+"""Largest magnitude of a weight."""
+ACCUMULATOR = 2**31 - 1
+GATE_FRAC = 16
+"""Fractional bits of what gates and scores are computed in, 32-bit."""
+CELL_FRAC = 20
+"""Fractional bits of the cell of an LSTM, 32-bit."""
+UNIT_FRAC = 15
+"""Fractional bits of what lies between -1 and 1."""
+GATE_LIMIT = 2**29
+CELL_LIMIT = 2**30
+TABLE = 513
+"""Entries of a table; between them it is interpolated."""
+
+
+def frac_for(largest: float, bits: int = 15) -> int:
+    """The most fractional bits with which `largest` still fits in `bits` bits and a sign."""
+    if not largest > 0.0:
+        return bits
+    frac = math.floor(math.log2((2**bits - 1) / largest))
+    return max(-bits, min(2 * bits, frac))
+
+
+def rounded_shift(x: Any, bits: int) -> Whole:
+    """``x 2^-bits``, rounded half up."""
+    x = np.asarray(x, dtype=np.int64)
+    if bits <= 0:
+        return np.asarray(x << -bits)
+    return np.asarray((x + (1 << (bits - 1))) >> bits)
+
+
+def saturated(x: Any, largest: int = LARGEST) -> Whole:
+    """Kept in [-largest, largest]."""
+    return np.clip(np.asarray(x, dtype=np.int64), -largest, largest)
+
+
+def to_fixed(values: Any, frac: int, largest: int = LARGEST) -> Whole:
+    """Real numbers as whole ones, rounded and kept in range."""
+    scaled = np.floor(np.asarray(values, dtype=np.float64) * 2.0**frac + 0.5)
+    return np.clip(scaled, -largest, largest).astype(np.int64)
+
+
+def factor(real: Any) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """Positive factors as ``multiplier 2^-shift``, multipliers of 31 bits, shifts between 1 and 62.
+
+    Raises:
+        ExportError: a factor of 2^30 and more.
+    """
+    values = np.asarray(real, dtype=np.float64)
+    mantissa, exponent = np.frexp(values)
+    multiplier = np.floor(mantissa * 2.0**31 + 0.5)
+    over = multiplier >= 2.0**31
+    multiplier, exponent = np.where(over, 2.0**30, multiplier), np.where(over, exponent + 1, exponent)
+    shift = 31 - exponent
+    if (shift < 1).any():
+        raise ExportError(
+            f"a factor of {values.max():.3g} between two formats is beyond 2^30: their ranges differ too much"
+        )
+    small = shift > 62  # A factor this small is no more than nought after rounding.
+    return np.where(small, 0, multiplier).astype(np.int32), np.where(small, 62, shift).astype(np.uint8)
+
+
+def scaled(accumulator: Any, multiplier: Any, shift: Any) -> Whole:
+    """``accumulator multiplier 2^-shift`` rounded half up; accumulators of 32 bits."""
+    shift = np.asarray(shift, dtype=np.int64)
+    product = np.asarray(accumulator, dtype=np.int64) * np.asarray(multiplier, dtype=np.int64)
+    return np.asarray((product + (np.int64(1) << (shift - 1))) >> shift)
+
+
+def _table(function: Any, last: float) -> NDArray[np.uint16]:
+    at = np.linspace(0.0, last, TABLE)
+    values = np.array([function(float(x)) for x in at])
+    return np.clip(np.floor(values * 65536.0 + 0.5), 0, 65535).astype(np.uint16)
+
+
+TANH = _table(math.tanh, 8.0)
+"""tanh on [0, 8], in 2^-16."""
+EXP = _table(lambda x: math.exp(-x), 16.0)
+"""exp(-x) on [0, 16], in 2^-16."""
+LOG1P_EXP = _table(lambda x: math.log1p(math.exp(-x)), 16.0)
+"""log(1 + exp(-x)) on [0, 16], in 2^-16."""
+NORMAL = _table(lambda x: 0.5 * (1.0 + math.erf(x / math.sqrt(2.0))), 8.0)
+"""Cumulated normal distribution on [0, 8], in 2^-16."""
+
+
+def looked_up(table: NDArray[np.uint16], x: Whole, step: int) -> Whole:
+    """A table at x >= 0, `2^step` apart, interpolated; beyond its end its last entries."""
+    x = np.minimum(x, ((TABLE - 1) << step) - 1)
+    at, rest = x >> step, x & ((1 << step) - 1)
+    low = table[at].astype(np.int64)
+    high = table[at + 1].astype(np.int64)
+    return low + rounded_shift((high - low) * rest, step)
+
+
+def tanh(x: Whole, frac: int) -> Whole:
+    """In 2^-15, of x in ``2^-frac``, `frac` at least 6."""
+    size = looked_up(TANH, np.abs(x), frac - 6)
+    return np.where(x < 0, -1, 1) * np.minimum((size + 1) >> 1, LARGEST)
+
+
+def sigmoid(x: Whole) -> Whole:
+    """In 2^-15, of x in 2^-16: ``(1 + tanh(x / 2)) / 2``."""
+    half = looked_up(TANH, np.abs(x), GATE_FRAC - 5)
+    return np.minimum(rounded_shift(65536 + np.where(x < 0, -1, 1) * half, 2), LARGEST)
+
+
+def exp(x: Whole) -> Whole:
+    """In 2^-16, of x <= 0 in 2^-16."""
+    return looked_up(EXP, -x, GATE_FRAC - 5)
+
+
+def softplus(x: Whole) -> Whole:
+    """In 2^-16, of x in 2^-16."""
+    return np.maximum(x, 0) + looked_up(LOG1P_EXP, np.abs(x), GATE_FRAC - 5)
+
+
+def normal(x: Whole) -> Whole:
+    """Cumulated normal distribution in 2^-16, of x in 2^-16."""
+    above = looked_up(NORMAL, np.abs(x), GATE_FRAC - 6)
+    return np.where(x < 0, 65536 - above, above)
+
+
+def softmax(scores: Whole) -> Whole:
+    """Weights in 2^-15 over the last axis, of scores in 2^-16."""
+    raised = exp(scores - scores.max(axis=-1, keepdims=True))
+    total = raised.sum(axis=-1, keepdims=True)
+    return np.asarray(((raised << 15) + (total >> 1)) // total)

@@ -1,0 +1,88 @@
+"""A predictor that computes in W8A16: what a controller computes to the last bit, judged like any other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import NoReturn
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edp.data.scaling import Scaler
+from edp.data.series import Series
+from edp.errors import ExportError
+from edp.graph import Graph
+from edp.integer import Formats, Integers, calibrate, quantise
+from edp.models.predictor import Predictor
+from edp.streaming import State
+
+
+class IntegerPredictor(Predictor):
+    """The whole-number form of a trained predictor; it cannot be trained.
+
+    Args:
+        source: the float network.
+        chosen: formats of its values.
+
+    Attributes:
+        formats: formats of its values.
+        integers: its layers.
+
+    Raises:
+        ExportError: a part of the network has no whole-number form.
+    """
+
+    number_format = "w8a16"
+
+    def __init__(self, source: Predictor, chosen: Formats) -> None:
+        numbers = (source.front.offset, source.front.width, source.code.offset, source.code.width)
+        offset, width, zero, unit = (part.detach().cpu().double().numpy() for part in numbers)
+        super().__init__(source.task, source.spec, Scaler(offset, width, zero, unit))
+        self.load_state_dict(source.state_dict())
+        self.formats = chosen
+        self.integers: Graph = quantise(source.graph(), chosen)
+        self.eval()
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        """State at reset for `batch` streams."""
+        return Integers(self.integers, batch)
+
+    def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Predictions in SI units, ``(batch, time, horizon, target)``, and the next state."""
+        results, new = self._run(x, state)
+        return self._shaped(results["prediction"], x), new
+
+    def intervals(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper, and the next state."""
+        results, new = self._run(x, state)
+        sides = [self._shaped(results[side], x, len(self.output.coverages)) for side in ("lower", "upper")]
+        return torch.stack(sides, dim=3), new
+
+    def expose(self, x: Tensor, state: State) -> NoReturn:
+        """There is nothing to see inside.
+
+        Raises:
+            ExportError: always.
+        """
+        raise ExportError("a network in w8a16 gives predictions only; train, calibrate and teach with the float one")
+
+    def _run(self, x: Tensor, state: State) -> tuple[dict[str, np.ndarray], State]:
+        new = deepcopy(state)
+        return new.run(x.detach().cpu().float().numpy().transpose(1, 0, 2)), new
+
+    def _shaped(self, values: np.ndarray, like: Tensor, *more: int) -> Tensor:
+        sizes = (*more, len(self.task.horizons), len(self.task.targets))
+        rows = torch.from_numpy(np.ascontiguousarray(values.transpose(1, 0, 2)))
+        return rows.reshape(*rows.shape[:2], *sizes).to(like)
+
+
+def integer_predictor(predictor: Predictor, series: Sequence[Series], ticks: int = 20_000) -> IntegerPredictor:
+    """Quantise a trained network; formats and weights are chosen on the inputs of `series`, its training part.
+
+    Raises:
+        ExportError: a part of the network has no whole-number form.
+    """
+    graph = predictor.graph()
+    return IntegerPredictor(predictor, calibrate(graph, [part.inputs for part in series], ticks))

@@ -1,0 +1,105 @@
+"""Every network that the registries allow, in whole numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from edp.data.series import Series
+from edp.errors import ExportError
+from edp.graph import base
+from edp.integer import calibrate, quantise
+from edp.integer.quantise import FLOAT, LOWER, REFUSED
+from edp.integer.reference import WHOLE
+from edp.integer.single import OVER_TIME
+from edp.models.integer import IntegerPredictor
+from edp.models.running import stream_intervals, stream_predictions
+
+
+def series_of(rows, predictor):
+    return Series("s", rows, np.zeros((len(rows), len(predictor.task.targets)), dtype=np.float32))
+
+
+@pytest.fixture
+def network(structure, predictor_of, integers_of):
+    """A float network and its whole-number form."""
+    return predictor_of(structure, dtype=torch.float32), integers_of(structure)
+
+
+def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, rows_of):
+    predictor = predictor_of(structure, dtype=torch.float32)
+    if predictor.physics is not None:
+        return
+    graph = predictor.graph()
+    if {type(layer) for layer in graph.layers} & set(REFUSED):
+        with pytest.raises(ExportError, match="no form in whole numbers; train with"):
+            calibrate(graph, [rows_of(predictor, 50)])
+    else:
+        calibrate(graph, [rows_of(predictor, 50)])
+
+
+def test_whole_numbers_predict_nearly_the_same(network, rows_of):
+    predictor, integers = network
+    rows = [series_of(rows_of(predictor, seed=seed), predictor) for seed in (1, 2)]
+    wanted, found = (np.stack(stream_predictions(each, rows)) for each in (predictor, integers))
+    spread = predictor.code.width.numpy() * np.ones_like(wanted[0])
+    error = np.sqrt(np.mean(((found - wanted) / spread) ** 2))
+    assert error < 0.03 * max(1.0, float(np.std(wanted / spread)))
+    if predictor.output.coverages:
+        bounds = np.stack(stream_intervals(integers, rows))
+        assert (bounds[:, :, :, 0] <= bounds[:, :, :, 1]).all()
+
+
+def test_chunks_and_company_change_no_bit(network, rows_of):
+    predictor, integers = network
+    rows = torch.from_numpy(np.stack([rows_of(predictor, 90, seed) for seed in (3, 4)]))
+    whole, _ = integers.predict(rows, integers.initial_state(2, rows))
+    state, parts = integers.initial_state(1, rows), []
+    for start, stop in ((0, 1), (1, 37), (37, 90)):
+        part, state = integers.predict(rows[1:, start:stop], state)
+        parts.append(part)
+    torch.testing.assert_close(torch.cat(parts, dim=1)[0], whole[1], rtol=0, atol=0)
+
+
+def test_weights_and_formats_are_all_that_is_needed(network):
+    predictor, integers = network
+    again = IntegerPredictor(predictor, integers.formats)
+    for (layer, name, values), (_, _, other) in zip(integers.integers.tensors(), again.integers.tensors(), strict=True):
+        np.testing.assert_array_equal(values, other, err_msg=f"{layer} {name}")
+        assert values.dtype == other.dtype
+
+
+def test_no_weight_stays_real(network):
+    _, integers = network
+    for layer in integers.integers.layers:
+        weighted = [values.dtype for name, values in layer.tensors().items() if "weight" in name or name == "score"]
+        assert set(weighted) <= {np.dtype(np.int8)}, layer.name
+        assert layer.macs == 0 or weighted or isinstance(layer, FLOAT), layer.name
+
+
+def test_every_kind_of_layer_is_known():
+    kinds = {kind for kind in base.Layer.__subclasses__() if kind.__module__.startswith("edp.graph.")}
+    kinds |= {kind for parent in kinds for kind in parent.__subclasses__()}
+    known = set(LOWER) | set(OVER_TIME) | set(REFUSED)
+    assert {kind for kind in kinds if not kind.__name__.startswith("_")} <= known
+    assert len(WHOLE) == 17
+
+
+def test_inputs_beyond_their_range_are_clipped_and_counted(predictor_of, rows_of):
+    predictor = predictor_of("lstm", dtype=torch.float32)
+    integers = IntegerPredictor(predictor, calibrate(predictor.graph(), [rows_of(predictor)]))
+    run = integers.initial_state(1, torch.zeros(1))
+    run.run(rows_of(predictor)[:, None])
+    assert run.clipped == 0
+    run.run(1e6 * np.ones((3, 1, predictor.front.inputs), dtype=np.float32))
+    assert run.clipped >= 3
+    run.reset()
+    assert run.clipped == 0
+
+
+def test_formats_of_another_network_are_refused(predictor_of, rows_of):
+    first, second = (predictor_of(name, dtype=torch.float32) for name in ("lstm", "tcn"))
+    chosen = calibrate(first.graph(), [rows_of(first)])
+    with pytest.raises(ExportError, match="the formats are those of another network"):
+        quantise(second.graph(), chosen)
