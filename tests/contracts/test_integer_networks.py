@@ -45,7 +45,7 @@ def test_whole_numbers_predict_nearly_the_same(network, rows_of):
     wanted, found = (np.stack(stream_predictions(each, rows)) for each in (predictor, integers))
     spread = predictor.code.width.numpy() * np.ones_like(wanted[0])
     error = np.sqrt(np.mean(((found - wanted) / spread) ** 2))
-    assert error < 0.03 * max(1.0, float(np.std(wanted / spread)))
+    assert error < 0.05 * max(1.0, float(np.std(wanted / spread)))
     if predictor.output.coverages:
         bounds = np.stack(stream_intervals(integers, rows))
         assert (bounds[:, :, :, 0] <= bounds[:, :, :, 1]).all()
