@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from edp.evaluation.judge import Evaluation, JudgeSpec, judge
 from edp.evaluation.traced import check_counted
 from edp.evaluation.worth import Worths, WorthSpec
 from edp.evaluation.worth import channel_worths as measure_worths
-from edp.export import TARGETS
+from edp.export import make_target
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination, describe
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
@@ -303,14 +303,19 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str]:
     return bundle.predictor, describe(bundle.predictor.spec)
 
 
-def export_bundle(path: str | Path, to: str, folder: str | Path, name: str = "predictor") -> list[Path]:
+def export_bundle(
+    path: str | Path,
+    to: str,
+    folder: str | Path,
+    name: str = "predictor",
+    options: Mapping[str, object] | None = None,
+) -> list[Path]:
     """Write a bundle or the bundle of a run folder in the form `to`; returns the files, the one to read first in front.
 
     Raises:
-        EdpError: not a bundle, an unknown form, or a network or name that this form cannot hold.
+        EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
     """
-    target = TARGETS[to]()
-    return target.write(load_bundle(path), name, Path(folder))
+    return make_target(to, options).write(load_bundle(path), name, Path(folder))
 
 
 def _untrained(model: ModelSpec, task: Any) -> Predictor:

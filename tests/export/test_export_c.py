@@ -180,7 +180,7 @@ def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path):
         with pytest.raises(ExportError, match="--name"):
             CTarget().write(bundle_of("lstm"), name, tmp_path)
     with pytest.raises(ConfigError, match="known: c"):
-        TARGETS["onnxx"]
+        TARGETS["simulynk"]
     assert not list(tmp_path.iterdir())
 
 

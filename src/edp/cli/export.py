@@ -12,18 +12,19 @@ from edp.cli.console import JsonFlag, emit, out
 
 def export(
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train.")],
-    to: Annotated[str, typer.Option(help="Form: c (C99 for controllers).")],
+    to: Annotated[str, typer.Option(help="Form: c (C99 for controllers) or onnx.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; those of the same names are replaced.")],
     name: Annotated[str, typer.Option(help="What the network is called there.")] = "predictor",
+    opset: Annotated[int | None, typer.Option(help="Of onnx: version of the operators (default 13).")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a trained network as source code that reads and gives SI units, tick by tick.
+    """Write a trained network in a form that runs without EDP; it reads and gives SI units.
 
     Example: `edp export runs/first --to c --out firmware/predictor`
     """
     from edp.workflow import export_bundle
 
-    files = export_bundle(bundle, to, folder, name)
+    files = export_bundle(bundle, to, folder, name, {} if opset is None else {"opset": opset})
 
     def show() -> None:
         for file in files:

@@ -1,6 +1,7 @@
 """Writes a trained network in a form that runs without EDP: one file or folder a target, entered in `TARGETS`."""
 
-from edp.export.base import TARGETS, ExportTarget
+from edp.export.base import TARGETS, ExportTarget, make_target
 from edp.export.c import CTarget
+from edp.export.onnx import OnnxTarget
 
-__all__ = ["TARGETS", "CTarget", "ExportTarget"]
+__all__ = ["TARGETS", "CTarget", "ExportTarget", "OnnxTarget", "make_target"]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Protocol
 
+from edp.errors import ConfigError
 from edp.registry import Registry
 from edp.training.bundle import Bundle
 
@@ -31,3 +34,19 @@ class ExportTarget(Protocol):
 
 
 TARGETS: Registry[type[ExportTarget]] = Registry("export target")
+
+
+def make_target(name: str, options: Mapping[str, object] | None = None) -> ExportTarget:
+    """A target by name with its options.
+
+    Raises:
+        ConfigError: there is no such target, or it has no such option.
+        ExportError: a value that the target does not take.
+    """
+    kind, given = TARGETS[name], dict(options or {})
+    known: list[str] = [entry.name for entry in fields(kind)] if is_dataclass(kind) else []
+    for option in given:
+        if option not in known:
+            has = f"it has {', '.join(known)}" if known else "it has none"
+            raise ConfigError(f"export target '{name}' has no option '{option}' ({has}); leave it out")
+    return kind(**given)

@@ -91,6 +91,14 @@ def test_export_lists_its_files(edp, trained, tmp_path):
     assert str(tmp_path / "c" / "arm_golden.h") in made["files"]
 
 
+def test_export_to_onnx_takes_an_opset(edp, trained, tmp_path):
+    pytest.importorskip("onnx", reason="needs the extra onnx")
+    shown = edp("export", trained, "--to", "onnx", "--opset", "11", "--out", tmp_path / "onnx").out
+    assert "read predictor.json first" in shown
+    described = json.loads((tmp_path / "onnx" / "predictor.json").read_text())
+    assert described["graphs"]["step"]["opset"] == 11
+
+
 def test_json_of_a_process_is_all_of_standard_output(trained):
     command = [sys.executable, "-m", "edp", "report", str(trained), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -145,6 +145,8 @@ def test_unknown_preset_machine_format_and_paths(edp, logs, tmp_path):
     refused(edp("footprint", tmp_path / "none.toml"), "none.toml")
     refused(edp("export", tmp_path, "--to", "c", "--out", run), "not a bundle", "edp train")
     refused(edp("export", tmp_path, "--to", "see", "--out", run), "unknown export target 'see'", "known: c")
+    refused(edp("export", tmp_path, "--to", "c", "--opset", "9", "--out", run), "'c' has no option 'opset'")
+    refused(edp("export", tmp_path, "--to", "onnx", "--opset", "10", "--out", run), "opset 10", "9, 11, 13")
     assert not run.exists()
 
 

@@ -1,0 +1,221 @@
+"""An ONNX graph in the making: the only file that imports the `onnx` package, and that knows how opsets differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edp import __version__
+from edp.errors import ExportError
+
+OPSETS = {9: 4, 11: 6, 13: 7, 17: 8, 21: 10}
+"""IR version by opset: the one that was current when the opset came out, so that readers of that time take the file."""
+DEFAULT_OPSET = 13
+_NAMES = """
+Add Clip Concat Div Erf Exp Gemm Identity Mul ReduceMean Relu Reshape Sigmoid Softmax Softplus Split Sqrt Sub Tanh
+"""
+ALLOWED = frozenset(_NAMES.split())
+"""Operators that are written: long-lived ones with a plain meaning, whose indices and shapes are constants."""
+
+
+def library() -> ModuleType:
+    """The `onnx` package.
+
+    Raises:
+        ExportError: it is not installed.
+    """
+    try:
+        import onnx
+    except ImportError as error:
+        raise ExportError(
+            "ONNX files need the package onnx, which is not installed; run pip install "
+            "'excavator-dynamics-predictor[onnx]'"
+        ) from error
+    return onnx
+
+
+class Nodes:
+    """Nodes and constants; every method that adds a node returns the name of its value.
+
+    Args:
+        opset: a key of `OPSETS`.
+
+    Raises:
+        ExportError: the package is missing, or the opset is not one that is written.
+    """
+
+    def __init__(self, opset: int = DEFAULT_OPSET) -> None:
+        if opset not in OPSETS:
+            raise ExportError(f"opset {opset} is not written; choose one of {', '.join(map(str, OPSETS))}")
+        self.opset, self._onnx = opset, library()
+        self._nodes: list[Any] = []
+        self._constants: dict[tuple[str, tuple[int, ...], bytes], str] = {}
+        self._tensors: list[Any] = []
+        self._taken: set[str] = set()
+        self._scope = "graph"
+
+    @contextmanager
+    def inside(self, scope: str) -> Iterator[None]:
+        """Names made within begin with `scope`."""
+        before, self._scope = self._scope, scope
+        try:
+            yield
+        finally:
+            self._scope = before
+
+    def reserve(self, *names: str) -> None:
+        """Keep names of inputs and outputs from being given to anything else."""
+        self._taken |= set(names)
+
+    def name(self, what: str) -> str:
+        """A name of this scope that is not in use."""
+        first = f"{self._scope}_{what}"
+        made = next(c for n in range(len(self._taken) + 1) if (c := f"{first}_{n}" if n else first) not in self._taken)
+        self._taken.add(made)
+        return made
+
+    def constant(self, values: ArrayLike, what: str = "constant") -> str:
+        """A float32 array, or an int64 one if that is what comes; equal ones are written once."""
+        array = np.asarray(values)
+        plain = np.ascontiguousarray(array, dtype=np.int64 if array.dtype == np.int64 else np.float32)
+        key = (str(plain.dtype), array.shape, plain.tobytes())
+        if key not in self._constants:
+            self._constants[key] = name = self.name(what)
+            self._tensors.append(self._onnx.numpy_helper.from_array(plain.reshape(array.shape), name))
+        return self._constants[key]
+
+    def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
+        """A node with one output."""
+        return self.several(operator, inputs, 1, **attributes)[0]
+
+    def several(self, operator: str, inputs: Sequence[str], outputs: int, **attributes: Any) -> list[str]:
+        """A node with several outputs."""
+        if operator not in ALLOWED:
+            raise ExportError(f"operator {operator} is not one that importers can be counted on to have")
+        made = [self.name(operator.lower()) for _ in range(outputs)]
+        self._nodes.append(self._onnx.helper.make_node(operator, list(inputs), made, made[0], **attributes))
+        return made
+
+    def split(self, x: str, sizes: Sequence[int], axis: int) -> list[str]:
+        """Neighbouring pieces; the value itself where there is one piece."""
+        if len(sizes) == 1:
+            return [x]
+        if self.opset < 13:
+            return self.several("Split", [x], len(sizes), axis=axis, split=list(sizes))
+        return self.several("Split", [x, self.constant(np.array(sizes, np.int64), "sizes")], len(sizes), axis=axis)
+
+    def join(self, parts: Sequence[str], axis: int) -> str:
+        """Values end to end; the value itself where there is one."""
+        return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=axis)
+
+    def shaped(self, x: str, *shape: int) -> str:
+        """The numbers of a value in another shape, in the same order."""
+        return self.add("Reshape", x, self.constant(np.array(shape, np.int64), "shape"))
+
+    def clip(self, x: str, low: float, high: float) -> str:
+        """Each number, but no less than `low` and no more than `high`."""
+        if self.opset < 11:
+            return self.add("Clip", x, min=float(low), max=float(high))
+        return self.add("Clip", x, self.constant(np.float32(low)), self.constant(np.float32(high)))
+
+    def mean(self, x: str, axis: int) -> str:
+        """Mean over an axis, which stays with length 1."""
+        if self.opset < 18:
+            return self.add("ReduceMean", x, axes=[axis], keepdims=1)
+        return self.add("ReduceMean", x, self.constant(np.array([axis], np.int64), "axis"), keepdims=1)
+
+    def linear(self, x: str, weight: NDArray[np.float32], bias: NDArray[np.float32] | str) -> str:
+        """``x W^T + b``, row by row; `weight` ``(out, in)``, `bias` an array ``(out,)`` or a value."""
+        added = bias if isinstance(bias, str) else self.constant(bias, "bias")
+        return self.add("Gemm", x, self.constant(weight, "weight"), added, transB=1)
+
+    def product(self, a: str, b: str, added: str | None = None, scale: float = 1.0, turn: bool = False) -> str:
+        """``scale a b`` plus a value, both matrices; with `turn`, b is transposed first."""
+        third = added or self.constant(np.zeros((1, 1), np.float32), "zero")  # not optional before opset 11
+        return self.add("Gemm", a, b, third, alpha=float(scale), transB=int(turn))
+
+    def times(self, x: str, factor: ArrayLike) -> str:
+        """A value times a constant."""
+        return self.add("Mul", x, self.constant(factor, "factor"))
+
+    def plus(self, x: str, term: ArrayLike) -> str:
+        """A value plus a constant."""
+        return self.add("Add", x, self.constant(term, "term"))
+
+    def less(self, a: str, b: str) -> str:
+        """``a - b``, without a subtraction of two values, which importers lack."""
+        return self.add("Add", a, self.times(b, np.float32(-1.0)))
+
+    def softmax(self, x: str) -> str:
+        """Weights that sum to 1 in each row of a matrix."""
+        return self.add("Softmax", x, axis=1)
+
+    def model(
+        self,
+        name: str,
+        inputs: Mapping[str, tuple[int, ...]],
+        outputs: Mapping[str, tuple[str, tuple[int, ...]]],
+        notes: Mapping[str, str],
+    ) -> bytes:
+        """The finished, checked file.
+
+        Args:
+            name: of the graph.
+            inputs: shapes by name.
+            outputs: by name, the value that is given out and its shape.
+            notes: kept in the file as metadata.
+
+        Raises:
+            ExportError: the checker of the `onnx` package objects.
+        """
+        self._name_outputs(set(inputs), {out: value for out, (value, _) in outputs.items()})
+        self._drop_unread(outputs)
+        helper, proto = self._onnx.helper, self._onnx.TensorProto.FLOAT
+        graph = helper.make_graph(
+            self._nodes,
+            name,
+            [helper.make_tensor_value_info(key, proto, shape) for key, shape in inputs.items()],
+            [helper.make_tensor_value_info(key, proto, shape) for key, (_, shape) in outputs.items()],
+            self._tensors,
+        )
+        made = helper.make_model(
+            graph,
+            opset_imports=[helper.make_opsetid("", self.opset)],
+            ir_version=OPSETS[self.opset],
+            producer_name="excavator-dynamics-predictor",
+            producer_version=__version__,
+        )
+        helper.set_model_props(made, dict(notes))
+        try:
+            self._onnx.checker.check_model(made, full_check=True)
+        except Exception as error:
+            raise ExportError(f"the ONNX checker refuses graph '{name}' at opset {self.opset}: {error}") from error
+        return bytes(made.SerializeToString(deterministic=True))
+
+    def _name_outputs(self, inputs: set[str], outputs: Mapping[str, str]) -> None:
+        """Let the nodes that make the outputs give them their names."""
+        made = {name for node in self._nodes for name in node.output}
+        names: dict[str, str] = {}
+        for out, value in outputs.items():
+            if value in names or value in inputs or value not in made:
+                self._nodes.append(self._onnx.helper.make_node("Identity", [names.get(value, value)], [out], out))
+            else:
+                names[value] = out
+        for node in self._nodes:
+            node.input[:] = [names.get(key, key) for key in node.input]
+            node.output[:] = [names.get(key, key) for key in node.output]
+
+    def _drop_unread(self, outputs: Mapping[str, object]) -> None:
+        """Remove nodes and constants that no output rests on."""
+        wanted, kept = set(outputs), []
+        for node in reversed(self._nodes):
+            if wanted & set(node.output):
+                kept.append(node)
+                wanted |= set(node.input)
+        self._nodes = kept[::-1]
+        self._tensors = [tensor for tensor in self._tensors if tensor.name in wanted]

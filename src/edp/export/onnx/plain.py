@@ -1,0 +1,149 @@
+"""ONNX nodes of the layers without memory: matrices ``(tick, number)`` in, one out, each row by itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from edp.export.onnx.nodes import Nodes
+from edp.graph import Layer, layers
+from edp.graph.layers import Function
+
+MOST_PIECES = 12
+"""Runs of neighbouring columns up to which numbers are moved by splitting and joining; beyond, by a 0/1 matrix."""
+
+Plain = Callable[[Nodes, Any, int, Sequence[str], Sequence[int]], str]
+"""(nodes, layer, ticks, values, their widths) to the layer's value."""
+
+
+def activate(nodes: Nodes, function: Function, x: str) -> str:
+    """A function of each number."""
+    if function is Function.GELU:
+        half = nodes.plus(nodes.add("Erf", nodes.times(x, np.float32(1 / math.sqrt(2)))), np.float32(1.0))
+        return nodes.add("Mul", nodes.times(x, np.float32(0.5)), half)
+    return nodes.add(OPERATORS[function], x)
+
+
+OPERATORS = {
+    Function.RELU: "Relu",
+    Function.SIGMOID: "Sigmoid",
+    Function.TANH: "Tanh",
+    Function.SOFTPLUS: "Softplus",
+    Function.EXP: "Exp",
+}
+
+
+def normed(nodes: Nodes, x: str, epsilon: float) -> str:
+    """Each row less its mean, over the root of its variance plus `epsilon`."""
+    middle = nodes.less(x, nodes.mean(x, 1))
+    spread = nodes.plus(nodes.mean(nodes.add("Mul", middle, middle), 1), np.float32(epsilon))
+    return nodes.add("Div", middle, nodes.add("Sqrt", spread))
+
+
+def _rows(nodes: Nodes, x: str, ticks: int, rows: int, size: int) -> str:
+    return x if rows == 1 else nodes.shaped(x, ticks * rows, size)
+
+
+def _flat(nodes: Nodes, x: str, ticks: int, rows: int, width: int) -> str:
+    return x if rows == 1 else nodes.shaped(x, ticks, width)
+
+
+def _gather(nodes: Nodes, layer: layers.Gather, ticks: int, values: Sequence[str], widths: Sequence[int]) -> str:
+    origin = [(value, column) for value, width in enumerate(widths) for column in range(width)]
+    runs: list[list[int]] = []  # value, first column, one past the last
+    for column in layer.columns:
+        value, at = origin[column]
+        if runs and runs[-1][0] == value and runs[-1][2] == at:
+            runs[-1][2] = at + 1
+        else:
+            runs.append([value, at, at + 1])
+    if len(runs) > MOST_PIECES:
+        matrix = np.zeros((len(layer.columns), len(origin)), np.float32)
+        matrix[np.arange(len(layer.columns)), list(layer.columns)] = 1.0
+        return nodes.linear(nodes.join(list(values), 1), matrix, np.zeros(1, np.float32))
+    pieces: dict[int, dict[int, tuple[int, str]]] = {}
+    for number, width in enumerate(widths):
+        ends = {end for value, *both in runs if value == number for end in both}
+        if ends:
+            cuts = sorted({0, width} | ends)
+            names = nodes.split(values[number], [b - a for a, b in pairwise(cuts)], 1)
+            pieces[number] = {a: (b, name) for (a, b), name in zip(pairwise(cuts), names, strict=True)}
+    parts = []
+    for value, at, stop in runs:
+        while at < stop:
+            at, name = pieces[value][at]
+            parts.append(name)
+    return nodes.join(parts, 1)
+
+
+def _standardise(nodes: Nodes, layer: layers.Standardise, ticks: int, values: Sequence[str], *_: object) -> str:
+    centred = nodes.add("Sub", values[0], nodes.constant(layer.offset, "offset"))
+    return nodes.add("Div", centred, nodes.constant(layer.scale, "scale"))
+
+
+def _scale_shift(nodes: Nodes, layer: layers.ScaleShift, ticks: int, values: Sequence[str], *_: object) -> str:
+    return nodes.plus(nodes.times(values[0], layer.gain), layer.shift)
+
+
+def _glu(nodes: Nodes, layer: layers.Glu, ticks: int, values: Sequence[str], *_: object) -> str:
+    half = layer.size // 2
+    value, gate = nodes.split(_rows(nodes, values[0], ticks, layer.rows, layer.size), [half, half], 1)
+    return _flat(nodes, nodes.add("Mul", value, nodes.add("Sigmoid", gate)), ticks, layer.rows, layer.width)
+
+
+def _accumulate(nodes: Nodes, layer: layers.Accumulate, ticks: int, values: Sequence[str], *_: object) -> str:
+    rows = nodes.split(values[0], [layer.size] * layer.rows, 1)
+    sums = rows[:1]
+    for row in rows[1:]:
+        sums.append(nodes.add("Add", sums[-1], row))
+    return nodes.join(sums, 1)
+
+
+def _dense(nodes: Nodes, layer: layers.Dense, ticks: int, values: Sequence[str], *_: object) -> str:
+    rows = _rows(nodes, values[0], ticks, layer.rows, layer.weight.shape[1])
+    return _flat(nodes, nodes.linear(rows, layer.weight, layer.bias), ticks, layer.rows, layer.width)
+
+
+def _grouped(nodes: Nodes, layer: layers.GroupedDense, ticks: int, values: Sequence[str], *_: object) -> str:
+    count, _, into = layer.weight.shape
+    rows = nodes.split(values[0], [into] * count, 1)
+    parts = [nodes.linear(x, w, b) for x, w, b in zip(rows, layer.weight, layer.bias, strict=True)]
+    return nodes.join(parts, 1)
+
+
+def _norm(nodes: Nodes, layer: layers.LayerNorm, ticks: int, values: Sequence[str], *_: object) -> str:
+    rows = _rows(nodes, values[0], ticks, layer.rows, len(layer.gain))
+    scaled = nodes.plus(nodes.times(normed(nodes, rows, layer.epsilon), layer.gain), layer.shift)
+    return _flat(nodes, scaled, ticks, layer.rows, layer.width)
+
+
+def _row_attention(nodes: Nodes, layer: layers.RowAttention, ticks: int, values: Sequence[str], *_: object) -> str:
+    split = [nodes.split(x, [1] * ticks, 0) for x in values]
+    seen = []
+    for tick in zip(*split, strict=True):
+        q, k, v = (nodes.shaped(x, layer.rows, layer.size) for x in tick)
+        weights = nodes.softmax(nodes.product(q, k, scale=1 / math.sqrt(layer.size), turn=True))
+        seen.append(nodes.shaped(nodes.product(weights, v), 1, layer.width))
+    return nodes.join(seen, 0)
+
+
+PLAIN: dict[type[Layer], Plain] = {
+    layers.Gather: _gather,
+    layers.Standardise: _standardise,
+    layers.ScaleShift: _scale_shift,
+    layers.Add: lambda nodes, layer, ticks, values, widths: nodes.add("Add", *values),
+    layers.Subtract: lambda nodes, layer, ticks, values, widths: nodes.less(*values),
+    layers.Multiply: lambda nodes, layer, ticks, values, widths: nodes.add("Mul", *values),
+    layers.Activate: lambda nodes, layer, ticks, values, widths: activate(nodes, layer.function, values[0]),
+    layers.Glu: _glu,
+    layers.Accumulate: _accumulate,
+    layers.Dense: _dense,
+    layers.GroupedDense: _grouped,
+    layers.LayerNorm: _norm,
+    layers.RowAttention: _row_attention,
+}
+"""By kind of layer."""

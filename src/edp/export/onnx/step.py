@@ -1,0 +1,157 @@
+"""The graph ``step``: the inputs of one tick and all states in, predictions and the next states out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from edp.errors import ExportError
+from edp.export.onnx.memory import STEPS, Held, shape_of, step_correction
+from edp.export.onnx.nodes import DEFAULT_OPSET, Nodes
+from edp.export.onnx.plain import PLAIN
+from edp.graph import Array, Graph, Layer, memory
+from edp.graph.base import INPUT
+
+INPUTS = "inputs"
+"""The graph's input of raw numbers, SI units."""
+SPOILT = "spoilt"
+"""The state that is 0 until an input was not finite, and NaN from then on."""
+LAST = "_next"
+"""What the name of a state ends with where it comes out."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A state of the step graph.
+
+    Attributes:
+        name: of the graph's input; the output has `LAST` behind it.
+        layer: that remembers it, and its slot there; empty for `SPOILT`.
+        start: values after a reset, a matrix.
+    """
+
+    name: str
+    layer: tuple[str, str]
+    start: Array
+
+    @property
+    def next(self) -> str:
+        """The name of the output."""
+        return self.name + LAST
+
+
+def plain_name(name: str) -> str:
+    """The name of a layer as part of a name in the graph."""
+    return name.replace(".", "_")
+
+
+def states_of(graph: Graph) -> list[State]:
+    """The states of the step graph, in the order of its inputs."""
+    kept: list[State] = []
+    taken = {INPUTS, SPOILT, *graph.results}
+    for layer, slot in graph.slots():
+        if slot.size:
+            first = f"{plain_name(layer)}_{slot.name}"
+            name = next(c for n in range(len(kept) + 9) if (c := f"{first}_{n}" if n else first) not in taken)
+            taken |= {name, name + LAST}
+            kept.append(State(name, (layer, slot.name), graph.start(layer, slot).reshape(shape_of(slot))))
+    return [*kept, State(SPOILT, ("", ""), np.zeros((1, 1), np.float32))]
+
+
+def refuse(layer: Layer) -> ExportError:
+    """The error for a kind of layer that is not written."""
+    kinds: set[type[Layer]] = {*PLAIN, *STEPS, memory.PrefixCorrection}
+    known = sorted(kind.__name__ for kind in kinds)
+    return ExportError(
+        f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in ONNX; these have: {', '.join(known)}"
+    )
+
+
+def shape_of_result(graph: Graph, value: str, targets: int) -> tuple[int, int]:
+    """Shape of a result as a matrix: horizons, or intervals and horizons, by targets."""
+    return graph.width_of(value) // targets, targets
+
+
+def spoil(nodes: Nodes, inputs: str) -> str:
+    """0 ``(tick, 1)`` where all inputs of a tick are finite, else NaN: ReLU and clipping may swallow a NaN."""
+    return nodes.mean(nodes.times(inputs, np.float32(0)), 1)
+
+
+def step_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], opset: int = DEFAULT_OPSET) -> bytes:
+    """The file of the step graph.
+
+    Args:
+        graph: the layers.
+        targets: numbers of each horizon.
+        name: of the ONNX graph.
+        notes: kept in the file.
+        opset: one of `OPSETS`.
+
+    Raises:
+        ExportError: a layer has no form in ONNX, or the opset is not written.
+    """
+    nodes, states = Nodes(opset), states_of(graph)
+    nodes.reserve(INPUTS, *graph.results, *(name for s in states for name in (s.name, s.next)))
+    held: dict[str, dict[str, str]] = {layer.name: {} for layer in graph.layers}
+    for state in states[:-1]:
+        held[state.layer[0]][state.layer[1]] = state.name
+    values = {INPUT: INPUTS}
+    fresh: dict[str, Held] = {}
+    for layer in graph.layers:
+        with nodes.inside(plain_name(layer.name)):
+            _add_layer(nodes, graph, layer, values, held, fresh)
+    with nodes.inside("end"):
+        spoilt = nodes.add("Add", SPOILT, spoil(nodes, INPUTS))
+        outputs = add_results(nodes, graph, values, spoilt, targets)
+    for state in states[:-1]:
+        outputs[state.next] = (fresh[state.layer[0]][state.layer[1]], state.start.shape)
+    outputs[SPOILT + LAST] = (spoilt, (1, 1))
+    inputs = {INPUTS: (1, graph.inputs)} | {state.name: state.start.shape for state in states}
+    return nodes.model(name, inputs, outputs, notes)
+
+
+def _add_layer(
+    nodes: Nodes,
+    graph: Graph,
+    layer: Layer,
+    values: dict[str, str],
+    held: Mapping[str, Held],
+    fresh: dict[str, Held],
+) -> None:
+    given = [values[name] for name in layer.inputs]
+    if isinstance(layer, memory.PrefixCorrection):
+        numbers, fresh[layer.name] = step_correction(nodes, layer, held[layer.name], given[0])
+        for (owner, slot), part in corrections(nodes, graph, layer, numbers).items():
+            fresh[owner] = dict(fresh[owner]) | {slot: nodes.add("Add", fresh[owner][slot], part)}
+    elif type(layer) in STEPS:
+        values[layer.name], fresh[layer.name] = STEPS[type(layer)](nodes, layer, held[layer.name], *given)
+    elif type(layer) in PLAIN:
+        widths = [graph.width_of(name) for name in layer.inputs]
+        values[layer.name] = PLAIN[type(layer)](nodes, layer, 1, given, widths)
+    else:
+        raise refuse(layer)
+
+
+def corrections(nodes: Nodes, graph: Graph, layer: memory.PrefixCorrection, numbers: str) -> dict[tuple[str, str], str]:
+    """The part of a correction that each state gets, in the shape of the state."""
+    slots = {(name, slot.name): slot for name, slot in graph.slots()}
+    parts = nodes.split(numbers, [slots[owner].size for owner in layer.corrects], 1)
+    shaped = {}
+    for owner, part in zip(layer.corrects, parts, strict=True):
+        shape = shape_of(slots[owner])
+        shaped[owner] = part if shape[0] == 1 else nodes.shaped(part, *shape)
+    return shaped
+
+
+def add_results(
+    nodes: Nodes, graph: Graph, values: Mapping[str, str], spoilt: str, targets: int
+) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """The results, NaN where an input was not finite, as outputs of the graph."""
+    outputs: dict[str, tuple[str, tuple[int, ...]]] = {}
+    for meaning, value in graph.results.items():
+        shape = shape_of_result(graph, value, targets)
+        marked = nodes.add("Add", values[value], spoilt)
+        outputs[meaning] = (marked if shape[0] == 1 else nodes.shaped(marked, *shape), shape)
+    return outputs

@@ -1,0 +1,48 @@
+"""``--to onnx``: the graphs of a network, and a file that says what goes in and what comes out."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from edp.errors import ExportError
+from edp.export.base import TARGETS
+from edp.export.onnx.metadata import Description, as_json, notes
+from edp.export.onnx.nodes import DEFAULT_OPSET, OPSETS
+from edp.export.onnx.step import states_of, step_model
+from edp.storage import make_folder, write_bytes
+from edp.training.bundle import Bundle
+
+
+@TARGETS.register("onnx")
+@dataclass(frozen=True)
+class OnnxTarget:
+    """ONNX, float32: ``NAME_step.onnx`` and ``NAME.json``, which describes it.
+
+    Attributes:
+        opset: version of the operators; 13 goes with most readers, 9 and 11 with old ones.
+    """
+
+    opset: int = DEFAULT_OPSET
+
+    def __post_init__(self) -> None:
+        if self.opset not in OPSETS:
+            raise ExportError(f"opset {self.opset} is not written; choose one of {', '.join(map(str, OPSETS))}")
+
+    def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
+        """See `edp.export.ExportTarget`."""
+        if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name):
+            raise ExportError(
+                f"name '{name}' is that of files and graphs: up to 31 lower-case letters, digits, underscores, a "
+                "letter first; give another one with --name"
+            )
+        graph = bundle.predictor.graph()
+        described = Description(name, bundle, graph, tuple(states_of(graph)), self.opset)
+        targets = len(bundle.task.targets)
+        step = step_model(graph, targets, f"{name}_step", notes(described), self.opset)
+        made = {f"{name}.json": as_json(described, {"step": step}), f"{name}_step.onnx": step}
+        path = make_folder(folder)
+        for file, content in made.items():
+            write_bytes(path / file, content)
+        return [path / file for file in made]

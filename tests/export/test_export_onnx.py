@@ -1,0 +1,241 @@
+"""The ONNX graphs against PyTorch in ONNX Runtime, for every network that the registries allow, and their rules."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from edp.errors import ConfigError, ExportError
+from edp.export import make_target
+from edp.export.c.target import random_inputs, stream, tolerance
+from edp.export.onnx import nodes as nodes_file
+from edp.export.onnx.memory import STEPS
+from edp.export.onnx.nodes import ALLOWED, OPSETS, Nodes
+from edp.export.onnx.plain import PLAIN
+from edp.export.onnx.step import INPUTS, SPOILT, states_of, step_model
+from edp.export.onnx.target import OnnxTarget
+from edp.graph import Graph, Layer, memory
+from edp.graph.reference import STEPS as REFERENCE
+
+needed = "needs the packages onnx and onnxruntime: pip install 'excavator-dynamics-predictor[dev]'"
+onnx = pytest.importorskip("onnx", reason=needed)
+runtime = pytest.importorskip("onnxruntime", reason=needed)
+
+NETWORKS = ("hybrid+all", "hybrid9", "tcn+all", "gru+quantiles", "lstm2")
+"""Among them all kinds of layers."""
+
+
+def session(model):
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = 1, 3
+    return runtime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+class StepStream:
+    """A stream through a step graph."""
+
+    def __init__(self, graph, targets, opset=13):
+        self.graph, self.states = graph, states_of(graph)
+        self.run = session(step_model(graph, targets, "step", {}, opset))
+        self.names = [output.name for output in self.run.get_outputs()]
+        self.reset()
+
+    def reset(self):
+        self.held = {state.name: state.start for state in self.states}
+
+    def __call__(self, rows):
+        found = []
+        for row in rows:
+            made = dict(zip(self.names, self.run.run(None, {INPUTS: row[None], **self.held})))
+            self.held = {state.name: made[state.next] for state in self.states}
+            found.append(np.concatenate([made[meaning].ravel() for meaning in self.graph.results]))
+        return np.array(found)
+
+
+@pytest.fixture(scope="session")
+def step_of(bundle_of):
+    def make(structure, opset=13):
+        predictor = bundle_of(structure).predictor
+        return predictor, StepStream(predictor.graph(), len(predictor.task.targets), opset)
+
+    return make
+
+
+def exportable(bundle):
+    try:
+        bundle.predictor.graph()
+    except ExportError:
+        return False
+    return True
+
+
+def held_to_pytorch(predictor, run, ticks):
+    inputs = random_inputs(predictor, ticks, seed=5)
+    wanted = stream(predictor, inputs)
+    assert np.isfinite(wanted).all()
+    return float((np.abs(run(inputs) - wanted) / tolerance(predictor, inputs, wanted)).max())
+
+
+def test_the_step_predicts_what_pytorch_predicts(structure, bundle_of, step_of):
+    """Within 1e-5 of a standard deviation and of the largest value."""
+    if not exportable(bundle_of(structure)):
+        with pytest.raises(ExportError, match="physics base"):
+            bundle_of(structure).predictor.graph()
+        return
+    assert held_to_pytorch(*step_of(structure), 60) < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", NETWORKS)
+def test_the_step_follows_pytorch_for_a_long_time(network, step_of):
+    assert held_to_pytorch(*step_of(network), 20_000) < 1
+
+
+@pytest.mark.parametrize("opset", OPSETS)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_every_opset_gives_the_same_numbers(network, opset, step_of):
+    assert held_to_pytorch(*step_of(network, opset), 25) < 1
+
+
+@pytest.mark.parametrize("network", ["tcn", "hybrid+all"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_bad_inputs_show_until_the_reset(network, bad, step_of):
+    """ReLU swallows a NaN: without a state of its own it would be a wrong number some ticks later."""
+    predictor, run = step_of(network)
+    inputs = random_inputs(predictor, 60, seed=4)
+    fresh = run(inputs)
+    spoilt = inputs.copy()
+    spoilt[10, 0] = bad
+    run.reset()
+    found = run(spoilt)
+    np.testing.assert_array_equal(found[:10], fresh[:10])
+    assert np.isnan(found[10:]).all()
+    run.reset()
+    np.testing.assert_array_equal(run(inputs), fresh)
+
+
+def test_two_streams_do_not_know_of_each_other(step_of):
+    predictor, run = step_of("hybrid+all")
+    a, b = (random_inputs(predictor, 20, seed=seed) for seed in (1, 2))
+    alone = run(a)
+    run.reset()
+    held, found = [run.held, run.held], []
+    for pair in zip(a, b):
+        for which, row in enumerate(pair):
+            run.held = held[which]
+            made = run(row[None])
+            held[which] = run.held
+            if which == 0:
+                found.append(made[0])
+    np.testing.assert_array_equal(found, alone)
+
+
+def test_what_does_not_fit_is_refused_by_the_runtime(step_of):
+    predictor, run = step_of("hybrid")
+    good = random_inputs(predictor, 1, seed=0)
+    for bad in (good[:, :-1], np.concatenate([good, good], axis=1), np.repeat(good, 2, axis=0), good.astype(float)):
+        with pytest.raises(Exception, match=r"(?i)invalid|unexpected"):
+            run.run.run(None, {INPUTS: bad, **run.held})
+    first = next(iter(run.held))
+    with pytest.raises(Exception, match=r"(?i)required input|missing"):
+        run.run.run(None, {INPUTS: good, **{key: value for key, value in run.held.items() if key != first}})
+
+
+@pytest.mark.parametrize("opset", OPSETS)
+def test_files_are_clean(opset, bundle_of, tmp_path):
+    bundle = bundle_of("hybrid+all")
+    files = OnnxTarget(opset).write(bundle, "arm", tmp_path)
+    read = {file.name: file.read_bytes() for file in files}
+    assert sorted(read) == sorted(file.name for file in tmp_path.iterdir())
+    OnnxTarget(opset).write(bundle, "arm", tmp_path)
+    assert {file.name: file.read_bytes() for file in files} == read  # the same network gives the same bytes
+    described = json.loads(read["arm.json"])
+    for graph in described["graphs"].values():
+        model = onnx.load_from_string(read[graph["file"]])
+        onnx.checker.check_model(model, full_check=True)
+        assert (model.ir_version, model.opset_import[0].version) == (OPSETS[opset], opset) == (graph["ir"], opset)
+        assert {node.op_type for node in model.graph.node} <= ALLOWED
+        assert all(node.domain == "" for node in model.graph.node)
+        sides = (*model.graph.input, *model.graph.output)
+        assert all(d.dim_value > 0 for v in sides for d in v.type.tensor_type.shape.dim)  # no open shapes
+        kept = {entry.key: entry.value for entry in model.metadata_props}
+        assert (
+            json.loads(kept["inputs"]) == [entry["name"] for entry in described["inputs"]] == list(bundle.task.inputs)
+        )
+        assert kept["model_hash"] == described["model_hash"]
+
+
+def test_the_description_is_enough_to_stream(bundle_of, tmp_path):
+    """Nothing but the two files; the hidden start of this network was learned."""
+    bundle = bundle_of("hybrid8")
+    OnnxTarget().write(bundle, "predictor", tmp_path)
+    described = json.loads((tmp_path / "predictor.json").read_text())
+    graph = described["graphs"]["step"]
+    run = session((tmp_path / graph["file"]).read_bytes())
+    held = {
+        state["name"]: np.broadcast_to(np.float32(state["start"]), state["shape"]).copy() for state in graph["states"]
+    }
+    assert any(isinstance(state["start"], list) for state in graph["states"])
+    inputs, found = random_inputs(bundle.predictor, 30, seed=3), []
+    wanted = stream(bundle.predictor, inputs)
+    names = [output.name for output in run.get_outputs()]
+    for row in inputs:
+        made = dict(zip(names, run.run(None, {graph["input"]: row[None], **held})))
+        held = {state["name"]: made[state["next"]] for state in graph["states"]}
+        assert made["prediction"].shape == tuple(described["results"]["prediction"])
+        found.append(made["prediction"].ravel())
+    assert (np.abs(found - wanted) <= tolerance(bundle.predictor, inputs, wanted)).all()
+    assert [entry["name"] for entry in described["targets"]] == list(bundle.task.targets)
+    assert {"rate_hz", "window", "mode", "horizons", "rules", "scale_hash", "coverages"} <= set(described)
+
+
+def test_every_kind_of_layer_has_nodes():
+    assert set(PLAIN) | set(STEPS) == set(REFERENCE)
+    assert not set(PLAIN) & set(STEPS)
+
+
+class Strange(Layer):
+    @property
+    def width(self):
+        return 1
+
+
+def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path, monkeypatch):
+    graph = Graph(1, (Strange(name="odd.one", inputs=("input",)),), {"prediction": "odd.one"})
+    with pytest.raises(ExportError, match=r"layer 'odd\.one' is a Strange, .* these have: Accumulate"):
+        step_model(graph, 1, "step", {})
+    with pytest.raises(ExportError, match="opset 12 is not written; choose one of 9, 11, 13"):
+        OnnxTarget(12)
+    with pytest.raises(ExportError, match="opset 8"):
+        Nodes(8)
+    with pytest.raises(ExportError, match="operator Loop"):
+        Nodes().add("Loop", "x")
+    for name in ("Arm", "2arm", "a-b", "../arm", "", "a" * 40):
+        with pytest.raises(ExportError, match="--name"):
+            OnnxTarget().write(bundle_of("lstm"), name, tmp_path)
+    with pytest.raises(ConfigError, match=r"'c' has no option 'opset' \(it has none\)"):
+        make_target("c", {"opset": 9})
+    with pytest.raises(ConfigError, match=r"no option 'opsett' \(it has opset\)"):
+        make_target("onnx", {"opsett": 9})
+    monkeypatch.setitem(__import__("sys").modules, "onnx", None)
+    with pytest.raises(ExportError, match=r"pip install 'excavator-dynamics-predictor\[onnx\]'"):
+        nodes_file.library()
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_of_states_are_their_own(bundle_of):
+    for network in NETWORKS:
+        graph = bundle_of(network).predictor.graph()
+        states = states_of(graph)
+        names = [name for state in states for name in (state.name, state.next)]
+        assert len(set(names)) == len(names)
+        assert states[-1].name == SPOILT
+        assert sum(state.start.size for state in states) == 1 + sum(slot.size for _, slot in graph.slots())
+
+
+def test_corrections_reach_the_states_of_other_layers(bundle_of):
+    kinds = {type(layer) for network in NETWORKS for layer in bundle_of(network).predictor.graph().layers}
+    assert memory.PrefixCorrection in kinds
+    assert memory.WindowAttention in kinds
