@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 
 from edp.errors import ConfigError, ExportError
 from edp.export import make_target
@@ -16,6 +22,7 @@ from edp.export.onnx.nodes import ALLOWED, OPSETS, Nodes
 from edp.export.onnx.plain import PLAIN
 from edp.export.onnx.step import INPUTS, SPOILT, states_of, step_model
 from edp.export.onnx.target import OnnxTarget
+from edp.export.onnx.window import rows_needed, window_model
 from edp.graph import Graph, Layer, memory
 from edp.graph.reference import STEPS as REFERENCE
 
@@ -87,6 +94,60 @@ def test_the_step_predicts_what_pytorch_predicts(structure, bundle_of, step_of):
     assert held_to_pytorch(*step_of(structure), 60) < 1
 
 
+def window_differs_by(predictor, opset=13, seeds=2):
+    graph = predictor.graph()
+    run, worst = session(window_model(graph, len(predictor.task.targets), "window", {}, opset)), 0.0
+    for seed in range(seeds):
+        inputs = random_inputs(predictor, graph.window, seed)
+        wanted = stream(predictor, inputs)
+        found = np.concatenate([made.ravel() for made in run.run(None, {INPUTS: inputs})])
+        worst = max(worst, float((np.abs(found - wanted[-1]) / tolerance(predictor, inputs, wanted)).max()))
+    return worst
+
+
+def test_the_window_predicts_what_pytorch_predicts_from_reset(structure, bundle_of):
+    if exportable(bundle_of(structure)):
+        assert window_differs_by(bundle_of(structure).predictor) < 1
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 4, 5, 6, 15])
+@pytest.mark.parametrize("network", NETWORKS)
+def test_windows_of_other_lengths(network, ticks, bundle_of):
+    """Shorter than what layers look back, no longer than the first ticks that are corrected, longer than a mean."""
+    predictor = bundle_of(network).predictor
+    graph = replace(predictor.graph(), window=ticks)
+    inputs = random_inputs(predictor, ticks, seed=2)
+    wanted = stream(predictor, inputs)
+    run = session(window_model(graph, len(predictor.task.targets), "window", {}))
+    found = np.concatenate([made.ravel() for made in run.run(None, {INPUTS: inputs})])
+    assert (np.abs(found - wanted[-1]) <= tolerance(predictor, inputs, wanted)).all()
+
+
+def test_a_window_computes_no_more_rows_than_it_needs(bundle_of):
+    graph = bundle_of("tcn").predictor.graph()
+    need = rows_needed(graph, 50)
+    convolutions = [need[layer.name] for layer in graph.layers if isinstance(layer, memory.Convolution)]
+    assert convolutions == sorted(convolutions, reverse=True)
+    assert convolutions[-1] == 1
+    assert need["input"] < 25
+    assert all(need[value] == 1 for value in graph.results.values())
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_input_anywhere_in_the_window_shows(bad, bundle_of):
+    predictor = bundle_of("tcn+all").predictor
+    graph = predictor.graph()
+    run = session(window_model(graph, len(predictor.task.targets), "window", {}))
+    inputs = random_inputs(predictor, graph.window, seed=1)
+    assert np.isfinite(run.run(None, {INPUTS: inputs})[0]).all()
+    for tick in (0, graph.window - 1):
+        spoilt = inputs.copy()
+        spoilt[tick, 1] = bad
+        assert np.isnan(run.run(None, {INPUTS: spoilt})[0]).all()
+    with pytest.raises(Exception, match=r"(?i)invalid|unexpected"):
+        run.run(None, {INPUTS: inputs[1:]})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("network", NETWORKS)
 def test_the_step_follows_pytorch_for_a_long_time(network, step_of):
@@ -97,6 +158,7 @@ def test_the_step_follows_pytorch_for_a_long_time(network, step_of):
 @pytest.mark.parametrize("network", NETWORKS)
 def test_every_opset_gives_the_same_numbers(network, opset, step_of):
     assert held_to_pytorch(*step_of(network, opset), 25) < 1
+    assert window_differs_by(step_of(network)[0], opset, 1) < 1
 
 
 @pytest.mark.parametrize("network", ["tcn", "hybrid+all"])
@@ -159,6 +221,7 @@ def test_files_are_clean(opset, bundle_of, tmp_path):
         assert {node.op_type for node in model.graph.node} <= ALLOWED
         assert all(node.domain == "" for node in model.graph.node)
         sides = (*model.graph.input, *model.graph.output)
+        assert [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] == graph["shape"]
         assert all(d.dim_value > 0 for v in sides for d in v.type.tensor_type.shape.dim)  # no open shapes
         kept = {entry.key: entry.value for entry in model.metadata_props}
         assert (
@@ -191,6 +254,34 @@ def test_the_description_is_enough_to_stream(bundle_of, tmp_path):
     assert {"rate_hz", "window", "mode", "horizons", "rules", "scale_hash", "coverages"} <= set(described)
 
 
+def test_matlab_reads_the_description(bundle_of, tmp_path):
+    bundle = bundle_of("hybrid8")
+    OnnxTarget().write(bundle, "predictor", tmp_path)
+    read = scipy.io.loadmat(tmp_path / "predictor.mat", simplify_cells=True)
+    described = json.loads((tmp_path / "predictor.json").read_text())
+    about, golden = read["edp"], read["golden"]
+    assert set(about) == set(described)
+    assert [entry["name"] for entry in about["inputs"]] == list(bundle.task.inputs)
+    for key in ("window", "rate_hz", "mode", "model_hash"):
+        assert about[key] == described[key]
+    graphs = {name: session((tmp_path / entry["file"]).read_bytes()) for name, entry in about["graphs"].items()}
+    held = {
+        s["name"]: np.float32(s["start"]).reshape(s["shape"].astype(int)) for s in about["graphs"]["step"]["states"]
+    }
+    assert any(np.ptp(start) > 0 for start in held.values())
+    found = graphs["step"].run(None, {INPUTS: golden["inputs"][:1], **held})[0].ravel()
+    assert (np.abs(found - golden["stream"][0]) <= golden["tolerance"]).all()
+    found = graphs["window"].run(None, {INPUTS: golden["inputs"][-described["window"] :]})[0].ravel()
+    assert (np.abs(found - golden["window"]) <= golden["tolerance"]).all()
+    if shutil.which("octave") is None:
+        pytest.skip("needs the Debian package octave (make system-packages)")
+    program = "load predictor.mat; printf('%s ', edp.inputs{2}.name, edp.graphs.step.states{1}.next); disp(edp.window)"
+    command = ["octave", "--norc", "--no-gui", "--eval", program]
+    printed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.split()
+    state = described["graphs"]["step"]["states"][0]
+    assert printed == [bundle.task.inputs[1], state["next"], str(described["window"])]
+
+
 def test_every_kind_of_layer_has_nodes():
     assert set(PLAIN) | set(STEPS) == set(REFERENCE)
     assert not set(PLAIN) & set(STEPS)
@@ -206,6 +297,13 @@ def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path, monkeypa
     graph = Graph(1, (Strange(name="odd.one", inputs=("input",)),), {"prediction": "odd.one"})
     with pytest.raises(ExportError, match=r"layer 'odd\.one' is a Strange, .* these have: Accumulate"):
         step_model(graph, 1, "step", {})
+    with pytest.raises(ExportError, match=r"'odd\.one' is a Strange"):
+        window_model(graph, 1, "window", {})
+    learned = bundle_of("hybrid9").predictor.graph()
+    late = {"inputs": (learned.results["prediction"],), "ticks": 1}
+    rest = tuple(replace(x, **late) if isinstance(x, memory.PrefixCorrection) else x for x in learned.layers)
+    with pytest.raises(ExportError, match="use the graph of a tick"):
+        window_model(replace(learned, layers=rest), 2, "window", {})
     with pytest.raises(ExportError, match="opset 12 is not written; choose one of 9, 11, 13"):
         OnnxTarget(12)
     with pytest.raises(ExportError, match="opset 8"):
@@ -239,3 +337,19 @@ def test_corrections_reach_the_states_of_other_layers(bundle_of):
     kinds = {type(layer) for network in NETWORKS for layer in bundle_of(network).predictor.graph().layers}
     assert memory.PrefixCorrection in kinds
     assert memory.WindowAttention in kinds
+
+
+def test_the_page_lists_the_operators(bundle_of):
+    page = (Path(__file__).parents[2] / "docs/onnx.md").read_text()
+    listed = page.partition("## Operators")[2].partition("and no others")[0]
+    assert set(re.findall(r"[A-Z]\w+", listed)) == ALLOWED
+    used = set()
+    for network in (*NETWORKS, "lstm+normal", "hybrid"):
+        predictor = bundle_of(network).predictor
+        for write in (step_model, window_model):
+            model = onnx.load_from_string(write(predictor.graph(), len(predictor.task.targets), "graph", {}))
+            kinds = {node.op_type for node in model.graph.node}
+            assert write is window_model or not kinds & {"Conv", "GRU", "LSTM", "Transpose"}
+            assert all(len(v.type.tensor_type.shape.dim) == 2 for v in (*model.graph.input, *model.graph.output))
+            used |= kinds
+    assert used == ALLOWED

@@ -1,17 +1,20 @@
-"""What a reader of the ONNX files must know: names, units, order, states and their starts, rules, hashes."""
+"""What a reader of the ONNX files must know: names, units, order, states and their starts, rules; JSON and MAT."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.io
 
 from edp import __version__
 from edp.export.c.model import model_hash, scale_hash
+from edp.export.c.target import GOLDEN_TICKS, random_inputs, stream, tolerance
 from edp.export.onnx.nodes import OPSETS
 from edp.export.onnx.step import INPUTS, State, shape_of_result
 from edp.graph import Graph
@@ -22,11 +25,11 @@ from edp.training.bundle import Bundle
 SCHEMA = 1
 RULES = {
     "order": "inputs and targets in the order of this file, in SI units",
-    "reset": "feed every state's start at the first tick, and again after a gap or a change of machine",
-    "missed tick": "feed the inputs of the tick before again; after five in a row reset",
-    "bad input": "an input that is NaN or infinite makes every result NaN, and those of all later ticks until a reset",
-    "warming up": "after a reset the first `window` predictions do not rest on a whole window",
-    "several machines": "each has states of its own",
+    "reset": "step: feed every state's start at the first tick, and again after a gap or a change of machine",
+    "missed_tick": "step: feed the inputs of the tick before again; after five in a row reset",
+    "bad_input": "NaN or infinite inputs make every result NaN; in step those of all later ticks too, until a reset",
+    "warming_up": "step: after a reset the first `window` predictions do not rest on a whole window",
+    "several_machines": "step: each has states of its own",
 }
 
 
@@ -100,18 +103,22 @@ def content(described: Description, files: Mapping[str, bytes]) -> dict[str, Any
 
 
 def _graph(described: Description, kind: str, data: bytes) -> dict[str, Any]:
-    return {
+    ticks = described.graph.window if kind == "window" else 1
+    about: dict[str, Any] = {
         "file": f"{described.name}_{kind}.onnx",
         "sha256": hashlib.sha256(data).hexdigest(),
         "opset": described.opset,
         "ir": OPSETS[described.opset],
         "input": INPUTS,
-        "shape": [1, described.graph.inputs],
-        "states": [
-            {"name": state.name, "next": state.next, "shape": list(state.start.shape), "start": _start(state)}
-            for state in described.states
-        ],
+        "shape": [ticks, described.graph.inputs],
     }
+    if kind == "window":
+        return about
+    states = [
+        {"name": state.name, "next": state.next, "shape": list(state.start.shape), "start": _start(state)}
+        for state in described.states
+    ]
+    return about | {"states": states}
 
 
 def _start(state: State) -> float | list[list[float]]:
@@ -119,3 +126,42 @@ def _start(state: State) -> float | list[list[float]]:
     first = float(state.start.flat[0])
     same = np.all(state.start == state.start.flat[0])
     return first if same else [[float(value) for value in row] for row in state.start]
+
+
+def as_mat(described: Description, files: Mapping[str, bytes]) -> bytes:
+    """The description as a MAT file (version 5): ``edp``, a struct as the JSON file, and ``golden``.
+
+    ``golden`` has random `inputs` ``(tick, input)``; what PyTorch streams from them, `stream` ``(tick, number)``, the
+    results of a tick one behind the other; what it predicts from the last window alone, `window` ``(1, number)``; and
+    the `tolerance` ``(1, number)``.
+    """
+    predictor, window = described.bundle.predictor, described.graph.window
+    inputs = random_inputs(predictor, max(GOLDEN_TICKS, window), seed=0)
+    outputs = stream(predictor, inputs)
+    golden = {
+        "inputs": inputs,
+        "stream": outputs,
+        "window": stream(predictor, inputs[-window:])[-1:],
+        "tolerance": tolerance(predictor, inputs, outputs)[None],
+    }
+    about = content(described, files)
+    for entry, state in zip(about["graphs"]["step"]["states"], described.states, strict=True):
+        entry["start"] = state.start
+    made = io.BytesIO()
+    scipy.io.savemat(made, {"edp": _for_matlab(about), "golden": golden}, long_field_names=True)
+    text = f"MATLAB 5.0 MAT-file, written by EDP {__version__}".ljust(116).encode()  # without the time of day
+    return text + made.getvalue()[len(text) :]
+
+
+def _for_matlab(value: Any) -> Any:
+    """Lists as rows of numbers or as cells."""
+    if isinstance(value, dict):
+        return {key: _for_matlab(entry) for key, entry in value.items()}
+    if not isinstance(value, list):
+        return value
+    if value and all(isinstance(entry, int | float) for entry in value):
+        return np.array([value], dtype=float)
+    cells = np.empty((1, len(value)), dtype=object)
+    for at, entry in enumerate(value):
+        cells[0, at] = _for_matlab(entry)
+    return cells

@@ -17,7 +17,8 @@ OPSETS = {9: 4, 11: 6, 13: 7, 17: 8, 21: 10}
 """IR version by opset: the one that was current when the opset came out, so that readers of that time take the file."""
 DEFAULT_OPSET = 13
 _NAMES = """
-Add Clip Concat Div Erf Exp Gemm Identity Mul ReduceMean Relu Reshape Sigmoid Softmax Softplus Split Sqrt Sub Tanh
+Add Clip Concat Conv Div Erf Exp GRU Gemm Identity LSTM Mul ReduceMean Relu Reshape Sigmoid Softmax Softplus Split Sqrt
+Sub Tanh Transpose
 """
 ALLOWED = frozenset(_NAMES.split())
 """Operators that are written: long-lived ones with a plain meaning, whose indices and shapes are constants."""
@@ -89,6 +90,10 @@ class Nodes:
             self._tensors.append(self._onnx.numpy_helper.from_array(plain.reshape(array.shape), name))
         return self._constants[key]
 
+    def is_zero(self, name: str) -> bool:
+        """Whether a value is a constant of zeros."""
+        return any(made == name and not any(data) for (_, _, data), made in self._constants.items())
+
     def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
         """A node with one output."""
         return self.several(operator, inputs, 1, **attributes)[0]
@@ -98,7 +103,10 @@ class Nodes:
         if operator not in ALLOWED:
             raise ExportError(f"operator {operator} is not one that importers can be counted on to have")
         made = [self.name(operator.lower()) for _ in range(outputs)]
-        self._nodes.append(self._onnx.helper.make_node(operator, list(inputs), made, made[0], **attributes))
+        given = list(inputs)
+        while not given[-1]:  # optional ones at the end that are left out
+            given.pop()
+        self._nodes.append(self._onnx.helper.make_node(operator, given, made, made[0], **attributes))
         return made
 
     def split(self, x: str, sizes: Sequence[int], axis: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""``--to onnx``: the graphs of a network, and a file that says what goes in and what comes out."""
+"""``--to onnx``: the graphs of a network, and files that say what goes in and what comes out."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 
 from edp.errors import ExportError
 from edp.export.base import TARGETS
-from edp.export.onnx.metadata import Description, as_json, notes
+from edp.export.onnx.metadata import Description, as_json, as_mat, notes
 from edp.export.onnx.nodes import DEFAULT_OPSET, OPSETS
 from edp.export.onnx.step import states_of, step_model
+from edp.export.onnx.window import window_model
 from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
 
@@ -18,7 +19,7 @@ from edp.training.bundle import Bundle
 @TARGETS.register("onnx")
 @dataclass(frozen=True)
 class OnnxTarget:
-    """ONNX, float32: ``NAME_step.onnx`` and ``NAME.json``, which describes it.
+    """ONNX, float32: ``NAME_step.onnx``, ``NAME_window.onnx``, and ``NAME.json`` and ``NAME.mat``, which describe them.
 
     Attributes:
         opset: version of the operators; 13 goes with most readers, 9 and 11 with old ones.
@@ -40,8 +41,12 @@ class OnnxTarget:
         graph = bundle.predictor.graph()
         described = Description(name, bundle, graph, tuple(states_of(graph)), self.opset)
         targets = len(bundle.task.targets)
-        step = step_model(graph, targets, f"{name}_step", notes(described), self.opset)
-        made = {f"{name}.json": as_json(described, {"step": step}), f"{name}_step.onnx": step}
+        files = {
+            "step": step_model(graph, targets, f"{name}_step", notes(described), self.opset),
+            "window": window_model(graph, targets, f"{name}_window", notes(described), self.opset),
+        }
+        made = {f"{name}.json": as_json(described, files), f"{name}.mat": as_mat(described, files)}
+        made |= {f"{name}_{kind}.onnx": data for kind, data in files.items()}
         path = make_folder(folder)
         for file, content in made.items():
             write_bytes(path / file, content)

@@ -1,0 +1,67 @@
+"""Values over several ticks, as rows ``(tick, number)`` and, for convolutions, as columns ``(1, number, tick)``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.export.onnx.nodes import Nodes
+
+
+@dataclass
+class _Value:
+    """The last `ticks` ticks of a value of `width` numbers, in one form or both."""
+
+    ticks: int
+    width: int
+    rows: str = ""
+    columns: str = ""
+
+
+class Sequences:
+    """Values by name; each form is made once, where it is asked for."""
+
+    def __init__(self, nodes: Nodes) -> None:
+        self._nodes = nodes
+        self._values: dict[str, _Value] = {}
+        self._cut: dict[tuple[str, int, int], str] = {}
+
+    def known(self, name: str) -> bool:
+        """Whether a value was given."""
+        return name in self._values
+
+    def give(self, name: str, rows: str, ticks: int, width: int) -> None:
+        """Enter a value as rows."""
+        self._values[name] = _Value(ticks, width, rows=rows)
+
+    def give_columns(self, name: str, columns: str, ticks: int, width: int) -> None:
+        """Enter a value as columns."""
+        self._values[name] = _Value(ticks, width, columns=columns)
+
+    def in_columns(self, name: str, ticks: int) -> bool:
+        """Whether these last ticks are there as columns."""
+        held = self._values[name]
+        return bool(held.columns) and held.ticks == ticks
+
+    def rows(self, name: str, ticks: int) -> str:
+        """The last `ticks` ticks as rows."""
+        held = self._values[name]
+        if not held.rows:
+            turned = self._nodes.add("Transpose", held.columns, perm=[0, 2, 1])
+            held.rows = self._nodes.shaped(turned, held.ticks, held.width)
+        return self._last(held.rows, held.ticks, ticks, 0)
+
+    def columns(self, name: str, ticks: int) -> str:
+        """The last `ticks` ticks as columns."""
+        held = self._values[name]
+        if not held.columns:
+            three = self._nodes.shaped(held.rows, 1, held.ticks, held.width)
+            held.columns = self._nodes.add("Transpose", three, perm=[0, 2, 1])
+        return self._last(held.columns, held.ticks, ticks, 2)
+
+    def _last(self, value: str, had: int, ticks: int, axis: int) -> str:
+        if had == ticks:
+            return value
+        key = (value, ticks, axis)
+        if key not in self._cut:
+            self._cut[key] = self._nodes.split(value, [had - ticks, ticks], axis)[1]
+        return self._cut[key]

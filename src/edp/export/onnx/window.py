@@ -1,0 +1,296 @@
+"""The graph ``window``: W ticks from reset in, the predictions after the last of them out.
+
+Only the rows that the last tick rests on are computed. What is alike at every tick runs over all of them at once; a
+recurrence for which ONNX has no operator is written tick by tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from edp.errors import ExportError
+from edp.export.onnx.memory import STEPS, attend, correct, shape_of
+from edp.export.onnx.nodes import DEFAULT_OPSET, Nodes
+from edp.export.onnx.plain import PLAIN, activate
+from edp.export.onnx.sequence import Sequences
+from edp.export.onnx.step import INPUTS, add_results, corrections, plain_name, refuse, spoil
+from edp.graph import Graph, Layer, layers, memory
+from edp.graph.base import INPUT
+from edp.graph.memory import UNSEEN
+
+TRAILING = (memory.TrailingMean, memory.AttentionPool, memory.WindowAttention)
+ELEMENTWISE = (layers.Activate, layers.Add, layers.Multiply)
+"""Work on channels first, as convolutions do."""
+
+
+def rows_before(layer: Layer, rows: int, ticks: int) -> int:
+    """Rows of its inputs that the last `rows` rows of a layer rest on, at most `ticks`."""
+    if isinstance(layer, memory.Difference):
+        return min(ticks, rows + 1)
+    if isinstance(layer, memory.Convolution):
+        return min(ticks, rows + (layer.weight.shape[1] - 1) * layer.dilation)
+    if isinstance(layer, TRAILING):
+        return min(ticks, rows + layer.window - 1)
+    return ticks if type(layer) in STEPS and not isinstance(layer, memory.Starting) else rows
+
+
+def rows_needed(graph: Graph, ticks: int) -> dict[str, int]:
+    """Rows of each value that the predictions after the last tick rest on."""
+    need = dict.fromkeys((INPUT, *(layer.name for layer in graph.layers)), 0)
+    need |= dict.fromkeys(graph.results.values(), 1)
+    for layer in reversed(graph.layers):
+        if isinstance(layer, memory.PrefixCorrection):
+            before = ticks if layer.ticks < ticks else 0
+        else:
+            before = rows_before(layer, need[layer.name], ticks) if need[layer.name] else 0
+        for name in layer.inputs:
+            need[name] = max(need[name], before)
+    return need
+
+
+class Window:
+    """Writes the layers of a graph over a window.
+
+    Args:
+        nodes: where to.
+        graph: the layers.
+    """
+
+    def __init__(self, nodes: Nodes, graph: Graph) -> None:
+        self.nodes, self.graph, self.ticks = nodes, graph, graph.window
+        self.need = rows_needed(graph, self.ticks)
+        self.values = Sequences(nodes)
+        self.values.give(INPUT, INPUTS, self.ticks, graph.inputs)
+        owners = [layer for layer in graph.layers if isinstance(layer, memory.PrefixCorrection)]
+        self.corrected = {owner: layer for layer in owners for owner, _ in layer.corrects if layer.ticks < self.ticks}
+        self._parts: dict[str, dict[tuple[str, str], str]] = {}
+
+    def add(self, layer: Layer) -> None:
+        """Write a layer.
+
+        Raises:
+            ExportError: its kind has no form in ONNX.
+        """
+        rows = self.need[layer.name]
+        if not rows or isinstance(layer, memory.PrefixCorrection):
+            return
+        write = getattr(self, f"_{WINDOWS[type(layer)]}") if type(layer) in WINDOWS else None
+        if write is not None:
+            write(layer, rows)
+        elif isinstance(layer, ELEMENTWISE) and any(self.values.in_columns(name, rows) for name in layer.inputs):
+            given = [self.values.columns(name, rows) for name in layer.inputs]
+            operator = "Add" if isinstance(layer, layers.Add) else "Mul"
+            made = activate(self.nodes, layer.function, given[0]) if isinstance(layer, layers.Activate) else ""
+            self.values.give_columns(layer.name, made or self.nodes.add(operator, *given), rows, layer.width)
+        elif type(layer) in PLAIN:
+            widths = [self.graph.width_of(name) for name in layer.inputs]
+            given = [self.values.rows(name, rows) for name in layer.inputs]
+            self.values.give(layer.name, PLAIN[type(layer)](self.nodes, layer, rows, given, widths), rows, layer.width)
+        elif type(layer) in STEPS:
+            self._recurrence(layer)
+        else:
+            raise refuse(layer)
+
+    def _give(self, layer: Layer, value: str, rows: int) -> None:
+        self.values.give(layer.name, value, rows, layer.width)
+
+    def _difference(self, layer: memory.Difference, rows: int) -> None:
+        nodes, reach = self.nodes, min(self.ticks, rows + 1)
+        given = self.values.rows(layer.inputs[0], reach)
+        before = nodes.split(given, [reach - 1, 1], 0)[:1] if reach > 1 else []
+        if rows < reach:
+            now = nodes.split(given, [1, rows], 0)[1]
+        else:
+            now, zero = given, nodes.constant(np.zeros((1, layer.width), np.float32), "zero")
+            before.insert(
+                0, zero if layer.from_zero else nodes.split(given, [1, rows - 1], 0)[0] if rows > 1 else given
+            )
+        self._give(layer, nodes.times(nodes.less(now, nodes.join(before, 0)), layer.factor), rows)
+
+    def _starting(self, layer: memory.Starting, rows: int) -> None:
+        nodes, first = self.nodes, self.ticks - rows
+        read = (np.arange(first, self.ticks)[:, None] < layer.ticks).astype(np.float32)
+        kept = nodes.times(self.values.rows(layer.inputs[0], rows), read)
+        value = nodes.plus(kept, layer.mean * (1 - read))
+        self._give(layer, nodes.join([value, nodes.constant(read, "read")], 1), rows)
+
+    def _convolution(self, layer: memory.Convolution, rows: int) -> None:
+        nodes, (out, taps, _) = self.nodes, layer.weight.shape
+        past = (taps - 1) * layer.dilation
+        reach = min(self.ticks, rows + past)
+        made = nodes.add(
+            "Conv",
+            self.values.columns(layer.inputs[0], reach),
+            nodes.constant(layer.weight.transpose(0, 2, 1), "weight"),
+            nodes.constant(layer.bias, "bias"),
+            kernel_shape=[taps],
+            dilations=[layer.dilation],
+            pads=[rows + past - reach, 0],
+        )
+        self.values.give_columns(layer.name, made, rows, out)
+
+    def _trailing_mean(self, layer: memory.TrailingMean, rows: int) -> None:
+        nodes, reach = self.nodes, rows_before(layer, rows, self.ticks)
+        given = self.values.rows(layer.inputs[0], reach)
+        if rows == 1:
+            self._give(layer, nodes.mean(given, 0), rows)
+            return
+        seen = self._seen(layer.window, rows, reach)
+        weights = (seen / seen.sum(axis=1, keepdims=True)).astype(np.float32)
+        self._give(layer, nodes.product(nodes.constant(weights, "weights"), given), rows)
+
+    def _seen(self, window: int, rows: int, reach: int) -> np.ndarray:
+        """Which of the last `reach` ticks each of the last `rows` ticks sees, ``(rows, reach)``."""
+        at, of = np.arange(reach - rows, reach)[:, None], np.arange(reach)[None]
+        return (of <= at) & (of > at - window)
+
+    def _hidden(self, window: int, rows: int, reach: int) -> str | None:
+        """What is added to scores so that ticks that are not seen do not count."""
+        seen = self._seen(window, rows, reach)
+        return None if seen.all() else self.nodes.constant(np.where(seen, 0, UNSEEN).astype(np.float32), "hidden")
+
+    def _attention_pool(self, layer: memory.AttentionPool, rows: int) -> None:
+        nodes, reach = self.nodes, rows_before(layer, rows, self.ticks)
+        given = self.values.rows(layer.inputs[0], reach)
+        scores = nodes.shaped(nodes.linear(given, layer.score[None], layer.bias), 1, reach)
+        hidden = self._hidden(layer.window, rows, reach)
+        weights = nodes.softmax(scores if hidden is None else nodes.add("Add", scores, hidden))
+        self._give(layer, nodes.product(weights, given), rows)
+
+    def _window_attention(self, layer: memory.WindowAttention, rows: int) -> None:
+        reach = rows_before(layer, rows, self.ticks)
+        query = self.values.rows(layer.inputs[0], rows)
+        keys, values = (self.values.rows(name, reach) for name in layer.inputs[1:])
+        hidden = self._hidden(layer.window, rows, reach)
+        self._give(layer, attend(self.nodes, layer, (query, keys, values), hidden), rows)
+
+    def _recurrence(self, layer: Layer) -> None:
+        """A layer that carries its state over the window, corrected after the first ticks where that is learned."""
+        nodes, ticks = self.nodes, self.ticks
+        given = self.values.rows(layer.inputs[0], ticks)
+        held = {
+            slot.name: nodes.constant(self.graph.start(layer.name, slot).reshape(shape_of(slot)), "start")
+            for slot in layer.slots
+        }
+        prefix = self.corrected.get(layer.name)
+        if prefix is None:
+            found, _ = self._run(layer, given, ticks, held)
+        else:
+            sizes = [prefix.ticks, ticks - prefix.ticks]
+            early, late = nodes.split(given, sizes, 0)
+            first, held = self._run(layer, early, sizes[0], held)
+            for (owner, slot), part in self._correction(prefix).items():
+                if owner == layer.name:
+                    held[slot] = nodes.add("Add", held[slot], part)
+            second, _ = self._run(layer, late, sizes[1], held)
+            found = nodes.join([first, second], 0)
+        self._give(layer, found, ticks)
+
+    def _correction(self, layer: memory.PrefixCorrection) -> dict[tuple[str, str], str]:
+        if layer.name not in self._parts:
+            nodes, ticks = self.nodes, layer.ticks
+            if not self.values.known(layer.inputs[0]):
+                raise ExportError(
+                    f"layer '{layer.name}' corrects layers that come before its input, which a window graph cannot "
+                    "hold; use the graph of a tick"
+                )
+            rows = self.values.rows(layer.inputs[0], self.ticks)
+            seen = nodes.split(rows, [ticks, self.ticks - ticks], 0)[0]
+            last = nodes.split(seen, [ticks - 1, 1], 0)[1] if ticks > 1 else seen
+            numbers = correct(nodes, layer, nodes.join([nodes.mean(seen, 0), last], 1))
+            self._parts[layer.name] = corrections(nodes, self.graph, layer, numbers)
+        return self._parts[layer.name]
+
+    def _run(self, layer: Layer, given: str, ticks: int, held: dict[str, str]) -> tuple[str, dict[str, str]]:
+        """Values ``(ticks, width)`` and the states after them."""
+        if isinstance(layer, memory.Lstm) and layer.share == 1.0:
+            return lstm(self.nodes, layer, given, ticks, held)
+        if isinstance(layer, memory.Gru):
+            return gru(self.nodes, layer, given, ticks, held)
+        made = []
+        for x in self.nodes.split(given, [1] * ticks, 0):
+            value, held = STEPS[type(layer)](self.nodes, layer, held, x)
+            made.append(value)
+        return self.nodes.join(made, 0), held
+
+
+WINDOWS = {
+    memory.Difference: "difference",
+    memory.Starting: "starting",
+    memory.Convolution: "convolution",
+    memory.TrailingMean: "trailing_mean",
+    memory.AttentionPool: "attention_pool",
+    memory.WindowAttention: "window_attention",
+}
+"""Layers with memory that are written over the whole window, by kind: methods of `Window`."""
+
+
+def _reordered(array: np.ndarray, order: Sequence[int]) -> np.ndarray:
+    """Gates in another order; a leading axis of one direction."""
+    return np.concatenate([np.split(array, len(order))[at] for at in order])[None]
+
+
+def _first(nodes: Nodes, state: str, units: int) -> str:
+    """A state as an operator takes it; left out where it is zero."""
+    return "" if nodes.is_zero(state) else nodes.shaped(state, 1, 1, units)
+
+
+def lstm(
+    nodes: Nodes, layer: memory.Lstm, given: str, ticks: int, held: Mapping[str, str]
+) -> tuple[str, dict[str, str]]:
+    """The operator's gates are in the order i, o, f, c."""
+    order, units = (0, 3, 1, 2), layer.width
+    bias = np.concatenate([_reordered(layer.bias, order), np.zeros((1, 4 * units), np.float32)], axis=1)
+    y, h, c = nodes.several(
+        "LSTM",
+        [
+            nodes.shaped(given, ticks, 1, layer.weight_x.shape[1]),
+            nodes.constant(_reordered(layer.weight_x, order), "w"),
+            nodes.constant(_reordered(layer.weight_h, order), "r"),
+            nodes.constant(bias, "b"),
+            "",
+            _first(nodes, held["h"], units),
+            _first(nodes, held["c"], units),
+        ],
+        3,
+        hidden_size=units,
+    )
+    return nodes.shaped(y, ticks, units), {"h": nodes.shaped(h, 1, units), "c": nodes.shaped(c, 1, units)}
+
+
+def gru(nodes: Nodes, layer: memory.Gru, given: str, ticks: int, held: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The operator's gates are in the order z, r, h; the reset gate acts behind the product, as in the network."""
+    order, units = (1, 0, 2), layer.width
+    bias = np.concatenate([_reordered(layer.bias_x, order), _reordered(layer.bias_h, order)], axis=1)
+    y, h = nodes.several(
+        "GRU",
+        [
+            nodes.shaped(given, ticks, 1, layer.weight_x.shape[1]),
+            nodes.constant(_reordered(layer.weight_x, order), "w"),
+            nodes.constant(_reordered(layer.weight_h, order), "r"),
+            nodes.constant(bias, "b"),
+            "",
+            _first(nodes, held["h"], units),
+        ],
+        2,
+        hidden_size=units,
+        linear_before_reset=1,
+    )
+    return nodes.shaped(y, ticks, units), {"h": nodes.shaped(h, 1, units)}
+
+
+def window_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], opset: int = DEFAULT_OPSET) -> bytes:
+    """The file of the window graph; arguments and errors as of `step_model`."""
+    nodes = Nodes(opset)
+    nodes.reserve(INPUTS, *graph.results)
+    window = Window(nodes, graph)
+    for layer in graph.layers:
+        with nodes.inside(plain_name(layer.name)):
+            window.add(layer)
+    with nodes.inside("end"):
+        flat = nodes.shaped(INPUTS, 1, window.ticks * graph.inputs)
+        ends = {value: window.values.rows(value, 1) for value in graph.results.values()}
+        outputs = add_results(nodes, graph, ends, spoil(nodes, flat), targets)
+    return nodes.model(name, {INPUTS: (window.ticks, graph.inputs)}, outputs, notes)
