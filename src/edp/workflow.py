@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ from edp.storage import make_folder, read_json, write_bytes, write_json
 from edp.training import Bundle, Diverged, Event, Fitted, fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler, weights_digest
 from edp.training.fit import thread_count
+from edp.training.lesson import Lesson
 from edp.training.spec import check_training
 
 SHOWN_RECORDINGS = 6
@@ -74,11 +75,26 @@ def prepare_data(source: DataSource, experiment: Experiment) -> Prepared:
     return prepare(recordings, task, experiment.split, experiment.model.window)
 
 
+@dataclass(frozen=True)
+class Teaching:
+    """What a training has besides data and settings.
+
+    Attributes:
+        facts: plain values that decide what is taught; they are part of the run's key and provenance.
+        lesson: makes the lesson for the prepared data.
+    """
+
+    facts: Mapping[str, Any]
+    lesson: Callable[[Prepared], Lesson]
+
+
 def train(
     source: DataSource,
     experiment: Experiment,
     out: str | Path,
     on_event: Callable[[Event], None] | None = None,
+    teaching: Teaching | None = None,
+    data: Prepared | None = None,
 ) -> Bundle:
     """Train on a data set and write a run folder with its bundle; an interrupted run goes on where it stopped.
 
@@ -87,6 +103,8 @@ def train(
         experiment: the settings.
         out: run folder.
         on_event: called with progress.
+        teaching: teachers, weights to begin with.
+        data: what `prepare_data` gave for this source and experiment, where it is there already.
 
     Raises:
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
@@ -96,21 +114,23 @@ def train(
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
     if experiment.model.physics is not None:  # an unknown machine is told before recordings are read
         settings["machine"] = experiment.model.physics.digest()
-    data = prepare_data(source, experiment)
-    key = run_key(settings, data.digest)
+    taught = {} if teaching is None else {"lesson": dict(teaching.facts)}
+    data = data or prepare_data(source, experiment)
+    key = run_key(settings | taught, data.digest)
     with RunFolder(out) as run:
         run.claim(key, experiment_toml(experiment))
         _refuse_diverged(run)
         run.write_status("running")
         try:
-            fitted = fit(data, experiment.model, experiment.training, (run, key), on_event)
+            lesson = None if teaching is None else teaching.lesson(data)
+            fitted = fit(data, experiment.model, experiment.training, (run, key), on_event, lesson)
         except Diverged as end:
             if end.fitted is not None:
-                provenance = _provenance(source, experiment, data, end.fitted.seconds)
+                provenance = _provenance(source, experiment, data, end.fitted.seconds) | taught
                 _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
             run.write_status("diverged", message=str(end), **end.facts)
             raise
-        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds), data)
+        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds) | taught, data)
         run.write_status("finished")
     return bundle
 
@@ -185,7 +205,7 @@ def evaluate(
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
     """
     folder = Path(run)
-    bundle, experiment, provenance, data = _trained(folder)
+    bundle, experiment, provenance, data = trained_run(folder)
     target, judged = folder, [data.digest]
     if source is not None:
         recordings = source.read()
@@ -206,8 +226,12 @@ def evaluate(
     return target
 
 
-def _trained(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepared]:
-    """Bundle, settings, provenance and data of a run, the data checked to be what it was trained on."""
+def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepared]:
+    """Bundle, settings, provenance and data of a run, the data checked to be what it was trained on.
+
+    Raises:
+        EdpError: not a run folder of EDP, or its recordings changed since.
+    """
     bundle = load_bundle(folder)
     if not (folder / "provenance.json").is_file():
         raise StorageError(f"'{folder}' is not a run folder: it has no provenance.json; give the folder of edp train")
@@ -241,7 +265,7 @@ def channel_worths(
         The figures, and the file ``worth.json`` with them: in the run folder, or in the folder in it for `source`.
     """
     folder = Path(run)
-    bundle, _, _, data = _trained(folder)
+    bundle, _, _, data = trained_run(folder)
     target = folder
     if source is not None:
         data = replace(data, test=[bundle.task.series(recording) for recording in source.read()])
@@ -325,6 +349,7 @@ def _untrained(model: ModelSpec, task: Any) -> Predictor:
 __all__ = [
     "DataSource",
     "SimulationOrder",
+    "Teaching",
     "build_report",
     "channel_worths",
     "coverage",
@@ -335,4 +360,5 @@ __all__ = [
     "prepare_data",
     "simulate_data_set",
     "train",
+    "trained_run",
 ]

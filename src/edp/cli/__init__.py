@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from edp import __version__
-from edp.cli import animate, demo, evaluate, export, footprint, inspect, report, screen, search, simulate, train
+from edp.cli import animate, demo, distil, evaluate, export, footprint, inspect, report, screen, search, simulate, train
 from edp.cli.console import run_app
 
 app = typer.Typer(
@@ -27,6 +27,7 @@ app.command("animate")(animate.animate)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(search.app, name="search")
+app.command("distil")(distil.distil)
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)
 app.command("report")(report.report)

@@ -1,0 +1,136 @@
+"""From a run to a run of a smaller network that learned from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from edp.compress import DistillationSpec, Order, RoundingSpec, unlabelled
+from edp.config import Experiment, load_experiment, plain_tree
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.errors import ConfigError, StorageError
+from edp.losses import LOSSES
+from edp.models.predictor import Predictor
+from edp.sources import DataSource
+from edp.storage import read_json
+from edp.training import Bundle, Event, load_bundle
+from edp.training.bundle import weights_digest
+from edp.training.lesson import Lesson
+from edp.workflow import Teaching, train
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistilSpec:
+    """What is made of a run.
+
+    Attributes:
+        units: width of the student.
+        levels: convolution levels; None for one less than the teacher has.
+        pruned: begin with what pruning leaves of the teacher.
+        distillation: the objective.
+        teachers: run folders or bundles of further teachers.
+        further: where recordings without truth are; the student learns what the teachers say of them.
+        changes: settings of the training that differ from the run's, as ``key.path=value``.
+    """
+
+    units: int
+    levels: int | None = None
+    pruned: bool = False
+    distillation: DistillationSpec = field(default_factory=DistillationSpec)
+    teachers: tuple[str, ...] = ()
+    further: DataSource | None = None
+    changes: tuple[str, ...] = ()
+
+
+def distil(
+    run: str | Path,
+    spec: DistilSpec,
+    out: str | Path,
+    source: DataSource | None = None,
+    on_event: Callable[[Event], None] | None = None,
+) -> Bundle:
+    """Train a student of a run and write a run folder; an interrupted one goes on where it stopped.
+
+    Args:
+        run: run folder of the teacher.
+        spec: what is made of it.
+        out: run folder of the student.
+        source: recordings to learn on; by default those of the run.
+        on_event: called with progress.
+
+    Raises:
+        EdpError: not a run, a student that is no smaller, teachers that contradict one another, other data or settings
+            in `out`.
+    """
+    teacher, experiment, own = read_run(run, spec.changes)
+    if spec.pruned and spec.levels is not None:
+        raise ConfigError("a pruned student keeps all levels of its teacher; leave out the levels, or the pruning")
+    order = Order(
+        name="student", units=spec.units, levels=spec.levels, pruned=spec.pruned, distillation=spec.distillation
+    )
+    model = order.model(teacher.spec)
+    if model == teacher.spec:
+        raise ConfigError(f"a student of {spec.units} units is the teacher itself; take fewer units or levels")
+    teachers = [teacher, *(load_bundle(path).predictor for path in spec.teachers)]
+    series, digests = _unlabelled(teacher, spec.further)
+    facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
+
+    def lesson(data: Prepared) -> Lesson:
+        return order.lesson(teachers, data, None, series)
+
+    made = replace(experiment, model=model)
+    return train(source or own, made, out, on_event, Teaching(facts, lesson))
+
+
+def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, Experiment, DataSource]:
+    """Network, settings and recordings of a run, or of the run that a bundle lies in.
+
+    Raises:
+        EdpError: not a run folder.
+    """
+    folder = Path(run)
+    if (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file():
+        folder = folder.parent
+    bundle = load_bundle(folder)
+    for name in ("config.toml", "provenance.json"):
+        if not (folder / name).is_file():
+            raise StorageError(
+                f"'{folder}' is not a run folder: it has no {name}, which says how the network was trained; give the "
+                "folder of edp train"
+            )
+    experiment = load_experiment(folder / "config.toml", None, changes)
+    if (
+        experiment.task != load_experiment(folder / "config.toml", None).task
+        or experiment.model != bundle.predictor.spec
+    ):
+        raise ConfigError(
+            "settings of the task or the model cannot be changed here: a student has those of its teacher"
+        )
+    return bundle.predictor, experiment, DataSource.from_plain(read_json(folder / "provenance.json")["data"]["reader"])
+
+
+def order_facts(order: Order) -> dict[str, Any]:
+    """Plain values that decide what an order teaches."""
+    plain = asdict(order.distillation) | {"soft": _loss(order.distillation)}
+    rounding: RoundingSpec | None = order.rounding
+    return {
+        "units": order.units,
+        "levels": order.levels,
+        "pruned": order.pruned,
+        "distillation": plain,
+        "rounding": None if rounding is None else asdict(rounding),
+    }
+
+
+def _loss(spec: DistillationSpec) -> Any:
+    """The soft loss with its name; a loss that is not registered, such as the softmax form, by its class."""
+    name = next((key for key, kind in LOSSES.items() if kind is type(spec.soft)), type(spec.soft).__name__)
+    return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}
+
+
+def _unlabelled(teacher: Predictor, source: DataSource | None) -> tuple[list[Series], list[str]]:
+    recordings = [] if source is None else source.read()
+    return [unlabelled(teacher.task, entry) for entry in recordings], [entry.digest for entry in recordings]
