@@ -30,7 +30,7 @@ SHARE = 1e-5
 @TARGETS.register("c")
 @dataclass(frozen=True)
 class CTarget:
-    """C99, float32: ``NAME.h``, ``NAME.c``, constants, runtime, test on a computer, example task, CMake file."""
+    """C99, float32: ``NAME.h``, ``NAME.c``, constants, runtime, test on a computer, fuzzer, example task, CMake."""
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
@@ -42,6 +42,7 @@ class CTarget:
             f"{name}_weights.h": model.weights(),
             f"{name}_golden.h": golden(model),
             "host_test.c": model.fill("host_test.c.in"),
+            "fuzz.c": model.fill("fuzz.c.in"),
             "example_task.c": model.fill("example_task.c.in"),
             "CMakeLists.txt": model.fill("CMakeLists.txt.in"),
         }

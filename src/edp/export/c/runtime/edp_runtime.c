@@ -58,12 +58,13 @@ static float small_expm1(float r) {
     return r + r * r * (0.5f + r * tail);
 }
 
-/* 2^n e^r with n a whole number; relative error about 2e-7. Beyond the range of float32 the nearest end of it. */
+/* 2^n e^r with n a whole number; relative error about 2e-7. Beyond the range of float32 the nearest end of it. NaN stays
+ * NaN here and in what follows, and never becomes a whole number: so it reaches the output, where it is seen. */
 float edp_exp(float x) {
     const float limited = (x > 88.0f) ? 88.0f : ((x < -87.0f) ? -87.0f : x);
     const float turns = limited * 1.44269504f;
     const float nearest = (turns >= 0.0f) ? (turns + 0.5f) : (turns - 0.5f);
-    const int32_t n = (int32_t)nearest;
+    const int32_t n = (nearest >= -126.0f) ? (int32_t)nearest : -126;
     /* ln 2 in two parts, of which n times the first is exact. */
     const float r = (limited - (float)n * 0.693359375f) - (float)n * -2.12194440e-4f;
     const int32_t exponent = n + 127;
@@ -79,10 +80,10 @@ float edp_tanh(float x) {
     if (size < 0.17f) {
         const float e = small_expm1(2.0f * size);
         y = e / (e + 2.0f);
-    } else if (size < 10.0f) {
-        y = 1.0f - 2.0f / (edp_exp(2.0f * size) + 1.0f);
-    } else {
+    } else if (size >= 10.0f) {
         y = 1.0f;
+    } else {
+        y = 1.0f - 2.0f / (edp_exp(2.0f * size) + 1.0f);
     }
     return (x < 0.0f) ? -y : y;
 }
@@ -142,7 +143,7 @@ void edp_multiply(const float *a, const float *b, uint32_t n, float *y) {
 
 void edp_map_relu(const float *x, uint32_t n, float *y) {
     for (uint32_t i = 0; i < n; i++) {
-        y[i] = (x[i] > 0.0f) ? x[i] : 0.0f;
+        y[i] = (x[i] < 0.0f) ? 0.0f : x[i];
     }
 }
 
