@@ -1,12 +1,14 @@
 """What does a tick of an exported network cost: executed instructions on a Cortex-M4F, time on this computer?
 
 Networks as in the thesis's setting (30 features, 3 targets, window of 50, four residual blocks of kernel 3, LSTM) with
-weights as drawn: costs do not depend on them. Instructions are counted by QEMU, the same at every run. The rival of the
-time is the same network in PyTorch, a tick at a time, as `Stream.step` runs it.
+weights as drawn: costs do not depend on them. Instructions are counted by QEMU, the same at every run; times are of the
+processor, one thread. Rivals, with the same weights: C that emx-onnx-cgen makes of our ONNX graphs of a tick and of a
+window, built with the same flags; ONNX Runtime on both graphs; PyTorch, a tick at a time, as `Stream.step` runs it.
 """
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import tempfile
 import time
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+import onnx_rivals
 from common import finish, parser, table, verdict
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
@@ -29,6 +32,11 @@ MODEL = ("predictor.c", "edp_runtime.c", "edp_memory.c")
 M4 = ("-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "--specs=rdimon.specs", "-nostartfiles")
 QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-icount", "shift=0")
 SIZES = ((32, 32), (32, 64), (64, 64), (64, 128))
+RUNS = {"step": 20, "window": 2}
+
+
+HEADS = ["channels/units", "constants", "MACs", "M4 instructions", "per MAC", "code bytes", "emx step", "emx window",
+         "C us", "ORT window us", "ORT step us", "PyTorch us"]  # fmt: skip
 
 
 def make(channels: int, units: int, seed: int) -> Bundle:
@@ -45,13 +53,25 @@ def run(command: list[str], folder: Path) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
-def instructions(folder: Path, flags: str) -> int:
+def on_board(folder: Path, sources: tuple[str, ...]) -> list[str]:
+    """What a program prints on the M4, in words."""
+    rest = [*sources, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
+    given = ["-std=gnu11", "-O2", "-ffp-contract=off", *M4, "-I.", "-DCLOCK_HZ=25000000u", "-T", str(BOARD / "mps2.ld")]
+    run(["arm-none-eabi-gcc", *given, *rest], folder)
+    return run([*QEMU, "-semihosting-config", "enable=on,target=native", "-kernel", "image.elf"], folder).split()
+
+
+def instructions(folder: Path) -> int:
     """Executed instructions of a tick, the mean over 200."""
-    sources = [*MODEL, str(BOARD / "count.c"), str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
-    given = ["-std=gnu99", flags, "-ffp-contract=off", *M4, "-I.", "-DCLOCK_HZ=25000000u", "-T", str(BOARD / "mps2.ld")]
-    run(["arm-none-eabi-gcc", *given, *sources], folder)
-    printed = run([*QEMU, "-semihosting-config", "enable=on,target=native", "-kernel", "image.elf"], folder)
-    return int(printed.split()[0])
+    return int(on_board(folder, (*MODEL, str(BOARD / "count.c")))[0])
+
+
+def rival_instructions(folder: Path, kind: str) -> int:
+    """Executed instructions of a prediction by the rival's C, which must be ours within its tolerance."""
+    counted, permille = on_board(folder, onnx_rivals.counting(folder, kind, RUNS[kind]))
+    if int(permille) > 1000:
+        raise RuntimeError(f"emx-onnx-cgen's {kind} is {int(permille) / 1000} times the tolerance away from PyTorch")
+    return int(counted)
 
 
 def code_bytes(folder: Path) -> int:
@@ -63,14 +83,20 @@ def code_bytes(folder: Path) -> int:
 
 
 def host_us(folder: Path, bundle: Bundle, ticks: int) -> float:
-    """Microseconds a tick on this computer, the best of three runs, reading and writing files included."""
+    """Microseconds a tick on this computer, the best of three runs, reading and writing included."""
     run(["gcc", "-std=c99", "-O2", "-ffp-contract=off", *MODEL, "host_test.c", "-lm", "-o", "program"], folder)
     feed, best = random_inputs(bundle.predictor, ticks, 1).tobytes(), float("inf")
     for _ in range(3):
-        start = time.perf_counter()
+        start = children_s()
         subprocess.run([str(folder / "program"), "stream"], input=feed, check=True, stdout=subprocess.DEVNULL)
-        best = min(best, time.perf_counter() - start)
+        best = min(best, children_s() - start)
     return 1e6 * best / ticks
+
+
+def children_s() -> float:
+    """Processor seconds of the programs that this one has run."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def torch_us(bundle: Bundle, ticks: int) -> float:
@@ -78,33 +104,41 @@ def torch_us(bundle: Bundle, ticks: int) -> float:
     best = float("inf")
     for _ in range(3):
         stream.reset()
-        start = time.perf_counter()
+        start = time.process_time()
         for row in rows:
             stream.step(row)
-        best = min(best, time.perf_counter() - start)
+        best = min(best, time.process_time() - start)
     return 1e6 * best / ticks
 
 
 def main() -> None:
     arguments = parser(__doc__ or "").parse_args()
     sizes = SIZES[:1] if arguments.quick else SIZES
-    rows, details, verdicts = [], [], []
+    rows, verdicts = [], []
+    versions: dict[str, object] = {}
     for channels, units in sizes:
         bundle = make(channels, units, arguments.seed)
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
             CTarget().write(bundle, "predictor", folder)
-            counted, code = instructions(folder, "-O2"), code_bytes(folder)
+            versions = onnx_rivals.write(bundle, folder)
+            counted, code = instructions(folder), code_bytes(folder)
+            step, window = (rival_instructions(folder, kind) for kind in ("step", "window"))
             host, torch = host_us(folder, bundle, 5_000 if arguments.quick else 20_000), torch_us(bundle, 300)
-        graph = bundle.predictor.graph()
-        row = (f"{channels}/{units}", graph.parameters, graph.macs, counted, counted / graph.macs, code, host, torch)
-        rows.append(row)
-        details.append(row)
-        name = f"time of a tick, {channels}/{units}, C against PyTorch"
-        verdicts.append(verdict(name, host, torch, "<= 0.05", "us", arguments.quick))
-    heads = ["channels/units", "constants", "MACs", "M4 instructions", "per MAC", "code bytes", "C us", "PyTorch us"]
-    table(heads, rows)
-    finish("embedded_step", verdicts, arguments.seed, [dict(zip(heads, row)) for row in details])
+            onnx_window, onnx_step = onnx_rivals.runtime_us(bundle, folder, 300 if arguments.quick else 2_000)
+        graph, size = bundle.predictor.graph(), f"{channels}/{units}"
+        made = (size, graph.parameters, graph.macs, counted, counted / graph.macs, code)
+        rows.append((*made, step, window, host, onnx_window, onnx_step, torch))
+        for name, ours, rival, goal, unit in (
+            ("instructions of a tick, C against emx-onnx-cgen's step", counted, step, "<= 0.5", "instructions"),
+            ("instructions of a tick, C against emx-onnx-cgen's window", counted, window, "<= 0.0333", "instructions"),
+            ("time of a tick, C against ONNX Runtime on the window", host, onnx_window, "<= 0.05", "us"),
+            ("time of a tick, C against PyTorch", host, torch, "<= 0.05", "us"),
+        ):
+            verdicts.append(verdict(f"{size}: {name}", ours, rival, goal, unit, arguments.quick))
+    table(HEADS, rows)
+    kept = [{"rivals": versions}, *(dict(zip(HEADS, row)) for row in rows)]
+    finish("embedded_step", verdicts, arguments.seed, kept)
 
 
 if __name__ == "__main__":
