@@ -96,7 +96,7 @@ def counting(folder: Path, kind: str, runs: int) -> tuple[str, ...]:
 
 
 def runtime_us(bundle: Bundle, folder: Path, calls: int) -> tuple[float, float]:
-    """Processor microseconds of a prediction by ONNX Runtime, best of three: of the window, and of the step with states."""
+    """Processor microseconds of a prediction by ONNX Runtime, best of three: of the window and of the step."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
