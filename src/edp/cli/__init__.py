@@ -8,7 +8,21 @@ from typing import Annotated
 import typer
 
 from edp import __version__
-from edp.cli import animate, demo, distil, evaluate, export, footprint, inspect, report, screen, search, simulate, train
+from edp.cli import (
+    animate,
+    compress,
+    demo,
+    distil,
+    evaluate,
+    export,
+    footprint,
+    inspect,
+    report,
+    screen,
+    search,
+    simulate,
+    train,
+)
 from edp.cli.console import run_app
 
 app = typer.Typer(
@@ -28,6 +42,7 @@ app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(search.app, name="search")
 app.command("distil")(distil.distil)
+app.command("compress")(compress.compress)
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)
 app.command("report")(report.report)

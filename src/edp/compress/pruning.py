@@ -39,7 +39,7 @@ def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> P
     Raises:
         ConfigError: a part that cannot be pruned, or specs that are not narrower ones of the same network.
     """
-    _check(predictor.spec, model)
+    check_pruning(predictor.spec, model)
     small = Predictor(predictor.task, model, blank_scaler(predictor.task)).eval()
     worth = importance(predictor, series)
     with torch.no_grad():
@@ -162,7 +162,7 @@ def _units(layer: nn.Module) -> int:
     return int(layer.cell.hidden_size if hasattr(layer, "cell") else layer.units)  # type: ignore[union-attr, arg-type]
 
 
-def _check(big: ModelSpec, small: ModelSpec) -> None:
+def check_pruning(big: ModelSpec, small: ModelSpec) -> None:
     """Refuse what cannot be pruned, and specs that are not narrower ones of the same network.
 
     Raises:

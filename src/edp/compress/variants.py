@@ -39,13 +39,19 @@ Variant = Callable[[Bench], Candidate]
 VARIANTS: Registry[Variant] = Registry("variant")
 
 
+def rounded_order(of: Order) -> Order:
+    """The order to train on what another one made, with everything rounded."""
+    return Order(name=f"{of.name}_qat", units=of.units, rounding=RoundingSpec(), of=of)
+
+
 def _distilled(units: int) -> Order:
     return Order(name=f"u{units}", units=units)
 
 
 def _rounded(bench: Bench, name: str, of: Order | None) -> Candidate:
     units = width_of(bench.teacher.spec) if of is None else of.units
-    order = Order(name=name.lower(), units=units, rounding=THESIS, of=of)
+    begun = "teacher" if of is None else of.name
+    order = Order(name=f"{begun}_thesis_qat", units=units, rounding=THESIS, of=of)
     network = bench.network(order)
     folded = sum(cost.parameters - cost.foldable for cost in network.costs())
     rounded = sum(matrix.values.numel() for matrix in matrices_of(network, recurrent=False))
@@ -83,8 +89,7 @@ def c_u64_qat(bench: Bench) -> Candidate:
 
 
 def _ours(bench: Bench, units: int) -> Candidate:
-    pruned = Order(name=f"p{units}", units=units, pruned=True)
-    order = Order(name=f"d_u{units}", units=units, rounding=RoundingSpec(), of=pruned)
+    order = rounded_order(Order(name=f"p{units}", units=units, pruned=True))
     return Candidate(f"D_u{units}", order, bench.network(order), "w8a16")
 
 

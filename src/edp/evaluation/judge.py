@@ -109,6 +109,20 @@ def judge(
     return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
 
 
+def score_predictions(predictions: Predictions, data: Prepared, skip: int) -> dict[str, Any]:
+    """Scores of predictions ``(time, horizon, target)`` of each of ``data.test``, as `judge` gives them for a model.
+
+    Args:
+        predictions: in SI units.
+        data: series with truth.
+        skip: first ticks of each stretch that are not scored.
+
+    Raises:
+        DataError: no tick can be scored.
+    """
+    return _Ruler(data, skip).measure(predictions)
+
+
 def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     """The baselines' task: present values only where an input measures them, or a feature derived from one."""
     inputs = (*_lasting(data), *_derived_targets(data))

@@ -1,5 +1,7 @@
 """The report of a run: `facts` reads, `figures` computes, `plots` draws, `page` writes one offline HTML file."""
 
+from edp.report.compression_facts import Compression, read_compression
+from edp.report.compression_page import write_compression_page
 from edp.report.coverage_page import build_coverage_page
 from edp.report.facts import Facts, comparison_rows, headline, read_facts
 from edp.report.page import build_report
@@ -9,6 +11,7 @@ from edp.report.study_facts import read_study
 from edp.report.study_page import StudyReport, write_study_page
 
 __all__ = [
+    "Compression",
     "Facts",
     "StudyReport",
     "build_coverage_page",
@@ -16,8 +19,10 @@ __all__ = [
     "build_screening_page",
     "comparison_rows",
     "headline",
+    "read_compression",
     "read_facts",
     "read_study",
+    "write_compression_page",
     "write_pictures",
     "write_study_page",
 ]

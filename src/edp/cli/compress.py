@@ -1,0 +1,109 @@
+"""``edp compress``: the best network that a controller can run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from edp.training import Event
+
+
+def compress(
+    bundle: Annotated[Path, typer.Argument(help="Run folder of the teacher, or its bundle.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder of the search; goes on where it stopped.")],
+    data: Annotated[
+        Path | None, typer.Option(help="A log, a folder of logs, or a data-set file; default: those of the run.")
+    ] = None,
+    budget: Annotated[
+        Path | None, typer.Option("--budget", help="Limits of the controller (TOML); by default those of the thesis.")
+    ] = None,
+    units: Annotated[list[int], typer.Option(help="A width to make; may be repeated. Default: planned.")] = [],  # noqa: B006
+    formats: Annotated[
+        list[str], typer.Option("--format", help="float32, dynamic_int8 or w8a16; may be repeated. Default: all.")
+    ] = [],  # noqa: B006
+    thesis: Annotated[bool, typer.Option(help="Also make the variants of the thesis's Table 4.9.")] = False,
+    again: Annotated[bool, typer.Option(help="Open the lock-box again for another choice; it is recorded.")] = False,
+    changes: Annotated[
+        list[str], typer.Option("--set", help="One setting of the trainings, for example training.epochs=10.")
+    ] = [],  # noqa: B006
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Search width, pruning, number formats and training with rounded numbers for the best network within a budget.
+
+    Choices rest on the validation part; the test part is opened once, for the chosen network and the teacher. Stop
+    it at any moment (Ctrl-C): the same command goes on.
+
+    Example: `edp compress runs/first --budget examples/budgets/small_controller.toml --out runs/small`
+    """
+    from edp.downsizing import SearchSpec, Watchers, search
+    from edp.evaluation.controller import Budget, load_budget
+    from edp.report import read_compression, write_compression_page
+
+    spec = SearchSpec(
+        budget=Budget() if budget is None else load_budget(budget),
+        units=tuple(units),
+        formats=tuple(formats),
+        thesis=thesis,
+        again=again,
+        changes=tuple(changes),
+    )
+    source = None if data is None else source_of(data, signal_map, repair)
+    with progress(as_json) as shown:
+        display = _Display(shown, Steps(as_json), as_json)
+        found = search(bundle, spec, folder, source, Watchers(display.on_note, display.on_training))
+    page = write_compression_page(folder)
+    facts = read_compression(folder)
+    best = found.best
+
+    def show() -> None:
+        _tables(facts)
+        if best is not None:
+            out.print(f"next: edp evaluate {best.run}, or edp footprint {best.run}")
+        out.print(f"report: {page}")
+
+    emit(as_json, dict(facts.held) | {"report": str(page)}, show)
+
+
+def _tables(facts: Any) -> None:
+    from edp.report import compression_facts as words
+
+    for horizon in facts.horizons:
+        sheet = words.table_sheet(facts, horizon)
+        heads = [f"{column.heading} [{column.unit}]" if column.unit else column.heading for column in sheet.columns]
+        marked = [("* " if place in sheet.marked else "  ") + cells[0] for place, cells in enumerate(sheet.texts())]
+        rows = [[name, *cells[2:]] for name, cells in zip(marked, sheet.texts(), strict=True)]
+        table(f"{sheet.caption}; * on the front", [heads[0], *heads[2:]], rows)
+        out.print()
+    out.print(words.headline(facts))
+    for line in words.verdict(facts):
+        out.print(line)
+
+
+class _Display:
+    """Shows which network is being made, and the time left of its training."""
+
+    def __init__(self, shown: Progress, steps: Steps, quiet: bool) -> None:
+        self.shown, self.steps, self.quiet = shown, steps, quiet
+        self.bar = shown.add_task("compress", total=1.0, note="reading recordings")
+
+    def on_note(self, text: str) -> None:
+        """Print a sentence."""
+        if not self.quiet:
+            out.print(text)
+
+    def on_training(self, name: str, done: int, count: int, event: Event) -> None:
+        """Show an event of a training."""
+        part = ((event.epoch - 1) * event.updates + event.update) / (event.epochs * event.updates)
+        note = f"{name}, network {done + 1} of at most {count}, epoch {event.epoch}/{event.epochs}"
+        self.shown.update(self.bar, completed=min(1.0, (done + part) / max(1, count)), note=note)
+        self.steps.say(f"compress: {note}, {duration(event.seconds_left)} left of it", force=event.row is not None)

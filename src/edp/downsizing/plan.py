@@ -1,0 +1,169 @@
+"""Which smaller networks a search makes, and a budget that no network of this kind meets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edp.compress import FORMATS, Order, Taken, student, taken, width_of
+from edp.compress.pruning import check_pruning
+from edp.compress.variants import rounded_order
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.errors import ConfigError, ExportError
+from edp.evaluation.controller import Budget
+from edp.models.predictor import ModelSpec, Predictor, build_model
+from edp.training.bundle import blank_scaler
+
+STEP = 4  # widths are multiples of it: what kernels compute at a time
+SHARES = (1.0, 0.5, 0.25)  # of the widest that fits: the front below it
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be made.
+
+    Attributes:
+        widths: of the networks, widest first.
+        formats: in which a network can be.
+        prunable: whether the teacher can be pruned.
+        notes: what was left out, and why.
+    """
+
+    widths: tuple[int, ...]
+    formats: tuple[str, ...]
+    prunable: bool
+    notes: tuple[str, ...]
+
+    def orders(self, width: int) -> list[Order]:
+        """The ways to a network of this width."""
+        ways = [Order(name=f"u{width}", units=width)]
+        return [*ways, Order(name=f"p{width}", units=width, pruned=True)] if self.prunable else ways
+
+    @property
+    def rounds(self) -> bool:
+        """Whether training with rounded numbers is of use."""
+        return any(FORMATS[name].rounded for name in self.formats)
+
+    @property
+    def trainings(self) -> int:
+        """How many there are at most."""
+        return len(self.widths) * (len(self.orders(1)) + self.rounds)
+
+    def tuned(self, best: Order) -> list[Order]:
+        """What is made of the better way of a width."""
+        return [rounded_order(best)] if self.rounds else []
+
+
+def make_plan(teacher: Predictor, budget: Budget, units: Sequence[int] = (), formats: Sequence[str] = ()) -> Plan:
+    """Plan a search: the widest network that fits in each format, and its halves and quarters.
+
+    Args:
+        teacher: the trained network.
+        budget: what the controller grants.
+        units: widths to make; none given, they are planned.
+        formats: names of number formats; none given, all.
+
+    Raises:
+        ConfigError: an unknown format, a width that is none, or a budget that no network of this kind meets.
+    """
+    able, notes = _able(teacher, formats or list(FORMATS))
+    prunable, why = _prunable(teacher)
+    notes += [why] if why else []
+    full = width_of(teacher.spec)
+    wrong = [width for width in units if not 1 <= width <= full]
+    if wrong:
+        raise ConfigError(
+            f"units = {', '.join(map(str, wrong))}; 1 <= units <= {full}, those of the teacher, must hold"
+        )
+    fitting = {name: _widest(teacher, name, budget) for name in able}
+    if not any(fitting.values()):
+        raise ConfigError(_refusal(teacher, budget, able))
+    for name, width in fitting.items():
+        if not width:
+            notes.append(f"no width fits the budget in {FORMATS[name].label}")
+    widths = set(units) or _around(set(fitting.values()) - {0}, full)
+    return Plan(tuple(sorted(widths, reverse=True)), tuple(able), prunable, tuple(notes))
+
+
+def _able(teacher: Predictor, formats: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The formats that have a form for every part of the network, and why the others have none."""
+    net = _untrained(student(teacher.spec, 1), teacher.task)
+    drawn = np.random.default_rng(0).normal(size=(2 * net.spec.window, len(net.task.inputs))).astype(np.float32)
+    series = [Series("drawn", drawn, np.zeros((len(drawn), len(net.task.targets)), dtype=np.float32))]
+    able, notes = [], []
+    for name in formats:
+        try:
+            FORMATS[name]().predictions(net, series)
+        except ExportError as error:
+            notes.append(f"number format '{name}' is left out: {error}")
+        else:
+            able.append(name)
+    if not able:
+        raise ConfigError("; ".join(notes))
+    return able, notes
+
+
+def _around(tops: set[int], full: int) -> set[int]:
+    shares = {max(1, round(max(tops) * share / STEP) * STEP or 1) for share in SHARES}
+    return {min(width, full) for width in tops | shares}
+
+
+def _prunable(teacher: Predictor) -> tuple[bool, str]:
+    """Whether there is a rule for every part of the teacher, else the reason."""
+    try:
+        check_pruning(teacher.spec, _narrow(teacher.spec, 1))
+    except ConfigError as error:
+        return False, str(error)
+    return True, ""
+
+
+def _narrow(model: ModelSpec, units: int) -> ModelSpec:
+    """A student with all levels of the teacher."""
+    channels = getattr(model.backbone, "channels", None)
+    return student(model, units, None if channels is None else len(channels))
+
+
+def _untrained(model: ModelSpec, task: Task) -> Predictor:
+    return build_model(task, model, blank_scaler(task), seed=0)
+
+
+def _taken(teacher: Predictor, units: int, name: str, budget: Budget) -> Taken:
+    return taken(_untrained(_narrow(teacher.spec, units), teacher.task), name, budget)
+
+
+def _widest(teacher: Predictor, name: str, budget: Budget) -> int:
+    """The widest network that fits, a multiple of `STEP` where it is not the teacher's own; 0 for none."""
+    full = width_of(teacher.spec)
+    widths = sorted({1, 2, full, *range(STEP, full + 1, STEP)} & set(range(1, full + 1)))
+    low, high = 0, len(widths)  # those before `low` fit, those from `high` on do not
+    while low < high:
+        middle = (low + high) // 2
+        if _taken(teacher, widths[middle], name, budget).over(budget):
+            high = middle
+        else:
+            low = middle + 1
+    return widths[low - 1] if low else 0
+
+
+def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str]) -> str:
+    """What the nearest network takes, and what the limits would have to be."""
+    least = {name: _taken(teacher, 1, name, budget) for name in formats}
+
+    def worst(name: str) -> float:
+        return max(value / limit for value, limit in least[name].over(budget).values())
+
+    nearest = min(formats, key=worst)
+    over = least[nearest].over(budget)
+    granted = ", ".join(f"{limit} = {pair[1]:,}" for limit, pair in over.items())
+    needed = ", ".join(f"{limit} = {pair[0]:,}" for limit, pair in over.items())
+    return (
+        f"budget '{budget.name}': {granted} can be met by no width of this network in any number format. The nearest "
+        f"that would work is one of a single unit in {FORMATS[nearest].label}, with {needed}: raise these limits to "
+        "that at least, leave out blocks, or read fewer channels"
+    )
+
+
+__all__ = ["Plan", "make_plan"]

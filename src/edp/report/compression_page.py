@@ -1,0 +1,69 @@
+"""The report of a search for a smaller network: one offline HTML page, tables and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from edp.report import compression_facts as words
+from edp.report.compression_facts import Compression, read_compression
+from edp.report.compression_plots import compression_plots, drawings
+from edp.report.drawing import write_drawings
+from edp.report.page import asset, script_json
+from edp.report.sheets import Sheet
+from edp.report.templates import template
+from edp.report.wording import unbroken
+from edp.storage import make_folder, write_bytes
+
+
+def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
+    """Write ``report.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp compress`.
+
+    Returns:
+        The page.
+
+    Raises:
+        StorageError: the folder holds no search, or a file cannot be written.
+    """
+    facts = read_compression(folder)
+    tables = sheets(facts)
+    page = facts.folder / "report.html"
+    write_bytes(page, render(facts, tables).encode())
+    for sheet in tables:
+        place = make_folder(facts.folder / "tables") / sheet.name
+        write_bytes(place.with_suffix(".csv"), sheet.csv().encode())
+        write_bytes(place.with_suffix(".md"), sheet.markdown().encode())
+    if pictures:
+        write_drawings(facts.folder / "pictures", drawings(facts))
+    return page
+
+
+def sheets(facts: Compression) -> list[Sheet]:
+    """A table a horizon, longest first, and that of the lock-box."""
+    box = words.box_sheet(facts)
+    return [*(words.table_sheet(facts, horizon) for horizon in reversed(facts.horizons)), *([box] if box else [])]
+
+
+def render(facts: Compression, tables: list[Sheet]) -> str:
+    """The page's text."""
+    plots = compression_plots(facts)
+    context: dict[str, Any] = {
+        "title": facts.folder.resolve().name,
+        "headline": unbroken(words.headline(facts)),
+        "verdict": words.verdict(facts),
+        "tiles": words.tiles(facts),
+        "caveats": words.caveats(facts),
+        "tables": [sheet.table() for sheet in tables if sheet.name != "lockbox"],
+        "box": next((sheet.table() for sheet in tables if sheet.name == "lockbox"), None),
+        "opened": facts.held["box"].get("opened", ""),
+        "budget": facts.held["budget"],
+        "plots": plots,
+        "specs": script_json([plot.spec() for plot in plots.values()]),
+        "style": Markup(asset("page.css")),
+        "script": Markup(asset("page.js")),
+        "plotly": Markup(get_plotlyjs()),
+    }
+    return template("compression.html.jinja").render(**context)

@@ -1,0 +1,186 @@
+"""The search for the best network that a controller can run: what it makes, chooses, records and refuses."""
+
+import csv
+import json
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from edp.cli import app
+from edp.compress import taken
+from edp.config import load_experiment
+from edp.downsizing import SearchSpec, Watchers, search, searching
+from edp.downsizing.plan import make_plan
+from edp.errors import ConfigError, StorageError
+from edp.evaluation.controller import Budget
+from edp.models.cells import LayerNormLstmCell
+from edp.models.predictor import build_model
+from edp.report import read_compression, write_compression_page
+from edp.storage import read_json
+from edp.training import load_bundle
+from edp.training.bundle import blank_scaler
+from edp.workflow import train
+
+SETTINGS = (
+    'task.features={name="levers", channels=["speed", "lever"]}',
+    'task.targets=["speed"]',
+    "task.horizons=[1, 3]",
+    "training.epochs=2",
+    "training.updates=4",
+    'training.optimizer={kind="adamw"}',
+    'training.chunks={regime="chunk",length=32,batch=4,burn_in=10}',
+    'model.backbone={kind="hybrid",channels=[16],kernel=2,units=16}',
+    "model.head.hidden=8",
+    "model.blocks=[]",
+    "model.window=10",
+    'judge.baselines=["persistence"]',
+)
+
+
+@pytest.fixture(scope="module")
+def run(lever_sessions, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("teacher") / "run"
+    train(lever_sessions, load_experiment(preset="quick", overrides=SETTINGS), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tight(run):
+    """Half of what the teacher takes in whole numbers."""
+    need = taken(load_bundle(run).predictor, "w8a16", Budget())
+    return Budget(name="tight", cycles=need.cycles[2] // 2, parameter_bytes=need.parameter_bytes // 2)
+
+
+@pytest.fixture(scope="module")
+def done(run, tight, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("search") / "out"
+    return folder, search(run, SearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
+
+
+def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight):
+    folder, found = done
+    best = found.best
+    assert best is not None
+    assert best.fits
+    assert best.error == min(row.error for row in found.rows if row.fits)
+    assert best.taken.cycles[2] <= tight.cycles
+    for place, row in enumerate(found.rows):
+        point = (row.error, row.taken.cycles[2], row.taken.parameter_bytes)
+        others = [(r.error, r.taken.cycles[2], r.taken.parameter_bytes) for r in found.rows]
+        beaten = any(all(a <= b for a, b in zip(other, point)) and other != point for other in others)
+        assert (place in found.front) != beaten
+    assert {row.way for row in found.rows} >= {"teacher", "distilled", "pruned and distilled"}
+    assert any(row.way.endswith("trained on rounded") for row in found.rows)
+    held = read_json(folder / "compression.json")
+    assert len(held["box"]["openings"]) == 1
+    assert set(held["box"]["scores"]) == {"teacher", "chosen"}
+    assert held["box"]["seen_before"] is False
+    assert load_bundle(best.run).predictor.spec.backbone.units < 16
+
+
+def test_the_same_call_trains_and_opens_nothing_again(run, tight, done, monkeypatch):
+    folder, found = done
+    monkeypatch.setattr(searching, "train", None)
+    again = search(run, SearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
+    assert [row.name for row in again.rows] == [row.name for row in found.rows]
+    assert [row.error for row in again.rows] == [row.error for row in found.rows]
+    assert len(again.box["openings"]) == 1
+
+
+def test_a_stopped_search_goes_on_to_the_same_result(run, tight, done, tmp_path):
+    class Pulled(Exception):
+        pass
+
+    def pull(name, number, count, event):
+        if number == 1 and event.row is not None:
+            raise Pulled
+
+    spec = SearchSpec(budget=tight, formats=("float32", "w8a16"))
+    with pytest.raises(Pulled):
+        search(run, spec, tmp_path / "out", watchers=Watchers(on_training=pull))
+    found = search(run, spec, tmp_path / "out")
+    assert [row.error for row in found.rows] == [row.error for row in done[1].rows]
+
+
+def test_another_choice_needs_a_word_and_is_recorded(run, tight, done, tmp_path):
+    folder = shutil.copytree(done[0], tmp_path / "out")
+    other = SearchSpec(budget=tight, units=(2,), formats=("float32",))
+    with pytest.raises(ConfigError, match="was opened on"):
+        search(run, other, folder)
+    looked = search(run, replace(other, again=True), folder)
+    assert looked.best != done[1].best
+    assert len(looked.box["openings"]) == 2
+
+
+def test_a_budget_that_nobody_can_meet_is_refused_with_the_nearest(run, tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"cycles = 100 can be met by no width .* single unit in W8A16, with cycles = \d"
+    ):
+        search(run, SearchSpec(budget=Budget(name="none", cycles=100)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("spec", "reason"),
+    [
+        (SearchSpec(budget=Budget(), units=(17,)), "1 <= units <= 16"),
+        (SearchSpec(budget=Budget(), formats=("w8a6",)), "w8a16"),
+        (SearchSpec(budget=Budget(), changes=("model.window=20",)), "those of its teacher"),
+    ],
+)
+def test_what_cannot_be_is_refused(run, tmp_path, spec, reason):
+    with pytest.raises(ConfigError, match=reason):
+        search(run, spec, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_has_no_form_in_whole_numbers_is_left_out_with_the_reason(tiny, tiny_model):
+    backbone = replace(tiny_model.backbone, cell=LayerNormLstmCell())
+    teacher = build_model(tiny.task, replace(tiny_model, backbone=backbone), blank_scaler(tiny.task), seed=0)
+    plan = make_plan(teacher, Budget())
+    assert "w8a16" not in plan.formats
+    assert not plan.rounds
+    assert not plan.prunable
+    assert [order.name[0] for order in plan.orders(4)] == ["u"]
+    assert any("LayerNormLstm" in note for note in plan.notes)
+
+
+def test_widths_reach_from_the_widest_that_fits_to_a_quarter_of_it(run):
+    teacher = load_bundle(run).predictor
+    plan = make_plan(teacher, Budget(), formats=("float32",))
+    assert plan.widths == (16, 8, 4)
+    need = taken(teacher, "float32", Budget())
+    narrow = make_plan(teacher, Budget(cycles=need.cycles[2] - 1), formats=("float32",))
+    assert narrow.widths == (12, 8, 4)
+
+
+def test_report_tables_and_pictures(done):
+    folder, found = done
+    page = write_compression_page(folder)
+    text = page.read_text()
+    assert "http://" not in re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    assert found.best.name in text
+    for k in (1, 3):
+        rows = list(csv.reader((folder / "tables" / f"k{k}.csv").read_text().splitlines()))
+        assert rows[0][:3] == ["Variant", "Made", "MAE [mm/s]"]
+        assert len(rows) == 1 + len(read_json(folder / "compression.json")["rows"])
+        assert (folder / "pictures" / f"profile_k{k}.svg").is_file()
+    with pytest.raises(StorageError, match=r"holds no compression\.json"):
+        read_compression(folder / "runs")
+
+
+def test_the_command_prints_the_table_and_the_choice(run, tmp_path):
+    (tmp_path / "budget.toml").write_text("cycles = 60_000\n")
+    arguments = ["compress", str(run), "--budget", str(tmp_path / "budget.toml"), "--out", str(tmp_path / "out")]
+    arguments += ["--units", "4", "--format", "w8a16", "--set", "training.epochs=1"]
+    shown = CliRunner().invoke(app, arguments)
+    assert shown.exit_code == 0, shown.output
+    assert "Variant" in shown.output
+    assert "fits “budget”" in shown.output
+    facts = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
+    assert facts["rows"][facts["chosen"]]["fits"]
+    assert np.isfinite(facts["box"]["error"])
