@@ -20,6 +20,10 @@ from edp.compress.rounding import Site
 from edp.config import load_experiment
 from edp.errors import ConfigError
 from edp.export import TARGETS
+from edp.graph.layers import GroupedDense
+from edp.graph.memory import Lstm
+from edp.integer import calibrate, quantise
+from edp.integer.quantise import weights_of
 from edp.models.predictor import build_model
 from edp.models.running import stream_predictions
 from edp.runs import RunFolder
@@ -143,3 +147,21 @@ def test_sizes_are_those_of_table_4_9(name, size):
     rounded = sum(matrix.values.numel() for matrix in matrices_of(net, recurrent=False))
     folded = sum(cost.parameters - cost.foldable for cost in net.costs())
     assert f"{(4 * folded - 3 * rounded) / 1e6:.4f}" == size
+
+
+def test_whole_numbers_of_a_deployed_network_are_those_that_training_saw(tiny, tiny_model, brief, start):
+    """W8A16 of `edp.integer`, with weights of least error on data, finds the levels that are there already."""
+    net = fit(tiny, tiny_model, brief, lesson=QuantisationAware(start, Distillation([start]))).predictor
+    graph = net.graph()
+    found = weights_of(quantise(graph, calibrate(graph, [part.inputs for part in tiny.train])))
+    assert len(found) == len(matrices_of(net)) == 8
+    for layer in graph.layers:
+        for name, axes in (("weight", (0, 1) if isinstance(layer, GroupedDense) else (0,)), ("score", ())):
+            weight = layer.tensors().get(name)
+            if weight is not None and layer.name in found:
+                levels, _ = weight_levels(torch.from_numpy(weight), axes)
+                np.testing.assert_array_equal(found[layer.name].astype(int), levels.numpy().astype(int))
+    (lstm,) = [layer for layer in graph.layers if isinstance(layer, Lstm)]
+    for side, weight in (("x", lstm.weight_x), ("h", lstm.weight_h)):
+        levels, _ = weight_levels(torch.from_numpy(weight), (0,))
+        np.testing.assert_array_equal(found[f"{lstm.name}/{side}"].astype(int), levels.numpy().astype(int))

@@ -35,6 +35,16 @@ class Compression:
         rows: Sequence[Mapping[str, Any]] = self.held["rows"]
         return rows
 
+    def smallest(self) -> list[int]:
+        """Places of a row for each network: that of its smallest format; the teacher in float32 comes first."""
+        found: dict[tuple[str, bool], int] = {}
+        for place, row in enumerate(self.rows):
+            whole = row["way"] == "teacher" and row["number_format"] == "float32"
+            held = found.get((row["run"], whole))
+            if held is None or row["taken"]["parameter_bytes"] < self.rows[held]["taken"]["parameter_bytes"]:
+                found[row["run"], whole] = place
+        return sorted(found.values(), key=lambda place: (self.rows[place]["way"] != "teacher", place))
+
     @property
     def horizons(self) -> list[str]:
         """Look-aheads in samples, as keys of scores."""

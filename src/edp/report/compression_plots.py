@@ -13,6 +13,7 @@ from plotly.subplots import make_subplots
 from edp.report.compression_facts import COSTS, Compression
 from edp.report.drawing import BLUE as DRAWN_BLUE
 from edp.report.drawing import DROPPED, INK
+from edp.report.study_plots import TICKS, short
 from edp.report.style import BLUE, GREY, MUTED, RULE, SOFT, Control, Plot, styled, with_unit
 
 if TYPE_CHECKING:
@@ -31,20 +32,23 @@ def compression_plots(facts: Compression) -> dict[str, Plot]:
 def profile_plot(facts: Compression) -> Plot:
     """Parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
     figure = make_subplots(cols=2, specs=[[{"secondary_y": True}, {}]], horizontal_spacing=0.12)
-    names = [html.escape(row["name"]) for row in facts.rows]
-    sizes = [row["taken"]["parameters"] for row in facts.rows]
+    places = facts.smallest()
+    rows = [facts.rows[place] for place in places]
+    names = [html.escape(row["name"]) for row in rows]
+    sizes = [row["taken"]["parameters"] for row in rows]
     bars = {"marker": {"color": RULE}, "name": "parameters", "hovertemplate": "%{y:,}"}
     figure.add_bar(x=names, y=sizes, row=1, col=1, **bars)
     for horizon in facts.horizons:
         shared: dict[str, Any] = {"meta": {AHEAD: horizon}, "visible": horizon == facts.horizons[0]}
         for when, name, symbol, ink in MOMENTS:
-            values = [facts.mae(row, horizon, when) for row in facts.rows]
+            values = [facts.mae(row, horizon, when) for row in rows]
+            marker = {"symbol": symbol, "size": 13 if when == "before" else 7, "color": ink}
             figure.add_scatter(
-                x=names, y=values, mode="markers", name=f"MAE {name}", row=1, col=1, secondary_y=True,
-                marker={"symbol": symbol, "size": 9, "color": ink}, hovertemplate="%{y:.4~g}", **shared,
+                x=names, y=values, mode="markers", name=f"MAE {name}", row=1, col=1, secondary_y=True, marker=marker,
+                hovertemplate="%{y:.4~g}", **shared,
             )  # fmt: skip
-        colours = [BLUE if place in facts.held["front"] else MUTED[3] for place in range(len(names))]
-        scores = [row["scores"][horizon]["composite"] for row in facts.rows]
+        colours = [BLUE if place in facts.held["front"] else MUTED[3] for place in places]
+        scores = [row["scores"][horizon]["composite"] for row in rows]
         figure.add_bar(
             x=names, y=scores, row=1, col=2, marker={"color": colours}, showlegend=False, hovertemplate="%{y:.4~g}",
             **shared,
@@ -53,7 +57,9 @@ def profile_plot(facts: Compression) -> Plot:
     unit = facts.held["unit"]
     figure.update_yaxes(type="log", title_text="Parameters", row=1, col=1, secondary_y=False)
     error = with_unit("Mean absolute error", unit)
-    figure.update_yaxes(type="log", title_text=error, row=1, col=1, secondary_y=True, showgrid=False)
+    figure.update_yaxes(
+        type="log", title_text=error, nticks=6, tickformat=".3~g", row=1, col=1, secondary_y=True, showgrid=False
+    )
     figure.update_yaxes(title_text=with_unit("Composite score, the front in blue", unit), row=1, col=2)
     options = tuple((horizon, facts.ahead(horizon)) for horizon in facts.horizons)
     return Plot("profile", figure, (Control(AHEAD, "Horizon", options, False),) if len(options) > 1 else ())
@@ -89,7 +95,8 @@ def front_plot(facts: Compression) -> Plot:
             hoverinfo="skip", **shared,
         )  # fmt: skip
     styled(figure, 440)
-    figure.update_xaxes(type="log", title_text="Cost")
+    ticks = {"tickvals": TICKS, "ticktext": [short(tick) for tick in TICKS]}
+    figure.update_xaxes(type="log", title_text="Cost", showgrid=True, **ticks)
     figure.update_yaxes(title_text="Error over the teacher's [%]")
     return Plot("front", figure, (Control(COST, "Cost", tuple(COSTS.items()), False),))
 
@@ -100,24 +107,34 @@ def drawings(facts: Compression) -> dict[str, Callable[[Figure], None]]:
 
 
 def _draw(figure: Figure, facts: Compression, horizon: str) -> None:
-    figure.set_size_inches(max(8.0, 0.55 * len(facts.rows) + 4), 4.2)
+    shown = facts.smallest()
+    rows = [facts.rows[place] for place in shown]
+    figure.set_size_inches(max(8.0, 0.5 * len(rows) + 4), 4.2)
     left, right = figure.subplots(ncols=2)
-    places = range(len(facts.rows))
-    left.bar(places, [row["taken"]["parameters"] for row in facts.rows], color=RULE, label="parameters")
-    left.set(yscale="log", ylabel="Parameters")
+    places = range(len(rows))
+    left.bar(places, [row["taken"]["parameters"] for row in rows], color=RULE)
+    left.set(yscale="log", ylabel="Parameters (bars)")
     errors = left.twinx()
-    for when, text, fill in (("before", "MAE in float32", "none"), ("scores", "MAE in its format", DRAWN_BLUE)):
-        values = [facts.mae(row, horizon, when) for row in facts.rows]
-        edge = INK if fill == "none" else DRAWN_BLUE
-        errors.scatter(places, values, s=28, facecolors=fill, edgecolors=edge, label=text, zorder=3)
+    for when, text, size in (("before", "MAE in float32", 60), ("scores", "MAE in its format", 16)):
+        values = [facts.mae(row, horizon, when) for row in rows]
+        fill = "none" if when == "before" else DRAWN_BLUE
+        edge = INK if when == "before" else DRAWN_BLUE
+        errors.scatter(places, values, s=size, facecolors=fill, edgecolors=edge, label=text, zorder=3)
     errors.set(yscale="log", ylabel=f"MAE [{facts.held['unit']}]")
     errors.legend(frameon=False, fontsize=7)
-    colours = [DRAWN_BLUE if place in facts.held["front"] else DROPPED for place in places]
-    right.bar(places, [row["scores"][horizon]["composite"] for row in facts.rows], color=colours)
+    for axes in (left, errors):
+        axes.yaxis.set_major_formatter(_plainly)
+        axes.yaxis.set_minor_formatter(_plainly if axes is errors else "")
+    colours = [DRAWN_BLUE if place in facts.held["front"] else DROPPED for place in shown]
+    right.bar(places, [row["scores"][horizon]["composite"] for row in rows], color=colours)
     right.set(ylabel=f"Composite score [{facts.held['unit']}], the front in blue")
     for axes in (left, right):
-        axes.set_xticks(list(places), [row["name"] for row in facts.rows], rotation=90, fontsize=7)
+        axes.set_xticks(list(places), [row["name"] for row in rows], rotation=90, fontsize=7)
     figure.suptitle(facts.ahead(horizon), fontsize=10)
+
+
+def _plainly(value: float, place: int | None) -> str:
+    return f"{value:,.4g}" if value < 1e4 else f"{value / 1e3:,.4g} k"
 
 
 def _percent(row: Any) -> float:
