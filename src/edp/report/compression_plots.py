@@ -58,7 +58,14 @@ def profile_plot(facts: Compression) -> Plot:
     figure.update_yaxes(type="log", title_text="Parameters", row=1, col=1, secondary_y=False)
     error = with_unit("Mean absolute error", unit)
     figure.update_yaxes(
-        type="log", title_text=error, nticks=6, tickformat=".3~g", row=1, col=1, secondary_y=True, showgrid=False
+        type="log",
+        title_text=error,
+        tickvals=_ticks(facts),
+        tickformat=".3~g",
+        row=1,
+        col=1,
+        secondary_y=True,
+        showgrid=False,
     )
     figure.update_yaxes(title_text=with_unit("Composite score, the front in blue", unit), row=1, col=2)
     options = tuple((horizon, facts.ahead(horizon)) for horizon in facts.horizons)
@@ -131,6 +138,16 @@ def _draw(figure: Figure, facts: Compression, horizon: str) -> None:
     for axes in (left, right):
         axes.set_xticks(list(places), [row["name"] for row in rows], rotation=90, fontsize=7)
     figure.suptitle(facts.ahead(horizon), fontsize=10)
+
+
+def _ticks(facts: Compression) -> list[float]:
+    """Five round errors for each horizon, evenly spread on a logarithmic axis."""
+    found = set()
+    for horizon in facts.horizons:
+        values = [facts.mae(row, horizon) for row in facts.rows]
+        low, high = min(values), max(values)
+        found |= {float(f"{low * (high / low) ** (step / 4):.2g}") for step in range(5)} if low > 0 else set()
+    return sorted(found)
 
 
 def _plainly(value: float, place: int | None) -> str:
