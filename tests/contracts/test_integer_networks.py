@@ -29,8 +29,6 @@ def network(structure, predictor_of, integers_of):
 
 def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, rows_of):
     predictor = predictor_of(structure, dtype=torch.float32)
-    if predictor.physics is not None:
-        return
     graph = predictor.graph()
     if {type(layer) for layer in graph.layers} & set(REFUSED):
         with pytest.raises(ExportError, match="no form in whole numbers; train with"):

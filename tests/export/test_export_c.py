@@ -11,7 +11,7 @@ import pytest
 from edp.errors import ConfigError, ExportError
 from edp.export import TARGETS
 from edp.export.c.calls import CALLS, Calls
-from edp.export.c.model import LIMIT, ends, make_model
+from edp.export.c.model import LIMIT, ends
 from edp.export.c.plan import plan
 from edp.export.c.target import SHARE, CTarget, random_inputs, stream, tolerance
 from edp.export.c.text import identifiers, number
@@ -39,26 +39,17 @@ def test_what_is_allowed_is_little(bundle_of):
     )
 
 
-def exportable(predictor):
-    return predictor.physics is None
-
-
 def test_c_predicts_what_pytorch_predicts(c, structure, program_of, bundle_of):
     bundle = bundle_of(structure)
-    if not exportable(bundle.predictor):
-        with pytest.raises(ExportError, match="physics base"):
-            make_model("predictor", bundle)
-        return
     assert differs_by(c, program_of(structure), bundle.predictor, 2_000) < 1
 
 
 @pytest.mark.slow
 def test_c_follows_pytorch_for_a_long_time(c, structure, program_of, bundle_of):
     bundle = bundle_of(structure)
-    if exportable(bundle.predictor):
-        program = program_of(structure, "gcc", "-O2")
-        assert differs_by(c, program, bundle.predictor, 100_000) < 1
-        assert b"all tests passed" in c.run(program)
+    program = program_of(structure, "gcc", "-O2")
+    assert differs_by(c, program, bundle.predictor, 100_000) < 1
+    assert b"all tests passed" in c.run(program)
 
 
 @pytest.mark.parametrize("network", ["hybrid+all", "tcn+quantiles"])
@@ -143,10 +134,7 @@ def test_deviations_from_misra_are_the_ones_that_the_docs_list(c, bundle_of, tmp
 
 
 def test_values_do_not_lie_over_values_that_are_still_read(structure, bundle_of):
-    predictor = bundle_of(structure).predictor
-    if not exportable(predictor):
-        return
-    graph = predictor.graph()
+    graph = bundle_of(structure).predictor.graph()
     made = plan(graph)
     last = {name: at for at, layer in enumerate(graph.layers) for name in layer.inputs}
     last |= dict.fromkeys(graph.results.values(), len(graph.layers))

@@ -186,8 +186,7 @@ def test_no_layer_reads_or_writes_beside_its_memory(c, network, bundle_of, tmp_p
 
 @pytest.mark.slow
 def test_no_layer_of_any_network_reads_or_writes_beside_its_memory(c, structure, bundle_of, tmp_path):
-    if bundle_of(structure).predictor.physics is None:
-        check_zones(c, structure, bundle_of, tmp_path)
+    check_zones(c, structure, bundle_of, tmp_path)
 
 
 def test_its_cmake_file_builds_the_fuzzer(c, bundle_of, fuzzing, tmp_path):

@@ -20,6 +20,11 @@ class Function(StrEnum):
     GELU = "gelu"
     SOFTPLUS = "softplus"
     EXP = "exp"
+    SQRT = "sqrt"
+    SINE = "sine"
+    COSINE = "cosine"
+    POSITIVE = "positive"
+    """1 where a number is above 0, else 0."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,6 +87,39 @@ class Subtract(Layer):
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Multiply(Layer):
     """Product of two values of `size` numbers, element by element."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Divide(Layer):
+    """First value over the second, of `size` numbers each, element by element."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Minimum(Layer):
+    """The smaller one of each pair of two values of `size` numbers."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Maximum(Layer):
+    """The larger one of each pair of two values of `size` numbers."""
 
     size: int
 

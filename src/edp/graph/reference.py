@@ -112,6 +112,10 @@ FUNCTIONS: Mapping[plain.Function, Callable[[Values], Values]] = {
     plain.Function.GELU: _gelu,
     plain.Function.SOFTPLUS: lambda x: np.logaddexp(x, np.zeros_like(x)),
     plain.Function.EXP: np.exp,
+    plain.Function.SQRT: np.sqrt,
+    plain.Function.SINE: np.sin,
+    plain.Function.COSINE: np.cos,
+    plain.Function.POSITIVE: lambda x: np.asarray(x > 0, dtype=x.dtype),
 }
 
 
@@ -143,6 +147,21 @@ def _subtract(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values
 @_step(plain.Multiply)
 def _multiply(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
     return np.asarray(a * b)
+
+
+@_step(plain.Divide)
+def _divide(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
+    return np.asarray(a / b)
+
+
+@_step(plain.Minimum)
+def _minimum(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
+    return np.minimum(a, b)
+
+
+@_step(plain.Maximum)
+def _maximum(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
+    return np.maximum(a, b)
 
 
 @_step(plain.Activate)

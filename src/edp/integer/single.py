@@ -74,6 +74,23 @@ def _gelu(x: Rows) -> Rows:
     return np.asarray(np.float32(0.5) * x * (ONE + erf))
 
 
+def _turned(x: Rows, quarters: int) -> Rows:
+    """The runtime's sine of x and of so many quarter turns more."""
+    f = np.float32
+    limited = np.clip(x, f(-8192.0), f(8192.0))
+    turns = limited * f(0.636619772)
+    n = np.trunc(np.where(turns >= 0, turns + f(0.5), turns - f(0.5))).astype(np.int32)
+    whole = n.astype(f)
+    r = ((limited - whole * f(1.5703125)) - whole * f(4.83751297e-4)) - whole * f(7.54978995e-8)
+    q = r * r
+    sine = r + r * q * (f(-1 / 6) + q * (f(1 / 120) + q * (f(-1 / 5040) + q * f(1 / 362880))))
+    tail = f(1 / 24) + q * (f(-1 / 720) + q * (f(1 / 40320) + q * f(-1 / 3628800)))
+    cosine = ONE + q * (f(-0.5) + q * tail)
+    quarter = (n + quarters) & 3
+    y = np.where(quarter & 1, cosine, sine)
+    return np.asarray(np.where(quarter >= 2, -y, y))
+
+
 FUNCTIONS: dict[Function, Callable[[Rows], Rows]] = {
     Function.RELU: lambda x: np.where(x > 0, x, np.float32(0)),
     Function.SIGMOID: sigmoid,
@@ -81,6 +98,10 @@ FUNCTIONS: dict[Function, Callable[[Rows], Rows]] = {
     Function.GELU: _gelu,
     Function.SOFTPLUS: _softplus,
     Function.EXP: exp,
+    Function.SQRT: np.sqrt,
+    Function.SINE: lambda x: _turned(x, 0),
+    Function.COSINE: lambda x: _turned(x, 1),
+    Function.POSITIVE: lambda x: (x > 0).astype(np.float32),
 }
 
 
@@ -176,6 +197,9 @@ OVER_TIME: dict[type[Layer], Run] = {
     layers.Add: lambda layer, m, a, b: a + b,
     layers.Subtract: lambda layer, m, a, b: a - b,
     layers.Multiply: lambda layer, m, a, b: a * b,
+    layers.Divide: lambda layer, m, a, b: a / b,
+    layers.Minimum: lambda layer, m, a, b: np.where(a > b, b, a),
+    layers.Maximum: lambda layer, m, a, b: np.where(a < b, b, a),
     layers.Activate: lambda layer, m, x: FUNCTIONS[layer.function](x),
     layers.Glu: _glu,
     layers.Accumulate: _accumulate,

@@ -207,7 +207,7 @@ def ends(predictor: Predictor) -> tuple[Array, Array]:
     """Middle and width of each input's usual range in SI units, as the scaler tells them.
 
     A channel that only a derived one reads has the width of that one's change; one that only a physics base reads has
-    no scale, and 1e6.
+    what is usual for it.
     """
     front, features = predictor.front, predictor.task.features
     offset, width = (part.detach().cpu().double().numpy() for part in (front.offset, front.width))
@@ -222,6 +222,10 @@ def ends(predictor: Predictor) -> tuple[Array, Array]:
     first, count = logged + hidden, len(features.starting)
     at = slice(front.lasting, front.lasting + count)
     centre[first : first + count], spread[first : first + count] = offset[at], width[at]
+    if predictor.physics is not None:
+        usual = predictor.physics.usual()
+        for column, name in enumerate(predictor.task.inputs[front.sources :], front.sources):
+            centre[column], spread[column] = usual.get(name, (centre[column], spread[column]))
     return centre, spread
 
 

@@ -25,6 +25,8 @@ def activate(nodes: Nodes, function: Function, x: str) -> str:
     if function is Function.GELU:
         half = nodes.plus(nodes.add("Erf", nodes.times(x, np.float32(1 / math.sqrt(2)))), np.float32(1.0))
         return nodes.add("Mul", nodes.times(x, np.float32(0.5)), half)
+    if function is Function.POSITIVE:
+        return nodes.add("Relu", nodes.add("Sign", x))
     return nodes.add(OPERATORS[function], x)
 
 
@@ -34,6 +36,9 @@ OPERATORS = {
     Function.TANH: "Tanh",
     Function.SOFTPLUS: "Softplus",
     Function.EXP: "Exp",
+    Function.SQRT: "Sqrt",
+    Function.SINE: "Sin",
+    Function.COSINE: "Cos",
 }
 
 
@@ -138,6 +143,9 @@ PLAIN: dict[type[Layer], Plain] = {
     layers.Add: lambda nodes, layer, ticks, values, widths: nodes.add("Add", *values),
     layers.Subtract: lambda nodes, layer, ticks, values, widths: nodes.less(*values),
     layers.Multiply: lambda nodes, layer, ticks, values, widths: nodes.add("Mul", *values),
+    layers.Divide: lambda nodes, layer, ticks, values, widths: nodes.add("Div", *values),
+    layers.Minimum: lambda nodes, layer, ticks, values, widths: nodes.add("Min", *values),
+    layers.Maximum: lambda nodes, layer, ticks, values, widths: nodes.add("Max", *values),
     layers.Activate: lambda nodes, layer, ticks, values, widths: activate(nodes, layer.function, values[0]),
     layers.Glu: _glu,
     layers.Accumulate: _accumulate,

@@ -13,9 +13,11 @@ from torch import Tensor
 
 from edp.blocks.base import ModelView, TaskView
 from edp.data.task import Task
-from edp.errors import ConfigError, ExportError, closest
+from edp.errors import ConfigError, closest
 from edp.graph import Builder
+from edp.graph.memory import Difference
 from edp.models.physics.geometry import AXES, Geometry, Pose, inverse
+from edp.models.physics.symbols import Symbol
 from edp.registry import Registry
 from edp.streaming import Cost, Operation, State, Streaming
 
@@ -24,6 +26,10 @@ SPEEDS = tuple(f"CylVels_{i + 1}" for i in range(AXES))
 """Targets that a physics base predicts."""
 HEADS = tuple(f"CylPressures_{i + 1}" for i in range(AXES))
 RODS = tuple(f"CylPressures_{i + 5}" for i in range(AXES))
+ANGLE, RATE, SPEED = 0.5, 0.5, 0.2
+"""Usual widths of joint angles in rad, joint rates in rad/s and cylinder velocities in m/s."""
+PRESSURE = (1e7, 5e6)
+"""Usual middle and width of a pressure, Pa."""
 POSES = {
     "angles": (*(f"JointAngle_{i + 1}" for i in range(AXES)), *(f"JointVel_{i + 1}" for i in range(AXES))),
     "strokes": tuple(f"CylStroke_{i + 1}" for i in range(AXES)),
@@ -124,6 +130,18 @@ class PhysicsBase(Streaming):
     def settle(self, parts: Sequence[Tensor]) -> None:
         """Take averages over training inputs ``(time, input)`` where the base has any; most have none."""
 
+    def usual(self) -> dict[str, tuple[float, float]]:
+        """Middle and width of what each channel that the base reads usually is, SI units."""
+        pose = self.geometry.at_strokes(0.5 * self.geometry.axis("STROKE"))
+        middle = torch.atan2(pose.sine, pose.cosine).tolist()
+        stroke = self.geometry.axis("STROKE").tolist()
+        found = dict.fromkeys(SPEEDS, (0.0, SPEED)) | dict.fromkeys((*HEADS, *RODS), PRESSURE)
+        for i in range(AXES):
+            found[POSES["angles"][i]] = (middle[i], ANGLE)
+            found[POSES["angles"][AXES + i]] = (0.0, RATE)
+            found[POSES["strokes"][i]] = (0.5 * stroke[i], 0.25 * stroke[i])
+        return {name: found[name] for name in self.columns}
+
     def take(self, x: Tensor, names: Sequence[str]) -> Tensor:
         """Input columns by name."""
         return x[..., [self.columns[name] for name in names]]
@@ -169,10 +187,22 @@ class PhysicsBase(Streaming):
         """Multiplications, divisions, roots, sines and the like of one tick, beyond those of the pose."""
 
     def lower(self, build: Builder, x: str) -> str:
-        raise ExportError(
-            f"physics base '{PHYSICS.name_of(self.spec)}' has no form as a list of streaming layers yet; train "
-            "without model.physics for what is to be exported"
-        )
+        """Velocities, ``horizon * target`` numbers: the equations themselves, recorded."""
+        with build.inside("physics"):
+            inputs = Symbol(build, x, (build.width(x),))
+            # The equations are written for tensors; symbols stand in for them.
+            pose = self.pose(inputs)  # type: ignore[arg-type]
+            if self.spec.pose == "angles":
+                rate = self.take(inputs, POSES["angles"][AXES:])  # type: ignore[arg-type]
+                speed = pose.lever * rate
+            else:
+                strokes = self.take(inputs, POSES["strokes"])  # type: ignore[arg-type]
+                factor = torch.full((AXES,), float(self.rate_hz))
+                value = build.add(Difference, "speed", strokes.value, factor=factor, from_zero=False)  # type: ignore[attr-defined]
+                speed = Symbol(build, value, (AXES,))  # type: ignore[assignment]
+                rate = speed * inverse(pose.lever)
+            found = self.ahead(inputs, pose, rate, speed)[..., self.order]  # type: ignore[arg-type]
+            return build.join("ahead", found.value)  # type: ignore[attr-defined]
 
     def costs(self) -> list[Cost]:
         count = (52 if self.spec.pose == "angles" else 101) + AXES + self.arithmetic()

@@ -93,6 +93,27 @@ float edp_sigmoid(float x) {
     return ((x >= 0.0f) ? 1.0f : small) / (1.0f + small);
 }
 
+/* The sine of x and of so many quarter turns more, by series; beyond 8192 rad as at 8192. NaN stays NaN. */
+static float turned(float x, uint32_t quarters) {
+    const float limited = (x > 8192.0f) ? 8192.0f : ((x < -8192.0f) ? -8192.0f : x);
+    const float turns = limited * 0.636619772f;
+    const float nearest = (turns >= 0.0f) ? (turns + 0.5f) : (turns - 0.5f);
+    const int32_t n = (nearest >= -6000.0f) ? (int32_t)nearest : 0;
+    /* pi / 2 in three parts, of which n times the first and the second is exact. */
+    const float whole = (float)n;
+    const float r = ((limited - whole * 1.5703125f) - whole * 4.83751297e-4f) - whole * 7.54978995e-8f;
+    const float q = r * r;
+    const uint32_t quarter = ((uint32_t)n + quarters) & 3u;
+    float y;
+    if ((quarter & 1u) == 0u) {
+        y = r + r * q * (-1.0f / 6.0f + q * (1.0f / 120.0f + q * (-1.0f / 5040.0f + q * (1.0f / 362880.0f))));
+    } else {
+        y = 1.0f +
+            q * (-0.5f + q * (1.0f / 24.0f + q * (-1.0f / 720.0f + q * (1.0f / 40320.0f + q * (-1.0f / 3628800.0f)))));
+    }
+    return (quarter >= 2u) ? -y : y;
+}
+
 void edp_fill(float value, uint32_t n, float *y) {
     for (uint32_t i = 0; i < n; i++) {
         y[i] = value;
@@ -141,9 +162,27 @@ void edp_multiply(const float *a, const float *b, uint32_t n, float *y) {
     }
 }
 
+void edp_divide(const float *a, const float *b, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = a[i] / b[i];
+    }
+}
+
+void edp_minimum(const float *a, const float *b, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = (a[i] > b[i]) ? b[i] : a[i];
+    }
+}
+
+void edp_maximum(const float *a, const float *b, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = (a[i] < b[i]) ? b[i] : a[i];
+    }
+}
+
 void edp_map_relu(const float *x, uint32_t n, float *y) {
     for (uint32_t i = 0; i < n; i++) {
-        y[i] = (x[i] < 0.0f) ? 0.0f : x[i];
+        y[i] = (x[i] <= 0.0f) ? 0.0f : x[i];
     }
 }
 
@@ -174,6 +213,30 @@ void edp_map_softplus(const float *x, uint32_t n, float *y) {
 void edp_map_exp(const float *x, uint32_t n, float *y) {
     for (uint32_t i = 0; i < n; i++) {
         y[i] = edp_exp(x[i]);
+    }
+}
+
+void edp_map_sqrt(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = sqrtf(x[i]);
+    }
+}
+
+void edp_map_sine(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = turned(x[i], 0u);
+    }
+}
+
+void edp_map_cosine(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = turned(x[i], 1u);
+    }
+}
+
+void edp_map_positive(const float *x, uint32_t n, float *y) {
+    for (uint32_t i = 0; i < n; i++) {
+        y[i] = (x[i] > 0.0f) ? 1.0f : 0.0f;
     }
 }
 

@@ -91,12 +91,19 @@ void edp_scale_shift(const float *x, const float *gain, const float *shift, uint
 void edp_add(const float *a, const float *b, uint32_t n, float *y);
 void edp_subtract(const float *a, const float *b, uint32_t n, float *y);
 void edp_multiply(const float *a, const float *b, uint32_t n, float *y);
+void edp_divide(const float *a, const float *b, uint32_t n, float *y);
+void edp_minimum(const float *a, const float *b, uint32_t n, float *y);
+void edp_maximum(const float *a, const float *b, uint32_t n, float *y);
 void edp_map_relu(const float *x, uint32_t n, float *y);
 void edp_map_sigmoid(const float *x, uint32_t n, float *y);
 void edp_map_tanh(const float *x, uint32_t n, float *y);
 void edp_map_gelu(const float *x, uint32_t n, float *y);
 void edp_map_softplus(const float *x, uint32_t n, float *y);
 void edp_map_exp(const float *x, uint32_t n, float *y);
+void edp_map_sqrt(const float *x, uint32_t n, float *y);
+void edp_map_sine(const float *x, uint32_t n, float *y);
+void edp_map_cosine(const float *x, uint32_t n, float *y);
+void edp_map_positive(const float *x, uint32_t n, float *y); /* 1 where x > 0, else 0 */
 
 /* ---- rows ------------------------------------------------------------------------------------------------------ */
 
