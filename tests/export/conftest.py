@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from edp.export.c.target import RUNTIME, CTarget
+from edp.export.c.model import make_model
+from edp.export.c.target import CTarget
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-ffp-contract=off")
+OWN = ("predictor.c",)
 NEEDED = {
     "gcc": "gcc libc6-dev",
     "clang": "clang",
@@ -47,18 +49,23 @@ def stream_c(program: Path, inputs: np.ndarray) -> np.ndarray:
     return np.frombuffer(found, dtype=np.float32).reshape(len(inputs), -1)
 
 
+def sources_of(folder: Path) -> list[str]:
+    """C files of an exported model and its runtime, without programs."""
+    return sorted(path.name for path in folder.glob("*.c") if path.name in OWN or path.name.startswith("edp_"))
+
+
 @pytest.fixture(scope="session")
 def c() -> SimpleNamespace:
     """What tests need of compilers and programs."""
-    return SimpleNamespace(flags=FLAGS, need=need, run=run, stream=stream_c)
+    return SimpleNamespace(flags=FLAGS, need=need, run=run, stream=stream_c, sources=sources_of)
 
 
 @pytest.fixture(scope="session")
-def bundle_of(predictor_of) -> Callable[[str], Bundle]:
-    """The bundle of a small network of the registries, single precision."""
+def bundle_of(predictor_of, integers_of) -> Callable[..., Bundle]:
+    """The bundle of a small network of the registries, in single precision or in whole numbers."""
 
-    def make(structure: str) -> Bundle:
-        predictor = predictor_of(structure, dtype=torch.float32)
+    def make(structure: str, whole: bool = False) -> Bundle:
+        predictor = integers_of(structure) if whole else predictor_of(structure, dtype=torch.float32)
         task = predictor.task
         inputs = tuple(Channel(name, Kind.GENERIC, "an input") for name in task.inputs)
         return Bundle(predictor, inputs, (Kind.GENERIC,) * len(task.targets), tuple(f"{n} */" for n in task.targets))
@@ -71,15 +78,16 @@ def program_of(bundle_of, tmp_path_factory) -> Callable[..., Path]:
     """The test program of an exported network; the runtime is compiled once for each set of flags."""
     runtimes: dict[tuple[str, ...], Path] = {}
 
-    def make(structure: str, compiler: str = "gcc", *more: str) -> Path:
+    def make(structure: str, compiler: str = "gcc", *more: str, whole: bool = False) -> Path:
         need(compiler)
         folder = tmp_path_factory.mktemp("exported")
-        CTarget().write(bundle_of(structure), "predictor", folder)
+        bundle = bundle_of(structure, whole)
+        CTarget().write(bundle, "predictor", folder)
         flags = (*FLAGS, *(more or ("-O1",)))
-        key = (compiler, *flags)
+        key = (compiler, *flags, str(whole))
         if key not in runtimes:
             runtimes[key] = tmp_path_factory.mktemp("runtime")
-            sources = [folder / name for name in RUNTIME if name.endswith(".c")]
+            sources = [folder / name for name in make_model("predictor", bundle).runtime if name.endswith(".c")]
             run(compiler, *flags, "-c", *sources, folder=runtimes[key])
         objects = sorted(runtimes[key].glob("*.o"))
         sources = ["predictor.c", "host_test.c"]

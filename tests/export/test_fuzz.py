@@ -13,12 +13,12 @@ import pytest
 import torch
 
 from edp.export.c.model import ends
-from edp.export.c.target import RUNTIME, CTarget
+from edp.export.c.target import CTarget
 
-SOURCES = ("fuzz.c", "predictor.c", "edp_runtime.c", "edp_memory.c")
 ADDRESSES = "-fsanitize=fuzzer,address,undefined,float-cast-overflow"
 UNINITIALISED = "-fsanitize=fuzzer,memory"
 SHORT = ["hybrid+all", "tcn+quantiles"]
+WHOLE = ["hybrid", "tcn+quantiles"]
 
 
 @pytest.fixture(scope="session")
@@ -33,7 +33,7 @@ def fuzzing(c, tmp_path_factory):
 
     def build(folder, sanitiser=ADDRESSES):
         flags = [*c.flags, "-O1", "-g", sanitiser, "-fno-sanitize-recover=all"]
-        c.run("clang", *flags, *SOURCES, "-lm", "-o", "fuzzer", folder=folder)
+        c.run("clang", *flags, "fuzz.c", *c.sources(folder), "-lm", "-o", "fuzzer", folder=folder)
 
     def run(folder, runs, *more):
         command = ["./fuzzer", f"-runs={runs}", "-seed=1", "-max_len=400", "-artifact_prefix=found-", *more]
@@ -47,17 +47,18 @@ def clean(done):
     assert "DONE" in done.stderr
 
 
-@pytest.mark.parametrize("network", SHORT)
-def test_nothing_is_found_in_a_short_run(network, bundle_of, fuzzing, tmp_path):
-    CTarget().write(bundle_of(network), "predictor", tmp_path)
+@pytest.mark.parametrize(("network", "whole"), [*((name, False) for name in SHORT), *((name, True) for name in WHOLE)])
+def test_nothing_is_found_in_a_short_run(network, whole, bundle_of, fuzzing, tmp_path):
+    CTarget().write(bundle_of(network, whole), "predictor", tmp_path)
     fuzzing.build(tmp_path)
     clean(fuzzing.run(tmp_path, 200))
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("sanitiser", [ADDRESSES, UNINITIALISED])
-def test_nothing_is_found_in_a_long_run(c, structure, sanitiser, bundle_of, fuzzing, tmp_path):
-    CTarget().write(bundle_of(structure), "predictor", tmp_path)
+def test_nothing_is_found_in_a_long_run(c, structure, sanitiser, whole, bundle_of, fuzzing, tmp_path):
+    CTarget().write(bundle_of(structure, whole), "predictor", tmp_path)
     fuzzing.build(tmp_path, sanitiser)
     clean(fuzzing.run(tmp_path, 5_000))
 
@@ -135,12 +136,12 @@ def test_a_planted_fault_is_found_and_can_be_replayed(c, rule, bundle_of, fuzzin
     assert rule in done.stderr, done.stderr[-1000:]
     (found,) = tmp_path.glob("found-*")
     c.need("gcc")
-    c.run("gcc", *c.flags, "-O1", "-DREPLAY", *SOURCES, "-lm", "-o", "replay", folder=tmp_path)
+    c.run("gcc", *c.flags, "-O1", "-DREPLAY", "fuzz.c", *c.sources(tmp_path), "-lm", "-o", "replay", folder=tmp_path)
     again = subprocess.run(["./replay", found.name], cwd=tmp_path, capture_output=True, text=True)
     assert again.returncode != 0
     assert rule in again.stderr
     (tmp_path / "predictor.c").write_text(model)
-    c.run("gcc", *c.flags, "-O1", "-DREPLAY", *SOURCES, "-lm", "-o", "replay", folder=tmp_path)
+    c.run("gcc", *c.flags, "-O1", "-DREPLAY", "fuzz.c", *c.sources(tmp_path), "-lm", "-o", "replay", folder=tmp_path)
     assert b"every rule held" in c.run("./replay", found.name, folder=tmp_path)
 
 
@@ -174,8 +175,7 @@ def check_zones(c, structure, bundle_of, folder):
     assert "zones" in test
     test = test.replace("static void rules(void)", "void rules(void);\nvoid rules(void)")
     (folder / "host_test.c").write_text(test)
-    sources = ["host_test.c", "predictor.c", *(name for name in RUNTIME if name.endswith(".c"))]
-    c.run("gcc", *c.flags, "-O1", *sources, "-lm", "-o", "program", folder=folder)
+    c.run("gcc", *c.flags, "-O1", "host_test.c", *c.sources(folder), "-lm", "-o", "program", folder=folder)
     assert b"all tests passed" in c.run("./program", folder=folder)
 
 

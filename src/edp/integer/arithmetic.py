@@ -28,7 +28,7 @@ CELL_FRAC = 20
 """Fractional bits of the cell of an LSTM, 32-bit."""
 UNIT_FRAC = 15
 """Fractional bits of what lies between -1 and 1."""
-GATE_LIMIT = 2**29
+GATE_LIMIT = 2**28
 CELL_LIMIT = 2**30
 TABLE = 513
 """Entries of a table; between them it is interpolated."""

@@ -69,8 +69,8 @@ class Integers:
     def _quantised(self, layer: made.Quantise, x: NDArray[np.float32]) -> Whole:
         wide = x * np.float32(2.0**layer.frac)
         top = np.float32(LARGEST)
-        self.clipped += int(((wide > top) | (wide < -top)).sum())
-        held = np.clip(wide, -top, top)
+        self.clipped += int((~((wide >= -top) & (wide <= top))).sum())
+        held = np.where(wide >= -top, np.minimum(wide, top), -top)
         return np.trunc(np.where(held >= 0, held + np.float32(0.5), held - np.float32(0.5))).astype(np.int64)
 
 

@@ -56,7 +56,7 @@ def sigmoid(x: Rows) -> Rows:
 
 
 def log1p(x: Rows) -> Rows:
-    """``edp_log1p`` of the runtime, for x in [0, 1]."""
+    """log(1 + x) as the runtime has it, for x in [0, 1]."""
     f = np.float32
     s = x / (f(2.0) + x)
     q = s * s

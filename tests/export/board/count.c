@@ -18,7 +18,7 @@ static predictor_state state;
 static predictor_output outputs[GOLDEN_TICKS];
 
 int main(void) {
-    const edp_table table = {(const float *)(const void *)outputs, (uint32_t)(sizeof outputs / sizeof(float))};
+    const edp_table table = {outputs, (uint32_t)(sizeof outputs / 4u), 4u};
     predictor_reset(&state);
 #ifdef __arm__
     SYST_RVR = 0xFFFFFFu;

@@ -6,11 +6,14 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from edp.errors import ExportError
-from edp.export.c.plan import Plan
+from edp.export.c.plan import Plan, scratch_number
 from edp.export.c.text import call, identifier, number
 from edp.graph import Graph, Layer, layers, memory
-from edp.graph.base import INPUT
+from edp.graph.base import INPUT, Number
+from edp.integer.layers import WGather
 
+WORK = {Number.FLOAT: "work", Number.INT16: "work16", Number.INT32: "work32"}
+"""Work memories."""
 MOST_COPIES = 8
 """Runs of neighbouring columns up to which copies are written; beyond, a table of columns."""
 
@@ -28,12 +31,16 @@ class Calls:
 
     def value(self, name: str, offset: int = 0) -> str:
         """Where a value lies, as a C expression."""
-        base, at = ("in", offset) if name == INPUT else ("work", self.plan.values[name] + offset)
+        if name == INPUT:
+            base, at = "in", offset
+        else:
+            base, at = WORK[self.graph.layer(name).number], self.plan.values[name] + offset
         return f"{base} + {at}" if at else base
 
     def scratch(self, layer: Layer, offset: int = 0) -> str:
         """Where a layer's scratch numbers lie."""
-        return f"work + {self.plan.scratch[layer.name] + offset}"
+        base, at = WORK[scratch_number(layer)], self.plan.scratch[layer.name] + offset
+        return f"{base} + {at}" if at else base
 
     def of(self, layer: Layer) -> list[str]:
         """The statements that compute a layer.
@@ -74,7 +81,7 @@ def ring(layer: Layer) -> str:
     return f"&s->{identifier(layer.name)}_ring_at"
 
 
-def runs(calls: Calls, layer: layers.Gather) -> Iterator[tuple[str, int, int]]:
+def runs(calls: Calls, layer: layers.Gather | WGather) -> Iterator[tuple[str, int, int]]:
     """Runs of neighbouring columns: the value they come from, the first column in it, their number."""
     origin = [(name, column) for name in layer.inputs for column in range(calls.graph.width_of(name))]
     start = 0
@@ -88,7 +95,9 @@ def runs(calls: Calls, layer: layers.Gather) -> Iterator[tuple[str, int, int]]:
 
 def needs_columns(calls: Calls, layer: Layer) -> bool:
     """Whether a layer's columns are written as a table."""
-    return isinstance(layer, layers.Gather) and len(layer.inputs) == 1 and len(list(runs(calls, layer))) > MOST_COPIES
+    if not isinstance(layer, layers.Gather | WGather):
+        return False
+    return len(layer.inputs) == 1 and len(list(runs(calls, layer))) > MOST_COPIES
 
 
 def _gather(calls: Calls, layer: layers.Gather) -> list[str]:

@@ -8,19 +8,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib import resources
 from string import Template
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp import __version__
-from edp.export.c.calls import Calls, constant, describe, needs_columns, slot, structs
+from edp.export.c import integer_calls
+from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, slot, structs
 from edp.export.c.plan import Plan, plan
 from edp.export.c.text import array, filled, identifiers, indented, number
 from edp.graph import Graph, Layer, memory
+from edp.graph.base import Number
+from edp.models.integer import IntegerPredictor
 from edp.models.predictor import Predictor
 from edp.models.predictor import describe as describe_network
 from edp.training.bundle import Bundle
 
+RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
+CLIPPED = "    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n"
 HOLD_TICKS = 5
 """Missed or bad ticks in a row that are held."""
 LIMIT = 1e6
@@ -34,9 +40,15 @@ COUNTED = (
     memory.AttentionPool,
     memory.WindowAttention,
     memory.PrefixCorrection,
+    *integer_calls.COUNTED,
 )
 """Layers with a ring or a counter."""
 Array = NDArray[np.float64]
+TYPES = {"float32": "float", "int8": "int8_t", "int16": "int16_t", "int32": "int32_t", "uint8": "uint8_t"}
+"""C types of constants."""
+STATES = {Number.FLOAT: "float", Number.INT16: "int16_t", Number.INT32: "int32_t"}
+FILLS = {Number.FLOAT: "edp_fill(0.0f, ", Number.INT16: "edp_q_zero16(", Number.INT32: "edp_q_fill32(0, "}
+COPIES = {Number.FLOAT: "edp_copy", Number.INT16: "edp_q_copy16", Number.INT32: "edp_q_copy32"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +67,16 @@ class Model:
     graph: Graph
     plan: Plan
 
+    @property
+    def whole(self) -> bool:
+        """Whether it computes in whole numbers."""
+        return isinstance(self.bundle.predictor, IntegerPredictor)
+
+    @property
+    def runtime(self) -> tuple[str, ...]:
+        """Files of the runtime that it needs."""
+        return RUNTIME + (integer_calls.FILES if self.whole else ())
+
     def weights(self) -> str:
         """The file of constants."""
         parts = [f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */"]
@@ -62,15 +84,17 @@ class Model:
         for layer in self.graph.layers:
             for name, values in layer.tensors().items():
                 note = " x ".join(map(str, values.shape))
-                parts.append(array("float", constant(layer, name), map(number, values.ravel()), note))
+                parts.append(_constants(constant(layer, name), integer_calls.laid_out(layer, values), note))
             if needs_columns(calls, layer):
                 parts.append(array("uint16_t", constant(layer, "columns"), (f"{c}u" for c in layer.columns)))  # type: ignore[attr-defined]
-            parts += structs(layer)
+            parts += structs(layer) + integer_calls.structs(layer)
         for (name, part), values in self.graph.initial.items():
             start = slot(name, part).removeprefix("s->") + "_start"
-            parts.append(array("float", start, map(number, values.ravel())))
+            parts.append(_constants(start, values))
         tables = [
-            f"{{{constant(layer, n)}, {v.size}u}}" for layer in self.graph.layers for n, v in layer.tensors().items()
+            f"{{{constant(layer, n)}, {v.size}u, {v.itemsize}u}}"
+            for layer in self.graph.layers
+            for n, v in layer.tensors().items()
         ]
         parts.append(array("edp_table", "tables", tables))
         return "\n".join(parts) + "\n"
@@ -103,14 +127,19 @@ class Model:
             "hold": HOLD_TICKS,
             "limit": f"{LIMIT:.0f}",
             "macs": self.graph.macs,
-            "flash": 4 * self.graph.parameters,
-            "ram": 4 * self._state_words(),
-            "work": self.plan.size,
+            "format": self.bundle.predictor.number_format,
+            "flash": sum(values.nbytes for _, _, values in self.graph.tensors()),
+            "ram": self._state_bytes(),
+            "runtime": "edp_integer.h" if self.whole else "edp_runtime.h",
+            "counters": CLIPPED if self.whole else "",
+            "clear_counters": "    s->clipped = 0u;\n" if self.whole else "",
+            "sources": " ".join(name for name in self.runtime if name.endswith(".c")),
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
             "what": self._what(),
             **self._enums(),
             **self._state(),
+            **self._work(),
             **self._code(),
         }
 
@@ -149,20 +178,32 @@ class Model:
                     continue
                 where, size = slot(layer, part.name), max(1, part.size)
                 field = where.removeprefix("s->")
-                declared.append(f"float {field}[{size}];")
+                declared.append(f"{STATES[part.number]} {field}[{size}];")
                 learned = (layer.name, part.name) in self.graph.initial
-                start = f"edp_copy({field}_start, {size}u, {where});"
-                cleared.append(start if learned else f"edp_fill({number(part.fill)}, {size}u, {where});")
+                start = f"{COPIES[part.number]}({field}_start, {size}u, {where});"
+                zero = f"{FILLS[part.number]}{size}u, {where});"
+                fill = f"edp_fill({number(part.fill)}, {size}u, {where});" if part.fill else zero
+                cleared.append(start if learned else fill)
             if has_ring(layer):
                 field = slot(layer, "ring_at").removeprefix("s->")
                 declared.append(f"edp_ring {field};")
                 cleared += [f"s->{field}.at = 0u;", f"s->{field}.seen = 0u;"]
         return {"state_fields": indented(declared), "forget": indented(cleared)}
 
-    def _state_words(self) -> int:
-        slots = sum(max(1, part.size) for _, part in self.graph.slots() if part.name != "age")
+    def _work(self) -> dict[str, str]:
+        sizes = self.plan.sizes
+        return {
+            "work_fields": indented(f"{STATES[kind]} {WORK[kind]}[{size}];" for kind, size in sizes.items()),
+            "work_pointers": indented(f"{STATES[kind]} *const {WORK[kind]} = s->{WORK[kind]};" for kind in sizes),
+            "clear_work": indented(f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in sizes.items()),
+        }
+
+    def _state_bytes(self) -> int:
+        """Of the state, without what a compiler may put between its parts."""
+        slots = sum(max(1, part.size) * part.number.bytes for _, part in self.graph.slots() if part.name != "age")
         rings = sum(has_ring(layer) for layer in self.graph.layers)
-        return 7 + self.graph.inputs + slots + 2 * rings + self.plan.size
+        work = sum(size * kind.bytes for kind, size in self.plan.sizes.items())
+        return 4 * (7 + self.whole + self.graph.inputs + 2 * rings) + slots + work
 
     def _code(self) -> dict[str, str]:
         calls = Calls(self.graph, self.plan)
@@ -194,7 +235,8 @@ def make_model(name: str, bundle: Bundle) -> Model:
     Raises:
         ExportError: a part of the network has no form as a layer.
     """
-    graph = bundle.predictor.graph()
+    predictor = bundle.predictor
+    graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
     return Model(name, bundle, graph, plan(graph))
 
 
@@ -230,11 +272,28 @@ def ends(predictor: Predictor) -> tuple[Array, Array]:
 
 
 def crc(graph: Graph) -> int:
-    """CRC-32 of all constants, little-endian float32, in the order of the layers."""
+    """CRC-32 of all constants, little-endian, in the order of the layers."""
     value = 0
-    for _, _, values in graph.tensors():
-        value = zlib.crc32(values.astype("<f4").tobytes(), value)
+    for layer in graph.layers:
+        for values in layer.tensors().values():
+            value = zlib.crc32(_little(integer_calls.laid_out(layer, values)), value)
     return value
+
+
+def _little(values: NDArray[Any]) -> bytes:
+    return values.astype(values.dtype.newbyteorder("<")).tobytes()
+
+
+def _constants(name: str, values: NDArray[Any], note: str = "") -> str:
+    """A constant array of a tensor."""
+    kind = TYPES[values.dtype.name]
+    items = map(number, values.ravel()) if kind == "float" else (_integer(v) for v in values.ravel().tolist())
+    return array(kind, name, items, note)
+
+
+def _integer(value: int) -> str:
+    # The literal of the least 32-bit number would not fit before its sign.
+    return "(-2147483647 - 1)" if value == -(2**31) else str(value)
 
 
 def model_hash(graph: Graph) -> str:
@@ -245,9 +304,9 @@ def model_hash(graph: Graph) -> str:
         rest = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in arrays}
         state.update(repr((type(layer).__name__, rest)).encode())
         for name, values in arrays.items():
-            state.update(repr((name, values.shape)).encode() + values.astype("<f4").tobytes())
+            state.update(repr((name, values.shape)).encode() + _little(values))
     for key, values in graph.initial.items():
-        state.update(repr(key).encode() + values.astype("<f4").tobytes())
+        state.update(repr(key).encode() + _little(values))
     return state.hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Where values lie in a model's work memory: places are used again once nobody reads them."""
+"""Where values lie in a model's work memories: places are used again once nobody reads them."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from edp.graph import Graph, Layer, layers, memory
+from edp.graph.base import Number
+from edp.integer import layers as whole
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Places in floats from the start of the work memory.
+    """Places from the start of the work memory of their kind of number.
 
     Attributes:
         values: of each layer's value.
         scratch: of each layer's scratch numbers, where it needs any.
-        size: of the whole.
+        sizes: of the work memories.
     """
 
     values: Mapping[str, int]
     scratch: Mapping[str, int]
-    size: int
+    sizes: Mapping[Number, int]
 
 
 def scratch_of(layer: Layer) -> int:
@@ -38,27 +40,47 @@ def scratch_of(layer: Layer) -> int:
     if isinstance(layer, memory.PrefixCorrection):
         hidden, seen = layer.first_weight.shape
         return seen + hidden + len(layer.second_bias)
-    return 0
+    return _scratch_of_whole(layer)
+
+
+def _scratch_of_whole(layer: Layer) -> int:
+    if isinstance(layer, whole.WDense | whole.WConvolution):
+        return len(layer.bias)
+    if isinstance(layer, whole.WGroupedDense):
+        return layer.bias.shape[1]
+    if isinstance(layer, whole.WLstm):
+        return 8 * layer.width
+    if isinstance(layer, whole.WGru):
+        return 6 * layer.width
+    return layer.window if isinstance(layer, whole.WAttentionPool) else 0
+
+
+def scratch_number(layer: Layer) -> Number:
+    """What a layer's scratch numbers are."""
+    return Number.FLOAT if layer.number is Number.FLOAT else Number.INT32
 
 
 def plan(graph: Graph) -> Plan:
     """Give every value the first gap that is wide enough from where it is made to where it is last read."""
     last = {name: at for at, layer in enumerate(graph.layers) for name in layer.inputs}
     last |= dict.fromkeys(graph.results.values(), len(graph.layers))
-    busy: dict[str, tuple[int, int, int]] = {}  # start, stop, the layer after which it is free
+    busy: list[tuple[Number, int, int, int]] = []  # start, stop, the layer after which it is free
     values: dict[str, int] = {}
     scratch: dict[str, int] = {}
-    size = 1
+    sizes: dict[Number, int] = {}
     for at, layer in enumerate(graph.layers):
-        busy = {name: held for name, held in busy.items() if held[2] >= at}
-        for kind, wide, until in (("value", layer.width, last.get(layer.name, at)), ("scratch", scratch_of(layer), at)):
+        busy = [held for held in busy if held[3] >= at]
+        for places, wide, until, number in (
+            (values, layer.width, last.get(layer.name, at), layer.number),
+            (scratch, scratch_of(layer), at, scratch_number(layer)),
+        ):
             if not wide:
                 continue
-            start = _gap(sorted((first, stop) for first, stop, _ in busy.values()), wide)
-            busy[f"{kind} {layer.name}"] = (start, start + wide, until)
-            (values if kind == "value" else scratch)[layer.name] = start
-            size = max(size, start + wide)
-    return Plan(values, scratch, size)
+            start = _gap(sorted((first, stop) for kind, first, stop, _ in busy if kind is number), wide)
+            busy.append((number, start, start + wide, until))
+            places[layer.name] = start
+            sizes[number] = max(sizes.get(number, 0), start + wide)
+    return Plan(values, scratch, sizes)
 
 
 def _gap(taken: list[tuple[int, int]], wide: int) -> int:

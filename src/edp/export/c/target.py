@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from edp.errors import ExportError
 from edp.export.base import TARGETS
+from edp.export.c.integer_calls import tables_header
 from edp.export.c.model import Model, ends, make_model
 from edp.export.c.text import KEYWORDS, filled, number
+from edp.models.integer import IntegerPredictor
 from edp.models.predictor import Predictor
 from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
 
-RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
 GOLDEN_TICKS = 200
 Rows = NDArray[np.float32]
 SHARE = 1e-5
@@ -30,7 +31,7 @@ SHARE = 1e-5
 @TARGETS.register("c")
 @dataclass(frozen=True)
 class CTarget:
-    """C99, float32: ``NAME.h``, ``NAME.c``, constants, runtime, test on a computer, fuzzer, example task, CMake."""
+    """C99, float32 or w8a16: ``NAME.h``, ``NAME.c``, constants, runtime, host test, fuzzer, example task, CMake."""
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
@@ -46,7 +47,9 @@ class CTarget:
             "example_task.c": model.fill("example_task.c.in"),
             "CMakeLists.txt": model.fill("CMakeLists.txt.in"),
         }
-        for file in RUNTIME:
+        if model.whole:
+            made["edp_tables.h"] = tables_header()
+        for file in model.runtime:
             made[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
         path = make_folder(folder)
         for file, text in made.items():
@@ -81,8 +84,10 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     """How far C code may be from `outputs`, PyTorch's in single precision, for each number of a tick.
 
     `SHARE` of a standard deviation and of the largest value; where PyTorch in single precision is farther than that
-    from itself in double precision (a layer norm of a cell near zero), twice that distance.
+    from itself in double precision (a layer norm of a cell near zero), twice that distance. Whole numbers: nothing.
     """
+    if isinstance(predictor, IntegerPredictor):
+        return np.zeros(outputs.shape[1], dtype=np.float32)
     exact = stream(copy.deepcopy(predictor).double(), inputs)
     sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
     widths = np.tile(sigma, outputs.shape[1] // len(sigma))

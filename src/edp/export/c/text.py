@@ -12,7 +12,7 @@ WIDTH = 118
 _WORDS = """
 auto break case char const continue default do double else enum extern float for goto if inline int long register
 restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true false
-in out s work main
+in out s work work16 work32 main
 """
 KEYWORDS = frozenset(re.findall(r"\w+", _WORDS))
 """Words that a name cannot be: those of C99, and those that the generated code uses."""

@@ -34,12 +34,29 @@ bool edp_all_finite(const float *x, uint32_t n) {
     return finite;
 }
 
+/* A number of 1, 2 or 4 bytes as it lies in memory. */
+static uint32_t bits_at(const uint8_t *from, uint32_t width) {
+    uint32_t bits = from[0];
+    if (width == 2u) {
+        uint16_t half;
+        (void)memcpy(&half, from, sizeof half);
+        bits = half;
+    } else if (width == 4u) {
+        (void)memcpy(&bits, from, sizeof bits);
+    } else {
+        /* one byte */
+    }
+    return bits;
+}
+
 uint32_t edp_crc(const edp_table *tables, uint32_t count) {
     uint32_t crc = 0xFFFFFFFFu;
     for (uint32_t t = 0; t < count; t++) {
+        const uint8_t *const from = tables[t].values;
+        const uint32_t width = tables[t].width;
         for (uint32_t i = 0; i < tables[t].count; i++) {
-            uint32_t bits = bits_of(tables[t].values[i]);
-            for (uint32_t bit = 0; bit < 32u; bit++) {
+            uint32_t bits = bits_at(from + i * width, width);
+            for (uint32_t bit = 0; bit < 8u * width; bit++) {
                 const uint32_t low = (crc ^ bits) & 1u;
                 crc = (crc >> 1) ^ (0xEDB88320u & (0u - low));
                 bits >>= 1;
@@ -112,6 +129,15 @@ static float turned(float x, uint32_t quarters) {
             q * (-0.5f + q * (1.0f / 24.0f + q * (-1.0f / 720.0f + q * (1.0f / 40320.0f + q * (-1.0f / 3628800.0f)))));
     }
     return (quarter >= 2u) ? -y : y;
+}
+
+/* log(1 + x) for x in [0, 1]: 2 artanh(x / (2 + x)) by its series. */
+static float small_log1p(float x) {
+    const float s = x / (2.0f + x);
+    const float q = s * s;
+    const float far = 1.0f / 11.0f + q * (1.0f / 13.0f + q * (1.0f / 15.0f));
+    const float tail = 1.0f / 3.0f + q * (1.0f / 5.0f + q * (1.0f / 7.0f + q * (1.0f / 9.0f + q * far)));
+    return 2.0f * (s + s * q * tail);
 }
 
 void edp_fill(float value, uint32_t n, float *y) {
@@ -206,7 +232,7 @@ void edp_map_gelu(const float *x, uint32_t n, float *y) {
 
 void edp_map_softplus(const float *x, uint32_t n, float *y) {
     for (uint32_t i = 0; i < n; i++) {
-        y[i] = ((x[i] > 0.0f) ? x[i] : 0.0f) + log1pf(edp_exp(-fabsf(x[i])));
+        y[i] = ((x[i] > 0.0f) ? x[i] : 0.0f) + small_log1p(edp_exp(-fabsf(x[i])));
     }
 }
 

@@ -27,8 +27,9 @@ typedef struct {
 
 /* A constant array of a model, for its checksum. */
 typedef struct {
-    const float *values;
+    const void *values;
     uint32_t count;
+    uint32_t width; /* bytes of a number: 1, 2 or 4 */
 } edp_table;
 
 /* Weights of an LSTM, gates in the order i, f, g, o. */
@@ -74,7 +75,7 @@ bool edp_finite(float x);
 /* True if every x[i] is finite and low[i] <= x[i] <= high[i]. */
 bool edp_valid(const float *x, const float *low, const float *high, uint32_t n);
 bool edp_all_finite(const float *x, uint32_t n);
-/* CRC-32 (polynomial 0xEDB88320) of float arrays, the low byte of each number first on every machine. */
+/* CRC-32 (polynomial 0xEDB88320) of arrays, the low byte of each number first on every machine. */
 uint32_t edp_crc(const edp_table *tables, uint32_t count);
 
 /* ---- element by element; y may be x ---------------------------------------------------------------------------- */

@@ -1,0 +1,178 @@
+"""The C calls of whole-number layers, and the runtime's tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.export.c.calls import CALLS, Calls, Write, constant, needs_columns, ring, runs, slot
+from edp.export.c.text import array, call, identifier, number
+from edp.graph import Layer
+from edp.graph.layers import Function
+from edp.integer import arithmetic as whole
+from edp.integer import layers as made
+
+FILES = ("edp_integer.h", "edp_integer.c", "edp_integer_memory.c")
+"""Of the runtime, with the tables of `tables_header`."""
+
+
+def _quantise(calls: Calls, x: made.Quantise) -> list[str]:
+    given, scale = calls.value(x.inputs[0]), number(2.0**x.frac)
+    made_call = call("edp_q_from_float", given, x.size, scale, calls.value(x.name))
+    return [f"s->clipped += {made_call}"]
+
+
+def _gather(calls: Calls, x: made.WGather) -> list[str]:
+    if needs_columns(calls, x):
+        given = calls.value(x.inputs[0])
+        return [call("edp_q_gather", given, constant(x, "columns"), x.width, x.shifts[0], calls.value(x.name))]
+    right = dict(zip(x.inputs, x.shifts, strict=True))
+    lines, at = [], 0
+    for name, first, length in runs(calls, x):
+        lines.append(call("edp_q_move", calls.value(name, first), length, right[name], calls.value(x.name, at)))
+        at += length
+    return lines
+
+
+def _sum(calls: Calls, x: made.WSum) -> list[str]:
+    a, b = (calls.value(name) for name in x.inputs)
+    factors = (str(2 ** x.lefts[0]), str((-1 if x.minus else 1) * 2 ** x.lefts[1]))
+    return [call("edp_q_sum", a, b, x.size, *factors, x.right, calls.value(x.name))]
+
+
+def _activate(calls: Calls, x: made.WActivate) -> list[str]:
+    sizes: list[object] = [x.size]
+    if x.function is not Function.RELU:
+        sizes.append(str(x.given))
+    if x.function is Function.SOFTPLUS:
+        sizes.append(str(x.frac))
+    return [call(f"edp_q_map_{x.function}", calls.value(x.inputs[0]), *sizes, calls.value(x.name))]
+
+
+def _linear(calls: Calls, x: Any, function: str, *sizes: int) -> list[str]:
+    given, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
+    rest = (calls.scratch(x), calls.value(x.name))
+    return [call(function, given, matrix, constant(x, "bias"), *sizes, *rest)]
+
+
+def _convolution(calls: Calls, x: made.WConvolution) -> list[str]:
+    out, taps, into = x.weight.shape
+    if taps == 1:
+        return _linear(calls, x, "edp_q_dense", 1, out, into)
+    given, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
+    held = (slot(x, "ring"), ring(x), calls.scratch(x), calls.value(x.name))
+    return [call("edp_q_convolution", given, matrix, constant(x, "bias"), out, taps, into, x.dilation, *held)]
+
+
+def _recurrent(calls: Calls, x: made.WLstm | made.WGru) -> list[str]:
+    lstm = isinstance(x, made.WLstm)
+    states = (slot(x, "h"), slot(x, "c")) if lstm else (slot(x, "h"),)
+    sizes = (x.weight_x.shape[1], x.width)
+    weights = f"&{identifier(x.name)}_weights"
+    function = "edp_q_lstm" if lstm else "edp_q_gru"
+    rest = (calls.scratch(x), calls.value(x.name))
+    return [call(function, calls.value(x.inputs[0]), weights, *sizes, *states, *rest)]
+
+
+def _difference(calls: Calls, x: made.WDifference) -> list[str]:
+    kind = "true" if x.from_zero else "false"
+    return calls.simple(x, "edp_q_difference", x.width, kind, x.right, slot(x, "before"), ring(x))
+
+
+def _pool(calls: Calls, x: made.WAttentionPool) -> list[str]:
+    given, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
+    held = (slot(x, "ring"), slot(x, "scores"), ring(x), calls.scratch(x), calls.value(x.name))
+    return [call("edp_q_attention_pool", given, matrix, x.width, x.window, *held)]
+
+
+def _mean(calls: Calls, x: made.WTrailingMean) -> list[str]:
+    return calls.simple(x, "edp_q_trailing_mean", x.size, x.window, slot(x, "ring"), ring(x))
+
+
+def _dequantise(calls: Calls, x: made.Dequantise) -> list[str]:
+    return calls.simple(x, "edp_q_to_float", x.size, number(2.0**-x.frac))
+
+
+INTEGER_CALLS: dict[type[Layer], Write] = {
+    made.Quantise: _quantise,
+    made.Dequantise: _dequantise,
+    made.WGather: _gather,
+    made.WSum: _sum,
+    made.WMultiply: lambda c, x: c.simple(x, "edp_q_multiply", x.size, x.right),
+    made.WScaleShift: lambda c, x: c.simple(x, "edp_q_scale_shift", x.width, x.right),
+    made.WActivate: _activate,
+    made.WGlu: lambda c, x: c.simple(x, "edp_q_glu", x.rows, x.size // 2, str(x.frac)),
+    made.WDense: lambda c, x: _linear(c, x, "edp_q_dense", x.rows, *x.weight.shape),
+    made.WGroupedDense: lambda c, x: _linear(c, x, "edp_q_grouped_dense", *x.weight.shape),
+    made.WConvolution: _convolution,
+    made.WLstm: _recurrent,
+    made.WGru: _recurrent,
+    made.WMinGru: lambda c, x: c.simple(x, "edp_q_min_gru", x.units, str(x.frac), slot(x, "h")),
+    made.WRotation: lambda c, x: c.simple(x, "edp_q_rotation", len(x.factor), x.left, x.right, slot(x, "h")),
+    made.WDifference: _difference,
+    made.WTrailingMean: _mean,
+    made.WAttentionPool: _pool,
+}
+"""By kind of whole-number layer."""
+CALLS |= INTEGER_CALLS
+
+COUNTED = (made.WDifference, made.WConvolution, made.WTrailingMean, made.WAttentionPool)
+"""Layers with a ring or a counter."""
+
+
+def structs(layer: Layer) -> list[str]:
+    """Constant structs that a whole-number layer's function reads, one a line."""
+    name = identifier(layer.name)
+
+    def matrix(suffix: str, weight: str = "weight") -> str:
+        parts = (f"{weight}{suffix}", f"multiplier{suffix}", f"shift{suffix}")
+        return "{" + ", ".join(constant(layer, part) for part in parts) + "}"
+
+    if isinstance(layer, made.WDense | made.WGroupedDense | made.WConvolution):
+        return [f"static const edp_q_matrix {name}_matrix = {matrix('')};"]
+    if isinstance(layer, made.WAttentionPool):
+        return [f"static const edp_q_matrix {name}_matrix = {matrix('', 'score')};"]
+    if isinstance(layer, made.WLstm):
+        held = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias')}, {constant(layer, 'bias')}, {layer.share}"
+        return [f"static const edp_q_recurrent {name}_weights = {{{held}}};"]
+    if isinstance(layer, made.WGru):
+        held = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias_x')}, {constant(layer, 'bias_h')}, 32768"
+        return [f"static const edp_q_recurrent {name}_weights = {{{held}}};"]
+    return []
+
+
+def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
+    """A constant in the order in which the runtime reads it: see ``edp_q_products``."""
+    if values.dtype != np.int8 or values.ndim < 2:
+        return values
+    if isinstance(layer, made.WConvolution):
+        values = values.transpose(1, 0, 2)
+    matrices = values.reshape(-1, *values.shape[-2:])
+    return np.concatenate([_in_order(matrix) for matrix in matrices])
+
+
+def _in_order(matrix: NDArray[Any]) -> NDArray[Any]:
+    out, into = matrix.shape
+    rows, columns = out - out % 4, into - into % 4
+    groups = matrix[:rows, :columns].reshape(rows // 4, 4, columns // 4, 4)[..., [0, 2, 1, 3]]
+    parts = []
+    for block, group in enumerate(groups):
+        parts.append(group.transpose(1, 0, 2).ravel())
+        parts.append(matrix[4 * block : 4 * block + 4, columns:].T.ravel())
+    return np.concatenate([*parts, matrix[rows:].ravel()])
+
+
+def tables_header() -> str:
+    """The file of the runtime's tables."""
+    parts = ["/* Functions at even distances, in 2^-16; see edp_integer.h. */", "#ifndef EDP_TABLES_H"]
+    parts += ["#define EDP_TABLES_H", "", "#include <stdint.h>", "", f"#define EDP_TABLE {whole.TABLE}u", ""]
+    for name, values, note in (
+        ("tanh", whole.TANH, "tanh on [0, 8]"),
+        ("exp", whole.EXP, "exp(-x) on [0, 16]"),
+        ("log1p_exp", whole.LOG1P_EXP, "log(1 + exp(-x)) on [0, 16]"),
+        ("normal", whole.NORMAL, "cumulated normal distribution on [0, 8]"),
+    ):
+        parts.append(array("uint16_t", f"edp_table_{name}", (f"{v}u" for v in values), note))
+    return "\n".join([*parts, "", "#endif", ""])

@@ -1,0 +1,49 @@
+"""C code in whole numbers against the integer reference, bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edp.export.c.integer_calls import INTEGER_CALLS
+from edp.export.c.target import random_inputs, stream
+from edp.integer.layers import Quantise
+from edp.integer.reference import WHOLE
+
+EXTREME = 30.0
+"""Standard widths: far beyond the range of the formats."""
+
+
+def outputs_of(c, program, predictor, ticks, wide=1.0):
+    inputs = wide * random_inputs(predictor, ticks, seed=5)
+    return c.stream(program, inputs), stream(predictor, inputs)
+
+
+def test_c_gives_the_bits_of_the_reference(c, structure, program_of, bundle_of):
+    bundle = bundle_of(structure, whole=True)
+    program = program_of(structure, whole=True)
+    found, wanted = outputs_of(c, program, bundle.predictor, 400)
+    np.testing.assert_array_equal(found, wanted)
+    found, wanted = outputs_of(c, program, bundle.predictor, 100, wide=EXTREME)
+    assert np.isfinite(found).all()
+    np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize("network", ["hybrid", "gru+all", "tcn+quantiles"])
+def test_the_rules_of_the_header_hold(c, network, program_of):
+    flags = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    assert b"all tests passed" in c.run(program_of(network, "gcc", *flags, whole=True))
+
+
+@pytest.mark.parametrize("network", ["hybrid", "tcn+all"])
+def test_every_optimisation_level_and_compiler_gives_the_same_bits(c, network, program_of, bundle_of):
+    inputs = random_inputs(bundle_of(network).predictor, 300, seed=2)
+    first = c.stream(program_of(network, "gcc", "-O0", whole=True), inputs)
+    for level in ("-O2", "-O3"):
+        np.testing.assert_array_equal(c.stream(program_of(network, "gcc", level, whole=True), inputs), first)
+    c.need("clang")
+    np.testing.assert_array_equal(c.stream(program_of(network, "clang", "-O2", whole=True), inputs), first)
+
+
+def test_every_whole_layer_has_a_c_function():
+    assert set(INTEGER_CALLS) == set(WHOLE) | {Quantise}
