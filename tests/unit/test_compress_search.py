@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from edp.blocks import AttentionBridge, TemporalDifference
 from edp.cli import app
 from edp.compress import taken
 from edp.config import load_experiment
@@ -17,6 +18,7 @@ from edp.downsizing import SearchSpec, Watchers, search, searching
 from edp.downsizing.plan import make_plan
 from edp.errors import ConfigError, StorageError
 from edp.evaluation.controller import Budget
+from edp.models.backbones import GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.models.cells import LayerNormLstmCell
 from edp.models.predictor import build_model
 from edp.report import read_compression, write_compression_page
@@ -91,6 +93,7 @@ def test_the_same_call_trains_and_opens_nothing_again(run, tight, done, monkeypa
     assert len(again.box["openings"]) == 1
 
 
+@pytest.mark.slow
 def test_a_stopped_search_goes_on_to_the_same_result(run, tight, done, tmp_path):
     class Pulled(Exception):
         pass
@@ -144,18 +147,18 @@ def test_what_has_no_form_in_whole_numbers_is_left_out_with_the_reason(tiny, tin
     plan = make_plan(teacher, Budget())
     assert "w8a16" not in plan.formats
     assert not plan.rounds
-    assert not plan.prunable
-    assert [order.name[0] for order in plan.orders(4)] == ["u"]
+    assert {order.name[0] for ways in plan.orders.values() for order in ways} == {"u"}
+    assert any(note.startswith("pruning: no rule") for note in plan.notes)
     assert any("LayerNormLstm" in note for note in plan.notes)
 
 
 def test_widths_reach_from_the_widest_that_fits_to_a_quarter_of_it(run):
     teacher = load_bundle(run).predictor
     plan = make_plan(teacher, Budget(), formats=("float32",))
-    assert plan.widths == (16, 8, 4)
+    assert tuple(plan.orders) == (8, 4)
     need = taken(teacher, "float32", Budget())
     narrow = make_plan(teacher, Budget(cycles=need.cycles[2] - 1), formats=("float32",))
-    assert narrow.widths == (12, 8, 4)
+    assert tuple(narrow.orders) == (12, 4, 2)
 
 
 def test_report_tables_and_pictures(done):
@@ -184,3 +187,31 @@ def test_the_command_prints_the_table_and_the_choice(run, tmp_path):
     facts = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
     assert facts["rows"][facts["chosen"]]["fits"]
     assert np.isfinite(facts["box"]["error"])
+
+
+@pytest.mark.parametrize(
+    ("backbone", "blocks"),
+    [
+        (LstmSpec(units=12), ()),
+        (GruSpec(units=12), ()),
+        (TcnSpec(channels=(12, 8), kernel=3), ()),
+        (HybridSpec(channels=(16, 16), kernel=2, units=16), (AttentionBridge(heads=4), TemporalDifference())),
+    ],
+)
+def test_every_kind_of_network_has_a_plan(tiny, tiny_model, backbone, blocks):
+    """Widths that cannot be built, as of a bridge whose heads do not divide the channels, are left out."""
+    model = replace(tiny_model, backbone=backbone, blocks=blocks)
+    teacher = build_model(tiny.task, model, blank_scaler(tiny.task), seed=0)
+    plan = make_plan(teacher, Budget())
+    assert plan.orders
+    for ways in plan.orders.values():
+        for order in ways:
+            build_model(tiny.task, order.model(model), blank_scaler(tiny.task), seed=0)
+
+
+def test_a_width_that_cannot_be_built_is_refused(tiny, tiny_model):
+    backbone = HybridSpec(channels=(16,), kernel=2, units=16)
+    model = replace(tiny_model, backbone=backbone, blocks=(AttentionBridge(heads=4),))
+    teacher = build_model(tiny.task, model, blank_scaler(tiny.task), seed=0)
+    with pytest.raises(ConfigError, match="heads = 4 do not divide"):
+        make_plan(teacher, Budget(), units=(6,))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,21 +26,14 @@ class Plan:
     """What is to be made.
 
     Attributes:
-        widths: of the networks, widest first.
+        orders: the ways to each width, widest first.
         formats: in which a network can be.
-        prunable: whether the teacher can be pruned.
         notes: what was left out, and why.
     """
 
-    widths: tuple[int, ...]
+    orders: Mapping[int, tuple[Order, ...]]
     formats: tuple[str, ...]
-    prunable: bool
     notes: tuple[str, ...]
-
-    def orders(self, width: int) -> list[Order]:
-        """The ways to a network of this width."""
-        ways = [Order(name=f"u{width}", units=width)]
-        return [*ways, Order(name=f"p{width}", units=width, pruned=True)] if self.prunable else ways
 
     @property
     def rounds(self) -> bool:
@@ -49,8 +42,8 @@ class Plan:
 
     @property
     def trainings(self) -> int:
-        """How many there are at most."""
-        return len(self.widths) * (len(self.orders(1)) + self.rounds)
+        """How many there are."""
+        return sum(len(ways) + self.rounds for ways in self.orders.values())
 
     def tuned(self, best: Order) -> list[Order]:
         """What is made of the better way of a width."""
@@ -69,28 +62,56 @@ def make_plan(teacher: Predictor, budget: Budget, units: Sequence[int] = (), for
     Raises:
         ConfigError: an unknown format, a width that is none, or a budget that no network of this kind meets.
     """
-    able, notes = _able(teacher, formats or list(FORMATS))
-    prunable, why = _prunable(teacher)
-    notes += [why] if why else []
     full = width_of(teacher.spec)
     wrong = [width for width in units if not 1 <= width <= full]
     if wrong:
         raise ConfigError(
             f"units = {', '.join(map(str, wrong))}; 1 <= units <= {full}, those of the teacher, must hold"
         )
-    fitting = {name: _widest(teacher, name, budget) for name in able}
+    possible = [width for width in sorted({1, 2, full, *range(STEP, full, STEP)}) if width <= full]
+    possible = [width for width in possible if not _why_not(teacher, _narrow(teacher.spec, width))]
+    able, notes = _able(teacher, possible[0], formats or list(FORMATS))
+    fitting = {name: _widest(teacher, name, budget, possible) for name in able}
     if not any(fitting.values()):
-        raise ConfigError(_refusal(teacher, budget, able))
+        raise ConfigError(_refusal(teacher, budget, able, possible[0]))
     for name, width in fitting.items():
         if not width:
             notes.append(f"no width fits the budget in {FORMATS[name].label}")
-    widths = set(units) or _around(set(fitting.values()) - {0}, full)
-    return Plan(tuple(sorted(widths, reverse=True)), tuple(able), prunable, tuple(notes))
+    tops = set(fitting.values()) - {0}
+    shares = {max(tops) * share for share in SHARES}
+    widths = set(units) or tops | {max([width for width in possible if width <= share] or tops) for share in shares}
+    ways = {width: _orders(teacher, width, notes) for width in sorted(widths - {full}, reverse=True)}
+    return Plan(ways, tuple(able), tuple(dict.fromkeys(notes)))
 
 
-def _able(teacher: Predictor, formats: Sequence[str]) -> tuple[list[str], list[str]]:
+def _orders(teacher: Predictor, width: int, notes: list[str]) -> tuple[Order, ...]:
+    """The ways to a network of this width; why there are no others is noted."""
+    ways = [Order(name=f"u{width}", units=width), Order(name=f"p{width}", units=width, pruned=True)]
+    try:
+        check_pruning(teacher.spec, _narrow(teacher.spec, width))
+    except ConfigError as error:
+        notes.append(str(error))
+        ways = ways[:1]
+    why = {way: _why_not(teacher, way.model(teacher.spec)) for way in ways}
+    notes += [f"{way.name} is left out: {reason}" for way, reason in why.items() if reason]
+    able = tuple(way for way, reason in why.items() if not reason)
+    if not able:
+        raise ConfigError("; ".join(reason for reason in why.values() if reason))
+    return able
+
+
+def _why_not(teacher: Predictor, model: ModelSpec) -> str:
+    """Why a network of these settings cannot be built; empty where it can."""
+    try:
+        _untrained(model, teacher.task)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def _able(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
     """The formats that have a form for every part of the network, and why the others have none."""
-    net = _untrained(student(teacher.spec, 1), teacher.task)
+    net = _untrained(_narrow(teacher.spec, least), teacher.task)
     drawn = np.random.default_rng(0).normal(size=(2 * net.spec.window, len(net.task.inputs))).astype(np.float32)
     series = [Series("drawn", drawn, np.zeros((len(drawn), len(net.task.targets)), dtype=np.float32))]
     able, notes = [], []
@@ -104,20 +125,6 @@ def _able(teacher: Predictor, formats: Sequence[str]) -> tuple[list[str], list[s
     if not able:
         raise ConfigError("; ".join(notes))
     return able, notes
-
-
-def _around(tops: set[int], full: int) -> set[int]:
-    shares = {max(1, round(max(tops) * share / STEP) * STEP or 1) for share in SHARES}
-    return {min(width, full) for width in tops | shares}
-
-
-def _prunable(teacher: Predictor) -> tuple[bool, str]:
-    """Whether there is a rule for every part of the teacher, else the reason."""
-    try:
-        check_pruning(teacher.spec, _narrow(teacher.spec, 1))
-    except ConfigError as error:
-        return False, str(error)
-    return True, ""
 
 
 def _narrow(model: ModelSpec, units: int) -> ModelSpec:
@@ -134,10 +141,8 @@ def _taken(teacher: Predictor, units: int, name: str, budget: Budget) -> Taken:
     return taken(_untrained(_narrow(teacher.spec, units), teacher.task), name, budget)
 
 
-def _widest(teacher: Predictor, name: str, budget: Budget) -> int:
-    """The widest network that fits, a multiple of `STEP` where it is not the teacher's own; 0 for none."""
-    full = width_of(teacher.spec)
-    widths = sorted({1, 2, full, *range(STEP, full + 1, STEP)} & set(range(1, full + 1)))
+def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]) -> int:
+    """The widest network that fits; 0 for none."""
     low, high = 0, len(widths)  # those before `low` fit, those from `high` on do not
     while low < high:
         middle = (low + high) // 2
@@ -148,9 +153,9 @@ def _widest(teacher: Predictor, name: str, budget: Budget) -> int:
     return widths[low - 1] if low else 0
 
 
-def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str]) -> str:
+def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str], least_width: int) -> str:
     """What the nearest network takes, and what the limits would have to be."""
-    least = {name: _taken(teacher, 1, name, budget) for name in formats}
+    least = {name: _taken(teacher, least_width, name, budget) for name in formats}
 
     def worst(name: str) -> float:
         return max(value / limit for value, limit in least[name].over(budget).values())
@@ -161,8 +166,9 @@ def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str]) -> str:
     needed = ", ".join(f"{limit} = {pair[0]:,}" for limit, pair in over.items())
     return (
         f"budget '{budget.name}': {granted} can be met by no width of this network in any number format. The nearest "
-        f"that would work is one of a single unit in {FORMATS[nearest].label}, with {needed}: raise these limits to "
-        "that at least, leave out blocks, or read fewer channels"
+        f"that would work is one of {'a single unit' if least_width == 1 else f'{least_width} units'} in "
+        f"{FORMATS[nearest].label}, with {needed}: raise these limits to that at least, leave out blocks, or read "
+        "fewer channels"
     )
 
 

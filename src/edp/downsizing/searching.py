@@ -173,10 +173,8 @@ def _rows(bench: DiskBench, court: _Court, plan: Plan, spec: SearchSpec) -> tupl
                 notes.append(f"{'teacher' if order is None else order.name} in {FORMATS[name].label}: {error}")
 
     judge(None, bench.teacher, plan.formats)
-    for width in plan.widths:
-        if width == width_of(bench.teacher.spec):
-            continue  # the teacher itself
-        made = {order: bench.network(order) for order in plan.orders(width)}
+    for orders in plan.orders.values():
+        made = {order: bench.network(order) for order in orders}
         for order, network in made.items():
             judge(order, network, plan.formats)
         plain = {order: court.float_error(network) for order, network in made.items()}
