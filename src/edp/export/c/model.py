@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edp import __version__
 from edp.export.c import integer_calls
 from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, slot, structs
+from edp.export.c.layout import laid
 from edp.export.c.plan import Plan, plan
 from edp.export.c.text import array, filled, identifiers, indented, number
 from edp.graph import Graph, Layer, memory
@@ -84,7 +85,7 @@ class Model:
         for layer in self.graph.layers:
             for name, values in layer.tensors().items():
                 note = " x ".join(map(str, values.shape))
-                parts.append(_constants(constant(layer, name), integer_calls.laid_out(layer, values), note))
+                parts.append(_constants(constant(layer, name), _laid(layer, name, values), note))
             if needs_columns(calls, layer):
                 parts.append(array("uint16_t", constant(layer, "columns"), (f"{c}u" for c in layer.columns)))  # type: ignore[attr-defined]
             parts += structs(layer) + integer_calls.structs(layer)
@@ -271,12 +272,17 @@ def ends(predictor: Predictor) -> tuple[Array, Array]:
     return centre, spread
 
 
+def _laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A constant in the order of the C code."""
+    return laid(layer, name, integer_calls.laid_out(layer, values))
+
+
 def crc(graph: Graph) -> int:
-    """CRC-32 of all constants, little-endian, in the order of the layers."""
+    """CRC-32 of all constants, little-endian, in the order of the C code."""
     value = 0
     for layer in graph.layers:
-        for values in layer.tensors().values():
-            value = zlib.crc32(_little(integer_calls.laid_out(layer, values)), value)
+        for name, values in layer.tensors().items():
+            value = zlib.crc32(_little(_laid(layer, name, values)), value)
     return value
 
 

@@ -40,9 +40,9 @@ void edp_convolution(const float *x, const float *weight, const float *bias, uin
     edp_copy(bias, out, y);
     for (uint32_t tap = 0; tap + 1u < taps; tap++) {
         const uint32_t row = (ring->at + tap * dilation) % length;
-        edp_product(past + row * in, weight + tap * in, taps * in, out, in, y);
+        edp_product(past + row * in, weight, tap * in, taps * in, out, in, y);
     }
-    edp_product(x, weight + (taps - 1u) * in, taps * in, out, in, y);
+    edp_product(x, weight, (taps - 1u) * in, taps * in, out, in, y);
     edp_copy(x, in, past + ring->at * in);
     ring->at = after(ring->at, length);
 }
@@ -67,8 +67,8 @@ static void lstm_cell(const float *gates, uint32_t units, float share, const edp
 void edp_lstm(const float *x, const edp_lstm_weights *w, uint32_t in, uint32_t units, float *h, float *c, float *gates,
               float *y) {
     edp_copy(w->bias, 4u * units, gates);
-    edp_product(x, w->weight_x, in, 4u * units, in, gates);
-    edp_product(h, w->weight_h, units, 4u * units, units, gates);
+    edp_product(x, w->weight_x, 0u, in, 4u * units, in, gates);
+    edp_product(h, w->weight_h, 0u, units, 4u * units, units, gates);
     lstm_cell(gates, units, w->share, NULL, y, h, c);
     edp_copy(h, units, y);
 }
@@ -79,9 +79,9 @@ void edp_layer_norm_lstm(const float *x, const edp_lstm_weights *w, const edp_ls
     float *const back = gates + wide;
 
     edp_fill(0.0f, 2u * wide, gates);
-    edp_product(x, w->weight_x, in, wide, in, gates);
+    edp_product(x, w->weight_x, 0u, in, wide, in, gates);
     edp_layer_norm(gates, norms->gain_x, w->bias, norms->epsilon, 1u, wide, gates);
-    edp_product(h, w->weight_h, units, wide, units, back);
+    edp_product(h, w->weight_h, 0u, units, wide, units, back);
     edp_layer_norm(back, norms->gain_h, gates, norms->epsilon, 1u, wide, gates);
     lstm_cell(gates, units, w->share, norms, y, h, c);
     edp_copy(h, units, y);
@@ -92,8 +92,8 @@ void edp_gru(const float *x, const edp_gru_weights *w, uint32_t in, uint32_t uni
     float *const back = gates + wide;
     edp_copy(w->bias_x, wide, gates);
     edp_copy(w->bias_h, wide, back);
-    edp_product(x, w->weight_x, in, wide, in, gates);
-    edp_product(h, w->weight_h, units, wide, units, back);
+    edp_product(x, w->weight_x, 0u, in, wide, in, gates);
+    edp_product(h, w->weight_h, 0u, units, wide, units, back);
     for (uint32_t i = 0; i < units; i++) {
         const float reset = edp_sigmoid(gates[i] + back[i]);
         const float keep = edp_sigmoid(gates[units + i] + back[units + i]);
@@ -150,16 +150,54 @@ void edp_trailing_mean(const float *x, uint32_t n, uint32_t window, float *past,
     advance(ring, window);
 }
 
+/* Eight columns of `weigh`, whose sums stay in registers. */
+static void weigh_eight(const float *present, const float *past, const float *weights, uint32_t seen, uint32_t stride,
+                        float *y) {
+    const float own = weights[seen];
+    const float *from = past;
+    float a0 = own * present[0];
+    float a1 = own * present[1];
+    float a2 = own * present[2];
+    float a3 = own * present[3];
+    float a4 = own * present[4];
+    float a5 = own * present[5];
+    float a6 = own * present[6];
+    float a7 = own * present[7];
+    for (uint32_t row = 0; row < seen; row++) {
+        const float weight = weights[row];
+        a0 += weight * from[0];
+        a1 += weight * from[1];
+        a2 += weight * from[2];
+        a3 += weight * from[3];
+        a4 += weight * from[4];
+        a5 += weight * from[5];
+        a6 += weight * from[6];
+        a7 += weight * from[7];
+        from = &from[stride];
+    }
+    y[0] = a0;
+    y[1] = a1;
+    y[2] = a2;
+    y[3] = a3;
+    y[4] = a4;
+    y[5] = a5;
+    y[6] = a6;
+    y[7] = a7;
+}
+
 /* Sum of the rows seen of a ring and of the present, each times its weight; the present has the last one. */
 static void weigh(const float *present, const float *past, const float *weights, uint32_t seen, uint32_t stride,
                   uint32_t n, float *y) {
-    for (uint32_t i = 0; i < n; i++) {
-        y[i] = weights[seen] * present[i];
+    uint32_t i = 0;
+    for (; i + 8u <= n; i += 8u) {
+        weigh_eight(present + i, past + i, weights, seen, stride, y + i);
     }
-    for (uint32_t row = 0; row < seen; row++) {
-        for (uint32_t i = 0; i < n; i++) {
-            y[i] += weights[row] * past[row * stride + i];
+    for (; i < n; i++) {
+        float a = weights[seen] * present[i];
+        for (uint32_t row = 0; row < seen; row++) {
+            a += weights[row] * past[row * stride + i];
         }
+        y[i] = a;
     }
 }
 

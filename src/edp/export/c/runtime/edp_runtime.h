@@ -110,8 +110,11 @@ void edp_map_positive(const float *x, uint32_t n, float *y); /* 1 where x > 0, e
 
 /* Each of `rows` rows of 2 n numbers: first half times sigmoid of the second. */
 void edp_glu(const float *x, uint32_t rows, uint32_t n, float *y);
-/* y += W x; row o of W begins at weight + o stride. */
-void edp_product(const float *x, const float *weight, uint32_t stride, uint32_t out, uint32_t in, float *y);
+/* y += W x with the columns of W from `first` on, `in` of them; W has `out` rows of `columns` numbers. Its rows lie in
+   panels of EDP_PANEL, each of them column by column; the rows that are left over lie one after the other. */
+#define EDP_PANEL 16u
+void edp_product(const float *x, const float *weight, uint32_t first, uint32_t columns, uint32_t out, uint32_t in,
+                 float *y);
 /* Scores to weights that sum to 1, in place. */
 void edp_softmax(float *scores, uint32_t n);
 /* Running sums down `rows` rows of n numbers. */

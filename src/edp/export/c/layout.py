@@ -1,0 +1,43 @@
+"""The order in which a matrix of weights lies in the C code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.graph import Layer, layers, memory
+
+PANEL = 16
+"""Rows that a product computes side by side: `EDP_PANEL` of the runtime."""
+MATRICES: dict[type[Layer], tuple[str, ...]] = {
+    layers.Dense: ("weight",),
+    layers.GroupedDense: ("weight",),
+    memory.Convolution: ("weight",),
+    memory.Lstm: ("weight_x", "weight_h"),
+    memory.LayerNormLstm: ("weight_x", "weight_h"),
+    memory.Gru: ("weight_x", "weight_h"),
+    memory.PrefixCorrection: ("first_weight", "second_weight"),
+}
+"""Constants that `edp_product` reads, by kind of layer."""
+
+
+def laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A constant's numbers in the order of the C code.
+
+    Matrices lie in panels of `PANEL` rows, in each of them column by column, so that a processor with vectors reads
+    neighbours; the rows that are left over lie one after the other.
+    """
+    if name not in MATRICES.get(type(layer), ()):
+        return values.ravel()
+    if isinstance(layer, layers.GroupedDense):
+        return np.concatenate([_panels(matrix) for matrix in values])
+    return _panels(values.reshape(len(values), -1))
+
+
+def _panels(matrix: NDArray[Any]) -> NDArray[Any]:
+    rows, columns = matrix.shape
+    whole = rows - rows % PANEL
+    packed = matrix[:whole].reshape(-1, PANEL, columns).transpose(0, 2, 1)
+    return np.concatenate([packed.ravel(), matrix[whole:].ravel()])
