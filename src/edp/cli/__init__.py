@@ -17,6 +17,7 @@ from edp.cli import (
     export,
     footprint,
     inspect,
+    quantise,
     report,
     screen,
     search,
@@ -45,6 +46,7 @@ app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)
+app.command("quantise")(quantise.quantise)
 app.command("report")(report.report)
 
 

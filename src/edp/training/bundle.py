@@ -66,8 +66,11 @@ def make_bundle(
 
 
 def weights_digest(predictor: Predictor) -> str:
-    """Content address of the weights of a predictor."""
-    return hashlib.blake2b(_weights_bytes(predictor), digest_size=16).hexdigest()
+    """Content address of the weights of a predictor, and of what they became in whole numbers."""
+    state = hashlib.blake2b(_weights_bytes(predictor), digest_size=16)
+    if isinstance(predictor, IntegerPredictor):
+        state.update(repr(sorted(predictor.formats.fracs.items())).encode() + _integers_bytes(predictor))
+    return state.hexdigest()
 
 
 def _weights_bytes(predictor: Predictor) -> bytes:
@@ -122,10 +125,14 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     return path
 
 
+def _integers_bytes(predictor: IntegerPredictor) -> bytes:
+    held = {name: torch.from_numpy(np.ascontiguousarray(x)) for name, x in weights_of(predictor.integers).items()}
+    return save(held)
+
+
 def _write_integers(predictor: IntegerPredictor, path: Path) -> dict[str, str]:
     """Write the 8-bit weights; returns file and digest."""
-    held = {name: torch.from_numpy(np.ascontiguousarray(x)) for name, x in weights_of(predictor.integers).items()}
-    data = save(held)
+    data = _integers_bytes(predictor)
     digest = hashlib.blake2b(data, digest_size=16).hexdigest()
     file = f"integers-{digest[:12]}.safetensors"
     write_bytes(path / file, data)

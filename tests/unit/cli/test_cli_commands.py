@@ -14,7 +14,19 @@ from edp.signals import TABLE_A1
 from edp.storage import read_json
 
 COMMANDS = [command.name for command in app.registered_commands]
-EXPECTED = ["demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "footprint", "export", "report"]
+EXPECTED = [
+    "demo",
+    "simulate",
+    "inspect",
+    "screen",
+    "animate",
+    "train",
+    "evaluate",
+    "footprint",
+    "export",
+    "quantise",
+    "report",
+]
 
 
 def test_all_commands_are_known_here():

@@ -1,0 +1,34 @@
+"""``edp quantise``: a trained network in whole numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, emit, out
+
+
+def quantise(
+    run: Annotated[Path, typer.Argument(help="Run folder of edp train, distil or compress.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder of the new run.")],
+    ticks: Annotated[int, typer.Option(min=1000, help="Ticks on which formats and weights are chosen.")] = 20_000,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write a run with 8-bit weights and 16-bit values: evaluate, report and export then use whole numbers.
+
+    Example: `edp quantise runs/first --out runs/first_w8a16`
+    """
+    from edp.downsizing.quantise import quantise as make
+
+    found = make(run, folder, ticks)
+
+    def show() -> None:
+        change = 100.0 * (found["integer"] / found["float"] - 1.0)
+        out.print(
+            f"error on the validation part: {change:+.2f} % against float32; constants {found['bytes']:,.0f} bytes"
+        )
+        out.print(f"next: edp evaluate {folder}, edp export {folder} --to c --out firmware/predictor")
+
+    emit(as_json, {"folder": str(folder), **found}, show)

@@ -1,0 +1,62 @@
+"""A run in whole numbers, as a run of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from edp.data.prepared import Prepared
+from edp.errors import ExportError
+from edp.models.integer import integer_predictor
+from edp.models.predictor import Predictor
+from edp.models.running import stream_predictions
+from edp.runs import RunFolder
+from edp.storage import write_bytes, write_json
+from edp.training import save_bundle
+from edp.workflow import trained_run
+
+
+def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str, float]:
+    """Write a run in W8A16: it is judged, reported and exported in whole numbers.
+
+    Formats and weights are chosen on the inputs of the training part; the errors are of the validation part.
+
+    Args:
+        run: run folder of a float network.
+        out: folder of the new run; one that holds such a run already is replaced.
+        ticks: about how many ticks of the training part run through the whole network.
+
+    Returns:
+        ``float`` and ``integer``: MAE over horizons and targets in SI units; ``bytes``: of the constants.
+
+    Raises:
+        EdpError: not a run folder, a network without a form in whole numbers or in them already, or a folder that
+            holds another run.
+    """
+    folder = Path(run)
+    bundle, _, provenance, data = trained_run(folder)
+    if bundle.predictor.number_format != "float32":
+        raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
+    if (Path(out) / "run.json").exists():
+        raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
+    made = integer_predictor(bundle.predictor, data.train, ticks)
+    found = {"float": validation_error(bundle.predictor, data), "integer": validation_error(made, data)}
+    with RunFolder(out) as target:
+        for name in ("config.toml", "history.jsonl", "footprint.json"):
+            if (folder / name).is_file():
+                write_bytes(target.file(name), (folder / name).read_bytes())
+        write_json(target.file("provenance.json"), provenance | {"number_format": made.number_format})
+        save_bundle(replace(bundle, predictor=made, scores={}), target.file("bundle"))
+    return found | {"bytes": float(sum(values.nbytes for _, _, values in made.integers.tensors()))}
+
+
+def validation_error(predictor: Predictor, data: Prepared) -> float:
+    """MAE on the validation part, mean over horizons and targets, SI units, after a whole window."""
+    skip, errors = predictor.spec.window, []
+    for predicted, series in zip(stream_predictions(predictor, data.validation), data.validation, strict=True):
+        for place, k in enumerate(data.task.horizons):
+            known = predicted[skip : series.samples - k, place]
+            errors.append(np.abs(known - series.targets[skip + k :]).mean(axis=0))
+    return float(np.mean(errors))
