@@ -68,7 +68,9 @@ def compress(
     def show() -> None:
         _tables(facts)
         if best is not None:
-            out.print(f"next: edp evaluate {best.run}, or edp footprint {best.run}")
+            whole = best.number_format == "w8a16"
+            then = f"edp quantise {best.run} --out {folder / 'w8a16'}" if whole else f"edp evaluate {best.run}"
+            out.print(f"next: {then}, or edp footprint {best.run}")
         out.print(f"report: {page}")
 
     emit(as_json, dict(facts.held) | {"report": str(page)}, show)
