@@ -2,16 +2,19 @@
 
 Networks as in the thesis's setting (30 features, 3 targets, window of 50, four residual blocks of kernel 3, LSTM) with
 weights as drawn: costs do not depend on them. Instructions are counted by QEMU, the same at every run; times are of the
-processor, one thread. Rivals, with the same weights: C that emx-onnx-cgen makes of our ONNX graphs of a tick and of a
-window, built with the same flags; ONNX Runtime on both graphs; PyTorch, a tick at a time, as `Stream.step` runs it.
+processor, one thread. W8A16 is the same network in whole numbers, with the core's DSP instructions and plain loops.
+Rivals, with the same weights: C that emx-onnx-cgen makes of our ONNX graphs of a tick and of a window, built with the
+same flags; ONNX Runtime on both graphs; PyTorch, a tick at a time, as `Stream.step` runs it.
 """
 
 from __future__ import annotations
 
+import re
 import resource
 import subprocess
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +25,14 @@ from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.export.c.target import CTarget, random_inputs
+from edp.integer import calibrate
 from edp.models import ModelSpec, Stream, build_model
 from edp.models.backbones import HybridSpec
+from edp.models.integer import IntegerPredictor
 from edp.signals import TABLE_A1, Kind
 from edp.training.bundle import Bundle
 
 BOARD = Path(__file__).parents[1] / "tests/export/board"
-MODEL = ("predictor.c", "edp_runtime.c", "edp_memory.c")
 M4 = ("-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "--specs=rdimon.specs", "-nostartfiles")
 QEMU = ("qemu-system-arm", "-M", "mps2-an386", "-nographic", "-icount", "shift=0")
 SIZES = ((32, 32), (32, 64), (64, 64), (64, 128))
@@ -37,6 +41,19 @@ RUNS = {"step": 20, "window": 2}
 
 HEADS = ["channels/units", "constants", "MACs", "M4 instructions", "per MAC", "code bytes", "emx step", "emx window",
          "C us", "ORT window us", "ORT step us", "PyTorch us"]  # fmt: skip
+WHOLE_HEADS = ["channels/units", "constant bytes", "W8A16 instructions", "per MAC", "plain loops", "code bytes", "C us"]
+
+
+def sources_of(folder: Path) -> tuple[str, ...]:
+    """C files of an exported model and its runtime."""
+    return ("predictor.c", *sorted(path.name for path in folder.glob("edp_*.c")))
+
+
+def whole(bundle: Bundle, seed: int) -> Bundle:
+    """The same network in whole numbers; which ones they are does not change what they cost."""
+    graph = bundle.predictor.graph()
+    chosen = calibrate(graph, [random_inputs(bundle.predictor, 500, seed)])
+    return replace(bundle, predictor=IntegerPredictor(bundle.predictor, chosen))
 
 
 def make(channels: int, units: int, seed: int) -> Bundle:
@@ -53,17 +70,17 @@ def run(command: list[str], folder: Path) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
-def on_board(folder: Path, sources: tuple[str, ...]) -> list[str]:
+def on_board(folder: Path, sources: tuple[str, ...], *flags: str) -> list[str]:
     """What a program prints on the M4, in words."""
-    rest = [*sources, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
+    rest = [*flags, *sources, str(BOARD / "startup.c"), "-lm", "-lrdimon", "-o", "image.elf"]
     given = ["-std=gnu11", "-O2", "-ffp-contract=off", *M4, "-I.", "-DCLOCK_HZ=25000000u", "-T", str(BOARD / "mps2.ld")]
     run(["arm-none-eabi-gcc", *given, *rest], folder)
     return run([*QEMU, "-semihosting-config", "enable=on,target=native", "-kernel", "image.elf"], folder).split()
 
 
-def instructions(folder: Path) -> int:
+def instructions(folder: Path, *flags: str) -> int:
     """Executed instructions of a tick, the mean over 200."""
-    return int(on_board(folder, (*MODEL, str(BOARD / "count.c")))[0])
+    return int(on_board(folder, (*sources_of(folder), str(BOARD / "count.c")), *flags)[0])
 
 
 def rival_instructions(folder: Path, kind: str) -> int:
@@ -76,15 +93,19 @@ def rival_instructions(folder: Path, kind: str) -> int:
 
 def code_bytes(folder: Path) -> int:
     """Program code of model and runtime on the M4, without constants."""
-    run(["arm-none-eabi-gcc", "-std=c99", "-O2", "-ffp-contract=off", *M4[:4], "-c", *MODEL], folder)
-    objects = [name.replace(".c", ".o") for name in MODEL]
+    sources = sources_of(folder)
+    run(["arm-none-eabi-gcc", "-std=c99", "-O2", "-ffp-contract=off", *M4[:4], "-c", *sources], folder)
+    objects = [name.replace(".c", ".o") for name in sources]
     lines = run(["arm-none-eabi-size", "-A", *objects], folder).splitlines()
     return sum(int(line.split()[1]) for line in lines if line.startswith(".text"))
 
 
 def host_us(folder: Path, bundle: Bundle, ticks: int) -> float:
     """Microseconds a tick on this computer, the best of three runs, reading and writing included."""
-    run(["gcc", "-std=c99", "-O2", "-ffp-contract=off", *MODEL, "host_test.c", "-lm", "-o", "program"], folder)
+    run(
+        ["gcc", "-std=c99", "-O2", "-ffp-contract=off", *sources_of(folder), "host_test.c", "-lm", "-o", "program"],
+        folder,
+    )
     feed, best = random_inputs(bundle.predictor, ticks, 1).tobytes(), float("inf")
     for _ in range(3):
         start = children_s()
@@ -114,7 +135,7 @@ def torch_us(bundle: Bundle, ticks: int) -> float:
 def main() -> None:
     arguments = parser(__doc__ or "").parse_args()
     sizes = SIZES[:1] if arguments.quick else SIZES
-    rows, verdicts = [], []
+    rows, whole_rows, verdicts = [], [], []
     versions: dict[str, object] = {}
     for channels, units in sizes:
         bundle = make(channels, units, arguments.seed)
@@ -126,18 +147,29 @@ def main() -> None:
             step, window = (rival_instructions(folder, kind) for kind in ("step", "window"))
             host, torch = host_us(folder, bundle, 5_000 if arguments.quick else 20_000), torch_us(bundle, 300)
             onnx_window, onnx_step = onnx_rivals.runtime_us(bundle, folder, 300 if arguments.quick else 2_000)
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            CTarget().write(whole(bundle, arguments.seed), "predictor", folder)
+            constants = int(re.findall(r"Constants (\d+) bytes", (folder / "predictor.h").read_text())[0])
+            eight, plain = instructions(folder), instructions(folder, "-DEDP_PORTABLE")
+            whole_us = host_us(folder, bundle, 5_000 if arguments.quick else 20_000)
+            whole_code = code_bytes(folder)
         graph, size = bundle.predictor.graph(), f"{channels}/{units}"
+        whole_rows.append((size, constants, eight, eight / graph.macs, plain, whole_code, whole_us))
         made = (size, graph.parameters, graph.macs, counted, counted / graph.macs, code)
         rows.append((*made, step, window, host, onnx_window, onnx_step, torch))
         for name, ours, rival, goal, unit in (
             ("instructions of a tick, C against emx-onnx-cgen's step", counted, step, "<= 0.5", "instructions"),
             ("instructions of a tick, C against emx-onnx-cgen's window", counted, window, "<= 0.0333", "instructions"),
+            ("instructions of a tick, W8A16 against emx-onnx-cgen's step", eight, step, "<= 0.5", "instructions"),
             ("time of a tick, C against ONNX Runtime on the window", host, onnx_window, "<= 0.05", "us"),
             ("time of a tick, C against PyTorch", host, torch, "<= 0.05", "us"),
         ):
             verdicts.append(verdict(f"{size}: {name}", ours, rival, goal, unit, arguments.quick))
     table(HEADS, rows)
+    table(WHOLE_HEADS, whole_rows)
     kept = [{"rivals": versions}, *(dict(zip(HEADS, row)) for row in rows)]
+    kept += [dict(zip(WHOLE_HEADS, row)) for row in whole_rows]
     finish("embedded_step", verdicts, arguments.seed, kept)
 
 
