@@ -34,6 +34,7 @@ from edp.evaluation.traced import check_counted
 from edp.evaluation.worth import Worths, WorthSpec
 from edp.evaluation.worth import channel_worths as measure_worths
 from edp.export import make_target
+from edp.models.integer import IntegerPredictor
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination, describe
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
@@ -323,8 +324,10 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str]:
         experiment = load_experiment(source)
         task = experiment.task.resolve(100.0, physics=experiment.model.physics)
         return _untrained(experiment.model, task), source.stem
-    bundle = load_bundle(source)
-    return bundle.predictor, describe(bundle.predictor.spec)
+    predictor = load_bundle(source).predictor
+    # Whole numbers have the counts of the network that they were made of.
+    counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
+    return counted, describe(predictor.spec)
 
 
 def export_bundle(

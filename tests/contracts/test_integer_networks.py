@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,8 @@ import torch
 from edp.data.series import Series
 from edp.errors import ExportError
 from edp.graph import base
-from edp.integer import calibrate, quantise
+from edp.graph.reference import Reference
+from edp.integer import Integers, calibrate, quantise
 from edp.integer.quantise import FLOAT, LOWER, REFUSED
 from edp.integer.reference import WHOLE
 from edp.integer.single import OVER_TIME
@@ -47,6 +50,34 @@ def test_whole_numbers_predict_nearly_the_same(network, rows_of):
     if predictor.output.coverages:
         bounds = np.stack(stream_intervals(integers, rows))
         assert (bounds[:, :, :, 0] <= bounds[:, :, :, 1]).all()
+
+
+def on_grid(graph):
+    """The graph with weights that are multiples of 1/127 of their output's largest one."""
+    held = []
+    for layer in graph.layers:
+        changed = {}
+        for name, values in layer.tensors().items():
+            if name in ("weight", "weight_x", "weight_h", "score"):
+                outputs = layer.bias.ndim if name == "weight" else values.ndim - 1
+                step = np.abs(values).max(axis=tuple(range(outputs, values.ndim)), keepdims=True) / 127
+                changed[name] = (np.rint(values / np.maximum(step, 1e-30)) * step).astype(np.float32)
+        held.append(replace(layer, **changed))
+    return replace(graph, layers=tuple(held))
+
+
+def test_sixteen_bit_values_lose_next_to_nothing(network, rows_of):
+    """Against double precision with weights that are whole numbers already: what is left is formats and tables."""
+    predictor, _ = network
+    if predictor.physics is not None:
+        pytest.skip("the equations stay in single precision, which poses of random inputs strain")
+    graph, rows = on_grid(predictor.graph()), rows_of(predictor)
+    exact = Reference(graph)
+    wanted = np.stack([exact.results(row)["prediction"] for row in rows])
+    found = Integers(quantise(graph, calibrate(graph, [rows]))).run(rows[:, None])["prediction"][:, 0]
+    spread = np.tile(predictor.code.width.numpy().ravel(), wanted.shape[1] // predictor.code.width.numel())
+    error = np.sqrt(np.mean(((found - wanted) / spread) ** 2))
+    assert error < 0.003 * max(1.0, float(np.std(wanted / spread)))
 
 
 def test_chunks_and_company_change_no_bit(network, rows_of):

@@ -37,14 +37,33 @@ class Whole(Layer):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Quantise(Whole):
-    """Real numbers to whole ones, rounded half away from nought; those beyond the range are clipped and counted."""
+class _Sized(Whole):
+    """One that gives `size` numbers."""
 
     size: int
 
     @property
     def width(self) -> int:
         return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Weighted(Whole):
+    """One with a matrix, and for each of its outputs a bias and the way from the sum to the value's format."""
+
+    weight: Bytes
+    bias: Words
+    multiplier: Words
+    shift: Shifts
+
+    @property
+    def macs(self) -> int:
+        return self.weight.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Quantise(_Sized):
+    """Real numbers to whole ones, rounded half away from nought; those beyond the range are clipped and counted."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,29 +91,19 @@ class WGather(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WSum(Whole):
+class WSum(_Sized):
     """``a + b`` or ``a - b`` of `size` numbers; they are shifted left by `lefts`, the sum right by `right`."""
 
-    size: int
     lefts: tuple[int, int]
     right: int
     minus: bool
 
-    @property
-    def width(self) -> int:
-        return self.size
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WMultiply(Whole):
+class WMultiply(_Sized):
     """``a b`` of `size` numbers, shifted right by `right`."""
 
-    size: int
     right: int
-
-    @property
-    def width(self) -> int:
-        return self.size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,16 +120,11 @@ class WScaleShift(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WActivate(Whole):
+class WActivate(_Sized):
     """A function of each number, which has `given` fractional bits."""
 
     function: Function
-    size: int
     given: int
-
-    @property
-    def width(self) -> int:
-        return self.size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,13 +140,9 @@ class WGlu(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WDense(Whole):
+class WDense(_Weighted):
     """``W x + b`` on each row; `weight` ``(out, in)``, the others ``(out,)``."""
 
-    weight: Bytes
-    bias: Words
-    multiplier: Words
-    shift: Shifts
     rows: int = 1
 
     @property
@@ -155,31 +155,18 @@ class WDense(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WGroupedDense(Whole):
+class WGroupedDense(_Weighted):
     """``W_i x_i + b_i``; `weight` ``(rows, out, in)``, the others ``(rows, out)``."""
-
-    weight: Bytes
-    bias: Words
-    multiplier: Words
-    shift: Shifts
 
     @property
     def width(self) -> int:
         return self.bias.size
 
-    @property
-    def macs(self) -> int:
-        return self.weight.size
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WConvolution(Whole):
+class WConvolution(_Weighted):
     """Causal convolution; `weight` ``(out, tap, in)``, the last tap is the present. Slot: ring of past inputs."""
 
-    weight: Bytes
-    bias: Words
-    multiplier: Words
-    shift: Shifts
     dilation: int = 1
 
     @property
@@ -191,10 +178,6 @@ class WConvolution(Whole):
         _, taps, into = self.weight.shape
         shape = ((taps - 1) * self.dilation, into)
         return (Slot("ring", shape, number=Number.INT16),) if taps > 1 else ()
-
-    @property
-    def macs(self) -> int:
-        return self.weight.size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -294,15 +277,10 @@ class WDifference(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WTrailingMean(Whole):
+class WTrailingMean(_Sized):
     """Mean of the last `window` inputs. Slots: ring, and ticks seen up to `window`."""
 
-    size: int
     window: int
-
-    @property
-    def width(self) -> int:
-        return self.size
 
     @property
     def slots(self) -> tuple[Slot, ...]:

@@ -45,6 +45,14 @@ class IntegerPredictor(Predictor):
         self.integers: Graph = quantise(source.graph(), chosen)
         self.eval()
 
+    def in_float(self) -> Predictor:
+        """The network that it was made of, in single precision: to be counted or trained on."""
+        offset, width = (part.double().numpy() for part in (self.front.offset, self.front.width))
+        zero, unit = (part.double().numpy() for part in (self.code.offset, self.code.width))
+        made = Predictor(self.task, self.spec, Scaler(offset, width, zero, unit))
+        made.load_state_dict(self.state_dict())
+        return made.eval()
+
     def initial_state(self, batch: int, like: Tensor) -> State:
         """State at reset for `batch` streams."""
         return Integers(self.integers, batch)
@@ -61,12 +69,12 @@ class IntegerPredictor(Predictor):
         return torch.stack(sides, dim=3), new
 
     def expose(self, x: Tensor, state: State) -> NoReturn:
-        """There is nothing to see inside.
+        """Not in whole numbers.
 
         Raises:
             ExportError: always.
         """
-        raise ExportError("a network in w8a16 gives predictions only; train, calibrate and teach with the float one")
+        raise ExportError("a network in w8a16 gives predictions only; train, teach and look inside with the float run")
 
     def _run(self, x: Tensor, state: State) -> tuple[dict[str, np.ndarray], State]:
         new = deepcopy(state)

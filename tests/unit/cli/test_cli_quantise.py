@@ -28,6 +28,8 @@ def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, t
     header = json.loads((whole / "bundle" / "bundle.json").read_text())
     assert (header["schema"], header["number_format"]) == (3, "w8a16")
     assert load_bundle(whole).scores
+    counts = [edp("footprint", run, "--json").json for run in (whole, trained)]
+    assert counts[0] == counts[1]
     made = edp("export", whole, "--to", "c", "--out", tmp_path / "c", "--json").json
     assert any(file.endswith("edp_integer.c") for file in made["files"])
 
