@@ -39,10 +39,10 @@ lint: $(READY) ## style, types and the import ladder
 bench: $(READY) ## every benchmark, quick
 	@for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python $$file --quick || exit 1; done
 
-system-packages: ## packages of the system that only some checks need: chromium for pages, ffmpeg for films, octave for MAT fixtures, compilers and QEMU for exported C
+system-packages: ## packages of the system that only some checks need: chromium for pages, ffmpeg for films, octave for MAT fixtures and MATLAB code, compilers, QEMU and Wine for exported code
 	-$(if $(filter 0,$(shell id -u)),,sudo) apt-get update --quiet --quiet
-	$(if $(filter 0,$(shell id -u)),,sudo) apt-get install --yes --no-install-recommends chromium ffmpeg octave \
-		gcc libc6-dev clang libclang-rt-dev cmake cppcheck gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
+	$(if $(filter 0,$(shell id -u)),,sudo) apt-get install --yes --no-install-recommends chromium ffmpeg octave octave-dev wine \
+		gcc libc6-dev clang libclang-rt-dev cmake cppcheck gcc-mingw-w64-x86-64 wine64 gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 
 clean: ## remove .venv and caches; runs, data and demo stay
 	rm -rf .venv build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -24,7 +24,8 @@ from common import finish, parser, table, verdict
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
-from edp.export.c.target import CTarget, random_inputs
+from edp.export.c.target import CTarget
+from edp.export.golden import random_inputs
 from edp.integer import calibrate
 from edp.models import ModelSpec, Stream, build_model
 from edp.models.backbones import HybridSpec

@@ -25,8 +25,8 @@ from edp.blocks import TemporalDifference
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
-from edp.export.c.model import ends
-from edp.export.c.target import SHARE, CTarget
+from edp.export.c.target import CTarget
+from edp.export.golden import SHARE, ends
 from edp.integer import calibrate
 from edp.models import ModelSpec, build_model
 from edp.models.backbones import HybridSpec

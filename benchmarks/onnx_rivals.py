@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edp.export.c.target import random_inputs
+from edp.export.golden import random_inputs
 from edp.export.onnx import OnnxTarget
 from edp.training.bundle import Bundle
 

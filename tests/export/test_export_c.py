@@ -12,10 +12,11 @@ from edp.errors import ConfigError, ExportError
 from edp.export import TARGETS
 from edp.export.c.calls import CALLS, Calls
 from edp.export.c.integer_calls import INTEGER_CALLS
-from edp.export.c.model import LIMIT, ends
+from edp.export.c.model import LIMIT
 from edp.export.c.plan import plan
-from edp.export.c.target import SHARE, CTarget, random_inputs, stream, tolerance
+from edp.export.c.target import CTarget
 from edp.export.c.text import identifiers, number
+from edp.export.golden import SHARE, ends, random_inputs, stream, tolerance
 from edp.graph import Graph, Layer, memory
 from edp.graph.reference import STEPS
 

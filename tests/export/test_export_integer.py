@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edp.export.c.integer_calls import INTEGER_CALLS
-from edp.export.c.target import random_inputs, stream
+from edp.export.golden import random_inputs, stream
 from edp.integer.layers import Quantise
 from edp.integer.reference import WHOLE
 

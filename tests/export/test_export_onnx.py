@@ -15,7 +15,7 @@ import scipy.io
 
 from edp.errors import ConfigError, ExportError
 from edp.export import make_target
-from edp.export.c.target import random_inputs, stream, tolerance
+from edp.export.golden import random_inputs, stream, tolerance
 from edp.export.onnx import nodes as nodes_file
 from edp.export.onnx.memory import STEPS
 from edp.export.onnx.nodes import ALLOWED, OPSETS, Nodes

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from edp.export.c.model import ends
 from edp.export.c.target import CTarget
+from edp.export.golden import ends
 
 ADDRESSES = "-fsanitize=fuzzer,address,undefined,float-cast-overflow"
 UNINITIALISED = "-fsanitize=fuzzer,memory"

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.errors import ConfigError
 
 
 def export(
@@ -15,7 +16,9 @@ def export(
     to: Annotated[str, typer.Option(help="Form: c (C99 for controllers) or onnx.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; those of the same names are replaced.")],
     name: Annotated[str, typer.Option(help="What the network is called there.")] = "predictor",
-    opset: Annotated[int | None, typer.Option(help="Of onnx: version of the operators (default 13).")] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Write a trained network in a form that runs without EDP; it reads and gives SI units.
@@ -24,7 +27,7 @@ def export(
     """
     from edp.workflow import export_bundle
 
-    files = export_bundle(bundle, to, folder, name, {} if opset is None else {"opset": opset})
+    files = export_bundle(bundle, to, folder, name, dict(map(_option, changes or [])))
 
     def show() -> None:
         for file in files:
@@ -35,3 +38,10 @@ def export(
             out.print(f"next: cmake -S {where} -B {build} && cmake --build {build} && ctest --test-dir {build}")
 
     emit(as_json, {"to": to, "name": name, "files": [str(file) for file in files]}, show)
+
+
+def _option(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise ConfigError(f"--set {text}: an option is NAME=VALUE, such as opset=11")
+    return name.strip(), value.strip()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, get_type_hints
 
 from edp.errors import ConfigError
 from edp.registry import Registry
@@ -40,13 +40,35 @@ def make_target(name: str, options: Mapping[str, object] | None = None) -> Expor
     """A target by name with its options.
 
     Raises:
-        ConfigError: there is no such target, or it has no such option.
+        ConfigError: there is no such target, it has no such option, or text that must be a number is none.
         ExportError: a value that the target does not take.
     """
     kind, given = TARGETS[name], dict(options or {})
-    known: list[str] = [entry.name for entry in fields(kind)] if is_dataclass(kind) else []
+    known = _options(kind)
     for option in given:
         if option not in known:
             has = f"it has {', '.join(known)}" if known else "it has none"
             raise ConfigError(f"export target '{name}' has no option '{option}' ({has}); leave it out")
-    return kind(**given)
+    return kind(**{option: _read(name, option, value, known[option]) for option, value in given.items()})
+
+
+def _options(kind: type[ExportTarget]) -> dict[str, type]:
+    """Types of a target's options by name."""
+    if not is_dataclass(kind):
+        return {}
+    hints = get_type_hints(kind)
+    return {entry.name: hints[entry.name] for entry in fields(kind)}
+
+
+def _read(target: str, option: str, value: object, kind: type) -> object:
+    """An option as the target wants it; text of a command line becomes a number, or yes or no."""
+    if not isinstance(value, str) or kind is str:
+        return value
+    try:
+        return _SWITCH[value.lower()] if kind is bool else kind(value)
+    except (KeyError, ValueError) as error:
+        wanted = "true or false" if kind is bool else "a whole number" if kind is int else "a number"
+        raise ConfigError(f"option '{option}' of export target '{target}' is '{value}'; it must be {wanted}") from error
+
+
+_SWITCH = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}

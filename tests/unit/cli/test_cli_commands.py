@@ -96,7 +96,7 @@ def test_export_lists_its_files(edp, trained, tmp_path):
 
 def test_export_to_onnx_takes_an_opset(edp, trained, tmp_path):
     pytest.importorskip("onnx", reason="needs the extra onnx")
-    shown = edp("export", trained, "--to", "onnx", "--opset", "11", "--out", tmp_path / "onnx").out
+    shown = edp("export", trained, "--to", "onnx", "--set", "opset=11", "--out", tmp_path / "onnx").out
     assert "read predictor.json first" in shown
     described = json.loads((tmp_path / "onnx" / "predictor.json").read_text())
     assert described["graphs"]["step"]["opset"] == 11

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import resources
 from string import Template
 from typing import Any
@@ -19,10 +18,11 @@ from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, s
 from edp.export.c.layout import laid
 from edp.export.c.plan import Plan, plan
 from edp.export.c.text import array, filled, identifiers, indented, number
+from edp.export.golden import ends
+from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.graph import Graph, Layer, memory
 from edp.graph.base import Number
 from edp.models.integer import IntegerPredictor
-from edp.models.predictor import Predictor
 from edp.models.predictor import describe as describe_network
 from edp.training.bundle import Bundle
 
@@ -44,7 +44,6 @@ COUNTED = (
     *integer_calls.COUNTED,
 )
 """Layers with a ring or a counter."""
-Array = NDArray[np.float64]
 TYPES = {"float32": "float", "int8": "int8_t", "int16": "int16_t", "int32": "int32_t", "uint8": "uint8_t"}
 """C types of constants."""
 STATES = {Number.FLOAT: "float", Number.INT16: "int16_t", Number.INT32: "int32_t"}
@@ -246,32 +245,6 @@ def has_ring(layer: Layer) -> bool:
     return isinstance(layer, COUNTED) and bool(layer.slots)
 
 
-def ends(predictor: Predictor) -> tuple[Array, Array]:
-    """Middle and width of each input's usual range in SI units, as the scaler tells them.
-
-    A channel that only a derived one reads has the width of that one's change; one that only a physics base reads has
-    what is usual for it.
-    """
-    front, features = predictor.front, predictor.task.features
-    offset, width = (part.detach().cpu().double().numpy() for part in (front.offset, front.width))
-    centre, spread = np.zeros(front.inputs), np.full(front.inputs, 1e6)
-    logged, hidden = len(features.channels), len(features.hidden)
-    centre[:logged], spread[:logged] = offset[:logged], width[:logged]
-    for number_, entry in enumerate(features.derived):
-        source = features.inputs.index(entry.source)
-        change = width[logged + number_] / (predictor.task.rate_hz if entry.how == "derivative" else 1.0)
-        if source >= logged:
-            spread[source] = min(spread[source], change)
-    first, count = logged + hidden, len(features.starting)
-    at = slice(front.lasting, front.lasting + count)
-    centre[first : first + count], spread[first : first + count] = offset[at], width[at]
-    if predictor.physics is not None:
-        usual = predictor.physics.usual()
-        for column, name in enumerate(predictor.task.inputs[front.sources :], front.sources):
-            centre[column], spread[column] = usual.get(name, (centre[column], spread[column]))
-    return centre, spread
-
-
 def _laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
     """A constant in the order of the C code."""
     return laid(layer, name, integer_calls.laid_out(layer, values))
@@ -282,12 +255,8 @@ def crc(graph: Graph) -> int:
     value = 0
     for layer in graph.layers:
         for name, values in layer.tensors().items():
-            value = zlib.crc32(_little(_laid(layer, name, values)), value)
+            value = zlib.crc32(little_endian(_laid(layer, name, values)), value)
     return value
-
-
-def _little(values: NDArray[Any]) -> bytes:
-    return values.astype(values.dtype.newbyteorder("<")).tobytes()
 
 
 def _constants(name: str, values: NDArray[Any], note: str = "") -> str:
@@ -300,25 +269,3 @@ def _constants(name: str, values: NDArray[Any], note: str = "") -> str:
 def _integer(value: int) -> str:
     # The literal of the least 32-bit number would not fit before its sign.
     return "(-2147483647 - 1)" if value == -(2**31) else str(value)
-
-
-def model_hash(graph: Graph) -> str:
-    """Content address of layers, options and constants."""
-    state = hashlib.blake2b(digest_size=16)
-    for layer in graph.layers:
-        arrays = layer.tensors()
-        rest = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in arrays}
-        state.update(repr((type(layer).__name__, rest)).encode())
-        for name, values in arrays.items():
-            state.update(repr((name, values.shape)).encode() + _little(values))
-    for key, values in graph.initial.items():
-        state.update(repr(key).encode() + _little(values))
-    return state.hexdigest()
-
-
-def scale_hash(predictor: Predictor) -> str:
-    """Content address of the scaling between SI units and the network's numbers."""
-    state = hashlib.blake2b(digest_size=16)
-    for part in (predictor.front.offset, predictor.front.width, predictor.code.offset, predictor.code.width):
-        state.update(part.detach().cpu().float().numpy().astype("<f4").tobytes())
-    return state.hexdigest()

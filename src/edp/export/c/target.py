@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
 from edp.errors import ExportError
 from edp.export.base import TARGETS
 from edp.export.c.integer_calls import tables_header
-from edp.export.c.model import Model, ends, make_model
+from edp.export.c.model import Model, make_model
 from edp.export.c.text import KEYWORDS, filled, number
-from edp.models.integer import IntegerPredictor
-from edp.models.predictor import Predictor
+from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
 from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
-
-GOLDEN_TICKS = 200
-Rows = NDArray[np.float32]
-SHARE = 1e-5
-"""How far the C code may be from PyTorch, in standard deviations of the target and as a share of the value."""
 
 
 @TARGETS.register("c")
@@ -78,44 +67,3 @@ def golden(model: Model) -> str:
         text.append(f"static const float golden_{name}[{len(rows)}][{rows.shape[1]}] = {{\n{body}\n}};")
     text.append(f"static const float golden_tolerance[{len(allowed)}] = {{\n{filled(map(number, allowed))}\n}};")
     return "\n".join(text) + "\n"
-
-
-def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
-    """How far C code may be from `outputs`, PyTorch's in single precision, for each number of a tick.
-
-    `SHARE` of a standard deviation and of the largest value; where PyTorch in single precision is farther than that
-    from itself in double precision (a layer norm of a cell near zero), twice that distance. Whole numbers: nothing.
-    """
-    if isinstance(predictor, IntegerPredictor):
-        return np.zeros(outputs.shape[1], dtype=np.float32)
-    exact = stream(copy.deepcopy(predictor).double(), inputs)
-    sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
-    widths = np.tile(sigma, outputs.shape[1] // len(sigma))
-    own = np.abs(outputs - exact).max(axis=0)
-    return np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
-
-
-def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:
-    """Smooth random inputs ``(tick, input)`` in the usual range of each channel, SI units."""
-    centre, spread = ends(predictor)
-    rng = np.random.default_rng(seed)
-    noise = rng.normal(size=(ticks, len(centre)))
-    value = rng.normal(size=len(centre))
-    rows = []
-    for kick in noise:
-        value = 0.9 * value + 0.4 * kick
-        rows.append(centre + spread * value)
-    return np.asarray(rows, dtype=np.float32)
-
-
-def stream(predictor: Predictor, inputs: Rows) -> Rows:
-    """What PyTorch predicts from reset, ``(tick, number)``: predictions, then lower and upper bounds, SI units."""
-    like = next(predictor.parameters())
-    x = torch.from_numpy(inputs).to(like).unsqueeze(0)
-    with torch.inference_mode():
-        prediction, _ = predictor.predict(x, predictor.initial_state(1, x))
-        parts = [prediction[0].flatten(1)]
-        if predictor.output.coverages:
-            bounds, _ = predictor.intervals(x, predictor.initial_state(1, x))
-            parts += [bounds[0, :, :, side].flatten(1) for side in (0, 1)]
-        return torch.cat(parts, dim=1).float().cpu().numpy()

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.io
 
 from edp import __version__
-from edp.export.c.model import model_hash, scale_hash
-from edp.export.c.target import GOLDEN_TICKS, random_inputs, stream, tolerance
+from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
+from edp.export.hashes import model_hash, scale_hash
 from edp.export.onnx.nodes import OPSETS
 from edp.export.onnx.step import INPUTS, State, shape_of_result
 from edp.graph import Graph

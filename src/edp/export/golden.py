@@ -1,0 +1,85 @@
+"""Golden recordings of a network: random inputs, what PyTorch makes of them, how far another form may be from it."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edp.models.integer import IntegerPredictor
+from edp.models.predictor import Predictor
+
+GOLDEN_TICKS = 200
+SHARE = 1e-5
+"""How far another form may be from PyTorch, in standard deviations of the target and as a share of the value."""
+Array = NDArray[np.float64]
+Rows = NDArray[np.float32]
+
+
+def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
+    """How far another form may be from `outputs`, PyTorch's in single precision, for each number of a tick.
+
+    `SHARE` of a standard deviation and of the largest value; where PyTorch in single precision is farther than that
+    from itself in double precision (a layer norm of a cell near zero), twice that distance. Whole numbers: nothing.
+    """
+    if isinstance(predictor, IntegerPredictor):
+        return np.zeros(outputs.shape[1], dtype=np.float32)
+    exact = stream(copy.deepcopy(predictor).double(), inputs)
+    sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
+    widths = np.tile(sigma, outputs.shape[1] // len(sigma))
+    own = np.abs(outputs - exact).max(axis=0)
+    return np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
+
+
+def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:
+    """Smooth random inputs ``(tick, input)`` in the usual range of each channel, SI units."""
+    centre, spread = ends(predictor)
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(ticks, len(centre)))
+    value = rng.normal(size=len(centre))
+    rows = []
+    for kick in noise:
+        value = 0.9 * value + 0.4 * kick
+        rows.append(centre + spread * value)
+    return np.asarray(rows, dtype=np.float32)
+
+
+def stream(predictor: Predictor, inputs: Rows) -> Rows:
+    """What PyTorch predicts from reset, ``(tick, number)``: predictions, then lower and upper bounds, SI units."""
+    like = next(predictor.parameters())
+    x = torch.from_numpy(inputs).to(like).unsqueeze(0)
+    with torch.inference_mode():
+        prediction, _ = predictor.predict(x, predictor.initial_state(1, x))
+        parts = [prediction[0].flatten(1)]
+        if predictor.output.coverages:
+            bounds, _ = predictor.intervals(x, predictor.initial_state(1, x))
+            parts += [bounds[0, :, :, side].flatten(1) for side in (0, 1)]
+        return torch.cat(parts, dim=1).float().cpu().numpy()
+
+
+def ends(predictor: Predictor) -> tuple[Array, Array]:
+    """Middle and width of each input's usual range in SI units, as the scaler tells them.
+
+    A channel that only a derived one reads has the width of that one's change; one that only a physics base reads has
+    what is usual for it.
+    """
+    front, features = predictor.front, predictor.task.features
+    offset, width = (part.detach().cpu().double().numpy() for part in (front.offset, front.width))
+    centre, spread = np.zeros(front.inputs), np.full(front.inputs, 1e6)
+    logged, hidden = len(features.channels), len(features.hidden)
+    centre[:logged], spread[:logged] = offset[:logged], width[:logged]
+    for number_, entry in enumerate(features.derived):
+        source = features.inputs.index(entry.source)
+        change = width[logged + number_] / (predictor.task.rate_hz if entry.how == "derivative" else 1.0)
+        if source >= logged:
+            spread[source] = min(spread[source], change)
+    first, count = logged + hidden, len(features.starting)
+    at = slice(front.lasting, front.lasting + count)
+    centre[first : first + count], spread[first : first + count] = offset[at], width[at]
+    if predictor.physics is not None:
+        usual = predictor.physics.usual()
+        for column, name in enumerate(predictor.task.inputs[front.sources :], front.sources):
+            centre[column], spread[column] = usual.get(name, (centre[column], spread[column]))
+    return centre, spread

@@ -1,0 +1,39 @@
+"""Content addresses of a network and of its scaling, as every exported form names them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import fields
+from typing import Any
+
+from numpy.typing import NDArray
+
+from edp.graph import Graph
+from edp.models.predictor import Predictor
+
+
+def model_hash(graph: Graph) -> str:
+    """Content address of layers, options and constants."""
+    state = hashlib.blake2b(digest_size=16)
+    for layer in graph.layers:
+        arrays = layer.tensors()
+        rest = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in arrays}
+        state.update(repr((type(layer).__name__, rest)).encode())
+        for name, values in arrays.items():
+            state.update(repr((name, values.shape)).encode() + little_endian(values))
+    for key, values in graph.initial.items():
+        state.update(repr(key).encode() + little_endian(values))
+    return state.hexdigest()
+
+
+def scale_hash(predictor: Predictor) -> str:
+    """Content address of the scaling between SI units and the network's numbers."""
+    state = hashlib.blake2b(digest_size=16)
+    for part in (predictor.front.offset, predictor.front.width, predictor.code.offset, predictor.code.width):
+        state.update(part.detach().cpu().float().numpy().astype("<f4").tobytes())
+    return state.hexdigest()
+
+
+def little_endian(values: NDArray[Any]) -> bytes:
+    """The values' bytes in the order that hashes and checksums take them."""
+    return values.astype(values.dtype.newbyteorder("<")).tobytes()
