@@ -24,29 +24,42 @@ class CTarget:
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
-        _check(name)
+        check_name(name)
         model = make_model(name, bundle)
-        made = {
-            f"{name}.h": model.fill("model.h.in"),
-            f"{name}.c": model.fill("model.c.in"),
-            f"{name}_weights.h": model.weights(),
+        made = core_files(model) | {
             f"{name}_golden.h": golden(model),
             "host_test.c": model.fill("host_test.c.in"),
             "fuzz.c": model.fill("fuzz.c.in"),
             "example_task.c": model.fill("example_task.c.in"),
             "CMakeLists.txt": model.fill("CMakeLists.txt.in"),
         }
-        if model.whole:
-            made["edp_tables.h"] = tables_header()
-        for file in model.runtime:
-            made[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
         path = make_folder(folder)
         for file, text in made.items():
             write_bytes(path / file, text.encode())
         return [path / file for file in made]
 
 
-def _check(name: str) -> None:
+def core_files(model: Model) -> dict[str, str]:
+    """Model and runtime as text by file name: what every form around the C code holds; the header comes first."""
+    name = model.name
+    made = {
+        f"{name}.h": model.fill("model.h.in"),
+        f"{name}.c": model.fill("model.c.in"),
+        f"{name}_weights.h": model.weights(),
+    }
+    if model.whole:
+        made["edp_tables.h"] = tables_header()
+    for file in model.runtime:
+        made[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
+    return made
+
+
+def check_name(name: str) -> None:
+    """Refuse what cannot be the name of a model in C.
+
+    Raises:
+        ExportError: it cannot.
+    """
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in KEYWORDS or name.startswith("edp_"):
         raise ExportError(
             f"name '{name}' is the prefix of C functions and files: up to 31 lower-case letters, digits, underscores, "

@@ -1,28 +1,18 @@
-"""What a reader of the ONNX files must know: names, units, order, states and their starts, rules; JSON and MAT."""
+"""What a reader of the ONNX files must know besides what every form tells: graphs, states and their starts, rules."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.io
 
-from edp import __version__
-from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
-from edp.export.hashes import model_hash, scale_hash
+from edp.export.description import Description
 from edp.export.onnx.nodes import OPSETS
-from edp.export.onnx.step import INPUTS, State, shape_of_result
-from edp.graph import Graph
-from edp.models.predictor import describe as describe_network
-from edp.signals import KINDS
-from edp.training.bundle import Bundle
+from edp.export.onnx.step import INPUTS, State
 
-SCHEMA = 1
 RULES = {
     "order": "inputs and targets in the order of this file, in SI units",
     "reset": "step: feed every state's start at the first tick, and again after a gap or a change of machine",
@@ -33,92 +23,49 @@ RULES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Description:
-    """What is described.
-
-    Attributes:
-        name: prefix of the files.
-        bundle: the trained network.
-        graph: its layers.
-        states: of the step graph.
-        opset: of the graphs.
-    """
-
-    name: str
-    bundle: Bundle
-    graph: Graph
-    states: tuple[State, ...]
-    opset: int
-
-
 def notes(described: Description) -> dict[str, str]:
     """What the ONNX files themselves carry."""
-    task = described.bundle.task
+    about = described.content()
     return {
-        "inputs": json.dumps([channel.name for channel in described.bundle.inputs]),
-        "targets": json.dumps(list(task.targets)),
-        "horizons_ticks": json.dumps(list(task.horizons)),
-        "rate_hz": f"{task.rate_hz:g}",
-        "window": str(described.graph.window),
-        "mode": str(task.mode),
-        "model_hash": model_hash(described.graph),
-        "scale_hash": scale_hash(described.bundle.predictor),
+        "inputs": json.dumps([channel["name"] for channel in about["inputs"]]),
+        "targets": json.dumps([target["name"] for target in about["targets"]]),
+        "horizons_ticks": json.dumps([ahead["ticks"] for ahead in about["horizons"]]),
+        "rate_hz": f"{about['rate_hz']:g}",
+        "window": str(about["window"]),
+        "mode": about["mode"],
+        "model_hash": about["model_hash"],
+        "scale_hash": about["scale_hash"],
     }
 
 
-def as_json(described: Description, files: Mapping[str, bytes]) -> bytes:
-    """The description as JSON; `files` are the graphs, by kind."""
-    return (json.dumps(content(described, files), indent=1, allow_nan=False) + "\n").encode()
+def content(described: Description, files: Mapping[str, bytes], states: Sequence[State], opset: int) -> dict[str, Any]:
+    """The description of graphs as plain values; `files` are the graphs, by kind."""
+    graphs = {kind: _graph(described, kind, data, opset) for kind, data in files.items()}
+    if "step" in graphs:
+        graphs["step"]["states"] = [
+            {"name": state.name, "next": state.next, "shape": list(state.start.shape), "start": _start(state)}
+            for state in states
+        ]
+    return described.content() | {"rules": RULES, "graphs": graphs}
 
 
-def content(described: Description, files: Mapping[str, bytes]) -> dict[str, Any]:
-    """The description as plain values."""
-    bundle, graph, task = described.bundle, described.graph, described.bundle.task
-    kinds, texts = bundle.target_kinds, bundle.descriptions
-    shapes = {meaning: shape_of_result(graph, value, len(task.targets)) for meaning, value in graph.results.items()}
-    return {
-        "schema": SCHEMA,
-        "edp": __version__,
-        "name": described.name,
-        "network": describe_network(bundle.predictor.spec),
-        "model_hash": model_hash(graph),
-        "scale_hash": scale_hash(bundle.predictor),
-        "rate_hz": task.rate_hz,
-        "window": graph.window,
-        "mode": str(task.mode),
-        "inputs": [
-            {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in bundle.inputs
-        ],
-        "targets": [
-            {"name": name, "unit": KINDS[kind].si_unit, "kind": str(kind), "description": text}
-            for name, kind, text in zip(task.targets, kinds, texts, strict=True)
-        ],
-        "horizons": [{"ticks": k, "seconds": k / task.rate_hz} for k in task.horizons],
-        "coverages": list(bundle.predictor.output.coverages),
-        "results": {meaning: list(shape) for meaning, shape in shapes.items()},
-        "rules": RULES,
-        "graphs": {kind: _graph(described, kind, data) for kind, data in files.items()},
-    }
+def with_full_starts(about: dict[str, Any], states: Sequence[State]) -> dict[str, Any]:
+    """`content` with whole arrays as the starts of states, for MATLAB."""
+    step = about["graphs"]["step"]
+    full = [entry | {"start": state.start} for entry, state in zip(step["states"], states, strict=True)]
+    return about | {"graphs": about["graphs"] | {"step": step | {"states": full}}}
 
 
-def _graph(described: Description, kind: str, data: bytes) -> dict[str, Any]:
+def _graph(described: Description, kind: str, data: bytes, opset: int) -> dict[str, Any]:
     ticks = described.graph.window if kind == "window" else 1
-    about: dict[str, Any] = {
+    return {
         "file": f"{described.name}_{kind}.onnx",
         "sha256": hashlib.sha256(data).hexdigest(),
-        "opset": described.opset,
-        "ir": OPSETS[described.opset],
+        "opset": opset,
+        "ir": OPSETS[opset],
         "input": INPUTS,
         "shape": [ticks, described.graph.inputs],
     }
-    if kind == "window":
-        return about
-    states = [
-        {"name": state.name, "next": state.next, "shape": list(state.start.shape), "start": _start(state)}
-        for state in described.states
-    ]
-    return about | {"states": states}
 
 
 def _start(state: State) -> float | list[list[float]]:
@@ -126,42 +73,3 @@ def _start(state: State) -> float | list[list[float]]:
     first = float(state.start.flat[0])
     same = np.all(state.start == state.start.flat[0])
     return first if same else [[float(value) for value in row] for row in state.start]
-
-
-def as_mat(described: Description, files: Mapping[str, bytes]) -> bytes:
-    """The description as a MAT file (version 5): ``edp``, a struct as the JSON file, and ``golden``.
-
-    ``golden`` has random `inputs` ``(tick, input)``; what PyTorch streams from them, `stream` ``(tick, number)``, the
-    results of a tick one behind the other; what it predicts from the last window alone, `window` ``(1, number)``; and
-    the `tolerance` ``(1, number)``.
-    """
-    predictor, window = described.bundle.predictor, described.graph.window
-    inputs = random_inputs(predictor, max(GOLDEN_TICKS, window), seed=0)
-    outputs = stream(predictor, inputs)
-    golden = {
-        "inputs": inputs,
-        "stream": outputs,
-        "window": stream(predictor, inputs[-window:])[-1:],
-        "tolerance": tolerance(predictor, inputs, outputs)[None],
-    }
-    about = content(described, files)
-    for entry, state in zip(about["graphs"]["step"]["states"], described.states, strict=True):
-        entry["start"] = state.start
-    made = io.BytesIO()
-    scipy.io.savemat(made, {"edp": _for_matlab(about), "golden": golden}, long_field_names=True)
-    text = f"MATLAB 5.0 MAT-file, written by EDP {__version__}".ljust(116).encode()  # without the time of day
-    return text + made.getvalue()[len(text) :]
-
-
-def _for_matlab(value: Any) -> Any:
-    """Lists as rows of numbers or as cells."""
-    if isinstance(value, dict):
-        return {key: _for_matlab(entry) for key, entry in value.items()}
-    if not isinstance(value, list):
-        return value
-    if value and all(isinstance(entry, int | float) for entry in value):
-        return np.array([value], dtype=float)
-    cells = np.empty((1, len(value)), dtype=object)
-    for at, entry in enumerate(value):
-        cells[0, at] = _for_matlab(entry)
-    return cells

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edp.errors import ExportError
+from edp.export.description import shape_of_result
 from edp.export.onnx.memory import STEPS, Held, shape_of, step_correction
 from edp.export.onnx.nodes import DEFAULT_OPSET, Nodes
 from edp.export.onnx.plain import PLAIN
@@ -67,11 +68,6 @@ def refuse(layer: Layer) -> ExportError:
     return ExportError(
         f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in ONNX; these have: {', '.join(known)}"
     )
-
-
-def shape_of_result(graph: Graph, value: str, targets: int) -> tuple[int, int]:
-    """Shape of a result as a matrix: horizons, or intervals and horizons, by targets."""
-    return graph.width_of(value) // targets, targets
 
 
 def spoil(nodes: Nodes, inputs: str) -> str:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from edp.errors import ExportError
 from edp.export.base import TARGETS
-from edp.export.onnx.metadata import Description, as_json, as_mat, notes
+from edp.export.description import Description, as_json, as_mat, float_graph, golden
+from edp.export.onnx.metadata import content, notes, with_full_starts
 from edp.export.onnx.nodes import DEFAULT_OPSET, OPSETS
 from edp.export.onnx.step import states_of, step_model
 from edp.export.onnx.window import window_model
@@ -38,16 +39,18 @@ class OnnxTarget:
                 f"name '{name}' is that of files and graphs: up to 31 lower-case letters, digits, underscores, a "
                 "letter first; give another one with --name"
             )
-        graph = bundle.predictor.graph()
-        described = Description(name, bundle, graph, tuple(states_of(graph)), self.opset)
-        targets = len(bundle.task.targets)
+        graph = float_graph(bundle.predictor, "ONNX")
+        described, states = Description(name, bundle, graph), states_of(graph)
+        targets, carried = len(bundle.task.targets), notes(described)
         files = {
-            "step": step_model(graph, targets, f"{name}_step", notes(described), self.opset),
-            "window": window_model(graph, targets, f"{name}_window", notes(described), self.opset),
+            "step": step_model(graph, targets, f"{name}_step", carried, self.opset),
+            "window": window_model(graph, targets, f"{name}_window", carried, self.opset),
         }
-        made = {f"{name}.json": as_json(described, files), f"{name}.mat": as_mat(described, files)}
+        about = content(described, files, states, self.opset)
+        tables = {"edp": with_full_starts(about, states), "golden": golden(bundle.predictor, graph.window)}
+        made = {f"{name}.json": as_json(about), f"{name}.mat": as_mat(tables)}
         made |= {f"{name}_{kind}.onnx": data for kind, data in files.items()}
         path = make_folder(folder)
-        for file, content in made.items():
-            write_bytes(path / file, content)
+        for file, data in made.items():
+            write_bytes(path / file, data)
         return [path / file for file in made]

@@ -1,0 +1,138 @@
+"""What the reader of any exported form must know: names, units, order, rate, window, hashes; as JSON and MAT."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from edp import __version__
+from edp.errors import ExportError
+from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
+from edp.export.hashes import model_hash, scale_hash
+from edp.graph import Graph
+from edp.models.integer import IntegerPredictor
+from edp.models.predictor import Predictor
+from edp.models.predictor import describe as describe_network
+from edp.signals import KINDS
+from edp.training.bundle import Bundle
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """What is described.
+
+    Attributes:
+        name: of the network in the exported form.
+        bundle: the trained network.
+        graph: its layers.
+    """
+
+    name: str
+    bundle: Bundle
+    graph: Graph
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, int]]:
+        """Shapes of the results as matrices: horizons, or intervals and horizons, by targets."""
+        targets = len(self.bundle.task.targets)
+        return {meaning: shape_of_result(self.graph, value, targets) for meaning, value in self.graph.results.items()}
+
+    def content(self) -> dict[str, Any]:
+        """Plain values that JSON can hold."""
+        bundle, task = self.bundle, self.bundle.task
+        kinds, texts = bundle.target_kinds, bundle.descriptions
+        return {
+            "schema": SCHEMA,
+            "edp": __version__,
+            "name": self.name,
+            "network": describe_network(bundle.predictor.spec),
+            "number_format": bundle.predictor.number_format,
+            "model_hash": model_hash(self.graph),
+            "scale_hash": scale_hash(bundle.predictor),
+            "rate_hz": task.rate_hz,
+            "window": self.graph.window,
+            "mode": str(task.mode),
+            "inputs": [
+                {"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description}
+                for c in bundle.inputs
+            ],
+            "targets": [
+                {"name": name, "unit": KINDS[kind].si_unit, "kind": str(kind), "description": text}
+                for name, kind, text in zip(task.targets, kinds, texts, strict=True)
+            ],
+            "horizons": [{"ticks": k, "seconds": k / task.rate_hz} for k in task.horizons],
+            "coverages": list(bundle.predictor.output.coverages),
+            "results": {meaning: list(shape) for meaning, shape in self.shapes.items()},
+        }
+
+
+def shape_of_result(graph: Graph, value: str, targets: int) -> tuple[int, int]:
+    """Shape of a result as a matrix: horizons, or intervals and horizons, by targets."""
+    return graph.width_of(value) // targets, targets
+
+
+def float_graph(predictor: Predictor, form: str) -> Graph:
+    """The layers of a network in single precision, for a form that has no other numbers.
+
+    Raises:
+        ExportError: the network computes in whole numbers.
+    """
+    if isinstance(predictor, IntegerPredictor):
+        raise ExportError(
+            f"the network computes in whole numbers ({predictor.number_format}), which {form} does not hold; export "
+            "the run that it was quantised from, or take a form around the C code"
+        )
+    return predictor.graph()
+
+
+def golden(predictor: Predictor, window: int) -> dict[str, Any]:
+    """A recording to compare with.
+
+    Returns:
+        Random `inputs` ``(tick, input)``; what PyTorch streams from them, `stream` ``(tick, number)``, the results of
+        a tick one behind the other; what it predicts from the last `window` ticks alone, `window` ``(1, number)``; and
+        the `tolerance` ``(1, number)``.
+    """
+    inputs = random_inputs(predictor, max(GOLDEN_TICKS, window), seed=0)
+    outputs = stream(predictor, inputs)
+    return {
+        "inputs": inputs,
+        "stream": outputs,
+        "window": stream(predictor, inputs[-window:])[-1:],
+        "tolerance": tolerance(predictor, inputs, outputs)[None],
+    }
+
+
+def as_json(content: Mapping[str, Any]) -> bytes:
+    """A description as a JSON file."""
+    return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
+
+
+def as_mat(variables: Mapping[str, Any]) -> bytes:
+    """Variables as a MAT file (version 5), the same bytes at any time of day; lists become rows of numbers or cells."""
+    made = io.BytesIO()
+    scipy.io.savemat(made, {name: _for_matlab(value) for name, value in variables.items()}, long_field_names=True)
+    text = f"MATLAB 5.0 MAT-file, written by EDP {__version__}".ljust(116).encode()  # without the time of day
+    return text + made.getvalue()[len(text) :]
+
+
+def _for_matlab(value: Any) -> Any:
+    """Lists as rows of numbers or as cells."""
+    if isinstance(value, Mapping):
+        return {key: _for_matlab(entry) for key, entry in value.items()}
+    if not isinstance(value, list):
+        return value
+    if value and all(isinstance(entry, int | float) for entry in value):
+        return np.array([value], dtype=float)
+    cells = np.empty((1, len(value)), dtype=object)
+    for at, entry in enumerate(value):
+        cells[0, at] = _for_matlab(entry)
+    return cells
