@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp import __version__
-from edp.export.c import integer_calls
+from edp.errors import ExportError
+from edp.export.c import integer_calls, tangents
 from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, slot, structs
 from edp.export.c.layout import laid
 from edp.export.c.plan import Plan, plan
@@ -60,12 +61,14 @@ class Model:
         bundle: the trained network.
         graph: its layers.
         plan: places in the work memory.
+        changes: places of their changes, where the model has tangents.
     """
 
     name: str
     bundle: Bundle
     graph: Graph
     plan: Plan
+    changes: Plan | None = None
 
     @property
     def whole(self) -> bool:
@@ -75,7 +78,14 @@ class Model:
     @property
     def runtime(self) -> tuple[str, ...]:
         """Files of the runtime that it needs."""
-        return RUNTIME + (integer_calls.FILES if self.whole else ())
+        more = integer_calls.FILES if self.whole else ()
+        return RUNTIME + more + (() if self.changes is None else tangents.FILES)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """C files that a program with this model compiles."""
+        own = (f"{self.name}.c",) if self.changes is None else (f"{self.name}.c", f"{self.name}_tangent.c")
+        return own + tuple(name for name in self.runtime if name.endswith(".c"))
 
     def weights(self) -> str:
         """The file of constants."""
@@ -133,7 +143,7 @@ class Model:
             "runtime": "edp_integer.h" if self.whole else "edp_runtime.h",
             "counters": CLIPPED if self.whole else "",
             "clear_counters": "    s->clipped = 0u;\n" if self.whole else "",
-            "sources": " ".join(name for name in self.runtime if name.endswith(".c")),
+            "sources": " ".join(self.sources),
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
             "what": self._what(),
@@ -141,6 +151,7 @@ class Model:
             **self._state(),
             **self._work(),
             **self._code(),
+            **({} if self.changes is None else self._tangent(self.changes)),
         }
 
     def _what(self) -> str:
@@ -198,6 +209,25 @@ class Model:
             "clear_work": indented(f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in sizes.items()),
         }
 
+    def _tangent(self, changes: Plan) -> dict[str, object]:
+        parts = [(layer, part) for layer, part in self.graph.slots() if part.name != "age"]
+        calls, work = tangents.Tangents(self.graph, self.plan, changes), changes.sizes[Number.FLOAT]
+        lines = [line for layer in self.graph.layers for line in ("", describe(layer), *calls.of(layer))]
+        fields = [(tangents.changed(name, part.name), max(1, part.size)) for name, part in parts]
+        copies = []
+        for meaning, value in self.graph.results.items():
+            first = "[0][0]" if meaning == "prediction" else "[0][0][0]"
+            place = calls.change(value).replace("t->", "t[k].")
+            copies.append(f"edp_copy({place}, {self.graph.width_of(value)}u, &dout[k].{meaning}{first});")
+        return {
+            "tangent_fields": indented(f"float {field.removeprefix('t->')}[{size}];" for field, size in fields),
+            "tangent_forget": indented(f"edp_fill(0.0f, {size}u, {field});" for field, size in fields),
+            "tangent_work": work,
+            "tangent_ram": 4 * (self.graph.inputs + sum(size for _, size in fields) + work),
+            "tangent_compute": indented(lines[1:]),
+            "tangent_copies": indented(copies, " " * 12),
+        }
+
     def _state_bytes(self) -> int:
         """Of the state, without what a compiler may put between its parts."""
         slots = sum(max(1, part.size) * part.number.bytes for _, part in self.graph.slots() if part.name != "age")
@@ -229,15 +259,24 @@ def _listed(entries: Sequence[tuple[str, str]]) -> str:
     return "\n".join(f"    {entry:<{wide}} /* {text.replace('*/', '* /')} */" for entry, text in entries)
 
 
-def make_model(name: str, bundle: Bundle) -> Model:
+def make_model(name: str, bundle: Bundle, tangent: bool = False) -> Model:
     """A model ready to be written.
 
+    Args:
+        name: C prefix of the model.
+        bundle: the trained network.
+        tangent: with tangents.
+
     Raises:
-        ExportError: a part of the network has no form as a layer.
+        ExportError: a part of the network has no form as a layer, or a tangent of whole numbers is asked for.
     """
     predictor = bundle.predictor
+    whole = isinstance(predictor, IntegerPredictor)
+    if whole and tangent:
+        raise ExportError("a network in whole numbers is a staircase and has no tangent; export the float run")
     graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
-    return Model(name, bundle, graph, plan(graph))
+    changes = plan(graph, tangents.tangent_scratch_of) if tangent else None
+    return Model(name, bundle, graph, plan(graph), changes)
 
 
 def has_ring(layer: Layer) -> bool:

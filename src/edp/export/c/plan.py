@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from edp.graph import Graph, Layer, layers, memory
@@ -60,8 +60,13 @@ def scratch_number(layer: Layer) -> Number:
     return Number.FLOAT if layer.number is Number.FLOAT else Number.INT32
 
 
-def plan(graph: Graph) -> Plan:
-    """Give every value the first gap that is wide enough from where it is made to where it is last read."""
+def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Plan:
+    """Give every value the first gap that is wide enough from where it is made to where it is last read.
+
+    Args:
+        graph: the layers.
+        scratch_of: scratch numbers that a layer needs beside its value.
+    """
     last = {name: at for at, layer in enumerate(graph.layers) for name in layer.inputs}
     last |= dict.fromkeys(graph.results.values(), len(graph.layers))
     busy: list[tuple[Number, int, int, int]] = []  # start, stop, the layer after which it is free

@@ -20,12 +20,18 @@ from edp.training.bundle import Bundle
 @TARGETS.register("c")
 @dataclass(frozen=True)
 class CTarget:
-    """C99, float32 or w8a16: ``NAME.h``, ``NAME.c``, constants, runtime, host test, fuzzer, example task, CMake."""
+    """C99, float32 or w8a16: ``NAME.h``, ``NAME.c``, constants, runtime, host test, fuzzer, example task, CMake.
+
+    Attributes:
+        tangent: with ``NAME_tangent.h`` and ``NAME_tangent.c``: how predictions change with inputs and past; float32.
+    """
+
+    tangent: bool = False
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
         check_name(name)
-        model = make_model(name, bundle)
+        model = make_model(name, bundle, self.tangent)
         made = core_files(model) | {
             f"{name}_golden.h": golden(model),
             "host_test.c": model.fill("host_test.c.in"),
@@ -47,6 +53,8 @@ def core_files(model: Model) -> dict[str, str]:
         f"{name}.c": model.fill("model.c.in"),
         f"{name}_weights.h": model.weights(),
     }
+    if model.changes is not None:
+        made |= {f"{name}_tangent.{end}": model.fill(f"model_tangent.{end}.in") for end in ("h", "c")}
     if model.whole:
         made["edp_tables.h"] = tables_header()
     for file in model.runtime:

@@ -1,0 +1,271 @@
+"""The C calls that bring the tangent of each kind of layer on: before and after the call of the layer itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from edp.errors import ExportError
+from edp.export.c.calls import Calls, constant, needs_columns, ring, runs, slot
+from edp.export.c.plan import Plan, scratch_of
+from edp.export.c.text import call, identifier, number
+from edp.graph import Graph, Layer, layers, memory
+from edp.graph.base import INPUT
+
+FILES = ("edp_tangent.h", "edp_tangent.c", "edp_tangent_memory.c")
+"""Of the runtime."""
+
+
+def tangent_scratch_of(layer: Layer) -> int:
+    """Scratch numbers of a layer's tangent along one direction; what all directions share lies with the first."""
+    if isinstance(layer, layers.Activate):
+        return layer.size
+    if isinstance(layer, memory.Lstm | memory.LayerNormLstm | memory.Gru):
+        return scratch_of(layer) + layer.width
+    return scratch_of(layer)
+
+
+class Tangents:
+    """Writes the calls of a graph's layers with their tangents.
+
+    Args:
+        graph: the layers.
+        plan: where their values lie.
+        changes: where the changes of their values lie.
+    """
+
+    def __init__(self, graph: Graph, plan: Plan, changes: Plan) -> None:
+        self.graph, self.calls, self.plan = graph, Calls(graph, plan), changes
+
+    def change(self, name: str, offset: int = 0) -> str:
+        """Where the change of a value lies."""
+        if name == INPUT:
+            return f"t->last + {offset}" if offset else "t->last"
+        return f"t->work + {self.plan.values[name] + offset}"
+
+    def scratch(self, layer: Layer, offset: int = 0) -> str:
+        """Where a tangent's scratch numbers lie."""
+        return f"t->work + {self.plan.scratch[layer.name] + offset}"
+
+    def of(self, layer: Layer) -> list[str]:
+        """The statements that compute a layer and bring its tangent on.
+
+        Raises:
+            ExportError: this kind of layer has no tangent.
+        """
+        write = TANGENTS.get(type(layer))
+        if write is None:
+            raise ExportError(
+                f"layer '{layer.name}' is a {type(layer).__name__}, which has no tangent in C; "
+                f"these have: {', '.join(kind.__name__ for kind in TANGENTS)}"
+            )
+        return write(self, layer)
+
+    def changes(self, layer: Layer) -> list[str]:
+        """Where the changes of a layer's inputs lie."""
+        return [self.change(name) for name in layer.inputs]
+
+    def values(self, layer: Layer) -> list[str]:
+        """Where a layer's inputs lie."""
+        return [self.calls.value(name) for name in layer.inputs]
+
+    def before(self, layer: Layer, function: str, *arguments: object) -> list[str]:
+        """A tangent and then the layer; directions and the change of its value close the arguments."""
+        return [call(function, *arguments, "d", self.change(layer.name)), *self.calls.of(layer)]
+
+
+Write = Callable[[Tangents, Any], list[str]]
+
+
+def changed(layer: Layer | str, name: str) -> str:
+    """The C array of the change of what a layer remembers."""
+    return slot(layer, name).replace("s->", "t->")
+
+
+def _pointers(places: list[str]) -> str:
+    return f"(const float *const[]){{{', '.join(places)}}}"
+
+
+def _linear(function: str, *constants: str) -> Write:
+    """Of a layer whose result changes with its inputs alone."""
+
+    def write(t: Tangents, layer: Layer) -> list[str]:
+        held = [constant(layer, name) for name in constants]
+        return t.before(layer, function, *t.changes(layer), *held, layer.width)
+
+    return write
+
+
+def _pair(function: str) -> Write:
+    def write(t: Tangents, layer: Layer) -> list[str]:
+        return t.before(layer, function, *t.values(layer), *t.changes(layer), layer.width)
+
+    return write
+
+
+def _gather(t: Tangents, layer: layers.Gather) -> list[str]:
+    if needs_columns(t.calls, layer):
+        return t.before(layer, "edp_gather_tangent", *t.changes(layer), constant(layer, "columns"), layer.width)
+    lines, at = [], 0
+    for name, first, length in runs(t.calls, layer):
+        lines.append(call("edp_copy_tangent", t.change(name, first), length, "d", t.change(layer.name, at)))
+        at += length
+    return [*lines, *t.calls.of(layer)]
+
+
+def _activate(t: Tangents, layer: layers.Activate) -> list[str]:
+    slope = t.scratch(layer)
+    first = call(f"edp_slope_{layer.function}", *t.values(layer), layer.size, slope)
+    return [first, *t.before(layer, "edp_scale_tangent", *t.changes(layer), slope, layer.size)]
+
+
+def _glu(t: Tangents, layer: layers.Glu) -> list[str]:
+    return t.before(layer, "edp_glu_tangent", *t.values(layer), *t.changes(layer), layer.rows, layer.size // 2)
+
+
+def _dense(t: Tangents, layer: layers.Dense) -> list[str]:
+    sizes = (layer.rows, *layer.weight.shape)
+    return t.before(layer, "edp_dense_tangent", *t.changes(layer), constant(layer, "weight"), *sizes)
+
+
+def _grouped(t: Tangents, layer: layers.GroupedDense) -> list[str]:
+    weight = constant(layer, "weight")
+    return t.before(layer, "edp_grouped_dense_tangent", *t.changes(layer), weight, *layer.weight.shape)
+
+
+def _norm(t: Tangents, layer: layers.LayerNorm) -> list[str]:
+    held = (constant(layer, "gain"), number(layer.epsilon), layer.rows, len(layer.gain))
+    return t.before(layer, "edp_layer_norm_tangent", *t.values(layer), *t.changes(layer), *held)
+
+
+def _rows(t: Tangents, layer: layers.RowAttention) -> list[str]:
+    six = (_pointers(t.values(layer)), _pointers(t.changes(layer)))
+    scratch = (t.calls.scratch(layer), t.scratch(layer))
+    return t.before(layer, "edp_row_attention_tangent", *six, layer.rows, layer.size, *scratch)
+
+
+def _difference(t: Tangents, layer: memory.Difference) -> list[str]:
+    kind = "true" if layer.from_zero else "false"
+    held = (constant(layer, "factor"), layer.width, kind, ring(layer), changed(layer, "before"))
+    return t.before(layer, "edp_difference_tangent", *t.changes(layer), *held)
+
+
+def _starting(t: Tangents, layer: memory.Starting) -> list[str]:
+    held = (len(layer.mean), layer.ticks, ring(layer))
+    return t.before(layer, "edp_starting_tangent", *t.changes(layer), *held)
+
+
+def _convolution(t: Tangents, layer: memory.Convolution) -> list[str]:
+    out, taps, into = layer.weight.shape
+    given = (*t.changes(layer), constant(layer, "weight"))
+    if taps == 1:
+        return t.before(layer, "edp_dense_tangent", *given, 1, out, into)
+    held = (out, taps, into, layer.dilation, ring(layer), changed(layer, "ring"))
+    return t.before(layer, "edp_convolution_tangent", *given, *held)
+
+
+def _lstm(t: Tangents, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
+    name, units, into = identifier(layer.name), layer.width, layer.weight_x.shape[1]
+    normed = isinstance(layer, memory.LayerNormLstm)
+    weights, norms = f"&{name}_weights", f"&{name}_norms" if normed else "NULL"
+    gates, dgates, old = t.calls.scratch(layer), t.scratch(layer), t.scratch(layer, scratch_of(layer))
+    states = changed(layer, "h"), changed(layer, "c")
+    if normed:
+        given = (*t.values(layer), *t.changes(layer), slot(layer, "h"), states[0], weights, norms, into, units, gates)
+        first = call("edp_layer_norm_gates_tangent", *given, "d", dgates)
+    else:
+        given = (*t.changes(layer), states[0], weights, into, units)
+        first = call("edp_lstm_gates_tangent", *given, "d", dgates)
+    kept = call("edp_copy", slot(layer, "c"), units, old)
+    rest = (gates, units, number(layer.share), norms, old, dgates, *states)
+    return [first, kept, *t.calls.of(layer), call("edp_lstm_cell_tangent", *rest, "d", t.change(layer.name))]
+
+
+def _gru(t: Tangents, layer: memory.Gru) -> list[str]:
+    name, units, into = identifier(layer.name), layer.width, layer.weight_x.shape[1]
+    old = t.scratch(layer, scratch_of(layer))
+    held = (t.calls.scratch(layer), old, t.scratch(layer), changed(layer, "h"))
+    kept = call("edp_copy", slot(layer, "h"), units, old)
+    own = call("edp_gru_tangent", *t.changes(layer), f"&{name}_weights", into, units, *held, "d", t.change(layer.name))
+    return [kept, *t.calls.of(layer), own]
+
+
+def _min_gru(t: Tangents, layer: memory.MinGru) -> list[str]:
+    states = (slot(layer, "h"), changed(layer, "h"))
+    return t.before(layer, "edp_min_gru_tangent", *t.values(layer), *t.changes(layer), layer.units, *states)
+
+
+def _rotation(t: Tangents, layer: memory.Rotation) -> list[str]:
+    held = (constant(layer, "factor"), len(layer.factor), changed(layer, "h"))
+    return t.before(layer, "edp_rotation_tangent", *t.changes(layer), *held)
+
+
+def _mean(t: Tangents, layer: memory.TrailingMean) -> list[str]:
+    held = (layer.size, layer.window, ring(layer), changed(layer, "ring"))
+    return t.before(layer, "edp_trailing_mean_tangent", *t.changes(layer), *held)
+
+
+def _attended(t: Tangents, layer: memory.AttentionPool | memory.WindowAttention, *slots: str) -> str:
+    past, moved = (", ".join(of(layer, name) for name in slots) for of in (slot, changed))
+    held = f"{{{past}}}, {{{moved}}}, {ring(layer)}, {layer.window}u"
+    return f"&(const edp_attended){{{held}, {t.calls.scratch(layer)}, {t.scratch(layer)}}}"
+
+
+def _pool(t: Tangents, layer: memory.AttentionPool) -> list[str]:
+    score = (constant(layer, "score"), f"{constant(layer, 'bias')}[0]", layer.width)
+    held = _attended(t, layer, "ring", "scores")
+    return t.before(layer, "edp_attention_pool_tangent", *t.values(layer), *t.changes(layer), *score, held)
+
+
+def _window(t: Tangents, layer: memory.WindowAttention) -> list[str]:
+    held = _attended(t, layer, "keys", "values")
+    six = (_pointers(t.values(layer)), _pointers(t.changes(layer)))
+    return t.before(layer, "edp_window_attention_tangent", *six, layer.size, layer.heads, held)
+
+
+def _prefix(t: Tangents, layer: memory.PrefixCorrection) -> list[str]:
+    hidden, seen = layer.first_weight.shape
+    states = (slot(layer, "total"), changed(layer, "total"), ring(layer))
+    work = (t.calls.scratch(layer), t.scratch(layer), "d")
+    given = (*t.values(layer), *t.changes(layer), f"&{identifier(layer.name)}_weights", seen // 2)
+    asked = call("edp_prefix_tangent", *given, *states, *work).removesuffix(";")
+    lines = [f"if ({asked}) {{"]
+    sizes, at = {(name, part.name): part.size for name, part in t.graph.slots()}, seen + hidden
+    for name, part in layer.corrects:
+        old = changed(name, part)
+        lines.append("    " + call("edp_add_tangent", old, t.scratch(layer, at), sizes[name, part], "d", old))
+        at += sizes[name, part]
+    return [*lines, "}", *t.calls.of(layer)]
+
+
+TANGENTS: dict[type[Layer], Write] = {
+    layers.Gather: _gather,
+    layers.Standardise: _linear("edp_standardise_tangent", "scale"),
+    layers.ScaleShift: _linear("edp_scale_tangent", "gain"),
+    layers.Add: _linear("edp_add_tangent"),
+    layers.Subtract: _linear("edp_subtract_tangent"),
+    layers.Multiply: _pair("edp_multiply_tangent"),
+    layers.Divide: _pair("edp_divide_tangent"),
+    layers.Minimum: _pair("edp_minimum_tangent"),
+    layers.Maximum: _pair("edp_maximum_tangent"),
+    layers.Activate: _activate,
+    layers.Glu: _glu,
+    layers.Accumulate: lambda t, x: t.before(x, "edp_accumulate_tangent", *t.changes(x), x.rows, x.size),
+    layers.Dense: _dense,
+    layers.GroupedDense: _grouped,
+    layers.LayerNorm: _norm,
+    layers.RowAttention: _rows,
+    memory.Difference: _difference,
+    memory.Starting: _starting,
+    memory.Convolution: _convolution,
+    memory.Lstm: _lstm,
+    memory.LayerNormLstm: _lstm,
+    memory.Gru: _gru,
+    memory.MinGru: _min_gru,
+    memory.Rotation: _rotation,
+    memory.TrailingMean: _mean,
+    memory.AttentionPool: _pool,
+    memory.WindowAttention: _window,
+    memory.PrefixCorrection: _prefix,
+}
+"""By kind of layer."""
