@@ -179,7 +179,7 @@ def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path):
     for name in ("Arm", "2arm", "for", "edp_arm", "a-b", "", "a" * 40):
         with pytest.raises(ExportError, match="--name"):
             CTarget().write(bundle_of("lstm"), name, tmp_path)
-    with pytest.raises(ConfigError, match="known: c"):
+    with pytest.raises(ConfigError, match="simulink"):
         TARGETS["simulynk"]
     assert not list(tmp_path.iterdir())
 

@@ -5,6 +5,7 @@ A value is a flat vector; where a layer has `rows`, it is that many rows of equa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -36,6 +37,19 @@ class Gather(Layer):
     @property
     def width(self) -> int:
         return len(self.columns)
+
+
+def runs(columns: Sequence[int], widths: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Runs of neighbouring columns of inputs that are laid end to end: which input, its first column, how many."""
+    origin = [(which, column) for which, width in enumerate(widths) for column in range(width)]
+    found: list[tuple[int, int, int]] = []
+    for column in columns:
+        which, at = origin[column]
+        if found and found[-1][0] == which and sum(found[-1][1:]) == at:
+            found[-1] = (which, found[-1][1], found[-1][2] + 1)
+        else:
+            found.append((which, at, 1))
+    return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

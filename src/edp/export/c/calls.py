@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from edp.errors import ExportError
@@ -10,6 +10,7 @@ from edp.export.c.plan import Plan, scratch_number
 from edp.export.c.text import call, identifier, number
 from edp.graph import Graph, Layer, layers, memory
 from edp.graph.base import INPUT, Number
+from edp.graph.layers import runs as neighbours
 from edp.integer.layers import WGather
 
 WORK = {Number.FLOAT: "work", Number.INT16: "work16", Number.INT32: "work32"}
@@ -81,23 +82,17 @@ def ring(layer: Layer) -> str:
     return f"&s->{identifier(layer.name)}_ring_at"
 
 
-def runs(calls: Calls, layer: layers.Gather | WGather) -> Iterator[tuple[str, int, int]]:
+def runs(calls: Calls, layer: layers.Gather | WGather) -> list[tuple[str, int, int]]:
     """Runs of neighbouring columns: the value they come from, the first column in it, their number."""
-    origin = [(name, column) for name in layer.inputs for column in range(calls.graph.width_of(name))]
-    start = 0
-    picked = [origin[column] for column in layer.columns]
-    for at in range(1, len(picked) + 1):
-        name, column = picked[at - 1]
-        if at == len(picked) or picked[at] != (name, column + 1):
-            yield (*picked[start], at - start)
-            start = at
+    widths = [calls.graph.width_of(name) for name in layer.inputs]
+    return [(layer.inputs[which], first, length) for which, first, length in neighbours(layer.columns, widths)]
 
 
 def needs_columns(calls: Calls, layer: Layer) -> bool:
     """Whether a layer's columns are written as a table."""
     if not isinstance(layer, layers.Gather | WGather):
         return False
-    return len(layer.inputs) == 1 and len(list(runs(calls, layer))) > MOST_COPIES
+    return len(layer.inputs) == 1 and len(runs(calls, layer)) > MOST_COPIES
 
 
 def _gather(calls: Calls, layer: layers.Gather) -> list[str]:

@@ -24,6 +24,7 @@ from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.graph import Graph, Layer, memory
 from edp.graph.base import Number
 from edp.models.integer import IntegerPredictor
+from edp.models.predictor import Predictor
 from edp.models.predictor import describe as describe_network
 from edp.training.bundle import Bundle
 
@@ -116,8 +117,7 @@ class Model:
 
     def _values(self) -> dict[str, object]:
         task, predictor = self.bundle.task, self.bundle.predictor
-        centre, spread = ends(predictor)
-        low, high = (np.clip(centre + side * LIMIT * spread, -LARGEST, LARGEST) for side in (-1.0, 1.0))
+        low, high = limits(predictor)
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -139,7 +139,7 @@ class Model:
             "macs": self.graph.macs,
             "format": self.bundle.predictor.number_format,
             "flash": sum(values.nbytes for _, _, values in self.graph.tensors()),
-            "ram": self._state_bytes(),
+            "ram": self.state_bytes(),
             "runtime": "edp_integer.h" if self.whole else "edp_runtime.h",
             "counters": CLIPPED if self.whole else "",
             "clear_counters": "    s->clipped = 0u;\n" if self.whole else "",
@@ -228,7 +228,7 @@ class Model:
             "tangent_copies": indented(copies, " " * 12),
         }
 
-    def _state_bytes(self) -> int:
+    def state_bytes(self) -> int:
         """Of the state, without what a compiler may put between its parts."""
         slots = sum(max(1, part.size) * part.number.bytes for _, part in self.graph.slots() if part.name != "age")
         rings = sum(has_ring(layer) for layer in self.graph.layers)
@@ -257,6 +257,13 @@ def _listed(entries: Sequence[tuple[str, str]]) -> str:
     """Lines of an enumeration with a comment each."""
     wide = max(len(entry) for entry, _ in entries)
     return "\n".join(f"    {entry:<{wide}} /* {text.replace('*/', '* /')} */" for entry, text in entries)
+
+
+def limits(predictor: Predictor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least and largest accepted value of each input, SI units."""
+    centre, spread = ends(predictor)
+    low, high = (np.clip(centre + side * LIMIT * spread, -LARGEST, LARGEST) for side in (-1.0, 1.0))
+    return low, high
 
 
 def make_model(name: str, bundle: Bundle, tangent: bool = False) -> Model:

@@ -11,7 +11,7 @@ import numpy as np
 
 from edp.export.onnx.nodes import Nodes
 from edp.graph import Layer, layers
-from edp.graph.layers import Function
+from edp.graph.layers import Function, runs
 
 MOST_PIECES = 12
 """Runs of neighbouring columns up to which numbers are moved by splitting and joining; beyond, by a 0/1 matrix."""
@@ -58,27 +58,21 @@ def _flat(nodes: Nodes, x: str, ticks: int, rows: int, width: int) -> str:
 
 
 def _gather(nodes: Nodes, layer: layers.Gather, ticks: int, values: Sequence[str], widths: Sequence[int]) -> str:
-    origin = [(value, column) for value, width in enumerate(widths) for column in range(width)]
-    runs: list[list[int]] = []  # value, first column, one past the last
-    for column in layer.columns:
-        value, at = origin[column]
-        if runs and runs[-1][0] == value and runs[-1][2] == at:
-            runs[-1][2] = at + 1
-        else:
-            runs.append([value, at, at + 1])
-    if len(runs) > MOST_PIECES:
-        matrix = np.zeros((len(layer.columns), len(origin)), np.float32)
+    found = runs(layer.columns, widths)
+    if len(found) > MOST_PIECES:
+        matrix = np.zeros((len(layer.columns), sum(widths)), np.float32)
         matrix[np.arange(len(layer.columns)), list(layer.columns)] = 1.0
         return nodes.linear(nodes.join(list(values), 1), matrix, np.zeros(1, np.float32))
     pieces: dict[int, dict[int, tuple[int, str]]] = {}
     for number, width in enumerate(widths):
-        ends = {end for value, *both in runs if value == number for end in both}
+        ends = {end for value, first, length in found if value == number for end in (first, first + length)}
         if ends:
             cuts = sorted({0, width} | ends)
             names = nodes.split(values[number], [b - a for a, b in pairwise(cuts)], 1)
             pieces[number] = {a: (b, name) for (a, b), name in zip(pairwise(cuts), names, strict=True)}
     parts = []
-    for value, at, stop in runs:
+    for value, at, length in found:
+        stop = at + length
         while at < stop:
             at, name = pieces[value][at]
             parts.append(name)

@@ -1,0 +1,242 @@
+"""What the templates of a MATLAB folder are filled with, and which of them a network gets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from edp import __version__
+from edp.export.c.model import HOLD_TICKS, Model, limits
+from edp.export.c.text import indented
+from edp.export.description import SCHEMA, Description
+from edp.export.hashes import model_hash, scale_hash
+from edp.export.simulink.native import Native, functions_for, matlab_names
+from edp.graph.base import Number
+from edp.models.predictor import describe as describe_network
+
+RULES = {
+    "order": "inputs and targets in the order of this file, in SI units",
+    "reset": "clears memory and counts before the tick",
+    "missed_tick": "the last accepted inputs are fed again; after five in a row the memory is cleared",
+    "bad_input": "NaN, infinite or far too large inputs are rejected as a whole, counted, and the tick is held",
+    "no_prediction": "results are NaN with status 3 (restarted) and 4 (not reset)",
+    "present_value": "inside: nothing is to be added to the results",
+}
+STATUS = ("ok", "warming", "held", "restarted", "not_reset")
+"""What a tick has done, by number."""
+C_FILES = ("sfun.c", "call.h", "call.c")
+MATLAB_FILES = ("load", "names", "rows", "octave", "build", "bus", "simulate", "golden")
+NATIVE_FILES = ("step", "reset", "stream")
+ABOUT = {
+    "golden.m": ("compares the other files with the golden recording", ""),
+    "build.m": ("makes the S-function and a model with both blocks", "Simulink, a C compiler"),
+    "sfun.c": ("level-2 S-function around `core/`: the block that streams", "Simulink"),
+    "call.c": ("the function of a C Caller block, its state as a port", "Simulink"),
+    "call.h": ("its declaration, for the model's custom code", "Simulink"),
+    "bus.m": ("bus type of the measurements, with units", "Simulink"),
+    "simulate.m": ("streams rows through the S-function in Simulink", "Simulink"),
+    "load.m": ("weights, description and golden recording", ""),
+    "step.m": ("one tick in plain MATLAB", ""),
+    "reset.m": ("the state of one machine before its first tick", ""),
+    "stream.m": ("a whole recording in plain MATLAB", ""),
+    "names.m": ("refuses signals that are missing or in another order", ""),
+    "rows.m": ("rows of inputs from a struct, table or timetable, by name", ""),
+    "window.onnx": ("the last window in, predictions out; for tools that keep windows", "ONNX importer"),
+    "onnx.m": ("imports the window and predicts with it", "Deep Learning Toolbox"),
+    "octave.m": ("runs the S-function in GNU Octave", "Octave, mkoctfile"),
+}
+"""Files of the table in the README: what each is, and what it needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Folder:
+    """Texts of a MATLAB folder.
+
+    Attributes:
+        model: the C code within.
+        window: whether the ONNX window is there.
+    """
+
+    model: Model
+    window: bool
+
+    @property
+    def described(self) -> Description:
+        """What every form tells."""
+        return Description(self.model.name, self.model.bundle, self.model.graph)
+
+    @property
+    def native(self) -> Native | None:
+        """The network as MATLAB code; there is none in whole numbers."""
+        return None if self.model.whole else Native(self.model.graph)
+
+    def content(self) -> dict[str, Any]:
+        """The description as plain values."""
+        about = self.described.content()
+        for side in ("inputs", "targets"):
+            fields = matlab_names([entry["name"] for entry in about[side]])
+            about[side] = [entry | {"field": field} for entry, field in zip(about[side], fields, strict=True)]
+        return about | {"rules": RULES, "status": list(STATUS)}
+
+    def tables(self) -> dict[str, Any]:
+        """What the MAT file holds besides the golden recording."""
+        low, high = limits(self.model.bundle.predictor)
+        made: dict[str, Any] = {"edp": self.content()}
+        if self.native is not None:
+            ends = {"low": low, "high": high}
+            made |= {side: values.astype(np.float32).reshape(-1, 1) for side, values in ends.items()}
+            made |= {"weights": self.native.weights(), "start": self.native.start()}
+        return made
+
+    def texts(self) -> dict[str, str]:
+        """All text files but the C code of the core; the README first."""
+        name = self.model.name
+        wanted = [*(f"{part}.m" for part in MATLAB_FILES), *C_FILES]
+        wanted += [f"{part}.m" for part in NATIVE_FILES] if self.native is not None else []
+        wanted += ["onnx.m"] if self.window else []
+        files = {"README.md": self._fill("README.md"), "rtwmakecfg.m": self._fill("rtwmakecfg.m")}
+        return files | {f"{name}_{part}": self._fill(part) for part in wanted}
+
+    def _fill(self, part: str) -> str:
+        text = resources.files("edp.export.simulink").joinpath(f"templates/{part}.in").read_text()
+        return Template(text).substitute(self._values)
+
+    @cached_property
+    def _values(self) -> Mapping[str, object]:
+        model, about = self.model, self.content()
+        task, graph = model.bundle.task, model.graph
+        sources = [f"{model.name}.c", *(file for file in model.runtime if file.endswith(".c"))]
+        fields = [entry["field"] for entry in about["inputs"]]
+        return {
+            "name": model.name,
+            "NAME": model.name.upper(),
+            "title": describe_network(model.bundle.predictor.spec),
+            "version": __version__,
+            "schema": SCHEMA,
+            "model_hash": model_hash(graph),
+            "scale_hash": scale_hash(model.bundle.predictor),
+            "format": about["number_format"],
+            "mode": about["mode"],
+            "period": repr(1.0 / task.rate_hz),
+            "rate": f"{task.rate_hz:g}",
+            "tick_ms": f"{1000.0 / task.rate_hz:g}",
+            "window": graph.window,
+            "hold": HOLD_TICKS,
+            "inputs": graph.inputs,
+            "numbers": sum(rows * columns for rows, columns in self.described.shapes.values()),
+            "results": len(graph.results),
+            "sources": ", ".join(f"'{file}'" for file in sources),
+            "selected": ",".join(fields),
+            "state_bytes": model.state_bytes(),
+            "words": self.words,
+            **self._ports(),
+            **self._matlab(),
+            **self._readme(about),
+        }
+
+    @property
+    def words(self) -> int:
+        """32-bit words that hold the C state, with what a compiler puts between its parts."""
+        short = sum(slot.number is Number.INT16 for _, slot in self.model.graph.slots())
+        short += sum(kind is Number.INT16 for kind in self.model.plan.sizes)
+        return (self.model.state_bytes() + 2 * short + 7) // 4
+
+    def _ports(self) -> dict[str, str]:
+        """Result ports of the S-function and results of the C Caller's function."""
+        sizes: list[str] = []
+        give: list[str] = []
+        copies: list[str] = []
+        ports, arguments = [], []
+        for port, (meaning, (rows, columns)) in enumerate(self.described.shapes.items()):
+            size = f"MatrixDimensions(S, {port}, {columns}, {rows})" if rows > 1 else f"Width(S, {port}, {columns})"
+            sizes += [f"ssSetOutputPort{size};", f"ssSetOutputPortDataType(S, {port}, SS_SINGLE);"]
+            at = f"ssGetOutputPortSignal(S, {port})"
+            for lines, where, there in ((give, at, "out->"), (copies, meaning, "out.")):
+                cast = f"(real32_T *){where}" if lines is give else where
+                lines += ["if (found) {", f"    memcpy({where}, {there}{meaning}, sizeof {there}{meaning});"]
+                lines += ["} else {", f"    fill_nan({cast}, {rows * columns});", "}"]
+            ports.append(f"{port} {meaning}, single [{columns} x {rows}], a column for each horizon")
+            arguments.append(f"float {meaning}[{rows * columns}]")
+        count = len(ports)
+        ports += [
+            f"{count} status, int32: an edp_status",
+            f"{count + 1} counts, uint32 [4]: ticks, rejected, held, restarts",
+        ]
+        many = len(self.model.bundle.predictor.output.coverages) > 1
+        return {
+            "sizes": indented(sizes),
+            "give": indented(give),
+            "copy": indented(copies),
+            "ports": "\n *               ".join(ports),
+            "arguments": ", ".join(arguments),
+            "columns": "; of bounds interval by interval" if many else "",
+            "out_names": ", ".join(f"'{meaning}'" for meaning in self.described.shapes),
+            "ports_count": str(count + 2),
+        }
+
+    def _matlab(self) -> dict[str, str]:
+        """Code of the tick, and of the comparison with the golden recording."""
+        shapes = self.described.shapes
+        forms = {"octave": "found = {0}_octave(net.golden.inputs);", "sfun": "found = {0}_simulate(net.golden.inputs);"}
+        if self.native is not None:
+            forms = {"native": "found = {0}_stream(net, net.golden.inputs);"} | forms
+        if self.window:
+            forms["onnx"] = "found = {0}_onnx(net.golden.inputs);\n        wanted = double(net.golden.window);"
+        cases = "\n".join(f"    case '{form}'\n        {line.format(self.model.name)}" for form, line in forms.items())
+        values = {
+            "cases": cases,
+            "forms": " or ".join(f"'{form}'" for form in forms),
+            "form_names": ", ".join(forms),
+            "first_form": f"'{next(iter(forms))}'",
+            "exact": "Whole numbers must be the same." if self.model.whole else "",
+            "layout": "; ".join(f"{meaning} {r} x {c} (horizons by targets)" for meaning, (r, c) in shapes.items()),
+            "bounds": ", OUT.lower and OUT.upper bounds" if len(shapes) > 1 else "",
+            "nothing": "\n".join(f"out.{meaning} = nan({r}, {c}, 'single');" for meaning, (r, c) in shapes.items()),
+            "shaped": "\n".join(
+                f"out.{meaning} = reshape(found.{meaning}, {c}, {r}).';" for meaning, (r, c) in shapes.items()
+            ),
+        }
+        if self.native is None:
+            return values
+        code = self.native.code()
+        return values | {"code": code, "given": self.native.results(), "functions": functions_for(code).rstrip()}
+
+    def _readme(self, about: Mapping[str, Any]) -> dict[str, str]:
+        """Tables of the README."""
+        name, there = self.model.name, self._there()
+        rows = [f"| `{name}_{part}` | {what} | {needs} |" for part, (what, needs) in ABOUT.items() if part in there]
+        rows += [
+            f"| `{name}.json`, `{name}.mat` | names, units, order, rate, window, mode, hashes; golden recording | |",
+            "| `rtwmakecfg.m` | where the C files of the S-function are, for code generation | Simulink Coder |",
+            "| `core/` | the C code: model and runtime | |",
+            "| `octave/` | stand-ins for Simulink's headers, for checks in Octave; keep them off MATLAB's path | |",
+        ]
+        table = ["| Input | Unit | Bus element | What it is |", "|---|---|---|---|"]
+        for entry in about["inputs"]:
+            text = entry["description"].replace("|", "\\|")
+            table.append(f"| {entry['name']} | {entry['unit']} | {entry['field']} | {text} |")
+        checked = "`${name}_golden('octave')` runs the S-function in GNU Octave against stand-ins of Simulink's headers"
+        if self.native is not None:
+            checked += ", and `${name}_golden('native')` the plain MATLAB code"
+        missing = "" if self.window else "\n\nThe ONNX window is not in this folder."
+        if self.model.whole:
+            missing = (
+                "\n\nThe network computes in whole numbers: there is C code only, no plain MATLAB code and no ONNX."
+            )
+        return {
+            "files": "\n".join(rows),
+            "inputs_table": "\n".join(table),
+            "checked": Template(checked).substitute(name=name) + "." + missing,
+            "onnx_unchecked": f" the import of `{name}_window.onnx`," if self.window else "",
+        }
+
+    def _there(self) -> set[str]:
+        parts = {*(f"{part}.m" for part in MATLAB_FILES), *C_FILES}
+        parts |= {f"{part}.m" for part in NATIVE_FILES} if self.native is not None else set()
+        return parts | ({"onnx.m", "window.onnx"} if self.window else set())

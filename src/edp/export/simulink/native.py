@@ -1,0 +1,266 @@
+"""The network as plain MATLAB code: a statement or two a layer, the functions that it calls, and the weights."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from edp.errors import ExportError
+from edp.export.c.text import identifier
+from edp.graph import Array, Graph, Layer, layers, memory
+from edp.graph.base import INPUT
+from edp.graph.layers import Function, runs
+
+LONGEST = 63
+"""Characters of a MATLAB name."""
+LONGEST_LAYER = 47
+"""Characters of a layer's part of it; names of constants and slots come behind."""
+MOST_PIECES = 8
+"""Runs of neighbouring columns up to which they are written as ranges; beyond, as a constant."""
+FUNCTIONS = {
+    Function.RELU: "max({x}, 0)",
+    Function.SIGMOID: "sigmoid({x})",
+    Function.TANH: "tanh({x})",
+    Function.GELU: "gelu({x})",
+    Function.SOFTPLUS: "softplus({x})",
+    Function.EXP: "exp({x})",
+    Function.SQRT: "sqrt({x})",
+    Function.SINE: "sin({x})",
+    Function.COSINE: "cos({x})",
+    Function.POSITIVE: "positive({x})",
+}
+"""Element-wise functions by name."""
+
+
+def matlab_names(names: Sequence[str]) -> list[str]:
+    """Names as MATLAB names, different ones for different names: letters, digits, underscores, a letter first."""
+    made: list[str] = []
+    for name in map(identifier, names):
+        plain = name if re.match(r"[A-Za-z]", name) else f"x{name}"
+        tries = (plain[:LONGEST] if not n else f"{plain[: LONGEST - 6]}_{n}" for n in range(len(names) + 1))
+        made.append(next(found for found in tries if found not in made))
+    return made
+
+
+@dataclass(frozen=True, eq=False)
+class Native:
+    """Writes the layers of a graph as MATLAB code.
+
+    Attributes:
+        graph: the layers.
+    """
+
+    graph: Graph
+
+    @cached_property
+    def _fields(self) -> dict[tuple[str, str], str]:
+        """Names of values (no part), constants and slots, by layer and part."""
+        keys = [(layer.name, "") for layer in self.graph.layers]
+        keys += [(layer.name, part) for layer in self.graph.layers for part in self.laid(layer)]
+        keys += [(name, slot.name) for name, slot in self.graph.slots()]
+        short = (
+            "_".join(filter(None, (name.replace(".", "_")[-LONGEST_LAYER:], part))).lstrip("_") for name, part in keys
+        )
+        return dict(zip(keys, matlab_names(list(short)), strict=True))
+
+    def laid(self, layer: Layer) -> dict[str, Any]:
+        """A layer's constants in the order in which MATLAB reads them."""
+        held = {part: values.reshape(-1, 1) if values.ndim == 1 else values for part, values in layer.tensors().items()}
+        if isinstance(layer, memory.Convolution):
+            held["weight"] = layer.weight.reshape(len(layer.weight), -1)
+        elif isinstance(layer, layers.GroupedDense):
+            held |= {"weight": layer.weight.transpose(1, 2, 0), "bias": layer.bias.T}
+        elif isinstance(layer, memory.Rotation):
+            held["factor"] = layer.factor.T
+        elif isinstance(layer, layers.Gather) and len(self.runs(layer)) > MOST_PIECES:
+            held["columns"] = np.array([[column + 1] for column in layer.columns], dtype=float)
+        return held
+
+    def runs(self, layer: layers.Gather) -> list[tuple[int, int, int]]:
+        """Runs of neighbouring columns: which input, its first column, how many."""
+        return runs(layer.columns, [self.graph.width_of(name) for name in layer.inputs])
+
+    def value(self, name: str) -> str:
+        """The variable of a value."""
+        return "in" if name == INPUT else f"v.{self._fields[name, '']}"
+
+    def constant(self, layer: Layer, part: str) -> str:
+        """The constant of a layer."""
+        return f"w.{self._fields[layer.name, part]}"
+
+    def slot(self, layer: str, part: str) -> str:
+        """What a layer remembers."""
+        return f"s.{self._fields[layer, part]}"
+
+    def weights(self) -> dict[str, Any]:
+        """All constants by field."""
+        held = {(layer.name, part): values for layer in self.graph.layers for part, values in self.laid(layer).items()}
+        return {self._fields[key]: values for key, values in held.items()}
+
+    def start(self) -> dict[str, Array]:
+        """States after a reset by field: columns; rings have a column a tick, the oldest first."""
+        return {
+            self._fields[name, slot.name]: _column(self.graph.start(name, slot)) for name, slot in self.graph.slots()
+        }
+
+    def code(self) -> str:
+        """The statements of a tick: from ``in`` and states ``s`` to values ``v`` and the next states.
+
+        Raises:
+            ExportError: a layer has no form in MATLAB.
+        """
+        lines: list[str] = []
+        for layer in self.graph.layers:
+            write = WRITERS.get(type(layer))
+            if write is None:
+                raise ExportError(
+                    f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in MATLAB; these have: "
+                    f"{', '.join(sorted(kind.__name__ for kind in WRITERS))}"
+                )
+            lines.append(f"% {layer.name}: {type(layer).__name__}, {layer.width or 'no'} numbers")
+            lines += write(self, layer, [self.value(name) for name in layer.inputs])
+        return "\n".join(lines)
+
+    def results(self) -> str:
+        """The statement that lists the results."""
+        return "; ".join(f"out.{meaning} = {self.value(value)}" for meaning, value in self.graph.results.items()) + ";"
+
+
+def functions_for(code: str) -> str:
+    """The functions that code calls, and those that they call."""
+    text = resources.files("edp.export.simulink").joinpath("templates/layers.m.in").read_text()
+    known = {}
+    for part in re.split(r"^(?=function )", text, flags=re.MULTILINE):
+        found = re.match(r"function (?:.*?= )?(\w+)\(", part)
+        if found:
+            known[found[1]] = part.strip() + "\n"
+    wanted: set[str] = set()
+    search = [code]
+    while search:
+        for name in set(re.findall(r"\b(\w+)\(", search.pop())) & set(known) - wanted:
+            wanted.add(name)
+            search.append(known[name])
+    return "\n".join(part for name, part in known.items() if name in wanted)
+
+
+Write = Callable[[Native, Any, Sequence[str]], list[str]]
+
+
+def _column(values: Array) -> Array:
+    """Vectors as columns; rows of a matrix as columns."""
+    return np.ascontiguousarray(values.reshape(-1, 1) if values.ndim == 1 else values.T)
+
+
+def _simple(pattern: str) -> Write:
+    """A statement with the inputs as ``{0}``, ``{1}``, constants and slots by name, other fields of the layer too."""
+
+    def write(native: Native, layer: Any, x: Sequence[str]) -> list[str]:
+        names = {part: native.constant(layer, part) for part in native.laid(layer)}
+        names |= {f"s_{slot.name}": native.slot(layer.name, slot.name) for slot in layer.slots}
+        plain = {key: _plain(value) for key, value in vars(layer).items() if key not in names}
+        return [pattern.format(*x, y=native.value(layer.name), **(plain | names))]
+
+    return write
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{np.float32(value):.9g}" if isinstance(value, float) else value
+
+
+def _gather(native: Native, layer: layers.Gather, x: Sequence[str]) -> list[str]:
+    found = native.runs(layer)
+    if len(found) > MOST_PIECES:
+        joined = x[0] if len(x) == 1 else f"[{'; '.join(x)}]"
+        lines = [f"given = {joined};"]
+        return [*lines, f"{native.value(layer.name)} = given({native.constant(layer, 'columns')});"]
+    parts = []
+    for value, first, length in found:
+        whole = (first, length) == (0, native.graph.width_of(layer.inputs[value]))
+        ends = str(first + 1) if length == 1 else f"{first + 1}:{first + length}"
+        parts.append(x[value] if whole else f"{x[value]}({ends})")
+    joined = parts[0] if len(parts) == 1 else f"[{'; '.join(parts)}]"
+    return [f"{native.value(layer.name)} = {joined};"]
+
+
+def _activate(native: Native, layer: layers.Activate, x: Sequence[str]) -> list[str]:
+    return [f"{native.value(layer.name)} = {FUNCTIONS[layer.function].format(x=x[0])};"]
+
+
+def _convolution(native: Native, layer: memory.Convolution, x: Sequence[str]) -> list[str]:
+    if not layer.slots:
+        return _simple("{y} = {weight} * {0} + {bias};")(native, layer, x)
+    return _simple("[{y}, {s_ring}] = convolution({0}, {weight}, {bias}, {dilation}, {s_ring});")(native, layer, x)
+
+
+def _prefix(native: Native, layer: memory.PrefixCorrection, x: Sequence[str]) -> list[str]:
+    parts = ("first_weight", "first_bias", "second_weight", "second_bias")
+    named = ", ".join(f"'{part}', {native.constant(layer, part)}" for part in parts)
+    total, age = (native.slot(layer.name, part) for part in ("total", "age"))
+    lines = [
+        f"correction = struct({named});",
+        f"[change, {total}, {age}] = prefix({x[0]}, correction, {layer.ticks}, {total}, {age});",
+    ]
+    sizes, at = {(name, slot.name): slot.size for name, slot in native.graph.slots()}, 0
+    for owner in layer.corrects:
+        held, size = native.slot(*owner), sizes[owner]
+        lines.append(f"{held} = {held} + reshape(change({at + 1}:{at + size}), size({held}));")
+        at += size
+    return lines
+
+
+def _layer_norm_lstm(native: Native, layer: memory.LayerNormLstm, x: Sequence[str]) -> list[str]:
+    parts = {"x": "gain_x", "h": "gain_h", "c": "gain_c", "shift": "shift_c"}
+    named = ", ".join(f"'{key}', {native.constant(layer, part)}" for key, part in parts.items())
+    weights = "{weight_x}, {weight_h}, {bias}, norms"
+    call = f"[{{s_h}}, {{s_c}}] = layer_norm_lstm({{0}}, {weights}, {{share}}, {{epsilon}}, {{s_h}}, {{s_c}});"
+    return [f"norms = struct({named});", *_simple(call)(native, layer, x), *_simple("{y} = {s_h};")(native, layer, x)]
+
+
+WRITERS: dict[type[Layer], Write] = {
+    layers.Gather: _gather,
+    layers.Standardise: _simple("{y} = ({0} - {offset}) ./ {scale};"),
+    layers.ScaleShift: _simple("{y} = {gain} .* {0} + {shift};"),
+    layers.Add: _simple("{y} = {0} + {1};"),
+    layers.Subtract: _simple("{y} = {0} - {1};"),
+    layers.Multiply: _simple("{y} = {0} .* {1};"),
+    layers.Divide: _simple("{y} = {0} ./ {1};"),
+    layers.Minimum: _simple("{y} = min({0}, {1});"),
+    layers.Maximum: _simple("{y} = max({0}, {1});"),
+    layers.Activate: _activate,
+    layers.Glu: _simple("{y} = glu({0}, {rows});"),
+    layers.Accumulate: _simple("{y} = accumulate({0}, {rows});"),
+    layers.Dense: _simple("{y} = dense({0}, {weight}, {bias}, {rows});"),
+    layers.GroupedDense: _simple("{y} = grouped_dense({0}, {weight}, {bias});"),
+    layers.LayerNorm: _simple("{y} = layer_norm({0}, {gain}, {shift}, {epsilon}, {rows});"),
+    layers.RowAttention: _simple("{y} = row_attention({0}, {1}, {2}, {rows});"),
+    memory.Difference: _simple(
+        "[{y}, {s_before}, {s_age}] = difference({0}, {factor}, {from_zero}, {s_before}, {s_age});"
+    ),
+    memory.Starting: _simple("[{y}, {s_age}] = starting({0}, {mean}, {ticks}, {s_age});"),
+    memory.Convolution: _convolution,
+    memory.Lstm: _simple(
+        "[{s_h}, {s_c}] = lstm({0}, {weight_x}, {weight_h}, {bias}, {share}, {s_h}, {s_c}); {y} = {s_h};"
+    ),
+    memory.LayerNormLstm: _layer_norm_lstm,
+    memory.Gru: _simple("{s_h} = gru({0}, {weight_x}, {weight_h}, {bias_x}, {bias_h}, {s_h}); {y} = {s_h};"),
+    memory.MinGru: _simple("{s_h} = min_gru({0}, {s_h}); {y} = {s_h};"),
+    memory.Rotation: _simple("[{y}, {s_h}] = rotation({0}, {factor}, {s_h});"),
+    memory.TrailingMean: _simple("[{y}, {s_ring}, {s_age}] = trailing_mean({0}, {window}, {s_ring}, {s_age});"),
+    memory.AttentionPool: _simple(
+        "[{y}, {s_ring}, {s_scores}] = attention_pool({0}, {score}, {bias}, {s_ring}, {s_scores});"
+    ),
+    memory.WindowAttention: _simple(
+        "[{y}, {s_keys}, {s_values}, {s_age}] = "
+        "window_attention({0}, {1}, {2}, [{heads}, {window}], {s_keys}, {s_values}, {s_age});"
+    ),
+    memory.PrefixCorrection: _prefix,
+}
+"""By kind of layer."""

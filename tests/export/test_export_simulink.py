@@ -1,0 +1,416 @@
+"""The folder for MATLAB and Simulink: plain MATLAB code in Octave, S-function and C Caller as C, and their rules."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from edp.errors import ConfigError, ExportError
+from edp.export import make_target
+from edp.export.c.model import make_model
+from edp.export.description import as_mat
+from edp.export.golden import random_inputs, stream, tolerance
+from edp.export.simulink import native as native_file
+from edp.export.simulink.folder import Folder
+from edp.export.simulink.native import WRITERS, Native, functions_for, matlab_names
+from edp.export.simulink.target import SimulinkTarget
+from edp.graph import Graph, Layer, memory
+from edp.graph.reference import STEPS
+
+TICKS = 24
+"""More than two windows of the small networks."""
+LONG = 300
+"""Ticks over which PyTorch's own error is looked for."""
+STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-O1")
+HEAP = {"malloc", "calloc", "realloc", "free", "alloca"}
+
+
+def octave(program: str, folder: Path) -> str:
+    """What Octave prints."""
+    if shutil.which("octave-cli") is None:
+        pytest.skip("needs the Debian package octave (make system-packages)")
+    script = folder / "program_of_the_test.m"
+    script.write_text(program)
+    done = subprocess.run(["octave-cli", "--norc", "--quiet", str(script)], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="session")
+def folder_of(bundle_of, tmp_path_factory):
+    """Folders as they are exported, by network."""
+    made: dict[tuple[str, bool], Path] = {}
+
+    def make(structure: str, whole: bool = False) -> Path:
+        if (structure, whole) not in made:
+            pytest.importorskip("onnx", reason="needs the package onnx: the extra dev has it")
+            folder = tmp_path_factory.mktemp("simulink")
+            SimulinkTarget().write(bundle_of(structure, whole), "arm", folder)
+            made[structure, whole] = folder
+        return made[structure, whole]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def natives(bundle_of, parts, tmp_path_factory):
+    """The largest difference of the MATLAB code, as a share of what is allowed, by network; all in one Octave."""
+    top, wanted = tmp_path_factory.mktemp("natives"), {}
+    lines = ["found = struct();"]
+    for number, structure in enumerate(parts[0]):
+        bundle, folder = bundle_of(structure), top / f"n{number}"
+        folder.mkdir()
+        inputs = random_inputs(bundle.predictor, LONG, seed=3)
+        made = Folder(make_model("arm", bundle), window=False)
+        for file, text in made.texts().items():
+            (folder / file).write_text(text)
+        (folder / "arm.mat").write_bytes(as_mat({**made.tables(), "inputs": inputs[:TICKS]}))
+        outputs = stream(bundle.predictor, inputs)
+        wanted[structure] = (f"n{number}", outputs[:TICKS], tolerance(bundle.predictor, inputs, outputs))
+        lines += [f"addpath('{folder}'); net = arm_load();", "[y, status] = arm_stream(net, net.inputs);"]
+        lines += [f"found.n{number} = y; found.s{number} = status;", f"rmpath('{folder}'); clear -f;"]
+    octave("\n".join([*lines, f"save('-v6', '{top}/found.mat', '-struct', 'found');"]), top)
+    found = scipy.io.loadmat(top / "found.mat")
+    return {
+        structure: (np.abs(found[key] - rows) / allowed, found[key.replace("n", "s")].ravel())
+        for structure, (key, rows, allowed) in wanted.items()
+    }
+
+
+def test_matlab_code_predicts_what_pytorch_predicts(structure, natives):
+    shares, status = natives[structure]
+    assert shares.shape[0] == TICKS
+    assert shares.max() < 1
+    assert status.tolist() == [1] * 8 + [0] * (TICKS - 8)
+
+
+def test_every_kind_of_layer_has_matlab_code():
+    assert set(WRITERS) == set(STEPS) | {memory.PrefixCorrection}
+
+
+class Strange(Layer):
+    @property
+    def width(self):
+        return 1
+
+
+def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path):
+    graph = Graph(1, (Strange(name="odd.one", inputs=("input",)),), {"prediction": "odd.one"})
+    with pytest.raises(ExportError, match=r"layer 'odd\.one' is a Strange, which has no form in MATLAB; .* Accumulate"):
+        Native(graph).code()
+    with pytest.raises(ExportError, match=r"21 characters; .* at most 20"):
+        SimulinkTarget().write(bundle_of("lstm"), "a" * 21, tmp_path)
+    with pytest.raises(ExportError, match="--name"):
+        SimulinkTarget().write(bundle_of("lstm"), "Arm", tmp_path)
+    with pytest.raises(ExportError, match="opset 12"):
+        make_target("simulink", {"opset": "12"})
+    with pytest.raises(ConfigError, match="'maybe'; it must be true or false"):
+        make_target("simulink", {"window": "maybe"})
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_of_matlab_are_their_own():
+    names = matlab_names(["a b", "a-b", "2x", "_y", "x" * 80, "x" * 81])
+    assert len(set(names)) == len(names)
+    assert all(re.fullmatch(r"[A-Za-z]\w{0,62}", name) for name in names)
+
+
+def test_only_functions_that_are_called_are_written():
+    found = re.findall(r"^function .*?(\w+)\(", functions_for("y = lstm(x); z = tanh(y);"), re.MULTILINE)
+    assert found == ["lstm", "gated", "mixed", "normed", "sigmoid"]
+    text = (Path(native_file.__file__).parent / "templates/layers.m.in").read_text()
+    every = functions_for(" ".join(re.findall(r"\w+\(", text)))
+    assert every.count("function ") == text.count("function ")
+
+
+def test_files_are_the_same_each_time_and_described(bundle_of, folder_of, tmp_path):
+    folder, bundle = folder_of("hybrid+quantiles"), bundle_of("hybrid+quantiles")
+    files = SimulinkTarget().write(bundle, "arm", tmp_path)
+    assert files[0].name == "README.md"
+    for file in files:
+        assert file.read_bytes() == (folder / file.relative_to(tmp_path)).read_bytes()
+    described = json.loads((folder / "arm.json").read_text())
+    read = scipy.io.loadmat(folder / "arm.mat", simplify_cells=True)
+    assert [entry["name"] for entry in described["inputs"]] == list(bundle.task.inputs)
+    assert [entry["field"] for entry in read["edp"]["inputs"]] == [entry["field"] for entry in described["inputs"]]
+    assert {"rules", "status", "model_hash", "rate_hz", "window", "mode"} <= set(described) == set(read["edp"])
+    assert described["status"] == ["ok", "warming", "held", "restarted", "not_reset"]
+    readme = files[0].read_text()
+    assert all(f"`{file.name}`" in readme for file in files if file.parent == tmp_path and file.suffix != ".md")
+    assert "Not checked, for want of MATLAB" in readme
+    assert all(line.count("|") == 4 for line in readme.splitlines() if line.startswith("| `"))
+
+
+def test_without_the_window_and_in_whole_numbers(bundle_of, folder_of, tmp_path):
+    files = {file.name for file in SimulinkTarget(window=False).write(bundle_of("lstm"), "arm", tmp_path)}
+    assert "arm_step.m" in files
+    assert not files & {"arm_onnx.m", "arm_window.onnx"}
+    folder = folder_of("hybrid", True)
+    there = {file.name for file in folder.iterdir()}
+    assert {"arm_sfun.c", "arm_call.c", "arm_golden.m"} <= there
+    assert not there & {"arm_step.m", "arm_reset.m", "arm_stream.m", "arm_onnx.m", "arm_window.onnx"}
+    assert "whole numbers: there is C code only" in (folder / "README.md").read_text()
+
+
+def test_octave_reads_every_file_of_matlab(folder_of, tmp_path):
+    """Those that need MATLAB or Simulink are parsed only."""
+    files = [file for whole in (False, True) for file in sorted(folder_of("hybrid", whole).glob("*.m"))]
+    assert len(files) == 13 + 9
+    octave("\n".join(f"__parse_file__('{file}');" for file in files), tmp_path)
+
+
+def test_names_widths_rates_and_states_of_others_are_refused(folder_of, bundle_of, tmp_path):
+    folder, names = folder_of("hybrid"), bundle_of("hybrid").task.inputs
+    cells = ", ".join(f"'{name}'" for name in names)
+    program = f"""
+addpath('{folder}'); net = arm_load();
+function say(f)
+    try f(); disp('taken'); catch problem, disp([problem.identifier, ' ', problem.message]); end
+end
+names = {{{cells}}};
+say(@() arm_names(net, names));
+say(@() arm_names(net, names([2 1 3:end])));
+say(@() arm_names(net, names(2:end)));
+say(@() arm_names(net, [names, {{'more'}}]));
+s = arm_reset(net);
+say(@() arm_step(net, zeros({len(names) - 1}, 1), s));
+say(@() arm_step(net, 'text', s));
+say(@() arm_step(net, [], s, 1.5));
+say(@() arm_stream(net, zeros(3, {len(names) + 1})));
+recording = struct();
+for at = numel(names):-1:1, recording.(names{{at}}) = (1:4)' + 10 * at; end
+recording.other = 1;
+rows = arm_rows(net, recording); disp(rows(2, :) - 10 * (1:numel(names)));
+say(@() arm_rows(net, rmfield(recording, names{{2}})));
+recording.(names{{3}}) = 1;
+say(@() arm_rows(net, recording));
+[out, status] = arm_step(net, zeros({len(names)}, 1), []); disp([status, out.prediction(1)]);
+s.marker = 'another'; [out, status] = arm_step(net, zeros({len(names)}, 1), s); disp([status, out.prediction(1)]);
+say(@() arm_golden('strange'));
+"""
+    said = octave(program, tmp_path).splitlines()
+    assert said[0] == "taken"
+    assert said[1].startswith(f"edp:names arm: signal 1 is {names[1]}, but it must be {names[0]}")
+    assert said[2].startswith(f"edp:names arm: missing: {names[0]}; it reads: {names[0]}, ")
+    assert said[3].endswith("leave out: more")
+    assert [line.split()[0] for line in said[4:8]] == ["edp:width", "edp:width", "edp:missed", "edp:width"]
+    assert said[8].split() == ["2"] * len(names)
+    assert said[9].startswith(f"edp:names arm: missing: {names[1]} (")
+    assert said[10].startswith("edp:length arm: ")
+    assert [line.split() for line in said[11:13]] == [["4", "NaN"]] * 2
+    assert said[13].startswith("edp:form arm_golden: no form strange; there are native, octave, sfun, onnx")
+
+
+def hard_rows(predictor, ticks=90):
+    """Inputs with bad ticks, single ones and a long run of them."""
+    rows = random_inputs(predictor, ticks, seed=6).astype(float)
+    rows[20, 0], rows[30, 1] = np.nan, np.inf
+    rows[40:49] = np.nan
+    rows[60, :] = 1e30
+    return rows
+
+
+@pytest.mark.parametrize("network", ["hybrid9", "tcn+quantiles"])
+def test_matlab_code_and_the_s_function_in_octave_keep_the_same_rules(network, c, folder_of, bundle_of, tmp_path):
+    """The S-function as a MEX: same statuses and counts, numbers within what is allowed, golden recording too."""
+    c.need("gcc")
+    if shutil.which("mkoctfile") is None:
+        pytest.skip("needs the Debian package octave-dev (make system-packages)")
+    folder, predictor = folder_of(network), bundle_of(network).predictor
+    rows = hard_rows(predictor)
+    scipy.io.savemat(tmp_path / "rows.mat", {"rows": rows})
+    program = f"""
+addpath('{folder}'); net = arm_load(); load('rows.mat');
+arm_golden('native'); arm_golden('octave');
+[found, status, counts] = arm_octave(rows);
+late = (0:size(rows, 1) - 1)' / {predictor.task.rate_hz};
+late(70:end) += 3 / {predictor.task.rate_hz}; late(80:end) += 1;
+[found2, status2, counts2] = arm_octave(rows, late);
+s = arm_reset(net); numbers = []; said = []; counted = [];
+s2 = s; numbers2 = []; said2 = []; counted2 = [];
+for tick = 1:size(rows, 1)
+    [out, said(tick, 1), s] = arm_step(net, rows(tick, :), s);
+    parts = cellfun(@(x) reshape(x.', 1, []), struct2cell(out), 'UniformOutput', false);
+    numbers(tick, :) = [parts{{:}}];
+    counted(tick, :) = [s.ticks, s.rejected, s.held, s.restarts];
+    if tick == 70, [~, ~, s2] = arm_step(net, [], s2, 3); end
+    if tick == 80, [~, ~, s2] = arm_step(net, [], s2, {predictor.task.rate_hz:g}); end
+    [out, said2(tick, 1), s2] = arm_step(net, rows(tick, :), s2);
+    parts = cellfun(@(x) reshape(x.', 1, []), struct2cell(out), 'UniformOutput', false);
+    numbers2(tick, :) = [parts{{:}}];
+    counted2(tick, :) = [s2.ticks, s2.rejected, s2.held, s2.restarts];
+end
+save('-v6', 'found.mat');
+"""
+    printed = octave(program, tmp_path)
+    assert printed.count("of what is allowed, over 200 ticks") == 2
+    found = scipy.io.loadmat(tmp_path / "found.mat")
+    allowed = 2 * tolerance(predictor, rows[:20].astype(np.float32), stream(predictor, rows[:20].astype(np.float32)))
+    for two in ("", "2"):
+        np.testing.assert_array_equal(found[f"status{two}"], found[f"said{two}"])
+        np.testing.assert_array_equal(found[f"counts{two}"], found[f"counted{two}"])
+        np.testing.assert_array_equal(np.isnan(found[f"found{two}"]), np.isnan(found[f"numbers{two}"]))
+        np.testing.assert_array_equal(np.isnan(found[f"found{two}"]).all(axis=1), found[f"status{two}"].ravel() >= 3)
+        assert (np.abs(np.nan_to_num(found[f"found{two}"] - found[f"numbers{two}"])) <= 100 * allowed).all()
+    status = found["status"].ravel()
+    assert set(status) == {0, 1, 2, 3}
+    assert (status[40:49] == [2] * 5 + [3] * 4).all()
+    assert found["status2"].ravel()[78:81].tolist() == [0, 1, 1]
+    assert found["counts2"][-1].tolist() == [90 + 3 + predictor.task.rate_hz, 12, 5 + 3 + 3, 2]
+
+
+@pytest.fixture(scope="session")
+def blocks(c, folder_of, tmp_path_factory):
+    """Programs that run a network's S-function, and libraries with its C Caller function."""
+
+    def make(structure: str, whole: bool = False) -> tuple[Path, Path]:
+        c.need("gcc")
+        folder, made = folder_of(structure, whole), tmp_path_factory.mktemp("blocks")
+        core = sorted((folder / "core").glob("*.c"))
+        places = ("-I", folder / "octave", "-I", folder / "core")
+        sources = [folder / "arm_sfun.c", folder / "octave/stub_main.c"]
+        c.run("gcc", *STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DSFUN=arm_sfun",
+              *places, *sources, *core, "-lm", "-o", made / "sfun")  # fmt: skip
+        c.run("gcc", *STRICT, "-shared", "-fPIC", *places, folder / "arm_call.c", *core, "-lm", "-o", made / "call.so")
+        return made / "sfun", made / "call.so"
+
+    return make
+
+
+class Block:
+    """Runs the S-function over rows."""
+
+    def __init__(self, program, predictor, shapes):
+        self.program, self.period = program, 1 / predictor.task.rate_hz
+        self.numbers = sum(rows * columns for rows, columns in shapes.values())
+
+    def __call__(self, rows, times=None, blocks=0, minor=0, resets=0, period=None):
+        ticks = len(rows)
+        head = np.zeros((ticks, 4))
+        head[:, 0], head[:, 2], head[:, 3] = blocks, minor, resets
+        head[:, 1] = np.arange(ticks) * self.period if times is None else times
+        given = np.hstack([head, rows]).tobytes()
+        done = subprocess.run([self.program, repr(period or self.period)], input=given, capture_output=True)
+        found = np.frombuffer(done.stdout).reshape(-1, self.numbers + 5)
+        return found[:, : self.numbers], found[:, self.numbers].astype(int), found[:, -4:], done.stderr.decode().strip()
+
+
+@pytest.mark.parametrize(("network", "whole"), [("hybrid+all", False), ("tcn+quantiles", False), ("hybrid", True)])
+def test_the_blocks_give_the_bits_of_the_c_code_and_keep_its_rules(network, whole, blocks, bundle_of, folder_of):
+    """S-function under the sanitisers, and the C Caller's function, side by side."""
+    program, library = blocks(network, whole)
+    bundle = bundle_of(network, whole)
+    predictor = bundle.predictor
+    made = Folder(make_model("arm", bundle), window=False)
+    run = Block(program, predictor, made.described.shapes)
+    inputs = random_inputs(predictor, 60, seed=5)
+    found, status, counts, error = run(inputs)
+    assert error == ""
+    wanted = stream(predictor, inputs)
+    assert (np.abs(found - wanted) <= tolerance(predictor, inputs, wanted)).all()
+    assert status.tolist() == [1] * 8 + [0] * 52
+    np.testing.assert_array_equal(counts, np.outer(np.arange(1, 61), [1, 0, 0, 0]))
+    function, words = ctypes.CDLL(str(library)).arm_call, made.words
+    hard = hard_rows(predictor).astype(np.float32)
+    resets = np.zeros(len(hard), dtype=bool)
+    resets[75] = True
+    found, status, counts, error = run(hard, resets=resets)
+    assert error == ""
+    state, rows, said = np.zeros(words, np.uint32), np.zeros_like(found), np.zeros(len(hard), np.int32)
+    for tick, row in enumerate(hard):
+        state, rows[tick], said[tick] = call(function, made.described.shapes, row, resets[tick], 0, state)
+    np.testing.assert_array_equal(rows, found)
+    np.testing.assert_array_equal(said, status)
+    assert (status >= 3).tolist() == np.isnan(found).all(axis=1).tolist()
+    assert counts[74].tolist() == [75, 12, 8, 1]
+    assert counts[75].tolist() == [1, 0, 0, 0]
+    assert status[75] == 1
+
+
+def call(function, shapes, row, reset, missed, state):
+    """One call of the C Caller's function: next state, results one behind the other, status."""
+    given, following = np.ascontiguousarray(row, np.float32), np.zeros_like(state)
+    results = [np.zeros(rows * columns, np.float32) for rows, columns in shapes.values()]
+    status = np.zeros(1, np.int32)
+    pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (given, state, following, *results, status)]
+    function(pointers[0], ctypes.c_bool(reset), ctypes.c_uint32(missed), *pointers[1:])
+    return following, np.concatenate(results), status[0]
+
+
+def test_the_s_function_watches_time_and_blocks_are_their_own(blocks, bundle_of):
+    program, library = blocks("hybrid")
+    bundle = bundle_of("hybrid")
+    predictor = bundle.predictor
+    made = Folder(make_model("arm", bundle), window=False)
+    run, shapes = Block(program, predictor, made.described.shapes), made.described.shapes
+    rows, period = random_inputs(predictor, 40, seed=5).astype(float), run.period
+    alone, status, _, _ = run(rows)
+    for wrong in (2 * period, period / 10, 1e-9):
+        assert "must run every 0.01 s, the sample time of the network" in run(rows, period=wrong)[3]
+    # Ticks that an enabled subsystem did not run: as the C Caller is told.
+    times = np.arange(40) * period
+    times[20:] += 3 * period
+    times[30:] += 100 * period
+    found, status, counts, error = run(rows, times)
+    state, function = np.zeros(made.words, np.uint32), ctypes.CDLL(str(library)).arm_call
+    for tick, row in enumerate(rows):
+        state, numbers, said = call(function, shapes, row, False, {20: 3, 30: 100}.get(tick, 0), state)
+        np.testing.assert_array_equal(numbers, found[tick])
+        assert said == status[tick]
+    assert error == ""
+    assert counts[-1].tolist() == [143, 0, 3, 1]
+    np.testing.assert_array_equal(found[30:], run(rows[30:])[0])
+    # Twice at one time: the same inputs change nothing, others are an algebraic loop.
+    twice = np.repeat(np.arange(40) * period, 2)
+    np.testing.assert_array_equal(run(np.repeat(rows, 2, axis=0), twice)[0][1::2], alone)
+    other = np.repeat(rows, 2, axis=0)
+    other[21, 0] += 1
+    found, *_, error = run(other, twice)
+    assert "algebraic loop" in error
+    assert len(found) == 22
+    assert "not a whole number of ticks" in run(rows, np.arange(40) * period * 1.5)[3]
+    assert "not a whole number of ticks" in run(rows, np.arange(40)[::-1] * period)[3]
+    # Minor steps of a continuous solver between ticks are no ticks.
+    minor = np.tile([0, 1], 40)
+    shifted = twice + minor * period / 2
+    np.testing.assert_array_equal(run(np.repeat(rows, 2, axis=0), shifted, minor=minor)[0][0::2], alone)
+    # Two blocks in one model.
+    pairs = np.stack([rows, rows[::-1]], axis=1).reshape(80, -1)
+    found, _, counts, _ = run(pairs, twice, blocks=np.tile([0, 1], 40))
+    np.testing.assert_array_equal(found[0::2], alone)
+    np.testing.assert_array_equal(found[1::2], run(rows[::-1])[0])
+
+
+def test_a_state_of_another_network_is_not_taken(blocks, bundle_of):
+    bundle = bundle_of("hybrid")
+    made = Folder(make_model("arm", bundle), window=False)
+    function, row = ctypes.CDLL(str(blocks("hybrid")[1])).arm_call, random_inputs(bundle.predictor, 1, seed=5)[0]
+    state, _, _ = call(function, made.described.shapes, row, False, 0, np.zeros(made.words, np.uint32))
+    at = np.flatnonzero(state == (int(made.content()["model_hash"][:8], 16) | 1))
+    assert len(at) == 1
+    state[at] += 2
+    for missed in (0, 3):
+        _, numbers, status = call(function, made.described.shapes, row, False, missed, state)
+        assert status == 4
+        assert np.isnan(numbers).all()
+    assert call(function, made.described.shapes, row, True, 0, state)[2] == 1  # a reset takes it
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_nothing_of_a_block_is_on_the_heap(whole, c, folder_of, tmp_path):
+    c.need("gcc")
+    folder = folder_of("hybrid", whole)
+    for file in (*sorted((folder / "core").glob("*.c")), folder / "arm_sfun.c", folder / "arm_call.c"):
+        made = tmp_path / f"{file.stem}.o"
+        c.run("gcc", *STRICT, "-fno-pie", "-I", folder / "octave", "-I", folder / "core", "-c", file, "-o", made)
+        assert not set(c.run("nm", "-u", "-j", made).decode().split()) & HEAP
+        kinds = {line.split()[-2] for line in c.run("nm", made).decode().splitlines()}
+        assert not kinds & {"B", "b", "D", "d", "C"}  # no numbers that blocks would share
