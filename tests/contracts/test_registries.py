@@ -157,6 +157,7 @@ BAD = [
     lambda: ACTIVATIONS["stanh"](start=6.0),
     lambda: LOSSES["huber"](delta=0.0),
     lambda: OPTIMIZERS["adamw"](learning_rate=0.0),
+    lambda: OPTIMIZERS["discriminative"](rates=(("backbone", 0.0),)),
     lambda: SCHEDULES["cosine"](floor=1.5),
     lambda: ModelSpec(window=0),
     lambda: PHYSICS["kinematic"](pose="angels"),

@@ -1,6 +1,7 @@
 """What the README and the examples show is run as it stands there."""
 
 import dataclasses
+import inspect
 import re
 import runpy
 import sys
@@ -13,6 +14,7 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
+from edp.cli.finetune import finetune
 from edp.compress import DistillationSpec
 from edp.config import TAGGED, TaskSettings, load_experiment
 from edp.data.chunks import ChunkSpec
@@ -31,6 +33,7 @@ from edp.search.settings import SearchSpec
 from edp.signals import TABLE_A1
 from edp.sources import RecordingEntry, load_data_set, load_signal_map
 from edp.training import TrainingSpec
+from edp.transfer import METHODS, FinetuneSpec
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -135,6 +138,18 @@ def test_compression_page_names_every_option_and_shows_the_budget_of_the_example
     (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     whole = (EXAMPLES / "budgets" / "small_controller.toml").read_text(encoding="utf-8")
     assert whole.endswith(example)
+
+
+def test_finetune_page_names_every_option_with_its_default_and_every_method():
+    page = (ROOT / "docs" / "finetune.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\| `(\w+)` \| `(.+?)` \|", page, re.MULTILINE)
+    assert shown == [(entry.name, str(entry.default)) for entry in dataclasses.fields(FinetuneSpec)]
+    named = re.findall(r"^\| `(\w+)` \| (?!`)", page.split("## Methods")[1], re.MULTILINE)
+    assert set(named) == set(METHODS)
+    options = inspect.signature(finetune).parameters
+    for entry in dataclasses.fields(FinetuneSpec):
+        if entry.name != "check_signs":
+            assert options[entry.name].default == entry.default, entry.name
 
 
 def test_search_page_names_every_phase_and_key_and_shows_the_examples():

@@ -15,6 +15,7 @@ from edp.cli import (
     distil,
     evaluate,
     export,
+    finetune,
     footprint,
     inspect,
     quantise,
@@ -44,6 +45,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.add_typer(search.app, name="search")
 app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)
+app.command("finetune")(finetune.finetune)
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)
 app.command("quantise")(quantise.quantise)

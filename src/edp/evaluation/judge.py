@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,14 @@ from edp.data.prepared import Prepared
 from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
-from edp.evaluation.baselines import BASELINES, BaselineTask
+from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
 from edp.metrics import Scores, interval_scores, mean_scores, score, spread
 from edp.models.predictor import Predictor
 from edp.models.running import stream_intervals, stream_predictions
 from edp.signals import KINDS
 
 Predictions = list[NDArray[np.float32]]
+B = TypeVar("B", bound=Baseline)
 SPEED_BINS = 6
 
 
@@ -85,14 +86,11 @@ def judge(
     say("network")
     predictions = {"network": stream_predictions(predictor, data.test)}
     names, times = {"network": label}, {"network": seconds}
-    task = baseline_task(data, spec)
-    known = {part: _with_derived_targets(data, getattr(data, part)) for part in ("train", "validation", "test")}
     for name in spec.baselines:
         say(name)
         began = time.perf_counter()
-        baseline = BASELINES[name](task)
-        baseline.fit(known["train"], known["validation"])
-        predictions[name] = [baseline.predict(series) for series in known["test"]]
+        predict, baseline = baseline_predictions(BASELINES[name], data, spec)
+        predictions[name] = predict(data)
         names[name], times[name] = baseline.label, time.perf_counter() - began
     skip = predictor.spec.window if spec.skip is None else spec.skip
     if data.task.features.starting:  # While the start is read there is nothing to predict.
@@ -107,6 +105,13 @@ def judge(
         say("intervals")
         models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
     return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
+
+
+def baseline_predictions(kind: type[B], data: Prepared, spec: JudgeSpec) -> tuple[Callable[[Prepared], Predictions], B]:
+    """A baseline fitted on the training part: what it predicts on the test part of this or other data, and itself."""
+    baseline = kind(baseline_task(data, spec))
+    baseline.fit(_with_derived_targets(data, data.train), _with_derived_targets(data, data.validation))
+    return lambda other: [baseline.predict(part) for part in _with_derived_targets(other, other.test)], baseline
 
 
 def score_predictions(predictions: Predictions, data: Prepared, skip: int) -> dict[str, Any]:

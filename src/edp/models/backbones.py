@@ -34,6 +34,10 @@ class BackboneSpec(Protocol):
         """The slots that it offers."""
         ...
 
+    def parts(self) -> tuple[str, ...]:
+        """Sub-modules of what it builds, from the input on, for learning rates that differ; none: it is one piece."""
+        ...
+
 
 BACKBONES: Registry[type] = Registry("backbone")
 
@@ -66,6 +70,10 @@ class LstmSpec:
     def slots(self) -> tuple[Slot, ...]:
         """Features derived from the recurrent states."""
         return (Slot.FEATURES,)
+
+    def parts(self) -> tuple[str, ...]:
+        """The recurrent layers, then what reads their states."""
+        return ("recurrent", "pooling", "extras")
 
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """The recurrent backbone on the scaled features."""
@@ -101,6 +109,10 @@ class GruSpec:
         """Features derived from the recurrent states."""
         return (Slot.FEATURES,)
 
+    def parts(self) -> tuple[str, ...]:
+        """The recurrent layers, then what reads their states."""
+        return ("recurrent", "pooling", "extras")
+
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """The recurrent backbone on the scaled features."""
         stack = Stack(self.cell, features, self.units, self.layers, self.dropout)
@@ -129,6 +141,10 @@ class TcnSpec:
     def slots(self) -> tuple[Slot, ...]:
         """Parallel stacks, and what works on their channels."""
         return (Slot.BRANCHES, Slot.CHANNELS)
+
+    def parts(self) -> tuple[str, ...]:
+        """One piece."""
+        return ()
 
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """The convolution stack(s); refused where the receptive field is shorter than the window."""
@@ -182,6 +198,10 @@ class HybridSpec:
     def slots(self) -> tuple[Slot, ...]:
         """Parallel stacks, what works on their channels, and features derived from the recurrent states."""
         return (Slot.BRANCHES, Slot.CHANNELS, Slot.FEATURES)
+
+    def parts(self) -> tuple[str, ...]:
+        """The convolutions, the recurrent layers, then what reads their states."""
+        return ("encoder", "recurrent", "pooling", "extras")
 
     def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
         """Convolutions and the recurrent backbone on their channels."""

@@ -1,0 +1,126 @@
+"""``edp finetune``: a network of one machine, trained on for another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from edp.report.transfer_facts import Transfer
+    from edp.training import Event
+
+
+def finetune(
+    bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
+    logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, a folder of logs, or a data-set file.")],
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished one goes on.")],
+    method: Annotated[str, typer.Option(help="The method whose network is kept.")] = "two_phase",
+    rivals: Annotated[
+        str, typer.Option(help="Comma-separated methods to compare with, 'all' or 'none'.")
+    ] = "ridge_arx",
+    head_epochs: Annotated[int, typer.Option(help="Epochs of phase 1, the head alone.")] = 15,
+    epochs: Annotated[int, typer.Option(help="Epochs of phase 2, everything.")] = 25,
+    head_rate: Annotated[float, typer.Option(help="Learning rate of the head, and of methods with one rate.")] = 3e-4,
+    backbone_rate: Annotated[float, typer.Option(help="Learning rate of the backbone in phase 2.")] = 1e-5,
+    depth_decay: Annotated[float, typer.Option(help="Rate of a part of the backbone over that of the next.")] = 1.0,
+    batch: Annotated[int, typer.Option(help="Lanes of a chunk, or windows, of an update.")] = 32,
+    smoothness: Annotated[float, typer.Option(help="Weight of the smoothness of predictions; 0: none.")] = 0.05,
+    weight_decay: Annotated[float, typer.Option(help="Lambda of AdamW.")] = 1e-4,
+    patience: Annotated[int, typer.Option(help="Epochs without gain before a phase ends; 0: never.")] = 8,
+    rank: Annotated[int, typer.Option(help="Of the low-rank adapters.")] = 8,
+    any_sign: Annotated[bool, typer.Option("--any-sign", help="Take logs of another sign convention.")] = False,
+    changes: Annotated[
+        list[str], typer.Option("--set", help="One setting of the trainings, for example training.updates=100.")
+    ] = [],  # noqa: B006
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Train a network of one machine on with logs of another, and judge it beside rivals on the same ticks.
+
+    Each log is divided by time: its beginning trains, a part validates, its end tests. The source's scaling is
+    carried. What comes out is a run: judge, report and export it. Stop it at any moment (Ctrl-C): the same command
+    goes on.
+
+    Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --rivals all`
+    """
+    from edp.report import read_transfer, write_transfer_page
+    from edp.transfer import METHODS, FinetuneSpec, Order, Watchers
+    from edp.transfer import finetune as make
+
+    spec = FinetuneSpec(
+        head_epochs=head_epochs,
+        epochs=epochs,
+        head_rate=head_rate,
+        backbone_rate=backbone_rate,
+        depth_decay=depth_decay,
+        batch=batch,
+        smoothness=smoothness,
+        weight_decay=weight_decay,
+        patience=patience,
+        rank=rank,
+        check_signs=not any_sign,
+    )
+    named = {"all": tuple(METHODS), "none": ()}.get(rivals) or tuple(name for name in rivals.split(",") if name)
+    order = Order(spec=spec, method=method, rivals=() if rivals == "none" else named, changes=tuple(changes))
+    source = source_of(logs, signal_map, repair)
+    with progress(as_json) as shown:
+        display = _Display(shown, Steps(as_json), as_json)
+        watchers = Watchers(display.on_note, display.on_training, display.on_method)
+        found = make(bundle, source, order, folder, watchers)
+    page = write_transfer_page(folder)
+    facts = read_transfer(folder)
+
+    def show() -> None:
+        _tables(facts)
+        out.print(f"report: {page}")
+        out.print(f"next: edp evaluate {folder}, or edp export {folder} --to c --out exported")
+
+    emit(as_json, found | {"run": str(folder), "report": str(page)}, show)
+
+
+def _tables(facts: Transfer) -> None:
+    from edp.report import transfer_facts as words
+
+    for horizon in facts.horizons:
+        for sheet in words.sheets_of(facts, horizon):
+            heads = [f"{column.heading} [{column.unit}]" if column.unit else column.heading for column in sheet.columns]
+            table(sheet.caption, heads, sheet.texts())
+            out.print()
+    out.print(words.headline(facts))
+    for line in words.verdict(facts):
+        out.print(line)
+
+
+class _Display:
+    """Shows which method is at work, and the time left of its training."""
+
+    def __init__(self, shown: Progress, steps: Steps, quiet: bool) -> None:
+        self.shown, self.steps, self.quiet = shown, steps, quiet
+        self.bar = shown.add_task("finetune", total=1.0, note="reading recordings")
+        self.done, self.count = 0, 1
+
+    def on_note(self, text: str) -> None:
+        """Print a sentence."""
+        if not self.quiet:
+            out.print(text)
+
+    def on_method(self, name: str, done: int, count: int) -> None:
+        """A method begins."""
+        self.done, self.count = done, count
+        self.shown.update(self.bar, completed=done / count, note=name)
+        self.steps.say(f"finetune: method {done + 1} of {count}, {name}", force=True)
+
+    def on_training(self, name: str, event: Event) -> None:
+        """Show an event of a training."""
+        part = ((event.epoch - 1) * event.updates + event.update) / (event.epochs * event.updates)
+        note = f"{name}, method {self.done + 1} of {self.count}, epoch {event.epoch}/{event.epochs}"
+        self.shown.update(self.bar, completed=(self.done + part) / self.count, note=note)
+        self.steps.say(f"finetune: {note}, {duration(event.seconds_left)} left of it", force=event.row is not None)

@@ -1,0 +1,63 @@
+"""The report of a transfer: one offline HTML page, tables and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from edp.report import transfer_facts as words
+from edp.report.drawing import write_drawings
+from edp.report.page import asset, script_json
+from edp.report.sheets import Sheet
+from edp.report.templates import template
+from edp.report.transfer_facts import Transfer, read_transfer
+from edp.report.transfer_plots import drawings, transfer_plots
+from edp.report.wording import unbroken
+from edp.storage import make_folder, write_bytes
+
+
+def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
+    """Write ``transfer.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp finetune`.
+
+    Returns:
+        The page.
+
+    Raises:
+        StorageError: the folder holds no transfer, or a file cannot be written.
+    """
+    facts = read_transfer(folder)
+    tables = [sheet for horizon in reversed(facts.horizons) for sheet in words.sheets_of(facts, horizon)]
+    page = facts.folder / "transfer.html"
+    write_bytes(page, render(facts, tables).encode())
+    for sheet in tables:
+        place = make_folder(facts.folder / "tables") / sheet.name
+        write_bytes(place.with_suffix(".csv"), sheet.csv().encode())
+        write_bytes(place.with_suffix(".md"), sheet.markdown().encode())
+    if pictures:
+        write_drawings(facts.folder / "pictures", drawings(facts))
+    return page
+
+
+def render(facts: Transfer, tables: list[Sheet]) -> str:
+    """The page's text."""
+    plots = transfer_plots(facts)
+    context: dict[str, Any] = {
+        "title": facts.folder.resolve().name,
+        "network": facts.held["network"],
+        "headline": unbroken(words.headline(facts)),
+        "verdict": words.verdict(facts),
+        "tiles": words.tiles(facts),
+        "caveats": words.caveats(facts),
+        "pairs": [sheet.table() for sheet in tables if sheet.name.startswith("pair")],
+        "methods": [sheet.table() for sheet in tables if sheet.name.startswith("methods")],
+        "both": words.SOURCE in facts.worlds,
+        "plots": plots,
+        "specs": script_json([plot.spec() for plot in plots.values()]),
+        "style": Markup(asset("page.css")),
+        "script": Markup(asset("page.js")),
+        "plotly": Markup(get_plotlyjs()),
+    }
+    return template("transfer.html.jinja").render(**context)

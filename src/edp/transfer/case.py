@@ -1,0 +1,102 @@
+"""One transfer: a source, the logs of a target, and the trainings that methods ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from edp.config import Experiment
+from edp.data.prepared import Prepared
+from edp.losses import Smoothness
+from edp.models.predictor import Predictor
+from edp.sources import DataSource
+from edp.training import Event
+from edp.training.lesson import Lesson
+from edp.training.optimizers import AdamW, OptimizerSpec
+from edp.training.spec import TrainingSpec
+from edp.transfer.source import Source
+from edp.transfer.spec import FinetuneSpec
+from edp.workflow import Teaching, train
+
+NEIGHBOURS = 4
+"""Windows drawn together, so that smoothness can compare neighbours; divides the usual batches."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a method works with.
+
+    Attributes:
+        source: the network of another machine.
+        logs: where the recordings of the target are.
+        data: those, divided by time.
+        experiment: settings of the source with the target's split.
+        spec: phases, rates and regularisers.
+        folder: of the method's run.
+        tell: called with the name of a training and its event.
+    """
+
+    source: Source
+    logs: DataSource
+    data: Prepared
+    experiment: Experiment
+    spec: FinetuneSpec
+    folder: Path
+    tell: Callable[[str, Event], None]
+
+    def train(
+        self,
+        name: str,
+        training: TrainingSpec,
+        lesson: Callable[[], Lesson] | None,
+        facts: Mapping[str, Any] | None = None,
+        phase: str = "",
+    ) -> Predictor:
+        """Train in the method's folder, or for a phase in a folder within; what was stopped goes on.
+
+        Args:
+            name: what progress calls it.
+            training: how.
+            lesson: makes what the training begins with; None begins at random.
+            facts: plain values that decide the lesson beside the source.
+            phase: name of a phase that a later one goes on from.
+        """
+        teaching = None
+        if lesson is not None:
+            make = lesson
+            teaching = Teaching({"method": name, "source": self.source.facts, **(facts or {})}, lambda data: make())
+        experiment = replace(self.experiment, training=training)
+        folder = self.folder / "phases" / phase if phase else self.folder
+        data = self.data
+        return train(self.logs, experiment, folder, lambda event: self.tell(name, event), teaching, data).predictor
+
+    def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:
+        """How a network is trained on: small batches, light smoothness, early stopping (3.4.5).
+
+        Args:
+            optimizer: by default one rate, that of the head, for all that learns.
+            epochs: by default those of both phases together.
+        """
+        spec, training = self.spec, self.experiment.training
+        rate = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)
+        terms = tuple(term for term in training.terms if not isinstance(term, Smoothness))
+        if spec.smoothness:
+            smooth: Any = Smoothness(weight=spec.smoothness)
+            terms = (*terms, smooth)
+        chunks = replace(training.chunks, batch=spec.batch)
+        if chunks.regime == "window":
+            near = NEIGHBOURS if spec.batch % NEIGHBOURS == 0 else spec.batch
+            chunks = replace(chunks, consecutive=near if terms else 1)
+        elif not chunks.carried:  # Minutes of logs do not fill many lanes: they are walked again, cut elsewhere.
+            chunks = replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))
+        return replace(
+            training,
+            chunks=chunks,
+            terms=terms,
+            optimizer=optimizer or rate,
+            epochs=epochs or spec.head_epochs + spec.epochs,
+            patience=spec.patience,
+            refit="none",
+        )

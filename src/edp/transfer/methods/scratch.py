@@ -1,0 +1,26 @@
+"""From scratch: the same network on the target's logs alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+from edp.transfer.case import Case
+from edp.transfer.methods.base import METHODS, Made, of_network, size_of
+
+
+@METHODS.register("scratch")
+class Scratch:
+    """The source's network and way of training, new weights, scaling fitted on the target."""
+
+    label: ClassVar[str] = "From scratch"
+    trains: ClassVar[bool] = True
+    replays: ClassVar[bool] = False
+
+    def make(self, case: Case) -> Made:
+        """Train as ``edp train`` would, with the early stopping of the fine-tuning."""
+        training, spec = case.experiment.training, case.spec
+        epochs = max(training.epochs, spec.head_epochs + spec.epochs)  # no fewer than what it is compared with
+        training = replace(training, epochs=epochs, patience=spec.patience, refit="none")
+        network = case.train("scratch", training, None)
+        return of_network(network, size_of(network))

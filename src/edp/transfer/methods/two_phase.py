@@ -1,0 +1,37 @@
+"""The thesis's fine-tuning: the head first, then everything at discriminative rates (3.4.4)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from edp.models.decomposition import decompose
+from edp.training.bundle import weights_digest
+from edp.training.optimizers import Discriminative
+from edp.transfer.case import Case
+from edp.transfer.lessons import GoOn
+from edp.transfer.methods.base import METHODS, Made, of_network, size_of
+
+
+@METHODS.register("two_phase")
+class TwoPhase:
+    """Phase 1 trains the head alone, phase 2 everything, the backbone at a much smaller rate (Table 3.1)."""
+
+    label: ClassVar[str] = "Fine-tuned, two phases"
+    trains: ClassVar[bool] = True
+    replays: ClassVar[bool] = False
+
+    def make(self, case: Case) -> Made:
+        """Both phases; the first is a run of its own within the run of the second."""
+        spec, parts = case.spec, decompose(case.source.predictor)
+        warmed = case.train(
+            "two_phase, head",
+            case.tuning(epochs=spec.head_epochs),
+            lambda: GoOn(case.source.predictor, parts.encoding),
+            phase="head",
+        )
+        above = list(reversed(parts.backbone))
+        rates = tuple((part, spec.backbone_rate * spec.depth_decay**depth) for depth, part in enumerate(above))
+        optimizer = Discriminative(rates=rates, learning_rate=spec.head_rate, weight_decay=spec.weight_decay)
+        start = {"start": weights_digest(warmed)}
+        network = case.train("two_phase", case.tuning(optimizer, spec.epochs), lambda: GoOn(warmed), start)
+        return of_network(network, size_of(network))

@@ -1,0 +1,57 @@
+"""What is set of a fine-tuning; the defaults are those of the thesis (Table 3.1 and 3.4.5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetuneSpec:
+    """Phases, rates and regularisers of a fine-tuning.
+
+    Attributes:
+        head_epochs: of phase 1, in which only the head learns.
+        epochs: of phase 2, in which everything learns; of methods without phases, both together.
+        head_rate: learning rate of the head, in both phases, and of methods with one rate.
+        backbone_rate: learning rate of the backbone in phase 2.
+        depth_decay: rate of a part of the backbone over that of the part above it; 1 for one rate.
+        batch: lanes of a chunk, or windows, of an update.
+        smoothness: weight of the second difference of consecutive predictions; 0 for none.
+        weight_decay: lambda of AdamW.
+        patience: epochs without a better validation score before a phase ends; 0 never ends early.
+        rank: of the low-rank adapters.
+        check_signs: refuse logs in which a target moves against the pilot pressures that moved it in the source.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    head_epochs: int = 15
+    epochs: int = 25
+    head_rate: float = 3e-4
+    backbone_rate: float = 1e-5
+    depth_decay: float = 1.0
+    batch: int = 32
+    smoothness: float = 0.05
+    weight_decay: float = 1e-4
+    patience: int = 8
+    rank: int = 8
+    check_signs: bool = True
+
+    def __post_init__(self) -> None:
+        if min(self.head_epochs, self.epochs, self.batch, self.rank) < 1 or self.patience < 0:
+            raise ConfigError(
+                f"finetune: head_epochs = {self.head_epochs}, epochs = {self.epochs}, batch = {self.batch}, rank = "
+                f"{self.rank}, patience = {self.patience}; at least 1, and a patience of at least 0, must hold"
+            )
+        if not min(self.head_rate, self.backbone_rate) > 0 or not 0 < self.depth_decay <= 1:
+            raise ConfigError(
+                f"finetune: head_rate = {self.head_rate}, backbone_rate = {self.backbone_rate}, depth_decay = "
+                f"{self.depth_decay}; rates > 0 and 0 < depth_decay <= 1 must hold"
+            )
+        if min(self.smoothness, self.weight_decay) < 0:
+            raise ConfigError(
+                f"finetune: smoothness = {self.smoothness}, weight_decay = {self.weight_decay}; at least 0 must hold"
+            )

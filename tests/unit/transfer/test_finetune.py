@@ -1,0 +1,226 @@
+"""Fine-tuning: what is carried, what is held, what comes out, and that it goes on after a stop to the same bits."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from typer.testing import CliRunner
+
+from edp.cli import app
+from edp.errors import BundleError, ConfigError, StorageError
+from edp.models.decomposition import decompose
+from edp.storage import read_json
+from edp.training import load_bundle
+from edp.transfer import METHODS, FinetuneSpec, Order, Watchers, finetune
+from edp.transfer.scores import errors_of, measure, skew
+from edp.transfer.source import read_source, target_experiment, task_settings
+from edp.workflow import evaluate
+
+BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
+
+
+@pytest.fixture(scope="module")
+def tuned(run, target, small, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tuned") / "run"
+    return folder, finetune(run, target, Order(spec=small, rivals=tuple(METHODS)), folder)
+
+
+class Pulled(Exception):
+    pass
+
+
+def test_every_method_is_judged_on_the_same_ticks_in_both_worlds(tuned):
+    _, found = tuned
+    assert set(found["methods"]) == set(METHODS)
+    for world in ("target", "source"):
+        counts = {row["worlds"][world][k]["rise"]["count"] for row in found["methods"].values() for k in ("2", "5")}
+        assert len(counts) == 1, world
+    mae = {name: row["worlds"]["target"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
+    assert all(np.isfinite(value) for value in mae.values())
+    assert mae["two_phase"] < mae["direct"]
+    assert mae["full"] < mae["direct"]
+
+
+def test_the_scaling_of_the_source_is_carried_and_only_from_scratch_fitted_anew(tuned, run):
+    folder, _ = tuned
+    before = load_bundle(run).predictor.state_dict()
+    for name in ("", "rivals/full", "rivals/linear_probe", "rivals/low_rank", "phases/head"):
+        after = load_bundle(folder / name).predictor.state_dict()
+        assert after.keys() == before.keys()
+        assert all(torch.equal(before[key], after[key]) for key in BUFFERS), name
+    scratch = load_bundle(folder / "rivals" / "scratch").predictor.state_dict()
+    assert not torch.equal(before["code.width"], scratch["code.width"])
+
+
+@pytest.mark.parametrize(
+    ("name", "learns"),
+    [
+        ("phases/head", lambda parts: {*parts.head}),
+        ("rivals/linear_probe", lambda parts: {*parts.last}),
+        ("rivals/full", lambda parts: {*parts.head, *parts.encoding}),
+        ("", lambda parts: {*parts.head, *parts.encoding}),
+    ],
+)
+def test_what_is_held_does_not_move(tuned, run, name, learns):
+    folder, _ = tuned
+    source = load_bundle(run).predictor
+    before, after = dict(source.named_parameters()), dict(load_bundle(folder / name).predictor.named_parameters())
+    moved = {key for key, tensor in after.items() if not torch.equal(tensor, before[key])}
+    assert moved <= learns(decompose(source))
+    assert all(parameter.requires_grad for parameter in after.values())
+    assert moved or name not in ("", "rivals/full")  # a part alone may find nothing better than the start
+
+
+def test_the_backbone_moves_less_than_the_head(tuned, run):
+    folder, _ = tuned
+    source = load_bundle(run).predictor
+    before, after = dict(source.named_parameters()), dict(load_bundle(folder).predictor.named_parameters())
+    assert {key for key in decompose(source).encoding if not torch.equal(before[key], after[key])}
+    assert [row["learning_rate"] for row in history(folder)] != []
+
+
+def history(folder):
+    return [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
+
+
+def test_low_rank_changes_have_their_rank_and_leave_an_ordinary_network(tuned, run, small):
+    folder, found = tuned
+    before = dict(load_bundle(run).predictor.named_parameters())
+    changed = 0
+    for name, after in load_bundle(folder / "rivals" / "low_rank").predictor.named_parameters():
+        change = (after - before[name]).detach().double()
+        if change.ndim == 2:
+            assert int(torch.linalg.matrix_rank(change, rtol=1e-4)) <= small.rank, name
+        if change.ndim == 1 or "bias" in name:
+            assert not change.any(), name
+        changed += bool(change.any())
+    assert changed >= 4
+    assert 0 < found["methods"]["low_rank"]["learned"] < found["methods"]["full"]["learned"]
+
+
+def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
+    whole, _ = tuned
+    order = Order(spec=small)
+    for stop in (1, 3):
+        seen = []
+
+        def pull(name, event, seen=seen, stop=stop):
+            seen.append(event.row)
+            if sum(row is not None for row in seen) == stop:
+                raise Pulled
+
+        with pytest.raises(Pulled):
+            finetune(run, target, order, tmp_path / "run", Watchers(on_training=pull))
+    found = finetune(run, target, order, tmp_path / "run")
+    ends = [load_bundle(folder).predictor.state_dict() for folder in (whole, tmp_path / "run")]
+    assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
+    assert set(found["methods"]) == {"two_phase", "direct"}
+    with pytest.raises(StorageError, match="holds another run"):
+        finetune(run, target, Order(spec=dataclasses.replace(small, head_rate=1e-3)), tmp_path / "run")
+
+
+def test_the_run_can_be_judged_like_any_other(tuned):
+    folder, found = tuned
+    scores = read_json(evaluate(folder) / "scores.json")
+    mine = scores["models"]["network"]["overall"]["5"]["rise"]["mae"]
+    assert mine == pytest.approx(found["methods"]["two_phase"]["worlds"]["target"]["5"]["rise"]["mae"], rel=1e-6)
+    assert read_json(folder / "provenance.json")["lesson"]["method"] == "two_phase"
+
+
+def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small, tmp_path):
+    (tmp_path / "alone").mkdir()
+    for file in (run / "bundle").iterdir():
+        (tmp_path / "alone" / file.name).write_bytes(file.read_bytes())
+    notes = []
+    order = Order(spec=small, changes=("training.updates=2", "training.chunks.length=32"))
+    found = finetune(tmp_path / "alone", target, order, tmp_path / "run", Watchers(on_note=notes.append))
+    assert list(found["methods"]["two_phase"]["worlds"]) == ["target"]
+    assert any("bundle without the run" in note for note in notes)
+    assert any("sign of rise, turn was not checked" in note for note in notes)
+
+
+def test_settings_of_a_task_resolve_to_it(run):
+    source = read_source(run)
+    assert task_settings(source.bundle.task).resolve(100.0) == source.bundle.task
+    made = target_experiment(source, ("split.test_share=0.3", "training.clip_norm=0.5"))
+    assert (made.split.test_share, made.training.clip_norm) == (0.3, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("model.window=20", "keeps task and network of its source"),
+        ("task.horizons=[1]", "keeps task and network"),
+        ("training.epochs=3", "options of its own"),
+        ("training.optimizer.learning_rate=1", "options of its own"),
+        ("training={}", "options of its own"),
+        ("training.clipnorm=1", "unknown key 'training.clipnorm'"),
+    ],
+)
+def test_changes_that_cannot_be_are_refused(run, change, reason):
+    with pytest.raises(ConfigError, match=reason):
+        target_experiment(read_source(run), (change,))
+
+
+@pytest.mark.parametrize(
+    "change", [{"epochs": 0}, {"head_rate": 0.0}, {"smoothness": -1.0}, {"depth_decay": 1.5}, {"patience": -1}]
+)
+def test_options_out_of_range_are_refused(change):
+    with pytest.raises(ConfigError, match="must hold"):
+        FinetuneSpec(**change)
+
+
+def test_methods_that_leave_no_run_or_do_not_exist_are_refused(small):
+    with pytest.raises(ConfigError, match=r"'ridge_arx' trains nothing.*two_phase"):
+        Order(spec=small, method="ridge_arx")
+    with pytest.raises(ConfigError, match="unknown method 'two_phases'; did you mean 'two_phase'"):
+        Order(spec=small, rivals=("two_phases",))
+
+
+def test_the_defaults_are_those_of_the_thesis():
+    spec = FinetuneSpec()
+    assert (spec.head_epochs, spec.epochs, spec.head_rate, spec.backbone_rate) == (15, 25, 3e-4, 1e-5)
+    assert (spec.batch, spec.smoothness) == (32, 0.05)
+
+
+def test_skew_and_squares_are_those_of_scipy(tiny):
+    rng = np.random.default_rng(0)
+    predictions = [
+        np.stack([part.targets] * 2, axis=1) + rng.gamma(2.0, 0.01, (part.samples, 2, 3)).astype(np.float32)
+        for part in tiny.test
+    ]
+    found, errors = measure(predictions, tiny, 10), errors_of(predictions, tiny, 10)
+    for horizon in ("1", "3"):
+        for place, name in enumerate(tiny.task.targets):
+            row, own = found[horizon][name], errors[horizon][:, place]
+            assert row["skew"] == pytest.approx(stats.skew(own))
+            assert row["mse"] == pytest.approx(float(np.mean(own**2)))
+            assert row["bias"] == pytest.approx(float(own.mean()))
+    assert skew(np.full(5, 2.0)) == 0.0
+
+
+def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
+    options = ["--head-epochs", "1", "--epochs", "1", "--batch", "4", "--rivals", "none", "--set", "training.updates=3"]
+    call = ["finetune", str(run), str(target.path), "--out", str(tmp_path / "run"), *options]
+    told = CliRunner().invoke(app, call)
+    assert told.exit_code == 0, told.output
+    assert "next: edp evaluate" in told.output
+    facts = read_json(tmp_path / "run" / "transfer.json")
+    assert set(facts["methods"]) == {"two_phase", "direct"}
+    assert math.isfinite(facts["methods"]["direct"]["worlds"]["target"]["2"]["mean"]["mse"])
+    page = (tmp_path / "run" / "transfer.html").read_text(encoding="utf-8")
+    assert "Before and after" in page
+    assert {path.name for path in (tmp_path / "run" / "tables").iterdir()} >= {"pair_k2.csv", "methods_k5.md"}
+    assert (tmp_path / "run" / "pictures" / "errors_two_phase_k5.svg").is_file()
+
+
+def test_a_network_in_whole_numbers_is_refused(run, tmp_path):
+    from edp.downsizing.quantise import quantise
+
+    quantise(run, tmp_path / "whole")
+    with pytest.raises(BundleError, match="cannot be trained on"):
+        read_source(tmp_path / "whole")
