@@ -180,6 +180,7 @@ say(@() arm_names(net, names));
 say(@() arm_names(net, names([2 1 3:end])));
 say(@() arm_names(net, names(2:end)));
 say(@() arm_names(net, [names, {{'more'}}]));
+say(@() arm_names(net, [names, names(2)]));
 s = arm_reset(net);
 say(@() arm_step(net, zeros({len(names) - 1}, 1), s));
 say(@() arm_step(net, 'text', s));
@@ -201,6 +202,7 @@ say(@() arm_golden('strange'));
     assert said[1].startswith(f"edp:names arm: signal 1 is {names[1]}, but it must be {names[0]}")
     assert said[2].startswith(f"edp:names arm: missing: {names[0]}; it reads: {names[0]}, ")
     assert said[3].endswith("leave out: more")
+    assert said.pop(4).endswith(f"leave out: {names[1]}")
     assert [line.split()[0] for line in said[4:8]] == ["edp:width", "edp:width", "edp:missed", "edp:width"]
     assert said[8].split() == ["2"] * len(names)
     assert said[9].startswith(f"edp:names arm: missing: {names[1]} (")
@@ -414,3 +416,15 @@ def test_nothing_of_a_block_is_on_the_heap(whole, c, folder_of, tmp_path):
         assert not set(c.run("nm", "-u", "-j", made).decode().split()) & HEAP
         kinds = {line.split()[-2] for line in c.run("nm", made).decode().splitlines()}
         assert not kinds & {"B", "b", "D", "d", "C"}  # no numbers that blocks would share
+
+
+@pytest.mark.parametrize("compiler", ["clang", "x86_64-w64-mingw32-gcc"])
+def test_other_compilers_take_the_sources(compiler, folder_of, tmp_path):
+    """Among them the one that MATLAB uses on Windows."""
+    if shutil.which(compiler) is None:
+        pytest.skip(f"needs {compiler} (make system-packages)")
+    folder = folder_of("hybrid", True)  # it has both runtimes
+    sources = [*sorted((folder / "core").glob("*.c")), folder / "arm_sfun.c", folder / "arm_call.c"]
+    command = [compiler, *STRICT, "-I", folder / "octave", "-I", folder / "core", "-c", *sources]
+    done = subprocess.run([str(part) for part in command], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
