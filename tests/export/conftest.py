@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -11,9 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from torch.func import jvp
 
 from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
+from edp.export.golden import ends
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 
@@ -95,3 +98,48 @@ def program_of(bundle_of, tmp_path_factory) -> Callable[..., Path]:
         return folder / "program"
 
     return make
+
+
+STEP = 1e-5
+
+
+def random_changes(predictor, ticks, directions, seed=9):
+    _, spread = ends(predictor)
+    return np.random.default_rng(seed).normal(size=(ticks, directions, len(spread))) * spread
+
+
+def differentiated(predictor, inputs, changes):
+    """What PyTorch makes of the changes along one direction, in double precision, ``(tick, number)``.
+
+    Forward-mode differentiation; a central difference where a recurrent layer has a backward pass of its own only.
+    """
+    exact = copy.deepcopy(predictor).double()
+
+    def predictions(x):
+        prediction, _ = exact.predict(x, exact.initial_state(1, x))
+        parts = [prediction[0].flatten(1)]
+        if exact.output.coverages:
+            bounds, _ = exact.intervals(x, exact.initial_state(1, x))
+            parts += [bounds[0, :, :, side].flatten(1) for side in (0, 1)]
+        return torch.cat(parts, dim=1)
+
+    x, dx = (torch.from_numpy(np.asarray(v, dtype=np.float64))[None] for v in (inputs, changes))
+    try:
+        return jvp(predictions, (x,), (dx,))[1].detach().numpy()
+    except RuntimeError as error:
+        if "autograd.Function" not in str(error):
+            raise
+    with torch.no_grad():
+        return ((predictions(x + STEP * dx) - predictions(x - STEP * dx)) / (2 * STEP)).numpy()
+
+
+@pytest.fixture(scope="session")
+def changes_of() -> Callable[..., np.ndarray]:
+    """Random changes of a network's inputs ``(tick, direction, input)``, as wide as the inputs themselves."""
+    return random_changes
+
+
+@pytest.fixture(scope="session")
+def torch_changes() -> Callable[..., np.ndarray]:
+    """How PyTorch's predictions change with inputs."""
+    return differentiated

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from torch.func import jvp
 
 from edp.errors import ExportError
 from edp.export import make_target
@@ -23,7 +20,6 @@ from edp.graph import Graph, Layer
 DRIVER = Path(__file__).with_name("tangent_driver.c")
 MISSED = -12345.0
 TICKS = 40
-STEP = 1e-5
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script:DeprecationWarning")  # PyTorch's own, at jvp
 TOLERANCE = 1e-4
 """Of the largest change of each result over the ticks."""
@@ -61,37 +57,7 @@ def tangent_of(c, bundle_of, tmp_path_factory):
     return make
 
 
-def changes_of(predictor, ticks, directions, seed=9):
-    _, spread = ends(predictor)
-    return np.random.default_rng(seed).normal(size=(ticks, directions, len(spread))) * spread
-
-
-def torch_changes(predictor, inputs, changes):
-    """What PyTorch makes of the changes along one direction, in double precision, ``(tick, number)``.
-
-    Forward-mode differentiation; a central difference where a recurrent layer has a backward pass of its own only.
-    """
-    exact = copy.deepcopy(predictor).double()
-
-    def predictions(x):
-        prediction, _ = exact.predict(x, exact.initial_state(1, x))
-        parts = [prediction[0].flatten(1)]
-        if exact.output.coverages:
-            bounds, _ = exact.intervals(x, exact.initial_state(1, x))
-            parts += [bounds[0, :, :, side].flatten(1) for side in (0, 1)]
-        return torch.cat(parts, dim=1)
-
-    x, dx = (torch.from_numpy(np.asarray(v, dtype=np.float64))[None] for v in (inputs, changes))
-    try:
-        return jvp(predictions, (x,), (dx,))[1].detach().numpy()
-    except RuntimeError as error:
-        if "autograd.Function" not in str(error):
-            raise
-    with torch.no_grad():
-        return ((predictions(x + STEP * dx) - predictions(x - STEP * dx)) / (2 * STEP)).numpy()
-
-
-def test_tangents_are_those_of_pytorch(structure, bundle_of, tangent_of):
+def test_tangents_are_those_of_pytorch(structure, bundle_of, tangent_of, changes_of, torch_changes):
     """A random direction through 40 ticks: inputs, states and rings all take part."""
     predictor = bundle_of(structure).predictor
     inputs, changes = random_inputs(predictor, TICKS, seed=5), changes_of(predictor, TICKS, 1)
@@ -104,7 +70,7 @@ def test_tangents_are_those_of_pytorch(structure, bundle_of, tangent_of):
 
 
 @pytest.mark.parametrize("network", ["hybrid+all", "tcn+quantiles"])
-def test_several_directions_at_once_are_each_alone(network, bundle_of, tangent_of):
+def test_several_directions_at_once_are_each_alone(network, bundle_of, tangent_of, changes_of):
     """Held and missed ticks and restarts among them: the driver holds the step itself to `predictor_step`."""
     predictor = bundle_of(network).predictor
     inputs, changes = random_inputs(predictor, 60, seed=6), changes_of(predictor, 60, 3)
@@ -123,7 +89,7 @@ def test_several_directions_at_once_are_each_alone(network, bundle_of, tangent_o
     np.testing.assert_array_equal(run(inputs[47:], changes[47:])[1], found[47:])  # cleared with the memory
 
 
-def test_held_changes_are_those_of_inputs_that_stay(bundle_of, tangent_of):
+def test_held_changes_are_those_of_inputs_that_stay(bundle_of, tangent_of, changes_of):
     predictor = bundle_of("hybrid+all").predictor
     inputs, changes = random_inputs(predictor, 30, seed=6), changes_of(predictor, 30, 1)
     lost = inputs.copy()
@@ -133,7 +99,7 @@ def test_held_changes_are_those_of_inputs_that_stay(bundle_of, tangent_of):
     np.testing.assert_array_equal(run(lost, changes)[1], run(inputs, changes)[1])
 
 
-def test_the_tick_alone_is_a_column_of_its_jacobian(bundle_of, tangent_of):
+def test_the_tick_alone_is_a_column_of_its_jacobian(bundle_of, tangent_of, torch_changes):
     """All inputs at once, each a direction, with the past as it was."""
     predictor = bundle_of("hybrid+all").predictor
     inputs, (_, spread) = random_inputs(predictor, 30, seed=6), ends(predictor)

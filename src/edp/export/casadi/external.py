@@ -1,0 +1,81 @@
+"""What fills the C file of the external function: how the state's column is read and written."""
+
+from __future__ import annotations
+
+from itertools import groupby
+
+from edp.export.c.model import has_ring
+from edp.export.c.text import call, identifier, indented, number
+from edp.export.casadi.states import Place, counts, is_ring, places, start
+from edp.graph import Graph, Layer, memory
+from edp.graph.memory import UNSEEN
+
+
+def blanks(graph: Graph, name: str) -> dict[str, object]:
+    """Values of the blanks of the template."""
+    load: list[str] = []
+    store: list[str] = []
+    load_change: list[str] = []
+    store_change: list[str] = []
+    for layer, group in groupby(places(graph), key=lambda place: place.layer):
+        held = list(group)
+        load += _load_count(graph, graph.layer(layer), held)
+        for place in held:
+            if place.slot.name == "age":
+                store.append(f"x[{place.at}] = (double)s->{identifier(layer)}_ring_at.seen;")
+                store_change.append(f"x[{place.at}] = 0.0;")
+                continue
+            for lines, who, fill in ((load, "s", None), (load_change, "t", None)):
+                lines.append(_moved(graph, place, "load", who, fill))
+            store.append(_moved(graph, place, "store", "s", number(UNSEEN if place.slot.name == "scores" else 0.0)))
+            store_change.append(_moved(graph, place, "store", "t", "0.0f"))
+    every = ["x_next", *graph.results]
+    sizes = [len(start(graph)), *map(graph.width_of, graph.results.values())]
+    members = [f"&out->{result}{'[0][0]' if result == 'prediction' else '[0][0][0]'}" for result in graph.results]
+    return {
+        "name": name,
+        "NAME": name.upper(),
+        "states": sizes[0],
+        "outputs": len(every),
+        "names": ", ".join(f'"{result}"' for result in every),
+        "names_out_in": ", ".join(f'"out_{result}"' for result in every),
+        "names_jacobian": ", ".join(f'"jac_{result}_{by}"' for result in every for by in "xu"),
+        "shapes": ", ".join(f"{{{size}, 1, 1}}" for size in sizes),
+        "jacobians": ", ".join(f"{{{size}, {by}, 1}}" for size in sizes for by in (sizes[0], graph.inputs)),
+        "members": ", ".join(members),
+        "prediction": every.index("prediction"),
+        "predictions": sizes[every.index("prediction")],
+        "load": indented(load),
+        "store": indented(store),
+        "load_change": indented(load_change),
+        "store_change": indented(store_change),
+    }
+
+
+def _load_count(graph: Graph, layer: Layer, held: list[Place]) -> list[str]:
+    """Sets the ring or the counter of a layer in the C state."""
+    if not has_ring(layer):
+        return []
+    rings = [place for place in held if is_ring(graph, place)]
+    rows, where = max((place.rows for place in rings), default=0), f"s->{identifier(layer.name)}_ring_at"
+    ages = [place for place in held if place.slot.name == "age"]
+    scores = [place for place in rings if place.slot.name == "scores"]
+    lines = []
+    if ages:
+        most = rows if rings else layer.ticks if not isinstance(layer, memory.Difference) else 1  # type: ignore[attr-defined]
+        lines.append(f"{where}.seen = whole(x[{ages[0].at}], {most}u);")
+    elif scores:
+        lines.append(f"{where}.seen = scored(x + {scores[0].at}, {rows}u);")
+    if rings and counts(graph, rings[0]):
+        lines.append(f"{where}.at = {where}.seen % {rows}u;")
+    return lines
+
+
+def _moved(graph: Graph, place: Place, way: str, who: str, fill: str | None) -> str:
+    field, column = f"{who}->{place.field}", f"x + {place.at}"
+    if not is_ring(graph, place):
+        return call(f"{way}_numbers", column, place.slot.size, field)
+    ring = f"s->{identifier(place.layer)}_ring_at"
+    seen = f"{ring}.seen" if counts(graph, place) else f"{place.rows}u"
+    rest = [fill] if fill is not None else []
+    return call(f"{way}_ring", column, place.rows, place.columns, f"{ring}.at", seen, *rest, field)

@@ -1,0 +1,69 @@
+"""The state of a network as a column of numbers: slots in the order of the layers, rings with the oldest tick first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edp.export.c.text import identifier
+from edp.graph import Array, Graph, memory
+from edp.graph.base import Slot
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A slot in the column.
+
+    Attributes:
+        layer: that remembers it.
+        slot: which.
+        at: its first number.
+    """
+
+    layer: str
+    slot: Slot
+    at: int
+
+    @property
+    def rows(self) -> int:
+        """Ticks, or pairs of a rotation; 1 otherwise."""
+        return self.slot.shape[0] if len(self.slot.shape) == 2 else 1
+
+    @property
+    def columns(self) -> int:
+        """Numbers of a row."""
+        return self.slot.size // self.rows if self.rows else 0
+
+    @property
+    def field(self) -> str:
+        """The name in the C state."""
+        return f"{identifier(self.layer)}_{self.slot.name}"
+
+
+def places(graph: Graph) -> list[Place]:
+    """Every slot with numbers. Ages are whole numbers: ticks seen before the present one, as far as they matter."""
+    made, at = [], 0
+    for layer, slot in graph.slots():
+        if slot.size:
+            # Scores are a ring of one number a tick.
+            shape = (slot.size, 1) if slot.name == "scores" else slot.shape
+            made.append(Place(layer, Slot(slot.name, shape, slot.fill), at))
+            at += slot.size
+    return made
+
+
+def start(graph: Graph) -> Array:
+    """The column after a reset."""
+    parts = [graph.start(layer, slot).ravel() for layer, slot in graph.slots() if slot.size]
+    return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+
+
+def is_ring(graph: Graph, place: Place) -> bool:
+    """Whether the rows are ticks that the C code keeps as a ring."""
+    return place.slot.name in ("ring", "keys", "values", "scores")
+
+
+def counts(graph: Graph, place: Place) -> bool:
+    """Whether the ring of the C code knows how many ticks it has seen; a convolution takes all of them as seen."""
+    return not isinstance(graph.layer(place.layer), memory.Convolution)

@@ -1,0 +1,119 @@
+"""``--to casadi``: a module and data from which CasADi builds the step, and the C code behind an external function."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, fields
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from edp import __version__
+from edp.errors import ExportError
+from edp.export.base import TARGETS
+from edp.export.c.model import make_model
+from edp.export.c.target import check_name, core_files
+from edp.export.casadi.external import blanks
+from edp.export.casadi.states import places, start
+from edp.export.description import Description, as_json, float_graph, golden
+from edp.graph import Graph, Layer, memory
+from edp.graph import layers as plain
+from edp.storage import make_folder, write_bytes
+from edp.training.bundle import Bundle
+
+RULES = {
+    "order": "inputs and targets in the order of this file, in SI units",
+    "reset": "feed `start` as x at the first tick, and again after a gap or a change of machine",
+    "missed_tick": "feed the inputs of the tick before again; after five in a row reset",
+    "bad_input": "NaN or infinite inputs give NaN, in the prediction or in the next state; the external refuses them",
+    "warming_up": "after a reset the first `window` predictions do not rest on a whole window",
+}
+KNOWN: frozenset[type[Layer]] = frozenset(
+    kind
+    for room in (plain, memory)
+    for kind in vars(room).values()
+    if isinstance(kind, type) and issubclass(kind, Layer) and kind is not Layer and not kind.__name__.startswith("_")
+)
+"""Kinds of layers that the module builds."""
+
+GOLDEN = ("inputs", "stream", "tolerance")
+
+
+@TARGETS.register("casadi")
+@dataclass(frozen=True)
+class CasadiTarget:
+    """CasADi, float32 runs: ``edp_casadi.py``, ``NAME.json`` and ``NAME.npz``, and C with ``NAME_casadi.c`` (external).
+
+    ``edp_horizon.py`` runs a horizon of the compiled C.
+    """
+
+    def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
+        """See `edp.export.ExportTarget`."""
+        check_name(name)
+        graph = float_graph(bundle.predictor, "CasADi")
+        data, described = arrays(graph), content(Description(name, bundle, graph))
+        golden_run = golden(bundle.predictor, graph.window)
+        model = make_model(name, bundle, tangent=True)
+        here = resources.files("edp.export.casadi")
+        made: dict[str, bytes] = {
+            "edp_casadi.py": here.joinpath("runtime.py").read_bytes(),
+            "edp_horizon.py": here.joinpath("horizon.py").read_bytes(),
+            f"{name}.json": as_json(described),
+            f"{name}.npz": packed(data),
+            f"{name}_golden.npz": packed(
+                {key: np.asarray(golden_run[key]) for key in ("inputs", "stream", "tolerance")}
+            ),
+            f"{name}_casadi.c": external(graph, name).encode(),
+        }
+        made |= {file: text.encode() for file, text in core_files(model).items()}
+        path = make_folder(folder)
+        for file, what in made.items():
+            write_bytes(path / file, what)
+        return [path / file for file in made]
+
+
+def content(described: Description) -> dict[str, Any]:
+    """The description of the network as plain values: what every form tells, layers, states and rules."""
+    graph = described.graph
+    return described.content() | {
+        "rules": RULES,
+        "layers": [_layer(layer) for layer in graph.layers],
+        "values": dict(graph.results),
+        "states": [
+            {"layer": place.layer, "slot": place.slot.name, "rows": place.rows, "columns": place.columns}
+            for place in places(graph)
+        ],
+    }
+
+
+def arrays(graph: Graph) -> dict[str, np.ndarray]:
+    """Constants by layer and name, and the state after a reset."""
+    made = {f"{layer}/{name}": values for layer, name, values in graph.tensors()}
+    return made | {"start": start(graph)}
+
+
+def _layer(layer: Layer) -> dict[str, Any]:
+    if type(layer) not in KNOWN:
+        raise ExportError(
+            f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in CasADi; "
+            f"these have: {', '.join(sorted(kind.__name__ for kind in KNOWN))}"
+        )
+    constants = list(layer.tensors())
+    options = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in constants}
+    return {"kind": type(layer).__name__, "constants": constants} | options
+
+
+def packed(data: dict[str, np.ndarray]) -> bytes:
+    """Arrays as a file of NumPy; it holds no objects."""
+    made = io.BytesIO()
+    np.savez(made, allow_pickle=False, **data)  # type: ignore[arg-type]
+    return made.getvalue()
+
+
+def external(graph: Graph, name: str) -> str:
+    """The C file that CasADi calls."""
+    text = resources.files("edp.export.casadi").joinpath("external.c.in").read_text()
+    return Template(text).substitute(blanks(graph, name) | {"version": __version__})
