@@ -168,7 +168,8 @@ def test_octave_reads_every_file_of_matlab(folder_of, tmp_path):
 
 
 def test_names_widths_rates_and_states_of_others_are_refused(folder_of, bundle_of, tmp_path):
-    folder, names = folder_of("hybrid"), bundle_of("hybrid").task.inputs
+    folder, task = folder_of("hybrid"), bundle_of("hybrid").task
+    names, rate = task.inputs, task.rate_hz
     cells = ", ".join(f"'{name}'" for name in names)
     program = f"""
 addpath('{folder}'); net = arm_load();
@@ -191,6 +192,10 @@ for at = numel(names):-1:1, recording.(names{{at}}) = (1:4)' + 10 * at; end
 recording.other = 1;
 rows = arm_rows(net, recording); disp(rows(2, :) - 10 * (1:numel(names)));
 say(@() arm_rows(net, rmfield(recording, names{{2}})));
+recording.time = 5 + (0:3)' / {rate}; disp(size(arm_rows(net, recording)));
+recording.time = (0:3)' / {rate} * 2;
+say(@() arm_rows(net, recording));
+recording = rmfield(recording, 'time');
 recording.(names{{3}}) = 1;
 say(@() arm_rows(net, recording));
 [out, status] = arm_step(net, zeros({len(names)}, 1), []); disp([status, out.prediction(1)]);
@@ -206,6 +211,8 @@ say(@() arm_golden('strange'));
     assert [line.split()[0] for line in said[4:8]] == ["edp:width", "edp:width", "edp:missed", "edp:width"]
     assert said[8].split() == ["2"] * len(names)
     assert said[9].startswith(f"edp:names arm: missing: {names[1]} (")
+    assert said.pop(10).split() == ["4", str(len(names))]
+    assert said.pop(10) == "edp:rate arm: rows 1 and 2 are 0.02 s apart; the network wants 0.01 s: resample first"
     assert said[10].startswith("edp:length arm: ")
     assert [line.split() for line in said[11:13]] == [["4", "NaN"]] * 2
     assert said[13].startswith("edp:form arm_golden: no form strange; there are native, octave, sfun, onnx")

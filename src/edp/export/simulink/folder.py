@@ -30,6 +30,11 @@ RULES = {
 }
 STATUS = ("ok", "warming", "held", "restarted", "not_reset")
 """What a tick has done, by number."""
+FIRST = {
+    True: "form = 'native';",
+    False: "forms = {'sfun', 'octave'};\n    form = forms{1 + (exist('OCTAVE_VERSION', 'builtin') > 0)};",
+}
+"""The form that is compared if none is asked for: with plain MATLAB code, without."""
 C_FILES = ("sfun.c", "call.h", "call.c")
 MATLAB_FILES = ("load", "names", "rows", "octave", "build", "bus", "simulate", "golden")
 NATIVE_FILES = ("step", "reset", "stream")
@@ -193,7 +198,7 @@ class Folder:
             "cases": cases,
             "forms": " or ".join(f"'{form}'" for form in forms),
             "form_names": ", ".join(forms),
-            "first_form": f"'{next(iter(forms))}'",
+            "first_form": FIRST[self.native is not None],
             "exact": "Whole numbers must be the same." if self.model.whole else "",
             "layout": "; ".join(f"{meaning} {r} x {c} (horizons by targets)" for meaning, (r, c) in shapes.items()),
             "bounds": ", OUT.lower and OUT.upper bounds" if len(shapes) > 1 else "",
@@ -229,7 +234,9 @@ class Folder:
             missing = (
                 "\n\nThe network computes in whole numbers: there is C code only, no plain MATLAB code and no ONNX."
             )
+        first = f" `{name}_golden` then compares the plain MATLAB code with PyTorch."
         return {
+            "first_check": first if self.native is not None else "",
             "files": "\n".join(rows),
             "inputs_table": "\n".join(table),
             "checked": Template(checked).substitute(name=name) + "." + missing,
