@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -95,6 +96,16 @@ def window_differs_by(predictor, opset=13, seeds=2):
 
 def test_the_window_predicts_what_pytorch_predicts_from_reset(structure, bundle_of):
     assert window_differs_by(bundle_of(structure).predictor) < 1
+
+
+def test_every_value_of_a_graph_is_read(structure, bundle_of):
+    """ONNX Runtime up to 1.18 lays what nobody reads over what is still needed, from the second run on."""
+    predictor = bundle_of(structure).predictor
+    graph, targets = predictor.graph(), len(predictor.task.targets)
+    for make in (step_model, window_model):
+        made = onnx.load_from_string(make(graph, targets, "graph", {})).graph
+        read = {name for node in made.node for name in node.input} | {output.name for output in made.output}
+        assert not [name for node in made.node for name in node.output if name and name not in read]
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 4, 5, 6, 15])
@@ -342,3 +353,56 @@ def test_the_page_lists_the_operators(bundle_of):
             assert all(len(v.type.tensor_type.shape.dim) == 2 for v in (*model.graph.input, *model.graph.output))
             used |= kinds
     assert used == ALLOWED
+
+
+OLD = """
+import json, sys
+import numpy as np
+import onnxruntime as o
+
+for case in json.load(open("cases.json")):
+    options = o.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = 1, 3
+    run, rows = o.InferenceSession(case["graph"], options, providers=["CPUExecutionProvider"]).run, []
+    held = {name: np.array(start, np.float32) for name, start in case["states"]}
+    names = case["results"] + case["next"]
+    for row in np.load(case["inputs"]):
+        made = dict(zip(names, run(names, {"inputs": row, **held})))
+        held = {name: made[then] for (name, _), then in zip(case["states"], case["next"])}
+        rows.append(np.concatenate([made[name].ravel() for name in case["results"]]))
+    np.save(case["found"], np.array(rows))
+"""
+
+
+@pytest.mark.slow
+def test_an_old_onnx_runtime_says_the_same(bundle_of, parts, tmp_path):
+    """``EDP_OLD_ONNXRUNTIME`` names a Python that has it, such as 1.15.1, which readers of that time are built on."""
+    python = os.environ.get("EDP_OLD_ONNXRUNTIME", "")
+    if not python:
+        pytest.skip("needs EDP_OLD_ONNXRUNTIME, a Python with an old onnxruntime")
+    cases, wanted = [], {}
+    for number, structure in enumerate(parts[0]):
+        predictor = bundle_of(structure).predictor
+        graph, targets = predictor.graph(), len(predictor.task.targets)
+        inputs = random_inputs(predictor, 3 * graph.window, seed=4)
+        windows = np.stack([inputs[at : at + graph.window] for at in range(2 * graph.window)])
+        said = stream(predictor, inputs)
+        each = np.concatenate([stream(predictor, window)[-1:] for window in windows])
+        allowed = tolerance(predictor, inputs, said)
+        for kind, make, rows, right in (
+            ("step", step_model, inputs[:, None], said),
+            ("window", window_model, windows, each),
+        ):
+            name = f"{number}_{kind}"
+            (tmp_path / f"{name}.onnx").write_bytes(make(graph, targets, "graph", {}))
+            np.save(tmp_path / f"{name}_in.npy", rows)
+            states = states_of(graph) if kind == "step" else []
+            case = {"graph": f"{name}.onnx", "inputs": f"{name}_in.npy", "found": f"{name}_out.npy"}
+            case |= {"results": list(graph.results), "next": [state.next for state in states]}
+            cases.append(case | {"states": [(state.name, state.start.tolist()) for state in states]})
+            wanted[name, structure] = right, allowed
+    (tmp_path / "cases.json").write_text(json.dumps(cases))
+    subprocess.run([python, "-c", OLD], cwd=tmp_path, check=True)
+    for (name, structure), (right, allowed) in wanted.items():
+        found = np.load(tmp_path / f"{name}_out.npy")
+        assert (np.abs(found - right) <= allowed).all(), (structure, name)

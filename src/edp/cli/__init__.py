@@ -18,6 +18,7 @@ from edp.cli import (
     finetune,
     footprint,
     inspect,
+    parity,
     quantise,
     report,
     screen,
@@ -48,6 +49,7 @@ app.command("compress")(compress.compress)
 app.command("finetune")(finetune.finetune)
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)
+app.command("parity")(parity.parity)
 app.command("quantise")(quantise.quantise)
 app.command("report")(report.report)
 

@@ -217,3 +217,11 @@ def test_the_report_says_the_limit_of_a_simulated_data_set(edp, tmp_path, small)
     edp("evaluate", run, "--baselines", "persistence")
     assert "limit of predictability here is" in " ".join(edp("report", run).out.split())
     assert "limit of predictability here is" in (run / "report.html").read_text(encoding="utf-8")
+
+
+def test_parity_holds_every_form_against_pytorch(edp, trained, logs):
+    found = json.loads(edp("parity", trained, "--form", "torch_ticks", "--form", "c", "--ticks", 80, "--json").out)
+    assert found["failed"] == []
+    assert {row["verdict"] for row in found["rows"]} <= {"same", "not run"}
+    shown = edp("parity", trained, "--form", "torch_ticks", "--data", logs, "--ticks", 60).out
+    assert "60 ticks against PyTorch" in shown

@@ -29,8 +29,11 @@ def shape_of(slot: Slot) -> tuple[int, ...]:
 
 def push(nodes: Nodes, ring: str, rows: int, x: str, axis: int = 0) -> tuple[str, str]:
     """The ring with a tick more at its end, and the same without its oldest tick."""
-    full = nodes.join([ring, x], axis)
-    return full, nodes.split(full, [1, rows], axis)[1]
+    if rows == 1:
+        return nodes.join([ring, x], axis), x
+    oldest, rest = nodes.split(ring, [1, rows - 1], axis)
+    kept = nodes.join([rest, x], axis)
+    return nodes.join([oldest, kept], axis), kept
 
 
 def _difference(nodes: Nodes, layer: memory.Difference, held: Held, x: str) -> tuple[str, dict[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
@@ -20,6 +20,8 @@ _NAMES = """
 Add Clip Concat Conv Cos Div Erf Exp GRU Gemm Identity LSTM Max Min Mul ReduceMean Relu Reshape Sigmoid Sign Sin Softmax
 Softplus Split Sqrt Sub Tanh Transpose
 """
+OPTIONAL = ("LSTM", "GRU")
+"""Operators whose outputs may be left out."""
 ALLOWED = frozenset(_NAMES.split())
 """Operators that are written: long-lived ones with a plain meaning, whose indices and shapes are constants."""
 
@@ -218,6 +220,15 @@ class Nodes:
             node.input[:] = [names.get(key, key) for key in node.input]
             node.output[:] = [names.get(key, key) for key in node.output]
 
+    def unread(self, ends: Iterable[str]) -> list[str]:
+        """Values that nothing reads, of nodes with another one that some of `ends` rest on."""
+        wanted = set(ends)
+        for node in reversed(self._nodes):
+            if wanted & set(node.output):
+                wanted |= set(node.input)
+        split = [node for node in self._nodes if wanted & set(node.output) and node.op_type not in OPTIONAL]
+        return [name for node in split for name in node.output if name not in wanted]
+
     def _drop_unread(self, outputs: Mapping[str, object]) -> None:
         """Remove nodes and constants that no output rests on."""
         wanted, kept = set(outputs), []
@@ -225,5 +236,15 @@ class Nodes:
             if wanted & set(node.output):
                 kept.append(node)
                 wanted |= set(node.input)
+                if node.op_type in OPTIONAL:
+                    _leave_out(node, wanted)
         self._nodes = kept[::-1]
         self._tensors = [tensor for tensor in self._tensors if tensor.name in wanted]
+
+
+def _leave_out(node: Any, wanted: set[str]) -> None:
+    """Drop the outputs of a node that nothing reads."""
+    names = [name if name in wanted else "" for name in node.output]
+    while not names[-1]:
+        names.pop()
+    node.output[:] = names

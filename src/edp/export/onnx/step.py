@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,9 +70,17 @@ def refuse(layer: Layer) -> ExportError:
     )
 
 
-def spoil(nodes: Nodes, inputs: str) -> str:
-    """0 ``(tick, 1)`` where all inputs of a tick are finite, else NaN: ReLU and clipping may swallow a NaN."""
-    return nodes.mean(nodes.times(inputs, np.float32(0)), 1)
+def spoil(nodes: Nodes, inputs: str, ends: Iterable[str]) -> str:
+    """0 ``(tick, 1)`` where all inputs of a tick are finite, else NaN: ReLU and clipping may swallow a NaN.
+
+    Values that nothing reads are read here. ONNX Runtime up to 1.18 puts them, from the second run on, over values that
+    are still needed.
+    """
+    zero = nodes.mean(nodes.times(inputs, np.float32(0)), 1)
+    for value in nodes.unread(ends):
+        nothing = nodes.times(nodes.shaped(nodes.add("ReduceMean", value, keepdims=1), 1, 1), np.float32(0))
+        zero = nodes.add("Add", zero, nothing)
+    return zero
 
 
 def step_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], opset: int = DEFAULT_OPSET) -> bytes:
@@ -99,7 +107,11 @@ def step_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], 
         with nodes.inside(plain_name(layer.name)):
             _add_layer(nodes, graph, layer, values, held, fresh)
     with nodes.inside("end"):
-        spoilt = nodes.add("Add", SPOILT, spoil(nodes, INPUTS))
+        ends = [
+            *(values[name] for name in graph.results.values()),
+            *(v for kept in fresh.values() for v in kept.values()),
+        ]
+        spoilt = nodes.add("Add", SPOILT, spoil(nodes, INPUTS, ends))
         outputs = add_results(nodes, graph, values, spoilt, targets)
     for state in states[:-1]:
         outputs[state.next] = (fresh[state.layer[0]][state.layer[1]], state.start.shape)

@@ -292,5 +292,5 @@ def window_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str]
     with nodes.inside("end"):
         flat = nodes.shaped(INPUTS, 1, window.ticks * graph.inputs)
         ends = {value: window.values.rows(value, 1) for value in graph.results.values()}
-        outputs = add_results(nodes, graph, ends, spoil(nodes, flat), targets)
+        outputs = add_results(nodes, graph, ends, spoil(nodes, flat, ends.values()), targets)
     return nodes.model(name, {INPUTS: (window.ticks, graph.inputs)}, outputs, notes)

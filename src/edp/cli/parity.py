@@ -1,0 +1,77 @@
+"""``edp parity``: does every form of a network say the same?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, emit, err, out, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from edp.parity import Row
+
+
+def parity(
+    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train or edp quantise.")],
+    data: Annotated[
+        Path | None, typer.Option(help="A log whose first ticks are the golden recording; default: random inputs.")
+    ] = None,
+    ticks: Annotated[int, typer.Option(min=1, help="Length of the golden recording.")] = 400,
+    forms: Annotated[list[str], typer.Option("--form", help="A form to run; may be repeated. Default: all.")] = [],  # noqa: B006
+    interpreters: Annotated[
+        list[str],
+        typer.Option("--onnxruntime", help="Python program with another ONNX Runtime to run too; may be repeated."),
+    ] = [],  # noqa: B006
+    strict: Annotated[bool, typer.Option(help="Forms that cannot be run here fail too.")] = False,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Run one recording through PyTorch and every exported form; compare the numbers and the time of a tick.
+
+    Ends with 1 where a form differs from PyTorch by more than its tolerance.
+
+    Example: `edp parity runs/first`
+    """
+    from edp.parity import compare, golden_case, recorded_case
+    from edp.training import load_bundle
+
+    loaded = load_bundle(bundle)
+    source = None if data is None else source_of(data, signal_map, repair)
+    case = golden_case(loaded, ticks) if source is None else recorded_case(loaded, source, ticks)
+
+    def tell(row: Row) -> None:
+        if not as_json:
+            err.print(f"{row.title}: {row.verdict}", style="dim")
+
+    rows = compare(case, forms, interpreters, tell)
+    bad = {"different", "failed"} | ({"not run"} if strict else set())
+    failed = [row.title for row in rows if row.verdict in bad]
+    facts = {"ticks": len(case.inputs), "rows": [row.to_json() for row in rows], "failed": failed}
+    emit(as_json, facts, lambda: _show(rows, len(case.inputs)))
+    if failed:
+        err.print(f"not the same: {', '.join(failed)}")
+        raise typer.Exit(1)
+
+
+def _show(rows: list[Row], ticks: int) -> None:
+    shown = [row for row in rows if row.largest is not None]
+    cells = [
+        (row.title, row.verdict, f"{row.largest:.3g}", f"{row.mean:.2g}", row.tolerance, f"{row.microseconds:,.1f}")
+        for row in shown
+    ]
+    heads = ["form", "verdict", "largest", "mean", "allowed", "µs a tick"]
+    table(f"{ticks} ticks against PyTorch", heads, cells)
+    out.print(
+        "differences are in what is allowed: a share of a standard deviation of the target and of the largest value;"
+    )
+    out.print("where all bits must agree, largest is how many numbers differ and mean their share")
+    for row in shown:
+        if row.note:
+            out.print(f"{row.title}: {row.note}")
+    for row in rows:
+        if row.largest is None:
+            out.print(f"{row.title}: {row.verdict}; {row.why}")
