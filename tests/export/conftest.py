@@ -16,7 +16,9 @@ from torch.func import jvp
 
 from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
-from edp.export.golden import ends
+from edp.export.golden import ends, random_inputs
+from edp.export.simulink import SimulinkTarget
+from edp.models.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 
@@ -29,6 +31,8 @@ NEEDED = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "cppcheck": "cppcheck",
     "qemu-system-arm": "qemu-system-arm",
+    "octave-cli": "octave",
+    "mkoctfile": "octave-dev",
 }
 
 
@@ -143,3 +147,50 @@ def changes_of() -> Callable[..., np.ndarray]:
 def torch_changes() -> Callable[..., np.ndarray]:
     """How PyTorch's predictions change with inputs."""
     return differentiated
+
+
+def run_octave(program: str, folder: Path) -> str:
+    """What Octave prints."""
+    need("octave-cli")
+    script = folder / "program_of_the_test.m"
+    script.write_text(program)
+    done = subprocess.run(["octave-cli", "--norc", "--quiet", str(script)], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="session")
+def octave() -> Callable[[str, Path], str]:
+    """What Octave prints of a program that runs in a folder."""
+    return run_octave
+
+
+def faulty(predictor: Predictor, ticks: int = 90) -> np.ndarray:
+    """Inputs with bad ticks, single ones and a long run of them."""
+    rows = random_inputs(predictor, ticks, seed=6).astype(float)
+    rows[20, 0], rows[30, 1] = np.nan, np.inf
+    rows[40:49] = np.nan
+    rows[60, :] = 1e30
+    return rows
+
+
+@pytest.fixture(scope="session")
+def hard_rows() -> Callable[..., np.ndarray]:
+    """Inputs of a predictor with faults."""
+    return faulty
+
+
+@pytest.fixture(scope="session")
+def matlab_folder_of(bundle_of, tmp_path_factory) -> Callable[..., Path]:
+    """Folders for MATLAB as they are exported, by network."""
+    made: dict[tuple[str, bool], Path] = {}
+
+    def make(structure: str, whole: bool = False) -> Path:
+        if (structure, whole) not in made:
+            pytest.importorskip("onnx", reason="needs the package onnx: the extra dev has it")
+            folder = tmp_path_factory.mktemp("simulink")
+            SimulinkTarget().write(bundle_of(structure, whole), "arm", folder)
+            made[structure, whole] = folder
+        return made[structure, whole]
+
+    return make
