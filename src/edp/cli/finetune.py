@@ -35,6 +35,9 @@ def finetune(
     weight_decay: Annotated[float, typer.Option(help="Lambda of AdamW.")] = 1e-4,
     patience: Annotated[int, typer.Option(help="Epochs without gain before a phase ends; 0: never.")] = 8,
     rank: Annotated[int, typer.Option(help="Of the low-rank adapters.")] = 8,
+    source_weight: Annotated[float, typer.Option(help="Weight of the source's loss, where it is replayed.")] = 1.0,
+    soft: Annotated[float, typer.Option(help="Share of that loss that the source's network teaches.")] = 0.5,
+    reversal: Annotated[float, typer.Option(help="Weight of the reversed gradient of the adversary.")] = 0.1,
     any_sign: Annotated[bool, typer.Option("--any-sign", help="Take logs of another sign convention.")] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting of the trainings, for example training.updates=100.")
@@ -66,6 +69,9 @@ def finetune(
         weight_decay=weight_decay,
         patience=patience,
         rank=rank,
+        source_weight=source_weight,
+        soft=soft,
+        reversal=reversal,
         check_signs=not any_sign,
     )
     named = {"all": tuple(METHODS), "none": ()}.get(rivals) or tuple(name for name in rivals.split(",") if name)

@@ -247,7 +247,9 @@ class Loop:
             loss = self.objective.evaluate(answer, future, features, valid)
         else:
             taught = torch.from_numpy(batch.taught).to(self.device)
-            loss = self.lesson.loss(self.objective, Moment(answer, future, features, hidden, valid, taught))
+            done = self.progress.updates / (self.updates * self.spec.epochs)
+            moment = Moment(answer, future, features, hidden, valid, taught, done)
+            loss = self.lesson.loss(self.objective, moment)
         self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):

@@ -27,6 +27,7 @@ class Moment:
         hidden: representation of the backbone, ``(batch, time, width)``.
         valid: ``(batch, time)``: ticks that count.
         taught: ``(batch, time, column)``: what the lesson said of these ticks.
+        progress: share of the training that is done, from 0 to 1.
     """
 
     answer: Answer
@@ -35,6 +36,7 @@ class Moment:
     hidden: Tensor
     valid: Tensor
     taught: Tensor
+    progress: float = 0.0
 
 
 class Lesson(Protocol):

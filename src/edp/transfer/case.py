@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from edp.config import Experiment
 from edp.data.prepared import Prepared
+from edp.data.series import Series
 from edp.losses import Smoothness
 from edp.models.predictor import Predictor
 from edp.sources import DataSource
@@ -53,6 +54,7 @@ class Case:
         lesson: Callable[[], Lesson] | None,
         facts: Mapping[str, Any] | None = None,
         phase: str = "",
+        judged: Sequence[Series] = (),
     ) -> Predictor:
         """Train in the method's folder, or for a phase in a folder within; what was stopped goes on.
 
@@ -62,6 +64,7 @@ class Case:
             lesson: makes what the training begins with; None begins at random.
             facts: plain values that decide the lesson beside the source.
             phase: name of a phase that a later one goes on from.
+            judged: further series that choose the best epoch.
         """
         teaching = None
         if lesson is not None:
@@ -69,7 +72,7 @@ class Case:
             teaching = Teaching({"method": name, "source": self.source.facts, **(facts or {})}, lambda data: make())
         experiment = replace(self.experiment, training=training)
         folder = self.folder / "phases" / phase if phase else self.folder
-        data = self.data
+        data = replace(self.data, validation=[*self.data.validation, *judged])
         return train(self.logs, experiment, folder, lambda event: self.tell(name, event), teaching, data).predictor
 
     def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:

@@ -22,6 +22,9 @@ class FinetuneSpec:
         weight_decay: lambda of AdamW.
         patience: epochs without a better validation score before a phase ends; 0 never ends early.
         rank: of the low-rank adapters.
+        source_weight: of the source's loss beside the target's, of methods that replay it.
+        soft: share of that loss that compares with what the source's network says, of the method that distils.
+        reversal: weight of the reversed gradient of the classifier of worlds, of the adversarial method.
         check_signs: refuse logs in which a target moves against the pilot pressures that moved it in the source.
 
     Raises:
@@ -38,6 +41,9 @@ class FinetuneSpec:
     weight_decay: float = 1e-4
     patience: int = 8
     rank: int = 8
+    source_weight: float = 1.0
+    soft: float = 0.5
+    reversal: float = 0.1
     check_signs: bool = True
 
     def __post_init__(self) -> None:
@@ -50,6 +56,11 @@ class FinetuneSpec:
             raise ConfigError(
                 f"finetune: head_rate = {self.head_rate}, backbone_rate = {self.backbone_rate}, depth_decay = "
                 f"{self.depth_decay}; rates > 0 and 0 < depth_decay <= 1 must hold"
+            )
+        if not self.source_weight > 0 or not 0 < self.soft <= 1 or not self.reversal > 0:
+            raise ConfigError(
+                f"finetune: source_weight = {self.source_weight}, soft = {self.soft}, reversal = {self.reversal}; "
+                "source_weight > 0, 0 < soft <= 1 and reversal > 0 must hold"
             )
         if min(self.smoothness, self.weight_decay) < 0:
             raise ConfigError(

@@ -27,8 +27,8 @@ SETTINGS = (
     'task.targets=["rise", "turn"]',
     "task.horizons=[2, 5]",
     "training.epochs=3",
-    "training.updates=40",
-    'training.optimizer={kind="adamw",learning_rate=1e-2}',
+    "training.updates=25",
+    'training.optimizer={kind="adamw",learning_rate=2e-2}',
     'training.chunks={regime="chunk",length=32,batch=4,burn_in=10}',
     'model.backbone={kind="hybrid",channels=[8],kernel=2,units=8}',
     "model.head.hidden=8",
@@ -87,4 +87,4 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
 @pytest.fixture(scope="session")
 def small() -> FinetuneSpec:
     """A fine-tuning of a second."""
-    return FinetuneSpec(head_epochs=2, epochs=2, batch=4, head_rate=1e-2, backbone_rate=1e-3, rank=2, patience=0)
+    return FinetuneSpec(head_epochs=2, epochs=2, batch=4, head_rate=2e-2, backbone_rate=4e-3, rank=2, patience=0)

@@ -43,6 +43,10 @@ def test_every_method_is_judged_on_the_same_ticks_in_both_worlds(tuned):
     assert all(np.isfinite(value) for value in mae.values())
     assert mae["two_phase"] < mae["direct"]
     assert mae["full"] < mae["direct"]
+    kept = {name: row["worlds"]["source"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
+    for name in ("replay", "replay_distilled", "adversarial"):
+        assert mae[name] < mae["direct"]
+        assert kept[name] < kept["full"]
 
 
 def test_the_scaling_of_the_source_is_carried_and_only_from_scratch_fitted_anew(tuned, run):
@@ -123,6 +127,22 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, smal
         finetune(run, target, Order(spec=dataclasses.replace(small, head_rate=1e-3)), tmp_path / "run")
 
 
+def test_a_stopped_adversarial_training_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
+    whole, _ = tuned
+
+    def pull(name, event):
+        if event.row is not None:
+            raise Pulled
+
+    order = Order(spec=small, method="adversarial")
+    with pytest.raises(Pulled):
+        finetune(run, target, order, tmp_path / "run", Watchers(on_training=pull))
+    finetune(run, target, order, tmp_path / "run")
+    ends = [load_bundle(folder).predictor.state_dict() for folder in (whole / "rivals/adversarial", tmp_path / "run")]
+    assert ends[0].keys() == ends[1].keys()
+    assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
+
+
 def test_the_run_can_be_judged_like_any_other(tuned):
     folder, found = tuned
     scores = read_json(evaluate(folder) / "scores.json")
@@ -141,6 +161,9 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
     assert list(found["methods"]["two_phase"]["worlds"]) == ["target"]
     assert any("bundle without the run" in note for note in notes)
     assert any("sign of rise, turn was not checked" in note for note in notes)
+    with pytest.raises(ConfigError, match=r"adversarial needs the recordings of the source.*bundle without the run"):
+        finetune(tmp_path / "alone", target, Order(spec=small, rivals=("adversarial",)), tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def test_settings_of_a_task_resolve_to_it(run):
@@ -167,7 +190,8 @@ def test_changes_that_cannot_be_are_refused(run, change, reason):
 
 
 @pytest.mark.parametrize(
-    "change", [{"epochs": 0}, {"head_rate": 0.0}, {"smoothness": -1.0}, {"depth_decay": 1.5}, {"patience": -1}]
+    "change",
+    [{"epochs": 0}, {"head_rate": 0.0}, {"smoothness": -1.0}, {"depth_decay": 1.5}, {"patience": -1}, {"soft": 0.0}],
 )
 def test_options_out_of_range_are_refused(change):
     with pytest.raises(ConfigError, match="must hold"):
