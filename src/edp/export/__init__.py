@@ -3,7 +3,17 @@
 from edp.export.base import TARGETS, ExportTarget, make_target
 from edp.export.c import CTarget
 from edp.export.casadi import CasadiTarget
+from edp.export.fmu import FmuTarget
 from edp.export.onnx import OnnxTarget
 from edp.export.simulink import SimulinkTarget
 
-__all__ = ["TARGETS", "CTarget", "CasadiTarget", "ExportTarget", "OnnxTarget", "SimulinkTarget", "make_target"]
+__all__ = [
+    "TARGETS",
+    "CTarget",
+    "CasadiTarget",
+    "ExportTarget",
+    "FmuTarget",
+    "OnnxTarget",
+    "SimulinkTarget",
+    "make_target",
+]

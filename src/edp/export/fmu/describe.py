@@ -1,0 +1,185 @@
+"""``modelDescription.xml`` of both versions of FMI, and what goes with the sources."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from edp import __version__
+from edp.export.fmu.interface import Variable
+from edp.export.fmu.units import BASES, shown, units_of
+
+EXPERIMENT_TICKS = 500
+"""Length of the simulation that is proposed to an importer."""
+CATEGORIES = {
+    "logStatusWarning": "bad or missing inputs, ticks left out",
+    "logStatusError": "calls that are refused, with the reason",
+}
+OPTIONS = "-O2 -ffp-contract=off"
+FORMS2 = {"real": "Real", "whole": "Integer", "flag": "Boolean"}
+FORMS3 = {"real": "Float64", "whole": "Int32", "flag": "Boolean"}
+
+
+@dataclass(frozen=True, eq=False)
+class About:
+    """What the XML files tell.
+
+    Attributes:
+        name: of the model and its binaries.
+        token: content address of sources and interface, in the form of a GUID.
+        title: the network in a line.
+        rate_hz: ticks a second.
+        listed: variables in the order of their value references.
+        derivatives: whether directional derivatives are provided.
+        facts: what else is known, by name.
+    """
+
+    name: str
+    token: str
+    title: str
+    rate_hz: float
+    listed: Sequence[Variable]
+    derivatives: bool
+    facts: dict[str, str]
+
+    @property
+    def step_s(self) -> float:
+        """Length of a tick."""
+        return 1.0 / self.rate_hz
+
+
+def fmi2(about: About, sources: Sequence[str]) -> bytes:
+    """The description for FMI 2.0; `sources` are the C files to compile."""
+    root = ET.Element("fmiModelDescription", {"fmiVersion": "2.0"} | _head(about) | {"guid": about.token})
+    abilities = _abilities("canGetAndSetFMUstate", "canSerializeFMUstate", "providesDirectionalDerivative", about)
+    more = {"canNotUseMemoryManagementFunctions": "true", "canInterpolateInputs": "false"}
+    simulated = ET.SubElement(root, "CoSimulation", {"modelIdentifier": about.name} | abilities | more)
+    files = ET.SubElement(simulated, "SourceFiles")
+    for file in sources:
+        ET.SubElement(files, "File", {"name": file})
+    _units(root, about)
+    _categories(root)
+    _experiment(root, about)
+    tool = ET.SubElement(ET.SubElement(root, "VendorAnnotations"), "Tool", {"name": "EDP"})
+    ET.SubElement(tool, "edp", about.facts)
+    listed = ET.SubElement(root, "ModelVariables")
+    for reference, entry in enumerate(about.listed):
+        made = ET.SubElement(listed, "ScalarVariable", _common(reference, entry))
+        ET.SubElement(made, FORMS2[entry.form], _numbers(entry))
+    structure = ET.SubElement(root, "ModelStructure")
+    for kind in ("Outputs", "InitialUnknowns"):
+        group = ET.SubElement(structure, kind)
+        for reference in _outputs(about):
+            ET.SubElement(group, "Unknown", {"index": str(reference + 1), "dependencies": ""})
+    return _text(root)
+
+
+def fmi3(about: About) -> bytes:
+    """The description for FMI 3.0."""
+    root = ET.Element("fmiModelDescription", {"fmiVersion": "3.0"} | _head(about) | {"instantiationToken": about.token})
+    abilities = _abilities("canGetAndSetFMUState", "canSerializeFMUState", "providesDirectionalDerivatives", about)
+    more = {"fixedInternalStepSize": repr(about.step_s)}
+    ET.SubElement(root, "CoSimulation", {"modelIdentifier": about.name} | abilities | more)
+    _units(root, about)
+    _categories(root)
+    _experiment(root, about)
+    listed = ET.SubElement(root, "ModelVariables")
+    for reference, entry in enumerate(about.listed):
+        ET.SubElement(listed, FORMS3[entry.form], _common(reference, entry) | _numbers(entry))
+    time = {"name": _time(about), "valueReference": str(len(about.listed)), "causality": "independent"}
+    ET.SubElement(listed, "Float64", time | {"variability": "continuous", "unit": "s", "description": "time"})
+    structure = ET.SubElement(root, "ModelStructure")
+    for kind in ("Output", "InitialUnknown"):
+        for reference in _outputs(about):
+            ET.SubElement(structure, kind, {"valueReference": str(reference), "dependencies": ""})
+    note = ET.SubElement(ET.SubElement(root, "Annotations"), "Annotation", {"type": "excavator-dynamics-predictor"})
+    ET.SubElement(note, "edp", about.facts)
+    return _text(root)
+
+
+def build_description(about: About, sources: Sequence[str]) -> bytes:
+    """``sources/buildDescription.xml`` of FMI 3.0."""
+    root = ET.Element("fmiBuildDescription", {"fmiVersion": "3.0"})
+    configuration = ET.SubElement(root, "BuildConfiguration", {"modelIdentifier": about.name})
+    files = ET.SubElement(
+        configuration, "SourceFileSet", {"language": "C99", "compiler": "gcc", "compilerOptions": OPTIONS}
+    )
+    for file in sources:
+        ET.SubElement(files, "SourceFile", {"name": file})
+    ET.SubElement(configuration, "Library", {"name": "m", "external": "true", "description": "the C library's"})
+    return _text(root)
+
+
+def _head(about: About) -> dict[str, str]:
+    return {
+        "modelName": about.name,
+        "description": about.title,
+        "generationTool": f"Excavator Dynamics Predictor {__version__}",
+        "variableNamingConvention": "flat",
+    }
+
+
+def _abilities(state: str, serial: str, derivative: str, about: About) -> dict[str, str]:
+    """What both versions promise, under their names."""
+    return {
+        "needsExecutionTool": "false",
+        "canBeInstantiatedOnlyOncePerProcess": "false",
+        "canHandleVariableCommunicationStepSize": "false",
+        state: "true",
+        serial: "true",
+        derivative: "true" if about.derivatives else "false",
+    }
+
+
+def _units(root: ET.Element, about: About) -> None:
+    group = ET.SubElement(root, "UnitDefinitions")
+    for name, displays in units_of([entry.kind for entry in about.listed if entry.form == "real"]).items():
+        unit = ET.SubElement(group, "Unit", {"name": name})
+        ET.SubElement(unit, "BaseUnit", {base: str(power) for base, power in BASES[name].items()})
+        for also in displays:
+            facts = {"name": also.name, "factor": repr(also.factor)}
+            ET.SubElement(unit, "DisplayUnit", facts | ({"offset": repr(also.offset)} if also.offset else {}))
+
+
+def _categories(root: ET.Element) -> None:
+    group = ET.SubElement(root, "LogCategories")
+    for name, text in CATEGORIES.items():
+        ET.SubElement(group, "Category", {"name": name, "description": text})
+
+
+def _experiment(root: ET.Element, about: About) -> None:
+    stop = repr(EXPERIMENT_TICKS / about.rate_hz)
+    ET.SubElement(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": stop, "stepSize": repr(about.step_s)})
+
+
+def _common(reference: int, entry: Variable) -> dict[str, str]:
+    made = {"name": entry.name, "valueReference": str(reference)}
+    if entry.description:
+        made["description"] = entry.description
+    made |= {"causality": entry.causality, "variability": "continuous" if entry.form == "real" else "discrete"}
+    return made if entry.causality == "input" else made | {"initial": "calculated"}
+
+
+def _numbers(entry: Variable) -> dict[str, str]:
+    if entry.form != "real":
+        return {}
+    made = {"unit": entry.unit}
+    also = shown(entry.kind)
+    made |= {"displayUnit": also.name} if also is not None else {}
+    made["nominal"] = repr(entry.nominal)
+    return made | ({"start": "0.0"} if entry.causality == "input" else {})
+
+
+def _time(about: About) -> str:
+    taken = {entry.name for entry in about.listed}
+    return next(name for k in range(len(taken) + 1) if (name := f"time_{k}" if k else "time") not in taken)
+
+
+def _outputs(about: About) -> list[int]:
+    return [reference for reference, entry in enumerate(about.listed) if entry.causality == "output"]
+
+
+def _text(root: ET.Element) -> bytes:
+    ET.indent(root)
+    return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode").encode() + b"\n"

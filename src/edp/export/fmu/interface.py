@@ -1,0 +1,96 @@
+"""What an importer sees of a predictor: its variables in the order of their value references."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from edp.export.c.model import Model
+from edp.export.golden import ends
+from edp.signals import KINDS, Kind
+
+Form = Literal["real", "whole", "flag"]
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable; its value reference is its place in the list.
+
+    Attributes:
+        name: unique.
+        causality: input, output or local.
+        description: for people.
+        form: real number, whole number, or true and false.
+        kind: what a real number measures.
+        nominal: usual size of a real number, SI unit.
+    """
+
+    name: str
+    causality: Literal["input", "output", "local"]
+    description: str
+    form: Form = "real"
+    kind: Kind = Kind.GENERIC
+    nominal: float = 1.0
+
+    @property
+    def unit(self) -> str:
+        """SI unit."""
+        return KINDS[self.kind].si_unit
+
+
+STATUS = "0 predicted; 1 warming up: fewer ticks than a window since a reset; 2 held: bad inputs; 3 no prediction"
+OWN = (
+    Variable("status", "output", STATUS, "whole"),
+    Variable("valid", "output", "true if the predictions rest on this tick's inputs and a whole window", "flag"),
+    Variable("rejected", "local", "ticks with bad inputs since the reset", "whole"),
+    Variable("held", "local", "ticks fed with the last accepted inputs since the reset", "whole"),
+    Variable("restarts", "local", "times the memory was cleared since the reset", "whole"),
+)
+"""Behind inputs and predictions, in the order of ``edp_fmu.h``."""
+
+
+def variables(model: Model) -> list[Variable]:
+    """Inputs, predictions and bounds in the order of the model's C structures, then those of the FMU itself."""
+    _, spread = ends(model.bundle.predictor)
+    made = [
+        Variable(entry.name, "input", entry.description, kind=entry.kind, nominal=_nominal(width))
+        for entry, width in zip(model.bundle.inputs, spread, strict=True)
+    ]
+    return _unique(made + _predictions(model) + list(OWN))
+
+
+def _predictions(model: Model) -> list[Variable]:
+    bundle, task = model.bundle, model.bundle.task
+    widths = bundle.predictor.code.width.detach().cpu().double().numpy()
+    ends_of = [("", "")]
+    for side in ("lower", "upper"):
+        for covered in bundle.predictor.output.coverages:
+            percent = f"{100 * covered:g}"
+            text = f", {side} bound of an interval meant to hold {percent} % of the true values"
+            ends_of.append((f"_{side}_{percent.replace('.', '_')}", text))
+    made = []
+    for ending, text in ends_of:
+        for row, ticks in zip(widths, task.horizons, strict=True):
+            when = f"{ticks} ticks ({1000 * ticks / task.rate_hz:g} ms) after the inputs of the last step"
+            for at, name in enumerate(task.targets):
+                about = " ".join(part for part in (bundle.descriptions[at], f"[{name}] {when}{text}") if part)
+                kind = bundle.target_kinds[at]
+                made.append(Variable(f"{name}_ahead_{ticks}{ending}", "output", about, "real", kind, _nominal(row[at])))
+    return made
+
+
+def _nominal(width: float) -> float:
+    """A width with three digits; 1 where there is none."""
+    return float(f"{abs(width):.3g}") or 1.0
+
+
+def _unique(listed: list[Variable]) -> list[Variable]:
+    """The same with names that differ, of one line each."""
+    taken: set[str] = set()
+    made = []
+    for entry in listed:
+        plain = " ".join(entry.name.split())
+        name = next(n for k in range(len(listed) + 1) if (n := f"{plain}_{k}" if k else plain) not in taken)
+        taken.add(name)
+        made.append(Variable(name, entry.causality, entry.description, entry.form, entry.kind, entry.nominal))
+    return made

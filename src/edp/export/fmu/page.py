@@ -1,0 +1,45 @@
+"""``documentation/index.html`` of an FMU."""
+
+from __future__ import annotations
+
+from html import escape
+
+from edp.export.fmu.describe import About
+
+RULES = (
+    "A step reads the inputs that were set before it; the predictions can be read after it. No output depends on an "
+    "input at the same communication point, so there are no algebraic loops.",
+    "Every step must be {step} s long and begin where the one before ended: another length is refused with an error "
+    "and a message. Whole steps that were left out are held: the last accepted inputs are fed again, up to five in a "
+    "row.",
+    "An input that is NaN, infinite, far beyond its range or was never set makes a tick bad: it is held as well, the "
+    "step returns a warning, and valid is false. Without anything to hold there is no prediction: outputs keep their "
+    "values, status is 3.",
+    "After a reset, and after more than five held ticks in a row, status is 1 and valid is false for {window} steps.",
+    "States can be saved, restored and serialised; what follows is the same to the last bit. Instances share nothing.",
+    "From the sources of several FMUs in one program: define FMI2_FUNCTION_PREFIX or FMI3_FUNCTION_PREFIX as {name}_ "
+    "for each. With EDP_FMI_HEADERS the standard's own headers are used.",
+)
+
+
+def page(about: About) -> bytes:
+    """The page: what goes in and out, and the rules."""
+    window = about.facts["window"]
+    rules = "".join(f"<li>{escape(t.format(step=about.step_s, window=window, name=about.name))}</li>" for t in RULES)
+    rows = "".join(
+        f"<tr><td>{escape(entry.name)}</td><td>{entry.causality}</td>"
+        f"<td>{escape(entry.unit) if entry.form == 'real' else ''}</td><td>{escape(entry.description)}</td></tr>"
+        for entry in about.listed
+    )
+    derivatives = (
+        "Directional derivatives of the predictions by the inputs of the last step are provided."
+        if about.derivatives
+        else "Directional derivatives are not provided."
+    )
+    name, title = escape(about.name), escape(about.title)
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{name}</title></head><body>\n'
+        f"<h1>{name}</h1>\n<p>{title}, {about.rate_hz:g} Hz, in SI units. {derivatives}</p>\n<ul>{rules}</ul>\n"
+        f"<table><tr><th>variable</th><th>causality</th><th>unit</th><th>what it is</th></tr>{rows}</table>\n"
+        "</body></html>\n"
+    ).encode()
