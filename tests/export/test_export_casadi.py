@@ -5,15 +5,24 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from edp.config import load_experiment
+from edp.data.features import FeatureSet
+from edp.data.scaling import Scaler
+from edp.data.task import Task
 from edp.errors import ExportError
 from edp.export import make_target
 from edp.export.casadi.target import KNOWN, CasadiTarget
 from edp.export.golden import random_inputs, stream, tolerance
 from edp.graph.reference import STEPS
+from edp.models.backbones import LstmSpec
+from edp.models.predictor import ModelSpec, build_model
+from edp.signals import Channel, Kind
+from edp.training.bundle import Bundle
 
 casadi = pytest.importorskip("casadi", reason="needs casadi: pip install 'excavator-dynamics-predictor[casadi]'")
 from edp.export.casadi import runtime  # noqa: E402
@@ -23,6 +32,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script:DeprecationWar
 NETWORKS = ("hybrid+all", "hybrid9", "tcn+all", "gru+quantiles", "lstm2", "lstm+hybrid physics")
 """Among them all kinds of layers."""
 TICKS = 30
+EXAMPLES = Path(__file__).parents[2] / "examples"
 TOLERANCE = 1e-4
 
 
@@ -124,8 +134,9 @@ def test_a_horizon_in_c_is_that_of_casadi(network, bundle_of, network_of, extern
     commands = made.inputs[-2:]
     x = run(made.step, made.start, inputs)[1][-1]
     library = made.path.with_name("predictor_external.so")
-    fast = Horizon(made, library, steps, commands, carry, feed)
-    y, jacobian = fast(x, first, base)
+    fast = Horizon(made, library, steps, 2, carry, feed)
+    by = np.tile(np.eye(len(made.inputs))[-2:], (steps, 1, 1))
+    y, jacobian = fast(x, first, base, by)
     plan = made.horizon(steps, carry, feed)
     assert relative(y, np.array(plan(x, first, base.T)).T) < TOLERANCE
     by_first, by_base = plan.jacobian()(x, first, base.T, 0)[1:3]
@@ -135,9 +146,9 @@ def test_a_horizon_in_c_is_that_of_casadi(network, bundle_of, network_of, extern
     assert relative(jacobian, wanted) < TOLERANCE
     first[0] = np.nan
     with pytest.raises(ValueError, match=r"inputs of tick 0 .* not finite"):
-        fast(x, first, base)
+        fast(x, first, base, by)
     with pytest.raises(ValueError, match="numbers"):
-        fast(x, first[1:], base)
+        fast(x, first[1:], base, by)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -198,3 +209,22 @@ def test_what_is_not_known_is_refused(bundle_of, network_of, tmp_path):
         runtime.Network(other)
     with pytest.raises(RuntimeError, match="does not start"):
         network_of("lstm").compile("no-such-compiler")
+
+
+@pytest.mark.slow
+def test_the_example_tracks(c, tmp_path):
+    """With an untrained plant: it runs, and every way ends with numbers."""
+    c.need("gcc")
+    task = load_experiment(EXAMPLES / "mpc.toml").task
+    names = tuple(task.features.channels)
+    scaler = Scaler(np.zeros(9), np.r_[np.full(3, 0.1), np.full(6, 1e6)], np.zeros((1, 3)), np.full((1, 3), 0.01))
+    made = Task(FeatureSet("plant", names), names[:3], (1,), task.mode, 100.0)
+    predictor = build_model(made, ModelSpec(backbone=LstmSpec(units=4), window=5), scaler, seed=1).eval()
+    kinds = [Kind.VELOCITY] * 3 + [Kind.PILOT_PRESSURE] * 6
+    inputs = tuple(Channel(name, kind, "an input") for name, kind in zip(names, kinds, strict=True))
+    CasadiTarget().write(Bundle(predictor, inputs, (Kind.VELOCITY,) * 3, names[:3]), "plant", tmp_path)
+    command = [sys.executable, EXAMPLES / "mpc.py", tmp_path / "plant.json", "1"]
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    assert lines[0].startswith("C horizon + DAQP")
+    assert len(lines) == 3
+    assert all("nan" not in line for line in lines)
