@@ -76,30 +76,38 @@ class Case:
         return train(self.logs, experiment, folder, lambda event: self.tell(name, event), teaching, data).predictor
 
     def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:
-        """How a network is trained on: small batches, light smoothness, early stopping (3.4.5).
+        """How a network is trained on, see `tuned`."""
+        return tuned(self.experiment.training, self.spec, optimizer, epochs)
 
-        Args:
-            optimizer: by default one rate, that of the head, for all that learns.
-            epochs: by default those of both phases together.
-        """
-        spec, training = self.spec, self.experiment.training
-        rate = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)
-        terms = tuple(term for term in training.terms if not isinstance(term, Smoothness))
-        if spec.smoothness:
-            smooth: Any = Smoothness(weight=spec.smoothness)
-            terms = (*terms, smooth)
-        chunks = replace(training.chunks, batch=spec.batch)
-        if chunks.regime == "window":
-            near = NEIGHBOURS if spec.batch % NEIGHBOURS == 0 else spec.batch
-            chunks = replace(chunks, consecutive=near if terms else 1)
-        elif not chunks.carried:  # Minutes of logs do not fill many lanes: they are walked again, cut elsewhere.
-            chunks = replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))
-        return replace(
-            training,
-            chunks=chunks,
-            terms=terms,
-            optimizer=optimizer or rate,
-            epochs=epochs or spec.head_epochs + spec.epochs,
-            patience=spec.patience,
-            refit="none",
-        )
+
+def tuned(
+    training: TrainingSpec, spec: FinetuneSpec, optimizer: OptimizerSpec | None = None, epochs: int | None = None
+) -> TrainingSpec:
+    """How a network is trained on: small batches, light smoothness, early stopping (thesis 3.4.5).
+
+    Args:
+        training: how the source was trained.
+        spec: what is set of the fine-tuning.
+        optimizer: by default one rate, that of the head, for all that learns.
+        epochs: by default those of both phases together.
+    """
+    rate = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)
+    terms = tuple(term for term in training.terms if not isinstance(term, Smoothness))
+    if spec.smoothness:
+        smooth: Any = Smoothness(weight=spec.smoothness)
+        terms = (*terms, smooth)
+    chunks = replace(training.chunks, batch=spec.batch, consecutive=1)
+    if chunks.regime == "window":
+        near = NEIGHBOURS if spec.batch % NEIGHBOURS == 0 else spec.batch
+        chunks = replace(chunks, consecutive=near if terms else 1)
+    elif not chunks.carried:  # Minutes of logs do not fill many lanes: they are walked again, cut elsewhere.
+        chunks = replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))
+    return replace(
+        training,
+        chunks=chunks,
+        terms=terms,
+        optimizer=optimizer or rate,
+        epochs=epochs or spec.head_epochs + spec.epochs,
+        patience=spec.patience,
+        refit="none",
+    )

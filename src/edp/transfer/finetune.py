@@ -21,7 +21,7 @@ from edp.sources import DataSource
 from edp.storage import make_folder, write_bytes, write_json
 from edp.training import Diverged, Event
 from edp.training.bundle import weights_digest
-from edp.transfer.case import Case
+from edp.transfer.case import Case, tuned
 from edp.transfer.checks import check_channels, check_lengths, check_moving, check_signs
 from edp.transfer.methods import METHODS, Made, Method
 from edp.transfer.scores import distributions, errors_of, excerpts, measure
@@ -143,7 +143,7 @@ def _target(source: Source, logs: DataSource, experiment: Experiment, order: Ord
     recordings = logs.read()
     check_channels(recordings, task)
     data = prepare(recordings, task, experiment.split, window)
-    check_lengths(data, Case(source, logs, data, experiment, order.spec, Path(), _deaf).tuning().chunks, window)
+    check_lengths(data, tuned(experiment.training, order.spec).chunks, window)
     check_moving(data)
     notes = []
     if order.spec.check_signs:
@@ -151,10 +151,6 @@ def _target(source: Source, logs: DataSource, experiment: Experiment, order: Ord
     if source.data is None:
         notes.append(f"What becomes of the source's world was not judged: {source.absent}.")
     return data, notes
-
-
-def _deaf(name: str, event: Event) -> None:
-    """Hear nothing."""
 
 
 def _result(

@@ -11,11 +11,15 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from edp.cli import app
+from edp.data.chunks import ChunkSpec
 from edp.errors import BundleError, ConfigError, StorageError
+from edp.losses import Drift, Smoothness
 from edp.models.decomposition import decompose
 from edp.storage import read_json
 from edp.training import load_bundle
+from edp.training.spec import TrainingSpec
 from edp.transfer import METHODS, FinetuneSpec, Order, Watchers, finetune
+from edp.transfer.case import tuned as tuning
 from edp.transfer.scores import errors_of, measure, skew
 from edp.transfer.source import read_source, target_experiment, task_settings
 from edp.workflow import evaluate
@@ -209,6 +213,20 @@ def test_the_defaults_are_those_of_the_thesis():
     spec = FinetuneSpec()
     assert (spec.head_epochs, spec.epochs, spec.head_rate, spec.backbone_rate) == (15, 25, 3e-4, 1e-5)
     assert (spec.batch, spec.smoothness) == (32, 0.05)
+
+
+def test_windows_are_drawn_together_for_smoothness_and_chunks_walked_again():
+    spec = FinetuneSpec()
+    window = TrainingSpec(chunks=ChunkSpec(regime="window", length=50, batch=256))
+    made = tuning(window, spec)
+    assert (made.chunks.batch, made.chunks.consecutive, made.epochs, made.patience) == (32, 4, 40, 8)
+    assert [term.weight for term in made.terms] == [0.05]
+    assert tuning(window, FinetuneSpec(smoothness=0.0)).chunks.consecutive == 1
+    made = tuning(TrainingSpec(terms=(Smoothness(weight=0.2), Drift()), refit="best"), spec, epochs=25)
+    assert [type(term) for term in made.terms] == [Drift, Smoothness]
+    assert made.terms[1].weight == 0.05
+    assert (made.chunks.carried, made.epochs, made.refit) == (8, 25, "none")
+    assert tuning(TrainingSpec(chunks=ChunkSpec(length=8, burn_in=100)), spec).chunks.carried == 13
 
 
 def test_skew_and_squares_are_those_of_scipy(tiny):
