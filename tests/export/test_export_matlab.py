@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -74,11 +76,19 @@ def test_only_functions_that_are_called_are_written():
     assert every.count("function ") == text.count("function ")
 
 
-def test_octave_reads_every_file_of_matlab(octave, matlab_folder_of, tmp_path):
-    """Those that need MATLAB or Simulink are parsed only."""
-    files = [file for whole in (False, True) for file in sorted(matlab_folder_of("hybrid", whole).glob("*.m"))]
+def test_every_file_is_matlab(matlab_folder_of, octave, tmp_path):
+    """Of R2021b for a parser of MATLAB, and for Octave's, which parses only what needs MATLAB or Simulink."""
+    folders = [matlab_folder_of("hybrid+all", whole) for whole in (False, True)]
+    files = [file for folder in folders for file in sorted(folder.glob("*.m"))]
     assert len(files) == 13 + 9
     octave("\n".join(f"__parse_file__('{file}');" for file in files), tmp_path)
+    parser = Path(sys.executable).with_name("mh_style")
+    if not parser.exists():
+        pytest.skip("needs the package miss-hit-core: the extra dev has it")
+    for folder in folders:
+        command = [parser, "--ignore-config", "--no-style", "--matlab", "2021b", "--single", folder]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
 
 
 def test_names_widths_rates_and_states_of_others_are_refused(octave, matlab_folder_of, bundle_of, tmp_path):
