@@ -108,12 +108,13 @@ def finetune(
     told = watchers or Watchers()
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
-    data, notes = _target(begun, logs, experiment, order)
+    names, notes = _able(begun, order)
+    data, found = _target(begun, logs, experiment, order)
+    notes += found
     for note in notes:
         told.on_note(note)
     folder = Path(out)
     made: dict[str, Made] = {}
-    names = order.names
     for number, name in enumerate(names):
         told.on_method(name, number, len(names))
         place = folder if name == order.method else folder / "rivals" / name
@@ -132,14 +133,26 @@ def finetune(
     return result
 
 
+def _able(source: Source, order: Order) -> tuple[list[str], list[str]]:
+    """The methods for which the source has what they need; and which others are left out, and why.
+
+    Raises:
+        ConfigError: the method that is to be kept is one of the others.
+    """
+    lacking = [name for name in order.names if METHODS[name].replays and source.data is None]
+    if order.method in lacking:
+        raise ConfigError(
+            f"method '{order.method}' needs the recordings of the source, which are not there: {source.absent}"
+        )
+    notes = [
+        f"{METHODS[name].label} is left out: it needs the recordings of the source. {source.absent}" for name in lacking
+    ]
+    return [name for name in order.names if name not in lacking], notes
+
+
 def _target(source: Source, logs: DataSource, experiment: Experiment, order: Order) -> tuple[Prepared, list[str]]:
     """The logs, divided and held against the source; and what could not be held."""
     task, window = source.bundle.task, source.predictor.spec.window
-    needing = [name for name in order.names if METHODS[name].replays]
-    if needing and source.data is None:
-        raise ConfigError(
-            f"method {', '.join(needing)} needs the recordings of the source, which are not there: {source.absent}"
-        )
     recordings = logs.read()
     check_channels(recordings, task)
     data = prepare(recordings, task, experiment.split, window)

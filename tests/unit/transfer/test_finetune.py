@@ -160,13 +160,15 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
     for file in (run / "bundle").iterdir():
         (tmp_path / "alone" / file.name).write_bytes(file.read_bytes())
     notes = []
-    order = Order(spec=small, changes=("training.updates=2", "training.chunks.length=32"))
+    changes = ("training.updates=2", "training.chunks.length=32")
+    order = Order(spec=small, rivals=("adversarial",), changes=changes)
     found = finetune(tmp_path / "alone", target, order, tmp_path / "run", Watchers(on_note=notes.append))
     assert list(found["methods"]["two_phase"]["worlds"]) == ["target"]
     assert any("bundle without the run" in note for note in notes)
     assert any("sign of rise, turn was not checked" in note for note in notes)
-    with pytest.raises(ConfigError, match=r"adversarial needs the recordings of the source.*bundle without the run"):
-        finetune(tmp_path / "alone", target, Order(spec=small, rivals=("adversarial",)), tmp_path / "other")
+    assert any(note.startswith("Replay, adversarial is left out: it needs the recordings") for note in notes)
+    with pytest.raises(ConfigError, match=r"'adversarial' needs the recordings of the source.*bundle without the run"):
+        finetune(tmp_path / "alone", target, Order(spec=small, method="adversarial"), tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
