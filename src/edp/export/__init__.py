@@ -5,6 +5,7 @@ from edp.export.c import CTarget
 from edp.export.casadi import CasadiTarget
 from edp.export.fmu import FmuTarget
 from edp.export.onnx import OnnxTarget
+from edp.export.ros2 import Ros2Target
 from edp.export.simulink import SimulinkTarget
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "ExportTarget",
     "FmuTarget",
     "OnnxTarget",
+    "Ros2Target",
     "SimulinkTarget",
     "make_target",
 ]

@@ -1,0 +1,116 @@
+"""The ROS 2 node: messages in and out; what they mean is in core.py."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import FluidPressure, JointState
+from std_msgs.msg import Bool, Float64
+
+from .core import Assembler, Core, Tick, read_sources
+
+FIELDS = {"velocity": "velocity", "angular_velocity": "velocity", "position": "position", "angle": "position"}
+"""Where a target of a kind goes in a JointState; any other is an effort."""
+
+
+def seconds(stamp: Any) -> float:
+    """A time of ROS in seconds."""
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
+class Predictor(Node):
+    """Predicts at each message of joints; see README.md for topics and parameters."""
+
+    def __init__(self) -> None:
+        super().__init__("predictor")
+        core = Core()
+        self.declare_parameter("sources", [""])
+        self.declare_parameter("rate_hz", float(core.about["rate_hz"]))
+        rate = self.get_parameter("rate_hz").value
+        if rate != core.about["rate_hz"]:
+            raise ValueError(f"rate_hz is {rate}; the network was trained at {core.about['rate_hz']} Hz, leave it out")
+        self.ticks = Assembler(core, read_sources(core.inputs, list(self.get_parameter("sources").value)))
+        make = partial(self.create_publisher, qos_profile=10)
+        self.results = {
+            (meaning, number, ahead["ticks"]): make(JointState, f"~/{meaning}{number or ''}/ahead_{ahead['ticks']}")
+            for meaning in core.results
+            for number in range(len(core.result(meaning)))
+            for ahead in core.about["horizons"]
+        }
+        self.valid, self.step_us = make(Bool, "~/valid"), make(Float64, "~/step_us")
+        self.diagnostics = make(DiagnosticArray, "/diagnostics")
+        self.create_subscription(JointState, "joint_states", self.on_joints, qos_profile_sensor_data)
+        self.create_subscription(FluidPressure, "pressures", self.on_pressure, qos_profile_sensor_data)
+        self.create_timer(1.0, self.report)
+        self.last: Tick | None = None
+        self.fresh = False
+
+    def on_pressure(self, message: Any) -> None:
+        """A pressure; its frame_id names the sensor."""
+        self.ticks.pressure(message.header.frame_id, message.fluid_pressure, seconds(message.header.stamp))
+
+    def on_joints(self, message: Any) -> None:
+        """A tick."""
+        position, velocity, effort = (list(part) for part in (message.position, message.velocity, message.effort))
+        tick = self.ticks.joints(list(message.name), position, velocity, effort, seconds(message.header.stamp))
+        self.fresh = True
+        if self.last is None or (tick.why and tick.why != self.last.why):
+            self.get_logger().warning(tick.why or "predicting")
+        self.last = tick
+        self.valid.publish(Bool(data=tick.valid))
+        self.step_us.publish(Float64(data=tick.step_us))
+        if tick.predicted:
+            self.publish(message.header.stamp)
+
+    def publish(self, stamp: Any) -> None:
+        """The results of this tick, stamped with the time of its inputs."""
+        core = self.ticks.core
+        for meaning in core.results:
+            for number, interval in enumerate(core.result(meaning)):
+                for ahead, values in zip(core.about["horizons"], interval):
+                    made = JointState()
+                    made.header.stamp = stamp
+                    made.name = [target["name"] for target in core.about["targets"]]
+                    for field in ("position", "velocity", "effort"):
+                        kinds = [FIELDS.get(target["kind"], "effort") for target in core.about["targets"]]
+                        if field in kinds:
+                            # One that goes elsewhere is NaN here: a JointState has all of a field or none.
+                            nan = float("nan")
+                            setattr(made, field, [v if k == field else nan for v, k in zip(values, kinds)])
+                    self.results[meaning, number, ahead["ticks"]].publish(made)
+
+    def report(self) -> None:
+        """Once a second; where no joints came since, the prediction is no longer valid."""
+        tick, core = self.last, self.ticks.core
+        if not self.fresh:
+            self.valid.publish(Bool(data=False))
+        good = self.fresh and tick is not None and tick.valid
+        why = "predicting" if good else tick.why if self.fresh and tick is not None else "no joints in the last second"
+        counts = core.counts | {"messages_rejected": self.ticks.rejected}
+        values = [KeyValue(key=key, value=str(value)) for key, value in counts.items()]
+        values += [KeyValue(key="step_us", value=f"{tick.step_us:.1f}" if tick is not None else "")]
+        values += [KeyValue(key="model_hash", value=core.about["model_hash"])]
+        level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
+        made = DiagnosticArray()
+        made.header.stamp = self.get_clock().now().to_msg()
+        made.status = [DiagnosticStatus(level=level, name=self.get_name(), message=why, values=values)]
+        self.diagnostics.publish(made)
+        self.fresh = False
+
+
+def main(args: Any = None) -> None:
+    """Run until interrupted."""
+    rclpy.init(args=args)
+    node = Predictor()
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
