@@ -78,7 +78,6 @@ class Core:
         self.inputs = [channel["name"] for channel in self.about["inputs"]]
         shapes = self.about["results"]
         self.results = {meaning: shape[0] * shape[1] for meaning, shape in shapes.items()}
-        self._in = (ctypes.c_float * len(self.inputs))()
         self._out = (ctypes.c_float * sum(self.results.values()))()
         self._state = (ctypes.c_uint64 * (size() // 8 + 1))()
         self.reset()
@@ -95,8 +94,8 @@ class Core:
         """
         if len(row) != len(self.inputs):
             raise ValueError(f"a tick has {len(row)} numbers; the network reads {len(self.inputs)}")
-        self._in[:] = (ctypes.c_float * len(row))(*row)
-        return Status(self._step(self._state, self._in, self._out))
+        given = (ctypes.c_float * len(row))(*row)
+        return Status(self._step(self._state, given, self._out))
 
     def missed(self, ticks: int) -> Status:
         """Tell that so many ticks went by without inputs."""
