@@ -58,6 +58,18 @@ def test_matlab_code_predicts_what_pytorch_predicts(structure, natives):
     assert status.tolist() == [1] * 8 + [0] * (TICKS - 8)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("network", ["hybrid+all", "tcn+all", "gru+quantiles", "lstm2", "lstm+hybrid physics"])
+def test_matlab_code_follows_pytorch_for_a_long_time(network, matlab_folder_of, bundle_of, octave, tmp_path):
+    predictor = bundle_of(network).predictor
+    inputs = random_inputs(predictor, 2_000, seed=8)
+    scipy.io.savemat(tmp_path / "rows.mat", {"rows": inputs})
+    program = "load('rows.mat'); found = arm_stream(arm_load(), rows); save('-v6', 'found.mat', 'found');"
+    octave(f"addpath('{matlab_folder_of(network)}'); {program}", tmp_path)
+    found, wanted = scipy.io.loadmat(tmp_path / "found.mat")["found"], stream(predictor, inputs)
+    assert (np.abs(found - wanted) <= tolerance(predictor, inputs, wanted)).all()
+
+
 def test_every_kind_of_layer_has_matlab_code():
     assert set(WRITERS) == set(STEPS) | {memory.PrefixCorrection}
 
