@@ -2,8 +2,6 @@
 #include "edp_integer.h"
 #include "edp_tables.h"
 
-#include <string.h>
-
 #if defined(__ARM_FEATURE_DSP) && (__ARM_FEATURE_DSP == 1) && !defined(__ARM_BIG_ENDIAN) && !defined(EDP_PORTABLE)
 #define EDP_DSP 1
 #include <arm_acle.h>
@@ -30,6 +28,10 @@ int32_t edp_q_rounded(int32_t x, uint32_t right) { return (right == 0u) ? x : ((
 
 int64_t edp_q_scaled(int32_t sum, int32_t multiplier, uint8_t shift) {
     const int64_t product = (int64_t)sum * multiplier;
+    if (shift > 32u) { /* the rule; the same number, without shifts of two words */
+        const int32_t high = (int32_t)(product >> 32);
+        return ((high >> (shift - 33u)) + 1) >> 1;
+    }
     return ((product >> (shift - 1u)) + 1) >> 1;
 }
 
@@ -207,15 +209,8 @@ void edp_q_glu(const int16_t *x, uint32_t rows, uint32_t n, int32_t given, int16
 }
 
 #if EDP_DSP
-static uint32_t word_at(const void *from) {
-    uint32_t word;
-    (void)memcpy(&word, from, sizeof word);
-    return word;
-}
-
 /* Four products of a row: bytes 0 and 2 are the weights of the first pair, 1 and 3 those of the second. */
-static int32_t four(const int8_t *weight, int16x2_t first, int16x2_t second, int32_t sum) {
-    const uint32_t bytes = word_at(weight);
+static int32_t four(uint32_t bytes, int16x2_t first, int16x2_t second, int32_t sum) {
     int16x2_t odd;
     /* Turns and widens at once, which no intrinsic says. */
     __asm__("sxtb16 %0, %1, ror #8" : "=r"(odd) : "r"(bytes));
@@ -238,21 +233,28 @@ void edp_q_products(const int16_t *x, const int8_t *weight, uint32_t out, uint32
         int32_t a2 = sums[o + 2u];
         int32_t a3 = sums[o + 3u];
         const int16_t *at = x;
-        for (; at != left; at += 4) {
+        while (at != left) {
 #if EDP_DSP
-            const int16x2_t first = (int16x2_t)word_at(at);
-            const int16x2_t second = (int16x2_t)word_at(at + 2);
-            a0 = four(w, first, second, a0);
-            a1 = four(w + 4, first, second, a1);
-            a2 = four(w + 8, first, second, a2);
-            a3 = four(w + 12, first, second, a3);
+            uint32_t w0, w1, w2, w3;
+            int16x2_t first, second;
+            /* Side by side, where each load but the first takes a single cycle; a compiler spreads them. */
+            __asm__ volatile("ldr %0, [%6], #16\n\tldr %1, [%6, #-12]\n\tldr %2, [%6, #-8]\n\tldr %3, [%6, #-4]\n\t"
+                    "ldr %4, [%7], #8\n\tldr %5, [%7, #-4]"
+                    : "=&r"(w0), "=&r"(w1), "=&r"(w2), "=&r"(w3), "=&r"(first), "=&r"(second), "+&r"(w), "+&r"(at)
+                    :
+                    : "memory");
+            a0 = four(w0, first, second, a0);
+            a1 = four(w1, first, second, a1);
+            a2 = four(w2, first, second, a2);
+            a3 = four(w3, first, second, a3);
 #else
             a0 = four(w, at, a0);
             a1 = four(w + 4, at, a1);
             a2 = four(w + 8, at, a2);
             a3 = four(w + 12, at, a3);
-#endif
             w += 16;
+            at += 4;
+#endif
         }
         for (; at != end; at++) {
             const int32_t value = *at;
