@@ -175,7 +175,7 @@ class Tick:
 
     Attributes:
         status: of the C code, None where no tick was made of it.
-        valid: the prediction rests on this tick's inputs and on a whole window.
+        valid: the prediction rests on this tick's inputs and on a whole window, at the network's rate.
         why: where it is not valid, a reason.
         missed: ticks that were missed before this one.
         step_us: time of the C code, microseconds.
@@ -252,7 +252,11 @@ class Assembler:
         row, reason = self._row(dict(zip(names, range(len(names)))), (position, velocity, effort), stamp)
         status = self.core.step(row)
         spent = 1e6 * (perf_counter() - began)
-        return Tick(status, status is Status.OK, "" if status is Status.OK else reason or _why(status), missed, spent)
+        if status is Status.OK:
+            reason = "" if len(self._gaps) == RATE_MESSAGES else "too few messages to know their rate"
+        else:
+            reason = reason or _why(status)
+        return Tick(status, not reason, reason, missed, spent)
 
     def _wrong_rate(self) -> str:
         """What is wrong with the time between messages; empty if nothing is."""
