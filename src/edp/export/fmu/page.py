@@ -32,7 +32,7 @@ def page(about: About) -> bytes:
         for entry in about.listed
     )
     derivatives = (
-        "Directional derivatives of the predictions by the inputs of the last step are provided."
+        "Directional derivatives are those of the predictions of a step made now, by the inputs as they are set."
         if about.derivatives
         else "Directional derivatives are not provided."
     )

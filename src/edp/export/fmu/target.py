@@ -51,7 +51,7 @@ class FmuTarget:
     Attributes:
         version: of FMI: 2, 3 or both.
         binaries: shared libraries beside the sources: linux64, win64, both or none.
-        derivatives: with directional derivatives, float32 only; the weights are held twice for them.
+        derivatives: with directional derivatives, float32 only; a second copy of the weights is in the code for them.
     """
 
     version: str = "both"

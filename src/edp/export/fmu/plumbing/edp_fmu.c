@@ -145,10 +145,6 @@ edp_fmu_status edp_fmu_step(edp_fmu *f, double at, double size) {
     }
     const uint32_t rejected = f->now.state.rejected;
     read_inputs(f, read);
-#ifdef FMU_TANGENT
-    (void)memcpy(&f->now.before, &f->now.state, sizeof f->now.state);
-    (void)memcpy(f->now.read, read, sizeof read);
-#endif
     f->now.status = FMU_STEP(&f->now.state, read, &f->now.out);
     f->now.stepped = true;
     f->now.next = at + size;
@@ -311,13 +307,14 @@ edp_fmu_status edp_fmu_change(const edp_fmu *f, uint32_t ref, const float *chang
 #ifdef FMU_TANGENT
 edp_fmu_status edp_fmu_derive(edp_fmu *f, const float seeds[FMU_INPUTS], float *changes) {
     FMU_OUTPUT out, moved;
-    if (!f->now.stepped || (f->now.status > EDP_WARMING)) {
-        f->tell(f, EDP_FMU_DISCARD, "logStatusWarning", "no derivatives: the last step has no prediction of its own");
+    float read[FMU_INPUTS];
+    read_inputs(f, read);
+    (void)memcpy(&f->copy, &f->now.state, sizeof f->copy);
+    FMU_TANGENT_RESET(&f->tangent);
+    if (FMU_STEP_TANGENT(&f->copy, &f->tangent, read, seeds, &out, &moved) > EDP_WARMING) {
+        f->tell(f, EDP_FMU_DISCARD, "logStatusWarning", "no derivatives: the inputs as they are give no prediction");
         return EDP_FMU_DISCARD;
     }
-    (void)memcpy(&f->copy, &f->now.before, sizeof f->copy);
-    FMU_TANGENT_RESET(&f->tangent);
-    (void)FMU_STEP_TANGENT(&f->copy, &f->tangent, f->now.read, seeds, &out, &moved);
     (void)memcpy(changes, &moved, sizeof moved);
     return EDP_FMU_OK;
 }

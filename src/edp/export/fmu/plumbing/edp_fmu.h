@@ -41,10 +41,6 @@ typedef struct {
     bool given[FMU_INPUTS];
     FMU_OUTPUT out;
     FMU_STATE state;
-#ifdef FMU_TANGENT
-    FMU_STATE before; /* the last step */
-    float read[FMU_INPUTS];
-#endif
 } edp_fmu_memory;
 
 typedef struct edp_fmu edp_fmu;
@@ -90,7 +86,8 @@ edp_fmu_status edp_fmu_read(const edp_fmu *f, const void *bytes, size_t size, ed
 
 /* The seed of an input, collected in `seeds`, which the caller sets to zero first. */
 edp_fmu_status edp_fmu_seed(const edp_fmu *f, uint32_t ref, double seed, float seeds[FMU_INPUTS]);
-/* Changes of all outputs of the last step along `seeds`, its memory taken as it was; `changes` holds FMU_OUTPUTS. */
+/* How the predictions of a step made now, with the inputs as they are, change along `seeds`; the memory is taken as it
+ * is and left so. `changes` holds FMU_OUTPUTS. */
 edp_fmu_status edp_fmu_derive(edp_fmu *f, const float seeds[FMU_INPUTS], float *changes);
 /* The change of one of them. */
 edp_fmu_status edp_fmu_change(const edp_fmu *f, uint32_t ref, const float *changes, double *change);
