@@ -125,6 +125,28 @@ def _physical() -> dict[str, Structure]:
 
 
 STRUCTURES = _structures() | _physical()
+ALONE = ("tcn+squeeze_excitation", "hybrid+multi_scale_tcn")
+"""The only ones in which some layer reads the output of some other."""
+
+
+def _covering() -> tuple[str, ...]:
+    """Structures that hold every part with each of its options, and each backbone with blocks and without.
+
+    The ones with most parts come first. Their graphs hold every layer, and every pair of layers, that any graph holds
+    (tests/contracts/test_graph.py), so that what is made of graphs is held to them; `slow` holds it to all.
+    """
+    held: set[object] = set()
+    chosen = list(ALONE)
+    for name, structure in sorted(STRUCTURES.items(), key=lambda item: -len(item[1].blocks)):
+        backbone, blocks, *others = structure
+        now = {backbone, (type(backbone), bool(blocks)), *blocks, *others}
+        if not now <= held:
+            held |= now
+            chosen.append(name)
+    return tuple(chosen)
+
+
+COVERING = _covering()
 
 
 def model_of(structure: str, activation: str) -> ModelSpec:
@@ -250,11 +272,18 @@ def parts() -> tuple[dict[str, Structure], list[Form]]:
     return STRUCTURES, FORMS
 
 
+@pytest.fixture(scope="session")
+def covering() -> tuple[str, ...]:
+    """Structures that hold every part, each option and every pair of layers."""
+    return COVERING
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """An argument `structure` runs a test for every structure; with `form`, in several forms that it agrees to.
 
     Backbones alone and with full slots take every form; the others every fifth, each from another start, so that all
-    activations, horizons and modes still meet every block.
+    activations, horizons and modes still meet every block. With the mark
+    `covering`, structures beyond `COVERING` are slow.
     """
     if {"structure", "form"} <= set(metafunc.fixturenames):
         pairs = []
@@ -265,4 +294,6 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         ids = [f"{structure}-{form[0]}-{len(form[1])}-{form[2]}" for structure, form in pairs]
         metafunc.parametrize(("structure", "form"), pairs, ids=ids)
     elif "structure" in metafunc.fixturenames:
-        metafunc.parametrize("structure", list(STRUCTURES))
+        fast = COVERING if metafunc.definition.get_closest_marker("covering") else STRUCTURES
+        marks = {name: () if name in fast else pytest.mark.slow for name in STRUCTURES}
+        metafunc.parametrize("structure", [pytest.param(name, marks=mark) for name, mark in marks.items()])

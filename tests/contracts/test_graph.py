@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import torch
@@ -70,6 +72,23 @@ def test_names_are_unique_and_values_are_made_before_they_are_read(structure, pr
         made[layer.name] = layer.width
     assert set(graph.results.values()) <= set(made)
     assert all(np.isfinite(values).all() and values.dtype == np.float32 for _, _, values in graph.tensors())
+
+
+def met(graph):
+    """Kinds of layers with their options, and which kind reads which."""
+    kinds = {layer.name: type(layer) for layer in graph.layers}
+    found = set()
+    for layer in graph.layers:
+        values = ((field.name, getattr(layer, field.name)) for field in fields(layer) if field.name != "name")
+        found.add((type(layer), *((name, value) for name, value in values if isinstance(value, str | bool))))
+        found |= {(type(layer), kinds.get(name)) for name in layer.inputs}
+    return found
+
+
+def test_a_covering_set_meets_every_layer_and_every_pair_of_layers(parts, covering, predictor_of):
+    seen = {structure: met(predictor_of(structure).graph()) for structure in parts[0]}
+    assert set().union(*(seen[structure] for structure in covering)) == set().union(*seen.values())
+    assert len(covering) < len(parts[0]) / 2
 
 
 def test_every_kind_of_layer_has_a_reference():

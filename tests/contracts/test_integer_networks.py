@@ -40,6 +40,7 @@ def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, ro
         calibrate(graph, [rows_of(predictor, 50)])
 
 
+@pytest.mark.covering
 def test_whole_numbers_predict_nearly_the_same(network, rows_of):
     predictor, integers = network
     rows = [series_of(rows_of(predictor, seed=seed), predictor) for seed in (1, 2)]
@@ -66,6 +67,7 @@ def on_grid(graph):
     return replace(graph, layers=tuple(held))
 
 
+@pytest.mark.covering
 def test_sixteen_bit_values_lose_next_to_nothing(network, rows_of):
     """Against double precision with weights that are whole numbers already: what is left is formats and tables."""
     predictor, _ = network

@@ -41,6 +41,7 @@ def test_what_is_allowed_is_little(bundle_of):
     )
 
 
+@pytest.mark.covering
 def test_c_predicts_what_pytorch_predicts(c, structure, program_of, bundle_of):
     bundle = bundle_of(structure)
     assert differs_by(c, program_of(structure), bundle.predictor, 2_000) < 1

@@ -84,6 +84,7 @@ def run_changes(step, start, inputs, changes):
     return np.array(found)
 
 
+@pytest.mark.covering
 def test_steps_and_derivatives_are_those_of_pytorch(structure, bundle_of, network_of, changes_of, torch_changes):
     """1e-5 for predictions; 1e-4 of the largest change for derivatives through the past."""
     predictor, network = bundle_of(structure).predictor, network_of(structure)

@@ -19,6 +19,7 @@ def outputs_of(c, program, predictor, ticks, wide=1.0):
     return c.stream(program, inputs), stream(predictor, inputs)
 
 
+@pytest.mark.covering
 def test_c_gives_the_bits_of_the_reference(c, structure, program_of, bundle_of):
     bundle = bundle_of(structure, whole=True)
     program = program_of(structure, whole=True)

@@ -78,6 +78,7 @@ def held_to_pytorch(predictor, run, ticks):
     return float((np.abs(run(inputs) - wanted) / tolerance(predictor, inputs, wanted)).max())
 
 
+@pytest.mark.covering
 def test_the_step_predicts_what_pytorch_predicts(structure, bundle_of, step_of):
     """Within 1e-5 of a standard deviation and of the largest value."""
     assert held_to_pytorch(*step_of(structure), 60) < 1
@@ -94,10 +95,12 @@ def window_differs_by(predictor, opset=13, seeds=2):
     return worst
 
 
+@pytest.mark.covering
 def test_the_window_predicts_what_pytorch_predicts_from_reset(structure, bundle_of):
     assert window_differs_by(bundle_of(structure).predictor) < 1
 
 
+@pytest.mark.covering
 def test_every_value_of_a_graph_is_read(structure, bundle_of):
     """ONNX Runtime up to 1.18 lays what nobody reads over what is still needed, from the second run on."""
     predictor = bundle_of(structure).predictor

@@ -57,6 +57,7 @@ def tangent_of(c, bundle_of, tmp_path_factory):
     return make
 
 
+@pytest.mark.covering
 def test_tangents_are_those_of_pytorch(structure, bundle_of, tangent_of, changes_of, torch_changes):
     """A random direction through 40 ticks: inputs, states and rings all take part."""
     predictor = bundle_of(structure).predictor

@@ -2,6 +2,7 @@
 
 import itertools
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,6 +29,7 @@ def close(found, wanted, tolerance):
     torch.testing.assert_close(found, wanted, rtol=0, atol=tolerance * max(1.0, float(wanted.abs().max())))
 
 
+@pytest.mark.covering
 def test_any_split_gives_the_same_stream(structure, predictor_of):
     predictor = predictor_of(structure)
     whole = in_chunks(predictor)
