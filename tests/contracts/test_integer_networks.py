@@ -82,6 +82,7 @@ def test_sixteen_bit_values_lose_next_to_nothing(network, rows_of):
     assert error < 0.003 * max(1.0, float(np.std(wanted / spread)))
 
 
+@pytest.mark.covering
 def test_chunks_and_company_change_no_bit(network, rows_of):
     predictor, integers = network
     rows = torch.from_numpy(np.stack([rows_of(predictor, 90, seed) for seed in (3, 4)]))

@@ -181,6 +181,19 @@ def hard_rows() -> Callable[..., np.ndarray]:
 
 
 @pytest.fixture(scope="session")
+def onnx_session() -> Callable[[bytes], object]:
+    """Sessions of ONNX Runtime in one thread."""
+    runtime = pytest.importorskip("onnxruntime", reason="needs the package onnxruntime: the extra dev has it")
+
+    def make(model: bytes) -> object:
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads, options.log_severity_level = 1, 3
+        return runtime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+    return make
+
+
+@pytest.fixture(scope="session")
 def matlab_folder_of(bundle_of, tmp_path_factory) -> Callable[..., Path]:
     """Folders for MATLAB as they are exported, by network."""
     made: dict[tuple[str, bool], Path] = {}

@@ -23,7 +23,7 @@ def outputs_of(c, program, predictor, ticks, wide=1.0):
 def test_c_gives_the_bits_of_the_reference(c, structure, program_of, bundle_of):
     bundle = bundle_of(structure, whole=True)
     program = program_of(structure, whole=True)
-    found, wanted = outputs_of(c, program, bundle.predictor, 400)
+    found, wanted = outputs_of(c, program, bundle.predictor, 200)
     np.testing.assert_array_equal(found, wanted)
     found, wanted = outputs_of(c, program, bundle.predictor, 100, wide=EXTREME)
     assert np.isfinite(found).all()
