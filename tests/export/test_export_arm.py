@@ -58,14 +58,18 @@ def on_core(c):
     return make
 
 
-@pytest.mark.parametrize(("network", "whole"), STORED)
-def test_every_core_gives_the_bits_of_this_machine(c, network, whole, bundle_of, on_core, tmp_path):
+RUNS = [(*case, tuple(CORES) if case[0] == "hybrid" else ("m4",)) for case in STORED]
+OTHERS = [pytest.param(*case, ("m7", "m33"), marks=pytest.mark.slow) for case in STORED if case[0] != "hybrid"]
+
+
+@pytest.mark.parametrize(("network", "whole", "cores"), [*RUNS, *OTHERS])
+def test_every_core_gives_the_bits_of_this_machine(c, network, whole, cores, bundle_of, on_core, tmp_path):
     CTarget().write(bundle_of(network, whole), "predictor", tmp_path)
     c.need("gcc")
     flags = ("-std=c99", "-O2", "-ffp-contract=off", "-I.")
     c.run("gcc", *flags, *c.sources(tmp_path), BOARD / "count.c", "-lm", "-o", "here", folder=tmp_path)
     (wanted,) = c.run(tmp_path / "here").decode().split()
-    for core in CORES:
+    for core in cores:
         count, found = on_core(tmp_path, core, BOARD / "count.c")
         assert found == wanted, core
         if core == "m4":

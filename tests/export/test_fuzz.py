@@ -18,7 +18,6 @@ from edp.export.golden import ends
 ADDRESSES = "-fsanitize=fuzzer,address,undefined,float-cast-overflow"
 UNINITIALISED = "-fsanitize=fuzzer,memory"
 SHORT = ["hybrid+all", "tcn+quantiles"]
-WHOLE = ["hybrid", "tcn+quantiles"]
 
 
 @pytest.fixture(scope="session")
@@ -47,7 +46,15 @@ def clean(done):
     assert "DONE" in done.stderr
 
 
-@pytest.mark.parametrize(("network", "whole"), [*((name, False) for name in SHORT), *((name, True) for name in WHOLE)])
+@pytest.mark.parametrize(
+    ("network", "whole"),
+    [
+        ("hybrid+all", False),
+        ("tcn+quantiles", True),
+        pytest.param("tcn+quantiles", False, marks=pytest.mark.slow),
+        pytest.param("hybrid", True, marks=pytest.mark.slow),
+    ],
+)
 def test_nothing_is_found_in_a_short_run(network, whole, bundle_of, fuzzing, tmp_path):
     CTarget().write(bundle_of(network, whole), "predictor", tmp_path)
     fuzzing.build(tmp_path)
