@@ -121,7 +121,7 @@ def test_another_choice_needs_a_word_and_is_recorded(run, tight, done, tmp_path)
 
 def test_a_budget_that_nobody_can_meet_is_refused_with_the_nearest(run, tmp_path):
     with pytest.raises(
-        ConfigError, match=r"cycles = 100 can be met by no width .* single unit in \w+, with cycles = \d"
+        ConfigError, match=r"cycles = 100 can be met by no width .* single unit in INT8, with cycles = \d"
     ):
         search(run, SearchSpec(budget=Budget(name="none", cycles=100)), tmp_path / "out")
     assert not (tmp_path / "out").exists()

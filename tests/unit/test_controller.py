@@ -42,7 +42,7 @@ def test_estimates_of_cycles_are_those_of_the_exported_code(channels, units):
     by_format = {entry.number_format: entry for entry in footprint(network(channels, units)).estimates}
     for name, counted in zip(("w8a16", "float32"), COUNTED[channels, units], strict=True):
         low, typical, high = by_format[name].cycles["cortex_m4f"]
-        assert low == pytest.approx(counted, rel=0.08)
+        assert low == pytest.approx(counted, rel=0.07)
         assert (typical, high) == (pytest.approx(1.26 * low, abs=2), pytest.approx(1.43 * low, abs=2))
 
 

@@ -81,10 +81,10 @@ def _tables(facts: Any) -> None:
 
     for horizon in facts.horizons:
         sheet = words.table_sheet(facts, horizon)
-        heads = [f"{column.heading} [{column.unit}]" if column.unit else column.heading for column in sheet.columns]
         marked = [("* " if place in sheet.marked else "  ") + cells[0] for place, cells in enumerate(sheet.texts())]
         rows = [[name, *cells[2:]] for name, cells in zip(marked, sheet.texts(), strict=True)]
-        table(f"{sheet.caption}; * on the front", [heads[0], *heads[2:]], rows)
+        first, _, *others = sheet.heads()
+        table(f"{sheet.caption}; * on the front", [first, *others], rows)
         out.print()
     out.print(words.headline(facts))
     for line in words.verdict(facts):
@@ -105,7 +105,6 @@ class _Display:
 
     def on_training(self, name: str, done: int, count: int, event: Event) -> None:
         """Show an event of a training."""
-        part = ((event.epoch - 1) * event.updates + event.update) / (event.epochs * event.updates)
         note = f"{name}, network {done + 1} of at most {count}, epoch {event.epoch}/{event.epochs}"
-        self.shown.update(self.bar, completed=min(1.0, (done + part) / max(1, count)), note=note)
+        self.shown.update(self.bar, completed=min(1.0, (done + event.share) / max(1, count)), note=note)
         self.steps.say(f"compress: {note}, {duration(event.seconds_left)} left of it", force=event.row is not None)

@@ -74,8 +74,7 @@ def finetune(
         reversal=reversal,
         check_signs=not any_sign,
     )
-    named = {"all": tuple(METHODS), "none": ()}.get(rivals) or tuple(name for name in rivals.split(",") if name)
-    order = Order(spec=spec, method=method, rivals=() if rivals == "none" else named, changes=tuple(changes))
+    order = Order(spec=spec, method=method, rivals=_named(rivals, tuple(METHODS)), changes=tuple(changes))
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:
         display = _Display(shown, Steps(as_json), as_json)
@@ -92,13 +91,18 @@ def finetune(
     emit(as_json, found | {"run": str(folder), "report": str(page)}, show)
 
 
+def _named(rivals: str, every: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of methods from the text of ``--rivals``."""
+    special = {"all": every, "none": ()}
+    return special[rivals] if rivals in special else tuple(name for name in rivals.split(",") if name)
+
+
 def _tables(facts: Transfer) -> None:
     from edp.report import transfer_facts as words
 
     for horizon in facts.horizons:
         for sheet in words.sheets_of(facts, horizon):
-            heads = [f"{column.heading} [{column.unit}]" if column.unit else column.heading for column in sheet.columns]
-            table(sheet.caption, heads, sheet.texts())
+            table(sheet.caption, sheet.heads(), sheet.texts())
             out.print()
     out.print(words.headline(facts))
     for line in words.verdict(facts):
@@ -126,7 +130,6 @@ class _Display:
 
     def on_training(self, name: str, event: Event) -> None:
         """Show an event of a training."""
-        part = ((event.epoch - 1) * event.updates + event.update) / (event.epochs * event.updates)
         note = f"{name}, method {self.done + 1} of {self.count}, epoch {event.epoch}/{event.epochs}"
-        self.shown.update(self.bar, completed=(self.done + part) / self.count, note=note)
+        self.shown.update(self.bar, completed=(self.done + event.share) / self.count, note=note)
         self.steps.say(f"finetune: {note}, {duration(event.seconds_left)} left of it", force=event.row is not None)

@@ -105,7 +105,7 @@ class ScreeningDisplay:
         """Show a training."""
         part, note = 0.0, f"{name}, training {done + 1} of {total}"
         if event is not None:
-            part = ((event.epoch - 1) + event.update / event.updates) / event.epochs
+            part = event.share
             note += f", epoch {event.epoch}/{event.epochs}"
         elif not self.trained:
             # Trainings that are in the folder already take no time, and say nothing about the others.

@@ -104,9 +104,8 @@ class TrainingDisplay:
         """Show one event."""
         if event.row is not None and event.row["best"]:
             self.best = event.row["validation_mae"]
-        done = ((event.epoch - 1) * event.updates + event.update) / (event.epochs * event.updates)
         score = "" if self.best is None else f", validation MAE {self.best:.4g}"
         stage = "refit, " if event.refit else ""
         note = f"{stage}epoch {event.epoch}/{event.epochs}, {event.targets_per_s:,.0f} targets/s{score}"
-        self.shown.update(self.bar, completed=done, note=note)
+        self.shown.update(self.bar, completed=event.share, note=note)
         self.steps.say(f"train: {note}, {duration(event.seconds_left)} left", force=event.row is not None)

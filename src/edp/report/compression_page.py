@@ -5,18 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
-
 from edp.report import compression_facts as words
 from edp.report.compression_facts import Compression, read_compression
 from edp.report.compression_plots import compression_plots, drawings
 from edp.report.drawing import write_drawings
-from edp.report.page import asset, script_json
-from edp.report.sheets import Sheet
+from edp.report.page import shown
+from edp.report.sheets import Sheet, write_sheets
 from edp.report.templates import template
 from edp.report.wording import unbroken
-from edp.storage import make_folder, write_bytes
+from edp.storage import write_bytes
 
 
 def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
@@ -32,10 +29,7 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
     tables = sheets(facts)
     page = facts.folder / "report.html"
     write_bytes(page, render(facts, tables).encode())
-    for sheet in tables:
-        place = make_folder(facts.folder / "tables") / sheet.name
-        write_bytes(place.with_suffix(".csv"), sheet.csv().encode())
-        write_bytes(place.with_suffix(".md"), sheet.markdown().encode())
+    write_sheets(facts.folder / "tables", tables)
     if pictures:
         write_drawings(facts.folder / "pictures", drawings(facts))
     return page
@@ -60,10 +54,6 @@ def render(facts: Compression, tables: list[Sheet]) -> str:
         "box": next((sheet.table() for sheet in tables if sheet.name == "lockbox"), None),
         "opened": facts.held["box"].get("opened", ""),
         "budget": facts.held["budget"],
-        "plots": plots,
-        "specs": script_json([plot.spec() for plot in plots.values()]),
-        "style": Markup(asset("page.css")),
-        "script": Markup(asset("page.js")),
-        "plotly": Markup(get_plotlyjs()),
+        **shown(plots),
     }
     return template("compression.html.jinja").render(**context)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
-
 from edp.data.coverage import INTEGRATED, Coverage
 from edp.data.spectrum import FLAT_DB
 from edp.data.wanted import BEYOND, OCCUPANCY, wanted
 from edp.logs import DataQuality
 from edp.report.coverage_plots import coverage_plots
-from edp.report.page import asset, script_json
+from edp.report.page import shown
 from edp.report.quality import quality_tables
 from edp.report.tables import Table
 from edp.report.templates import template
@@ -48,9 +45,8 @@ def render_coverage(found: Coverage, title: str, quality: DataQuality | None = N
         "headline": unbroken(headline(found)),
         "verdict": verdict(found),
         "tiles": tiles(found),
-        "plots": plots,
+        **shown(plots),
         "wanted": wanted_table(found),
-        "specs": script_json([plot.spec() for plot in plots.values()]),
         "found": found,
         "quality": {} if quality is None else quality_tables(quality),
         "integrated": found.occupancy is not None and found.occupancy.source == INTEGRATED,
@@ -59,9 +55,6 @@ def render_coverage(found: Coverage, title: str, quality: DataQuality | None = N
         "events": events_table(found),
         "joints": joints_table(found),
         "distance": distance_table(found),
-        "style": Markup(asset("page.css")),
-        "script": Markup(asset("page.js")),
-        "plotly": Markup(get_plotlyjs()),
     }
     return template("coverage.html.jinja").render(**context)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from plotly.offline import get_plotlyjs
 from edp.report import facts as run
 from edp.report import tables
 from edp.report.plots import DOTS_AT_MOST, plots_of
+from edp.report.style import Plot
 from edp.report.templates import template
 from edp.report.wording import moment, unbroken
 from edp.storage import write_bytes
@@ -69,8 +71,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "spread": run.spread_text(facts),
         "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
         "worst": tables.worst_recordings_table(facts),
-        "plots": plots,
-        "specs": script_json([plot.spec() for plot in plots.values()]),
+        **shown(plots),
         "checks": tables.budget_checks(facts),
         "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
         "parts": tables.parts_table(facts),
@@ -79,6 +80,14 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "config": facts.config,
         "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
         "absent": facts.absent,
+    }
+
+
+def shown(plots: Mapping[str, Plot]) -> dict[str, Any]:
+    """What every page needs to show its plots offline: them, their data, the style and the scripts."""
+    return {
+        "plots": plots,
+        "specs": script_json([plot.spec() for plot in plots.values()]),
         "style": Markup(asset("page.css")),
         "script": Markup(asset("page.js")),
         "plotly": Markup(get_plotlyjs()),

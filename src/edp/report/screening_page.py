@@ -6,12 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
-
 from edp.logs import DataQuality
 from edp.report import screening_tables as tables
-from edp.report.page import asset, script_json
+from edp.report.page import shown
 from edp.report.quality import quality_tables
 from edp.report.screening_plots import screening_plots
 from edp.report.screening_views import best_groups, joined
@@ -64,8 +61,7 @@ def render_screening(
         "headline": unbroken(headline(found)),
         "verdict": verdict(found, quality),
         "tiles": tiles(found),
-        "plots": plots,
-        "specs": script_json([plot.spec() for plot in plots.values()]),
+        **shown(plots),
         "found": found,
         "ahead": f"{found.horizon} samples ({1e3 * found.horizon / found.rate_hz:g} ms)",
         "kept": tables.kept_table(found),
@@ -83,9 +79,6 @@ def render_screening(
         "notes": tuple(notes),
         "window_reason": sentence(found.proposal.window_reason),
         "seconds": duration(sum(found.seconds.values())),
-        "style": Markup(asset("page.css")),
-        "script": Markup(asset("page.js")),
-        "plotly": Markup(get_plotlyjs()),
     }
     return template("screening.html.jinja").render(**context)
 

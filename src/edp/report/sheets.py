@@ -7,9 +7,11 @@ import io
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 from edp.report.tables import Table
 from edp.report.wording import MISSING, decimals_for, number
+from edp.storage import make_folder, write_bytes
 
 Value = float | int | str | None
 Show = Callable[[Value], str]
@@ -74,9 +76,13 @@ class Sheet:
         columns = tuple((column.heading, column.unit) for column in self.columns)
         return Table(self.caption, columns, self.texts(), self.marked)
 
+    def heads(self) -> list[str]:
+        """Headings, each with its unit."""
+        return [f"{c.heading} [{c.unit}]" if c.unit else c.heading for c in self.columns]
+
     def markdown(self) -> str:
         """For a document: the caption and a table; what stands out is bold."""
-        heads = [_piped(f"{c.heading} [{c.unit}]" if c.unit else c.heading) for c in self.columns]
+        heads = [_piped(head) for head in self.heads()]
         lines = [f"**{_piped(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
         for place, cells in enumerate(self.texts()):
             bold = place in self.marked
@@ -87,9 +93,21 @@ class Sheet:
         """For other programs: full precision, empty where there is no value."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([f"{c.heading} [{c.unit}]" if c.unit else c.heading for c in self.columns])
+        writer.writerow(self.heads())
         writer.writerows(["" if value is None else value for value in row] for row in self.rows)
         return stream.getvalue()
+
+
+def write_sheets(folder: Path, sheets: Iterable[Sheet]) -> None:
+    """Write each table as ``<name>.csv`` and ``<name>.md``.
+
+    Raises:
+        StorageError: a file cannot be written.
+    """
+    for sheet in sheets:
+        place = make_folder(folder) / sheet.name
+        write_bytes(place.with_suffix(".csv"), sheet.csv().encode())
+        write_bytes(place.with_suffix(".md"), sheet.markdown().encode())
 
 
 def _row(cells: list[str]) -> str:

@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
-
 from edp.report import study_words as words
-from edp.report.page import asset, script_json
+from edp.report.page import shown
 from edp.report.sheets import Sheet
 from edp.report.study_facts import StudyFacts, facts_of, reading
 from edp.report.study_pictures import write_study_pictures
@@ -87,13 +84,9 @@ def render_study(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
         "missing": words.missing,
         "study": study,
         "score": SCORE,
-        "plots": plots,
-        "specs": script_json([plot.spec() for plot in plots.values()]),
+        **shown(plots),
         "tables": {name: sheet.table() for name, sheet in tables.items()},
         "settings": words.settings(study),
-        "style": Markup(asset("page.css")),
-        "script": Markup(asset("page.js")),
-        "plotly": Markup(get_plotlyjs()),
     }
     return template("study.html.jinja").render(**context)
 

@@ -5,18 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
-
 from edp.report import transfer_facts as words
 from edp.report.drawing import write_drawings
-from edp.report.page import asset, script_json
-from edp.report.sheets import Sheet
+from edp.report.page import shown
+from edp.report.sheets import Sheet, write_sheets
 from edp.report.templates import template
 from edp.report.transfer_facts import Transfer, read_transfer
 from edp.report.transfer_plots import drawings, transfer_plots
 from edp.report.wording import unbroken
-from edp.storage import make_folder, write_bytes
+from edp.storage import write_bytes
 
 
 def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
@@ -32,10 +29,7 @@ def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
     tables = [sheet for horizon in reversed(facts.horizons) for sheet in words.sheets_of(facts, horizon)]
     page = facts.folder / "transfer.html"
     write_bytes(page, render(facts, tables).encode())
-    for sheet in tables:
-        place = make_folder(facts.folder / "tables") / sheet.name
-        write_bytes(place.with_suffix(".csv"), sheet.csv().encode())
-        write_bytes(place.with_suffix(".md"), sheet.markdown().encode())
+    write_sheets(facts.folder / "tables", tables)
     if pictures:
         write_drawings(facts.folder / "pictures", drawings(facts))
     return page
@@ -54,10 +48,6 @@ def render(facts: Transfer, tables: list[Sheet]) -> str:
         "pairs": [sheet.table() for sheet in tables if sheet.name.startswith("pair")],
         "methods": [sheet.table() for sheet in tables if sheet.name.startswith("methods")],
         "both": words.SOURCE in facts.worlds,
-        "plots": plots,
-        "specs": script_json([plot.spec() for plot in plots.values()]),
-        "style": Markup(asset("page.css")),
-        "script": Markup(asset("page.js")),
-        "plotly": Markup(get_plotlyjs()),
+        **shown(plots),
     }
     return template("transfer.html.jinja").render(**context)

@@ -26,6 +26,11 @@ class Event:
     row: dict[str, Any] | None = None
     refit: bool = False
 
+    @property
+    def share(self) -> float:
+        """Share of the training that is done."""
+        return ((self.epoch - 1) * self.updates + self.update) / (self.epochs * self.updates)
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:

@@ -8,7 +8,7 @@ import random
 import pytest
 
 from edp.errors import EdpError, StorageError
-from edp.report import read_study, study_page, write_study_page
+from edp.report import read_study, write_study_page
 from edp.report.study_facts import NUMBERS, facts_of
 from edp.report.study_page import render_study, study_text
 from edp.report.study_plots import study_plots
@@ -258,7 +258,7 @@ def test_missing_facts_name_their_phase(sound):
 def test_whatever_is_broken_gives_a_report_or_one_clear_error(request, mode, tmp_path, monkeypatch):
     whole = request.getfixturevalue(mode)
     rng = random.Random(7)
-    monkeypatch.setattr(study_page, "get_plotlyjs", str)
+    monkeypatch.setattr("edp.report.page.get_plotlyjs", str)
     messages = []
     for _ in range(24):
         study = copy.deepcopy(whole)
