@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from edp.data.prepared import Prepared
 from edp.errors import ExportError
 from edp.models.integer import integer_predictor
-from edp.models.predictor import Predictor
-from edp.models.running import stream_predictions
+from edp.models.running import mean_error
 from edp.runs import RunFolder
 from edp.storage import write_bytes, write_json
 from edp.training import save_bundle
@@ -42,7 +38,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     if (Path(out) / "run.json").exists():
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
     made = integer_predictor(bundle.predictor, data.train, ticks)
-    found = {"float": validation_error(bundle.predictor, data), "integer": validation_error(made, data)}
+    found = {name: mean_error(one, data.validation) for name, one in (("float", bundle.predictor), ("integer", made))}
     with RunFolder(out) as target:
         for name in ("config.toml", "history.jsonl", "footprint.json"):
             if (folder / name).is_file():
@@ -50,13 +46,3 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         write_json(target.file("provenance.json"), provenance | {"number_format": made.number_format})
         save_bundle(replace(bundle, predictor=made, scores={}), target.file("bundle"))
     return found | {"bytes": float(sum(values.nbytes for _, _, values in made.integers.tensors()))}
-
-
-def validation_error(predictor: Predictor, data: Prepared) -> float:
-    """MAE on the validation part, mean over horizons and targets, SI units, after a whole window."""
-    skip, errors = predictor.spec.window, []
-    for predicted, series in zip(stream_predictions(predictor, data.validation), data.validation, strict=True):
-        for place, k in enumerate(data.task.horizons):
-            known = predicted[skip : series.samples - k, place]
-            errors.append(np.abs(known - series.targets[skip + k :]).mean(axis=0))
-    return float(np.mean(errors))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edp.graph import Graph
 from edp.graph.base import INPUT
+from edp.graph.layers import Standardise
 from edp.graph.memory import Rotation
 from edp.graph.reference import Reference
 from edp.integer.moments import Moments
@@ -19,18 +20,27 @@ from edp.integer.single import OVER_TIME
 
 PIECE = 500
 """Ticks of a piece, from reset."""
+PATIENCE = 2
 
 
-def calibrate(graph: Graph, recordings: Sequence[NDArray[np.floating]], ticks: int = 20_000) -> Formats:
+def calibrate(
+    graph: Graph,
+    recordings: Sequence[NDArray[np.floating]],
+    ticks: int = 20_000,
+    error_of: Callable[[int], float] | None = None,
+) -> Formats:
     """Formats of all values and 8-bit weights, chosen on recordings.
 
     What is computed before the first weights is seen at every tick, since clipped inputs cost most; the rest on pieces
-    of `PIECE` ticks spread evenly over all recordings.
+    of `PIECE` ticks spread evenly over all recordings. All inputs share one format: where a few of them are very large
+    at rare moments (derivatives), a finer one that clips these may cost less than a coarse one costs the others.
 
     Args:
         graph: the float network.
         recordings: inputs ``(time, input)`` in SI units, of the training part.
         ticks: about how many of them run through the whole network.
+        error_of: the network's error when its standardised inputs have so many fractional bits and the others are as
+            they were; None keeps the format in which nothing is clipped.
 
     Raises:
         ExportError: a part of the network has no whole-number form.
@@ -43,7 +53,21 @@ def calibrate(graph: Graph, recordings: Sequence[NDArray[np.floating]], ticks: i
     for rows in pieces(recordings, ticks):
         moments.add(_follow(graph, rows, found))
     chosen = formats(found)
+    if error_of is not None:
+        names = [layer.name for layer in graph.layers if isinstance(layer, Standardise) and layer.name in chosen.fracs]
+        fracs = {name: finer(chosen.fracs[name], error_of) for name in names}
+        chosen = replace(chosen, fracs={**chosen.fracs, **fracs})
     return replace(chosen, weights=weights_of(quantise(graph, chosen, moments.means())))
+
+
+def finer(frac: int, error_of: Callable[[int], float]) -> int:
+    """The format of least error from `frac` on, until `PATIENCE` finer ones in a row bring nothing."""
+    best, error, place = frac, error_of(frac), frac
+    while place - best < PATIENCE:
+        place += 1
+        if (found := error_of(place)) < error:
+            best, error = place, found
+    return best
 
 
 def pieces(recordings: Sequence[NDArray[np.floating]], ticks: int) -> list[NDArray[np.floating]]:

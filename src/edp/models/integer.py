@@ -15,8 +15,13 @@ from edp.data.series import Series
 from edp.errors import ExportError
 from edp.graph import Graph
 from edp.integer import Formats, Integers, calibrate, quantise
+from edp.integer.arithmetic import LARGEST
 from edp.models.predictor import Predictor
+from edp.models.running import mean_error
 from edp.streaming import State
+
+JUDGED_TICKS = 200_000
+"""On about so many the format of the inputs is chosen: what a finer one clips is rare."""
 
 
 class IntegerPredictor(Predictor):
@@ -87,10 +92,30 @@ class IntegerPredictor(Predictor):
 
 
 def integer_predictor(predictor: Predictor, series: Sequence[Series], ticks: int = 20_000) -> IntegerPredictor:
-    """Quantise a trained network; formats and weights are chosen on the inputs of `series`, its training part.
+    """Quantise a trained network; formats and weights are chosen on `series`, its training part.
 
     Raises:
         ExportError: a part of the network has no whole-number form.
     """
-    graph = predictor.graph()
-    return IntegerPredictor(predictor, calibrate(graph, [part.inputs for part in series], ticks))
+    some = spread(series, JUDGED_TICKS)
+    inputs = [part.inputs for part in series]
+    made = calibrate(predictor.graph(), inputs, ticks, lambda frac: _error_with(predictor, some, frac))
+    return IntegerPredictor(predictor, made)
+
+
+def spread(series: Sequence[Series], ticks: int) -> list[Series]:
+    """Some of the series, at even distances, of about so many ticks in all; at least one."""
+    every = max(1, round(sum(part.samples for part in series) / ticks))
+    return list(series[::every])
+
+
+def _error_with(predictor: Predictor, series: Sequence[Series], frac: int) -> float:
+    """Mean absolute error of the float network with standardised inputs in a 16-bit format."""
+    rounded = deepcopy(predictor)
+    scale, unit = rounded.front.scale, 2.0**-frac
+
+    def scaled(features: Tensor) -> Tensor:
+        return (scale(features) / unit).round().clamp(-LARGEST, LARGEST) * unit
+
+    rounded.front.scale = scaled  # type: ignore[method-assign]
+    return mean_error(rounded, series)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -25,6 +26,20 @@ def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: in
         For each series float32 ``(time, horizon, target)`` in SI units: row t is the prediction made at t.
     """
     return _stream(predictor, predictor.predict, series, batch)
+
+
+def mean_error(predictor: Predictor, series: Sequence[Series]) -> float:
+    """Mean absolute error over series, horizons and targets, SI units; each series from reset, after a whole window.
+
+    Not a number where no series is longer than that.
+    """
+    skip, errors = predictor.spec.window, []
+    for predicted, part in zip(stream_predictions(predictor, series), series, strict=True):
+        for place, k in enumerate(predictor.task.horizons):
+            if part.samples > skip + k:
+                known = predicted[skip : part.samples - k, place]
+                errors.append(np.abs(known - part.targets[skip + k :]).mean(axis=0))
+    return float(np.mean(errors)) if errors else math.nan
 
 
 def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:

@@ -11,10 +11,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from edp.data.series import Series
 from edp.export.c import CTarget
 from edp.export.golden import Rows, stream
-from edp.models.integer import IntegerPredictor, integer_predictor
+from edp.integer import calibrate
+from edp.models.integer import IntegerPredictor
 from edp.parity.base import FORMS, NAME, ROUNDS, Case, Ran, called, need
 from edp.training.bundle import Bundle
 
@@ -89,11 +89,10 @@ class WholeNumbers:
 
     def run(self, case: Case, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.parity.base.Form`."""
-        predictor, targets = case.bundle.predictor, len(case.bundle.task.targets)
+        predictor = case.bundle.predictor
         if isinstance(predictor, IntegerPredictor):
             return []  # the form `c` is that already
-        known = Series("golden", case.inputs, np.zeros((len(case.inputs), targets), dtype=np.float32))
-        whole = integer_predictor(predictor, [known])
+        whole = IntegerPredictor(predictor, calibrate(predictor.graph(), [case.inputs]))
         found, seconds = streamed(replace(case.bundle, predictor=whole), case.inputs, folder)
         wanted = stream(whole, case.inputs)
         deviations = np.abs(wanted - case.wanted).max() / float(predictor.code.width.max())

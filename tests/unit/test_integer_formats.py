@@ -1,0 +1,68 @@
+"""The format of a network's inputs in whole numbers: what clips rare values may cost less than what is coarse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.integer import calibrate
+from edp.integer.calibration import finer
+from edp.models.integer import integer_predictor, spread
+from edp.models.running import mean_error, stream_predictions
+from edp.training import fit
+
+SCALED = "front.scaled"
+
+
+@pytest.fixture(scope="module")
+def network(tiny, tiny_model, tiny_training):
+    return fit(tiny, tiny_model, tiny_training).predictor
+
+
+def with_spike(series, size, at=100):
+    """The first series with one tick in which every input is `size` times its own."""
+    inputs = series[0].inputs.copy()
+    inputs[at] *= size
+    return [replace(series[0], inputs=inputs), *series[1:]]
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [([4, 3, 2, 3, 3, 1], 10), ([1, 1, 0, 1, 1], 10), ([3, 2, 1, 1, 0.5, 2, 2], 12), ([float("nan")] * 3, 8)],
+)
+def test_the_format_becomes_finer_while_the_error_falls(errors, chosen):
+    assert finer(8, lambda frac: errors[frac - 8]) == chosen
+
+
+def test_one_wild_tick_does_not_make_all_inputs_coarse(network, tiny):
+    known = with_spike(tiny.train, 3000.0)
+    plain = calibrate(network.graph(), [part.inputs for part in known]).fracs[SCALED]
+    usual = integer_predictor(network, tiny.train).formats.fracs[SCALED]
+    assert plain <= usual - 8
+    chosen = integer_predictor(network, known)
+    assert chosen.formats.fracs[SCALED] > plain
+    coarse = type(chosen)(network, calibrate(network.graph(), [part.inputs for part in known]))
+    wanted = stream_predictions(network, tiny.validation)
+
+    def away(one):
+        found = stream_predictions(one, tiny.validation)
+        return np.mean([np.abs(a - b).mean() for a, b in zip(found, wanted, strict=True)])
+
+    assert away(chosen) < away(coarse)
+
+
+def test_the_error_is_that_of_a_loop_over_ticks(network, tiny):
+    k, skip, sums = tiny.task.horizons[0], network.spec.window, []
+    for part, predicted in zip(tiny.validation, stream_predictions(network, tiny.validation), strict=True):
+        each = [abs(predicted[t, 0] - part.targets[t + k]) for t in range(skip, part.samples - k)]
+        sums.append(np.mean(each, axis=0))
+    if len(tiny.task.horizons) == 1:
+        assert mean_error(network, tiny.validation) == pytest.approx(np.mean(sums), rel=1e-5)
+    short = [replace(tiny.validation[0], inputs=part.inputs[:skip], targets=part.targets[:skip])]
+    assert np.isnan(mean_error(network, short))
+
+
+def test_series_are_taken_at_even_distances(tiny):
+    total = sum(part.samples for part in tiny.train)
+    assert spread(tiny.train, total) == tiny.train
+    assert spread(tiny.train, 1) == tiny.train[:1]
