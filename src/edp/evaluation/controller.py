@@ -11,11 +11,7 @@ from typing import Any
 from edp.errors import ConfigError, closest
 from edp.streaming import Cost
 
-# Flash of the prototype beside one byte a weight: program and tables, and scale and bias of each output.
-PROGRAM_BYTES, OUTPUT_BYTES = 22_000, 9
-# All its static memory against the numbers that it carries from tick to tick.
-WORKING_SHARE = 1.12
-STACK_BYTES = 2_048  # an allowance, not a measurement: the depth of calls is fixed and small
+STACK_BYTES = 1_024  # an allowance: a tick was seen to take 340 (``benchmarks/controller_memory.py``)
 # Published boards against zero-wait memory (flash wait states): the best, and the slowest, which decides.
 BOARD_TYPICAL, BOARD_SLOW = 1.26, 1.43
 
@@ -30,18 +26,25 @@ class NumberFormat:
 
     Attributes:
         weight_bytes: of a weight.
-        activation_bytes: of an activation or a number of the state.
+        output_bytes: of scale and bias of an output of weights.
+        program_bytes: of the program and its tables.
+        state_bytes: of a number that is carried from tick to tick, working memory included; the most that was seen.
         per_mac: cycles of a multiply-accumulate.
         per_output: cycles of a feature that a part writes.
     """
 
     weight_bytes: int
-    activation_bytes: int
+    output_bytes: int
+    program_bytes: int
+    state_bytes: float
     per_mac: float
     per_output: float
 
 
-FORMATS = {"float32": NumberFormat(4, 4, 4.05, 40.0), "w8a16": NumberFormat(1, 2, 2.14, 98.0)}
+FORMATS = {
+    "float32": NumberFormat(4, 0, 4_500, 4.6, 4.05, 40.0),
+    "w8a16": NumberFormat(1, 9, 7_900, 3.1, 2.14, 98.0),
+}
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,6 @@ def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str) -> E
         name: (round(step * core.low), round(step * core.typical * BOARD_TYPICAL), round(step * BOARD_SLOW))
         for name, core in CORES.items()
     }
-    weights = form.weight_bytes * sum(cost.parameters - cost.foldable for cost in costs) + OUTPUT_BYTES * outputs
-    working = round(WORKING_SHARE * form.activation_bytes * state_numbers)
-    return Estimate(number_format, cycles, weights, PROGRAM_BYTES + weights, working + STACK_BYTES)
+    weights = form.weight_bytes * sum(cost.parameters - cost.foldable for cost in costs) + form.output_bytes * outputs
+    working = round(form.state_bytes * state_numbers)
+    return Estimate(number_format, cycles, weights, form.program_bytes + weights, working + STACK_BYTES)
