@@ -31,14 +31,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import Verdict, finish, parser, table, verdict
+from common import Verdict, finish, kept, parser, table, verdict
 from edp.config import Experiment, load_experiment
 from edp.data.prepared import Prepared
 from edp.data_sets import find_data_set_limit
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import JudgeSpec, judge
 from edp.sim.limit import LimitSpec
-from edp.storage import make_folder, read_json, write_json
+from edp.storage import make_folder
 from edp.training import Event, fit
 from edp.training.schedules import Plateau
 from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
@@ -182,14 +182,6 @@ class League:
             return {name: models[name]["overall"][str(horizon)]["mean"]["mae"] for name in names}
 
         return self._kept(f"baselines k={horizon}", measure)
-
-
-def kept(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What an earlier run left in this file, or what is found now."""
-    if not path.exists():
-        write_json(path, measure())
-    found: dict[str, Any] = read_json(path)
-    return found
 
 
 def update_cost(data: Prepared, experiment: Experiment) -> float:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from edp.runs import command_line, environment
-from edp.storage import write_json
+from edp.storage import read_json, write_json
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -63,6 +64,14 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     widths = [max(len(row[i]) for row in [list(headings), *text]) for i in range(len(headings))]
     for row in [list(headings), *text]:
         print("  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths))))
+
+
+def kept(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What an earlier run left in this file, or what is found now."""
+    if not path.exists():
+        write_json(path, measure())
+    found: dict[str, Any] = read_json(path)
+    return found
 
 
 def finish(script: str, verdicts: Sequence[Verdict], seed: int, details: object = None) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.config import Experiment
+from edp.data.chunks import ChunkSpec
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.losses import Smoothness
@@ -15,7 +16,7 @@ from edp.models.predictor import Predictor
 from edp.sources import DataSource
 from edp.training import Event
 from edp.training.lesson import Lesson
-from edp.training.optimizers import AdamW, OptimizerSpec
+from edp.training.optimizers import OptimizerSpec, Soap
 from edp.training.spec import TrainingSpec
 from edp.transfer.source import Source
 from edp.transfer.spec import FinetuneSpec
@@ -88,10 +89,9 @@ def tuned(
     Args:
         training: how the source was trained.
         spec: what is set of the fine-tuning.
-        optimizer: by default one rate, that of the head, for all that learns.
-        epochs: by default those of both phases together.
+        optimizer: by default SOAP with one rate for all that learns.
+        epochs: by default those of methods without phases.
     """
-    rate = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)
     terms = tuple(term for term in training.terms if not isinstance(term, Smoothness))
     if spec.smoothness:
         smooth: Any = Smoothness(weight=spec.smoothness)
@@ -100,14 +100,21 @@ def tuned(
     if chunks.regime == "window":
         near = NEIGHBOURS if spec.batch % NEIGHBOURS == 0 else spec.batch
         chunks = replace(chunks, consecutive=near if terms else 1)
-    elif not chunks.carried:  # Minutes of logs do not fill many lanes: they are walked again, cut elsewhere.
-        chunks = replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))
+    else:
+        chunks = walked_again(chunks)
     return replace(
         training,
         chunks=chunks,
         terms=terms,
-        optimizer=optimizer or rate,
-        epochs=epochs or spec.head_epochs + spec.epochs,
+        optimizer=optimizer or Soap(learning_rate=spec.rate, weight_decay=spec.weight_decay),
+        epochs=epochs or spec.rounds,
         patience=spec.patience,
         refit="none",
     )
+
+
+def walked_again(chunks: ChunkSpec) -> ChunkSpec:
+    """Chunks with which minutes of logs, which do not fill many lanes, are walked again, cut elsewhere."""
+    if chunks.carried or chunks.regime == "window":
+        return chunks
+    return replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))

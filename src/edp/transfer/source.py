@@ -78,6 +78,8 @@ def read_source(path: str | Path) -> Source:
 def target_experiment(source: Source, changes: Sequence[str] = ()) -> Experiment:
     """Settings for logs of a target: the source's task and network, each log divided by time, then `changes`.
 
+    An epoch is a pass over the training parts, however long the source's epochs were, unless a change says otherwise.
+
     Raises:
         ConfigError: a change of what a transfer keeps, or of what it has options of its own for.
     """
@@ -92,7 +94,8 @@ def target_experiment(source: Source, changes: Sequence[str] = ()) -> Experiment
         if own or key in ("training", "training.chunks"):
             raise ConfigError(f"--set {key}: a fine-tuning has options of its own for it; see edp finetune --help")
     task = task_settings(source.bundle.task)
-    made = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec)
+    training = replace(source.experiment.training, updates=0)
+    made = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec, training=training)
     table = plain_tree(made)
     for text in changes:
         table = merged(table, override(text))

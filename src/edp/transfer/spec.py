@@ -1,4 +1,4 @@
-"""What is set of a fine-tuning; the defaults are those of the thesis (Table 3.1 and 3.4.5)."""
+"""What is set of a fine-tuning; the two phases have the values of the thesis (Table 3.1 and 3.4.5)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ class FinetuneSpec:
 
     Attributes:
         head_epochs: of phase 1, in which only the head learns.
-        epochs: of phase 2, in which everything learns; of methods without phases, both together.
-        head_rate: learning rate of the head, in both phases, and of methods with one rate.
+        epochs: of phase 2, in which everything learns.
+        head_rate: learning rate of the head, in both phases.
         backbone_rate: learning rate of the backbone in phase 2.
         depth_decay: rate of a part of the backbone over that of the part above it; 1 for one rate.
+        rounds: epochs of methods without phases.
+        rate: learning rate of methods without phases, which learn with SOAP.
         batch: lanes of a chunk, or windows, of an update.
         smoothness: weight of the second difference of consecutive predictions; 0 for none.
-        weight_decay: lambda of AdamW.
+        weight_decay: lambda of AdamW and SOAP.
         patience: epochs without a better validation score before a phase ends; 0 never ends early.
         rank: of the low-rank adapters.
         source_weight: of the source's loss beside the target's, of methods that replay it.
@@ -36,6 +38,8 @@ class FinetuneSpec:
     head_rate: float = 3e-4
     backbone_rate: float = 1e-5
     depth_decay: float = 1.0
+    rounds: int = 10
+    rate: float = 3e-3
     batch: int = 32
     smoothness: float = 0.05
     weight_decay: float = 1e-4
@@ -47,15 +51,16 @@ class FinetuneSpec:
     check_signs: bool = True
 
     def __post_init__(self) -> None:
-        if min(self.head_epochs, self.epochs, self.batch, self.rank) < 1 or self.patience < 0:
+        if min(self.head_epochs, self.epochs, self.rounds, self.batch, self.rank) < 1 or self.patience < 0:
             raise ConfigError(
-                f"finetune: head_epochs = {self.head_epochs}, epochs = {self.epochs}, batch = {self.batch}, rank = "
-                f"{self.rank}, patience = {self.patience}; at least 1, and a patience of at least 0, must hold"
+                f"finetune: head_epochs = {self.head_epochs}, epochs = {self.epochs}, rounds = {self.rounds}, batch = "
+                f"{self.batch}, rank = {self.rank}, patience = {self.patience}; at least 1, and a patience of at "
+                "least 0, must hold"
             )
-        if not min(self.head_rate, self.backbone_rate) > 0 or not 0 < self.depth_decay <= 1:
+        if not min(self.head_rate, self.backbone_rate, self.rate) > 0 or not 0 < self.depth_decay <= 1:
             raise ConfigError(
-                f"finetune: head_rate = {self.head_rate}, backbone_rate = {self.backbone_rate}, depth_decay = "
-                f"{self.depth_decay}; rates > 0 and 0 < depth_decay <= 1 must hold"
+                f"finetune: head_rate = {self.head_rate}, backbone_rate = {self.backbone_rate}, rate = {self.rate}, "
+                f"depth_decay = {self.depth_decay}; rates > 0 and 0 < depth_decay <= 1 must hold"
             )
         if not self.source_weight > 0 or not 0 < self.soft <= 1 or not self.reversal > 0:
             raise ConfigError(

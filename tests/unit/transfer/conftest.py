@@ -87,4 +87,6 @@ def target(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
 @pytest.fixture(scope="session")
 def small() -> FinetuneSpec:
     """A fine-tuning of a second."""
-    return FinetuneSpec(head_epochs=2, epochs=2, batch=4, head_rate=2e-2, backbone_rate=4e-3, rank=2, patience=0)
+    return FinetuneSpec(
+        head_epochs=2, epochs=2, rounds=4, batch=4, head_rate=2e-2, backbone_rate=4e-3, rate=2e-2, rank=2, patience=0
+    )

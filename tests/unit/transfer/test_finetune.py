@@ -17,6 +17,7 @@ from edp.losses import Drift, Smoothness
 from edp.models.decomposition import decompose
 from edp.storage import read_json
 from edp.training import load_bundle
+from edp.training.optimizers import Soap
 from edp.training.spec import TrainingSpec
 from edp.transfer import METHODS, FinetuneSpec, Order, Watchers, finetune
 from edp.transfer.case import tuned as tuning
@@ -24,13 +25,14 @@ from edp.transfer.scores import errors_of, measure, skew
 from edp.transfer.source import read_source, target_experiment, task_settings
 from edp.workflow import evaluate
 
+UPDATES = ("training.updates=25",)
 BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
 
 
 @pytest.fixture(scope="module")
 def tuned(run, target, small, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned") / "run"
-    return folder, finetune(run, target, Order(spec=small, rivals=tuple(METHODS)), folder)
+    return folder, finetune(run, target, Order(spec=small, rivals=tuple(METHODS), changes=UPDATES), folder)
 
 
 class Pulled(Exception):
@@ -112,7 +114,7 @@ def test_low_rank_changes_have_their_rank_and_leave_an_ordinary_network(tuned, r
 
 def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
     whole, _ = tuned
-    order = Order(spec=small)
+    order = Order(spec=small, changes=UPDATES)
     for stop in (1, 3):
         seen = []
 
@@ -128,7 +130,7 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, smal
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
     assert set(found["methods"]) == {"two_phase", "direct"}
     with pytest.raises(StorageError, match="holds another run"):
-        finetune(run, target, Order(spec=dataclasses.replace(small, head_rate=1e-3)), tmp_path / "run")
+        finetune(run, target, Order(spec=dataclasses.replace(small, head_rate=1e-3), changes=UPDATES), tmp_path / "run")
 
 
 def test_a_stopped_adversarial_training_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
@@ -138,7 +140,7 @@ def test_a_stopped_adversarial_training_goes_on_to_the_same_bits(tuned, run, tar
         if event.row is not None:
             raise Pulled
 
-    order = Order(spec=small, method="adversarial")
+    order = Order(spec=small, method="adversarial", changes=UPDATES)
     with pytest.raises(Pulled):
         finetune(run, target, order, tmp_path / "run", Watchers(on_training=pull))
     finetune(run, target, order, tmp_path / "run")
@@ -179,6 +181,13 @@ def test_settings_of_a_task_resolve_to_it(run):
     assert (made.split.test_share, made.training.clip_norm) == (0.3, 0.5)
 
 
+def test_an_epoch_is_a_pass_over_the_logs_unless_said_otherwise(run):
+    source = read_source(run)
+    assert source.experiment.training.updates == 25
+    assert target_experiment(source).training.updates == 0
+    assert target_experiment(source, ("training.updates=7",)).training.updates == 7
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -197,7 +206,16 @@ def test_changes_that_cannot_be_are_refused(run, change, reason):
 
 @pytest.mark.parametrize(
     "change",
-    [{"epochs": 0}, {"head_rate": 0.0}, {"smoothness": -1.0}, {"depth_decay": 1.5}, {"patience": -1}, {"soft": 0.0}],
+    [
+        {"epochs": 0},
+        {"rounds": 0},
+        {"head_rate": 0.0},
+        {"rate": 0.0},
+        {"smoothness": -1.0},
+        {"depth_decay": 1.5},
+        {"patience": -1},
+        {"soft": 0.0},
+    ],
 )
 def test_options_out_of_range_are_refused(change):
     with pytest.raises(ConfigError, match="must hold"):
@@ -211,7 +229,7 @@ def test_methods_that_leave_no_run_or_do_not_exist_are_refused(small):
         Order(spec=small, rivals=("two_phases",))
 
 
-def test_the_defaults_are_those_of_the_thesis():
+def test_the_defaults_of_the_two_phases_are_those_of_the_thesis():
     spec = FinetuneSpec()
     assert (spec.head_epochs, spec.epochs, spec.head_rate, spec.backbone_rate) == (15, 25, 3e-4, 1e-5)
     assert (spec.batch, spec.smoothness) == (32, 0.05)
@@ -221,7 +239,8 @@ def test_windows_are_drawn_together_for_smoothness_and_chunks_walked_again():
     spec = FinetuneSpec()
     window = TrainingSpec(chunks=ChunkSpec(regime="window", length=50, batch=256))
     made = tuning(window, spec)
-    assert (made.chunks.batch, made.chunks.consecutive, made.epochs, made.patience) == (32, 4, 40, 8)
+    assert (made.chunks.batch, made.chunks.consecutive, made.epochs, made.patience) == (32, 4, 10, 8)
+    assert made.optimizer == Soap(learning_rate=3e-3, weight_decay=1e-4)
     assert [term.weight for term in made.terms] == [0.05]
     assert tuning(window, FinetuneSpec(smoothness=0.0)).chunks.consecutive == 1
     made = tuning(TrainingSpec(terms=(Smoothness(weight=0.2), Drift()), refit="best"), spec, epochs=25)

@@ -11,7 +11,7 @@ from edp.transfer.methods.base import METHODS, Made, of_network, size_of
 
 @METHODS.register("full")
 class Full:
-    """All parameters from the first update on, at the rate of the head."""
+    """All parameters from the first update on, at one rate."""
 
     label: ClassVar[str] = "Fine-tuned, one rate"
     trains: ClassVar[bool] = True

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
-from edp.transfer.case import Case
+from edp.transfer.case import Case, walked_again
 from edp.transfer.methods.base import METHODS, Made, of_network, size_of
+
+TIMES = 2
+"""Epochs over those of a fine-tuning: weights that begin at random have farther to go."""
 
 
 @METHODS.register("scratch")
@@ -20,7 +23,7 @@ class Scratch:
     def make(self, case: Case) -> Made:
         """Train as ``edp train`` would, with the early stopping of the fine-tuning."""
         training, spec = case.experiment.training, case.spec
-        epochs = max(training.epochs, spec.head_epochs + spec.epochs)  # no fewer than what it is compared with
-        training = replace(training, epochs=epochs, patience=spec.patience, refit="none")
+        chunks = walked_again(training.chunks)
+        training = replace(training, chunks=chunks, epochs=TIMES * spec.rounds, patience=spec.patience, refit="none")
         network = case.train("scratch", training, None)
         return of_network(network, size_of(network))

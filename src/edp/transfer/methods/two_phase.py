@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from edp.models.decomposition import decompose
 from edp.training.bundle import weights_digest
-from edp.training.optimizers import Discriminative
+from edp.training.optimizers import AdamW, Discriminative
 from edp.transfer.case import Case
 from edp.transfer.lessons import GoOn
 from edp.transfer.methods.base import METHODS, Made, of_network, size_of
@@ -23,9 +23,10 @@ class TwoPhase:
     def make(self, case: Case) -> Made:
         """Both phases; the first is a run of its own within the run of the second."""
         spec, parts = case.spec, decompose(case.source.predictor)
+        heads = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)
         warmed = case.train(
             "two_phase, head",
-            case.tuning(epochs=spec.head_epochs),
+            case.tuning(heads, spec.head_epochs),
             lambda: GoOn(case.source.predictor, parts.encoding),
             phase="head",
         )

@@ -1,0 +1,431 @@
+"""How much is a simulated machine worth to another, worn one in soil, by minutes of its logs?
+
+The source is the preset ``standard`` trained on M22 in free air, the target the C14 with its full sensor model in air
+and soil. Every log of the target is a minute that trains and validates and a quarter of a minute that tests; with fewer
+minutes there are fewer logs, and the test parts stay those of all. Asked are: each method's error by minutes of logs;
+all methods with all logs, in both worlds (the form of Table 4.10); what becomes of it in a soil that no log holds; and
+whether a physics base carries over from one machine to the other (RQ1 of the thesis), with the geometry of the source
+and with that of the target.
+
+A seed draws the logs with which the few minutes begin, and every training. Intervals are over the logs that test.
+Every training is a cell, kept below ``--work`` when it is done, so that a long benchmark can be stopped and goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import stdtrit
+
+from common import Verdict, finish, kept, parser, table, verdict
+from edp.config import load_experiment
+from edp.data.prepared import Prepared, prepare
+from edp.data_sets import find_data_set_limit
+from edp.models.predictor import build_model
+from edp.report.drawing import BLUE, DROPPED, INK, write_drawings
+from edp.sim.limit import LimitSpec
+from edp.storage import make_folder
+from edp.training.bundle import blank_scaler
+from edp.transfer import METHODS, FinetuneSpec
+from edp.transfer.case import Case
+from edp.transfer.methods import Made
+from edp.transfer.scores import errors_of, measure
+from edp.transfer.source import Source, read_source, target_experiment
+from edp.workflow import DataSource, SimulationOrder, simulate_data_set, train
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENARIO = ROOT / "examples" / "scenarios" / "c14_soil.toml"
+HORIZON = "10"
+SKIP = 50  # ticks of start-up that are not judged
+LOG_MIN = 1.25  # of a log, of which four fifths train and validate
+OURS, NONE = "full", "direct"
+MAIN = (OURS, "scratch", "ridge_arx")  # with every seed
+SOILS = ("sandy_loam", "clay")  # one that logs of the target hold, and one that none holds
+BASES = {  # as options of the network; what they read of the pose is measured on both machines
+    "none": "",
+    "kinematic": '{kind="kinematic", pose="strokes"}',
+    "force": '{kind="hybrid", coupled=true, fade_s=0.03, pose="strokes"}',
+}
+KEYS = ("mae", "r2", "bias", "rmse", "mse", "skew", "p95", "p99")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How long everything is.
+
+    Attributes:
+        preset: of the source's network.
+        source_min: simulated minutes of the source.
+        source: changes of its training.
+        spec: how networks are trained on.
+        replayed: updates of an epoch of methods that replay the source, whose recordings are longer.
+        grid: minutes of logs by method; 0 is direct transfer.
+        rest: methods that are tried with all logs only.
+        seeds: trainings of each.
+        small: changes of the preset ``quick`` for the networks with physics bases.
+        soil_min: minutes of each soil.
+    """
+
+    preset: str
+    source_min: float
+    source: tuple[str, ...]
+    spec: FinetuneSpec
+    replayed: int
+    grid: dict[str, tuple[int, ...]]
+    rest: tuple[str, ...]
+    seeds: int
+    small: tuple[str, ...]
+    soil_min: float
+
+    @property
+    def logs(self) -> int:
+        """How many logs of the target there are."""
+        return max(minutes for sizes in self.grid.values() for minutes in sizes)
+
+
+FULL = Size(
+    preset="standard",
+    source_min=240.0,
+    source=("training.epochs=12", "training.updates=600"),
+    spec=FinetuneSpec(),
+    replayed=60,
+    grid={
+        OURS: (1, 2, 5, 10, 20, 45),
+        "scratch": (1, 2, 5, 10, 20, 45),
+        "ridge_arx": (1, 2, 5, 10, 20, 45),
+        "two_phase": (5, 45),
+        "low_rank": (1, 5, 45),
+        "linear_probe": (1, 5, 45),
+    },
+    rest=("replay", "replay_distilled", "adversarial"),
+    seeds=2,
+    small=("training.epochs=6", "training.updates=200"),
+    soil_min=10.0,
+)
+QUICK = replace(
+    FULL,
+    preset="quick",
+    source_min=12.0,
+    source=("training.epochs=1", "training.updates=4"),
+    spec=FinetuneSpec(rounds=1),
+    replayed=2,
+    grid={OURS: (1, 2), "scratch": (2,), "ridge_arx": (1, 2), "replay": (2,)},
+    rest=(),
+    seeds=1,
+    small=("training.epochs=1", "training.updates=2"),
+    soil_min=2.5,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A source, the logs of a target, and where finished cells lie."""
+
+    source: Source
+    logs: DataSource
+    data: Prepared
+    work: Path
+    size: Size
+
+    def cell(self, method: str, minutes: int, seed: int) -> dict[str, Any]:
+        """Scores of a method with so many minutes of logs, in both worlds, or what an earlier run found."""
+        label = f"{method} {minutes} min seed {seed}"
+
+        def found() -> dict[str, Any]:
+            began = time.process_time()
+            made = self.made(method, minutes, seed)
+            cell = {"cpu_s": time.process_time() - began, "learned": made.learned} | self.scores(
+                made, minutes in (0, len(self.data.train))
+            )
+            print(f"{label}: {cell['cpu_s']:.0f} processor s, {cell['target']['mean']['mae']:.3f} mm/s", flush=True)
+            return cell
+
+        return kept(self.work / "cells" / f"{label.replace(' ', '_')}.json", found)
+
+    def made(self, method: str, minutes: int, seed: int) -> Made:
+        """What a method comes to; a training that is done is read."""
+        shorter = (f"training.updates={self.size.replayed}",) if METHODS[method].replays else ()
+        experiment = target_experiment(self.source, (f"training.seed={seed}", *shorter))
+        folder = self.work / "runs" / f"{method}_{minutes}_{seed}"
+        data = shortened(self.data, minutes, seed) if minutes else self.data
+        case = Case(self.source, self.logs, data, experiment, self.size.spec, folder, lambda name, event: None)
+        return METHODS[method]().make(case)
+
+    def scores(self, made: Made, both: bool) -> dict[str, Any]:
+        """In the target, in each log of it (mean absolute error, mm/s), and in the source if asked for."""
+        said = made.predict(self.data)
+        found: dict[str, Any] = {"target": measure(said, self.data, SKIP)[HORIZON], "logs": []}
+        for place, part in enumerate(self.data.test):
+            error = errors_of(said[place : place + 1], replace(self.data, test=[part]), SKIP)[HORIZON]
+            found["logs"].append(float(np.abs(error).mean()))
+        if both and self.source.data is not None:
+            found["source"] = measure(made.predict(self.source.data), self.source.data, SKIP)[HORIZON]
+        return found
+
+
+def shortened(data: Prepared, minutes: int, seed: int) -> Prepared:
+    """The training and validation parts of so many logs, one after the other from one that the seed draws."""
+    count = len(data.train)
+    first = int(np.random.default_rng(seed).integers(count))
+    chosen = [(first + i) % count for i in range(minutes)]
+    digest = hashlib.blake2b(f"{data.digest} {chosen}".encode(), digest_size=16).hexdigest()
+    train_parts, validation = ([parts[i] for i in chosen] for parts in (data.train, data.validation))
+    return replace(data, train=train_parts, validation=validation, digest=digest)
+
+
+def order_of(minutes: float, logs: int, seed: int, **changes: Any) -> SimulationOrder:
+    """Logs of the target."""
+    return SimulationOrder.of(
+        SCENARIO, minutes=minutes, recordings=logs, seed=seed, suffix=".parquet", layout="", **changes
+    )
+
+
+def world_of(work: Path, size: Size, seed: int) -> World:
+    """Simulate both machines and train the source, or take what an earlier run left."""
+    m22, c14 = work / "m22", work / "c14"
+    simulate_data_set(m22, SimulationOrder(minutes=size.source_min, recordings=int(size.source_min / 3), seed=seed))
+    simulate_data_set(c14, order_of(LOG_MIN * size.logs, size.logs, seed + 100))
+    fixed = ("training.loss.delta=0.1", "task.horizons=[10]", "training.threads=1", "training.patience=0")
+    train(DataSource.of(m22), load_experiment(None, size.preset, [*fixed, *size.source]), work / "source")
+    source, logs = read_source(work / "source"), DataSource.of(c14)
+    return World(source, logs, divided(source, logs), work, size)
+
+
+def divided(source: Source, logs: DataSource) -> Prepared:
+    """The logs of the target, each divided by time."""
+    experiment = target_experiment(source)
+    return prepare(logs.read(), source.bundle.task, experiment.split, source.predictor.spec.window)
+
+
+def interval(values: Sequence[float]) -> float:
+    """Half the width of the 95 % interval of a mean."""
+    count = len(values)
+    return float(stdtrit(count - 1, 0.975) * np.std(values, ddof=1) / count**0.5) if count > 1 else float("nan")
+
+
+def curves_of(world: World, size: Size, seeds: Sequence[int]) -> dict[str, Any]:
+    """Each method by minutes: mean over seeds, each seed, and the interval over the logs that test."""
+    grid = {NONE: (0,), **size.grid, **dict.fromkeys(size.rest, (size.logs,))}
+    cells: dict[str, dict[int, list[dict[str, Any]]]] = {name: {m: [] for m in sizes} for name, sizes in grid.items()}
+    for seed in seeds:
+        for method, sizes in cells.items():
+            again = seed > seeds[0]
+            for minutes in (m for m in sizes if not (again and (method not in MAIN or once(method, m, size)))):
+                cells[method][minutes].append(world.cell(method, minutes, seed))
+    return {method: {m: together(same) for m, same in sizes.items()} for method, sizes in cells.items()}
+
+
+def once(method: str, minutes: int, size: Size) -> bool:
+    """Whether chance has no part in it."""
+    return method == NONE or (method == "ridge_arx" and minutes == size.logs)
+
+
+def together(cells: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Means over seeds."""
+    maes = [cell["target"]["mean"]["mae"] for cell in cells]
+    logs = np.mean([cell["logs"] for cell in cells], axis=0)
+    own = {world: averaged([cell[world] for cell in cells]) for world in ("target", "source") if world in cells[0]}
+    cost = float(np.mean([cell["cpu_s"] for cell in cells]))
+    return {"mae": float(np.mean(maes)), "seeds": maes, "interval": interval(logs), "cpu_s": cost, "worlds": own}
+
+
+def averaged(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Scores of several seeds, entry by entry."""
+    return {
+        target: {key: float(np.mean([score[target][key] for score in scores])) for key in KEYS if key in row}
+        for target, row in scores[0].items()
+    }
+
+
+def soils_of(world: World, size: Size, seed: int) -> dict[str, dict[str, float]]:
+    """Error in digs and levelling of one soil that the logs hold and of one that they do not, mm/s, by method."""
+    made = {name: world.made(name, 0 if name == NONE else size.logs, seed) for name in (NONE, OURS, "ridge_arx")}
+    found: dict[str, dict[str, float]] = {}
+    for soil in SOILS:
+        logs, folder = max(2, int(size.soil_min / LOG_MIN)), world.work / soil
+        order = order_of(LOG_MIN * logs, logs, seed + 200, mix={"dig": 0.6, "grading": 0.4}, materials={soil: 1.0})
+        simulate_data_set(folder, order)
+        series = [world.source.bundle.task.series(recording) for recording in DataSource.of(folder).read()]
+        unseen = replace(world, data=replace(world.data, test=series))
+        found[soil] = {
+            name: float(measure(one.predict(unseen.data), unseen.data, SKIP)[HORIZON]["mean"]["mae"])
+            for name, one in made.items()
+        }
+    return found
+
+
+def physics_of(world: World, size: Size, seed: int) -> dict[str, dict[str, float]]:
+    """Small networks with and without a base: on their own machine, as they are on the other, and after its logs."""
+    found: dict[str, dict[str, float]] = {}
+    for base, options in BASES.items():
+        fixed = ["task.horizons=[10]", "training.threads=1", "training.patience=0", *size.small]
+        changes = [*fixed, *([f"model.physics={options}"] if options else [])]
+        folder = make_folder(world.work / f"physics_{base}")
+        train(DataSource.of(world.work / "m22"), load_experiment(None, "quick", changes), folder / "source")
+        source = read_source(folder / "source")
+        machines = ("M22", "C14") if options else ("M22",)
+        for machine in machines:
+            begun = source if machine == "M22" else of_machine(source, machine)
+            other = replace(world, source=begun, data=divided(begun, world.logs), work=make_folder(folder / machine))
+            few = min(5, size.logs)
+            cells = {NONE: other.cell(NONE, 0, seed), OURS: other.cell(OURS, few, seed)}
+            found[f"{base}, {machine}" if options else base] = {
+                "own": cells[NONE]["source"]["mean"]["mae"],
+                **{name: cell["target"]["mean"]["mae"] for name, cell in cells.items()},
+            }
+    return found
+
+
+def of_machine(source: Source, machine: str) -> Source:
+    """The source with the geometry of another machine in its physics base, its weights as they are."""
+    old = source.predictor
+    physics = replace(old.spec.physics, machine=machine)
+    moved = build_model(old.task, replace(old.spec, physics=physics), blank_scaler(old.task), 0)
+    weights = {name: value for name, value in old.state_dict().items() if not name.startswith("physics.geometry")}
+    moved.load_state_dict(weights, strict=False)
+    return replace(source, bundle=replace(source.bundle, predictor=moved.eval()))
+
+
+def closed(mae: float, direct: float, limit: float) -> float:
+    """Share of the way from direct transfer to the limit of predictability."""
+    return (direct - mae) / (direct - limit)
+
+
+def show(found: dict[str, Any], size: Size) -> None:
+    """Print all tables."""
+    curves, limit = found["curves"], found["limit"]
+    direct = curves[NONE][0]["mae"]
+    minutes = sorted({m for sizes in curves.values() for m in sizes})
+    print(f"\nk = {HORIZON}: mean absolute error on the test parts by minutes of logs, mm/s; the limit is {limit:.3g}")
+    cells = {
+        method: {m: f"{row['mae']:.3g} +- {row['interval']:.2g}" for m, row in rows.items()}
+        for method, rows in curves.items()
+    }
+    table(
+        ["method", *map(str, minutes)],
+        [[METHODS[m].label, *(held.get(n, "-") for n in minutes)] for m, held in cells.items()],
+    )
+    print(f"\nall {size.logs} min of logs, both worlds")
+    rows = []
+    for method, sizes in curves.items():
+        held = sizes[max(sizes)]
+        for world, scores in held["worlds"].items():
+            for name, row in scores.items():
+                figures = [row.get(key, "-") for key in KEYS]
+                rows.append([METHODS[method].label, world, name, *figures])
+    table(["method", "world", "cylinder", *KEYS], rows)
+    print("\nof the way from direct transfer to the limit: ", end="")
+    print(", ".join(f"{m} {closed(s[max(s)]['mae'], direct, limit):.0%}" for m, s in curves.items() if m != NONE))
+    print("\ndigs and levelling of new logs, mm/s")
+    table(
+        ["method", *SOILS],
+        [[METHODS[m].label, *(found["soils"][soil][m] for soil in SOILS)] for m in found["soils"][SOILS[0]]],
+    )
+    print("\nsmall networks with a physics base and its geometry, mm/s")
+    heads = ["base", "on M22", "C14 as it is", "C14 fine-tuned"]
+    table(heads, [[name, row["own"], row[NONE], row[OURS]] for name, row in found["physics"].items()])
+
+
+def verdicts_of(curves: dict[str, Any], size: Size, quick: bool) -> Iterator[Verdict]:
+    """Every goal that this run can speak to."""
+    direct, ours = curves[NONE][0], curves[OURS]
+    best = ours[size.logs]
+    yield verdict("fine-tuned over direct transfer, all logs", best["mae"], direct["mae"], "<= 0.36", "mm/s", quick)
+    rows = [row for name, row in best["worlds"]["target"].items() if name != "mean"]
+    yield verdict("least R2 of a cylinder, all logs", min(row["r2"] for row in rows), 1.0, ">= 0.97", "1", quick)
+    bias = max(abs(row["bias"]) / row["mae"] for row in rows)
+    yield verdict("largest bias over MAE of a cylinder", bias, 1.0, "<= 0.05", "1", quick)
+    for minutes in sorted(set(ours) & set(curves["scratch"])):
+        alone = curves["scratch"][minutes]["mae"]
+        yield verdict(
+            f"fine-tuned over from scratch, {minutes} min", ours[minutes]["mae"], alone, "<= 1", "mm/s", quick
+        )
+    few = min(5, size.logs)
+    least = min(rows[few]["mae"] for rows in curves.values() if few in rows)
+    yield verdict(f"best with {few} min over fine-tuned with all", least, best["mae"], "<= 1.1", "mm/s", quick)
+    if "replay" in curves:
+        both = curves["replay"][size.logs]["worlds"]
+        yield verdict(
+            "both worlds: in the target", both["target"]["mean"]["mae"], best["mae"], "<= 1.05", "mm/s", quick
+        )
+        own = direct["worlds"]["source"]["mean"]["mae"]
+        yield verdict("both worlds: in the source", both["source"]["mean"]["mae"], own, "<= 1.05", "mm/s", quick)
+
+
+def draw(figure: Any, curves: dict[str, Any], limit: float) -> None:
+    """Error by minutes of logs."""
+    axes = figure.subplots()
+    figure.set_size_inches(7.2, 4.2)
+    direct = curves[NONE][0]["mae"]
+    axes.axhline(direct, color=DROPPED, linestyle="--", linewidth=1.2)
+    axes.annotate("direct transfer", (1, direct), xytext=(0, 4), textcoords="offset points", color=DROPPED)
+    axes.axhline(limit, color=DROPPED, linestyle=":", linewidth=1.2)
+    axes.annotate("limit of predictability", (1, limit), xytext=(0, 4), textcoords="offset points", color=DROPPED)
+    inks = dict(zip((OURS, "scratch", "ridge_arx"), (BLUE, INK, "#b45309"), strict=True))
+    marks = dict(zip((m for m in curves if m not in inks), "sD^vP*X", strict=False))
+    for method, sizes in curves.items():
+        if method == NONE:
+            continue
+        minutes = sorted(sizes)
+        label, maes = METHODS[method].label, [sizes[m]["mae"] for m in minutes]
+        if method in inks:
+            reach = [sizes[m]["interval"] for m in minutes]
+            axes.errorbar(minutes, maes, yerr=reach, color=inks[method], marker="o", capsize=3, label=label)
+        else:
+            axes.plot(minutes, maes, color="#66717d", marker=marks[method], linestyle=":", linewidth=0.8, label=label)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    ticks = sorted({m for sizes in curves.values() for m in sizes} - {0})
+    axes.set_xticks(ticks, [str(m) for m in ticks])
+    axes.set_yticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
+    axes.minorticks_off()
+    axes.set_xlabel("Minutes of the target's logs that train and validate")
+    axes.set_ylabel("Mean absolute error, mm/s")
+    axes.set_title("From M22 in free air to a worn C14 in soil, 100 ms ahead")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def run(arguments: argparse.Namespace, work: Path) -> None:
+    """All parts, in `work`."""
+    quick, seed = arguments.quick, arguments.seed
+    size = QUICK if quick else replace(FULL, seeds=arguments.seeds)
+    world = world_of(work, size, seed)
+    spec = LimitSpec(horizons=(10,), **({"moments": 4, "branches": 4} if quick else {"moments": 120}))
+    order = order_of(LOG_MIN * size.logs, size.logs, seed + 100)
+    limit = find_data_set_limit(work / "c14", order, spec)["commands_unknown"]["mae"][0][-1]
+    curves = curves_of(world, size, range(seed, seed + size.seeds))
+    found = {
+        "limit": limit,
+        "curves": curves,
+        "soils": kept(work / "cells" / "soils.json", lambda: soils_of(world, size, seed)),
+        "physics": kept(work / "cells" / "physics.json", lambda: physics_of(world, size, seed)),
+    }
+    show(found, size)
+    write_drawings(arguments.pictures or work, {"transfer_curves": lambda figure: draw(figure, curves, limit)})
+    finish("transfer", list(verdicts_of(curves, size, quick)), seed, found)
+
+
+def main() -> None:
+    """Command line."""
+    made = parser(__doc__ or "")
+    made.add_argument("--work", type=Path, default=None, help="folder that keeps data and finished cells")
+    made.add_argument("--seeds", type=int, default=2, help="trainings of the main methods")
+    made.add_argument("--pictures", type=Path, default=None, help="folder of the chart; else that of --work")
+    arguments = made.parse_args()
+    if arguments.work is not None:
+        run(arguments, make_folder(arguments.work))
+        return
+    with tempfile.TemporaryDirectory() as temporary:
+        run(arguments, Path(temporary))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Fine-tuning on recordings made by others: from one regime of a plant to another, beside rivals on the same ticks.
+
+Each set has two recordings: the first and the second part of a run (time-shifted), or two kinds of excitation. The
+network of the first is trained on with the second by what ``edp finetune`` does; its rivals are direct transfer,
+training from scratch and ridge ARX on the second alone. No machine changes in these sets, so what they show is that
+the command works on logs of other makes and rates, and how much a few tens of seconds of a changed regime bring; not
+what a transfer between machines brings.
+
+The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from common import Verdict, finish, parser, table, verdict
+from edp.config import load_experiment
+from edp.logs import write_recording
+from edp.storage import make_folder
+from edp.transfer import METHODS, FinetuneSpec, Order, finetune
+from edp.workflow import DataSource, train
+from real_recordings import EXAMPLES, PRESET, QUICK, shared_folder
+
+OURS, NONE = "full", "direct"
+RIVALS = (NONE, "scratch", "ridge_arx", "replay")
+SPEC = FinetuneSpec(batch=8)  # seconds of logs do not hold more lanes
+CHANGES = ('split={kind="time"}', "training.refit=none")
+
+
+@dataclass(frozen=True)
+class Regimes:
+    """Two regimes of one plant.
+
+    Attributes:
+        title: as the table calls it.
+        data: data-set file with two recordings, in ``examples/real``.
+        settings: settings file beside it.
+        change: what differs.
+    """
+
+    title: str
+    data: str
+    settings: str
+    change: str
+
+
+SETS = (
+    Regimes("two cylinders on one supply", "cylinders.toml", "cylinders_settings.toml", "later in the run"),
+    Regimes("fatigue rig", "faster.toml", "faster_settings.toml", "later in the run"),
+    Regimes("positioning axis", "emps.toml", "emps_settings.toml", "pulses of force added"),
+)
+QUICK_SETS = SETS[:1]
+
+
+def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[str, Any]:
+    """Train on the first recording, fine-tune on the second; the content of ``transfer.json``."""
+    first, second = DataSource.of(EXAMPLES / regimes.data).read()
+    for name, recording in (("source", first), ("target", second)):
+        write_recording(recording, make_folder(work / name) / f"{recording.name}.parquet")
+    changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(QUICK if quick else ())]
+    experiment = load_experiment(EXAMPLES / regimes.settings, PRESET, changes)
+    train(DataSource.of(work / "source"), experiment, work / "run")
+    spec = FinetuneSpec(batch=8, rounds=2) if quick else SPEC
+    order = Order(spec=spec, method=OURS, rivals=RIVALS)
+    return finetune(work / "run", DataSource.of(work / "target"), order, work / "tuned")
+
+
+def rows_of(regimes: Regimes, found: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Root-mean-square errors of each target and horizon by method, in the units of the logs."""
+    for horizon in found["task"]["horizons"]:
+        for target in found["targets"]:
+            errors = {
+                name: row["worlds"]["target"][str(horizon)][target["name"]]["rmse"]
+                for name, row in found["methods"].items()
+            }
+            yield {"set": regimes.title, "target": target["name"], "horizon": horizon, "rmse": errors}
+
+
+def verdicts_of(rows: Sequence[dict[str, Any]], quick: bool) -> Iterator[Verdict]:
+    """Fine-tuned against direct transfer and against training from scratch: geometric mean over the rows of a set."""
+    for title in dict.fromkeys(row["set"] for row in rows):
+        held = [row["rmse"] for row in rows if row["set"] == title]
+        for rival in (NONE, "scratch"):
+            ratio = statistics.geometric_mean(errors[OURS] / errors[rival] for errors in held)
+            yield verdict(f"{title}: over {METHODS[rival].label.lower()}", ratio, 1.0, "<= 1", "RMSE ratio", quick)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    options = parser(__doc__ or "")
+    options.add_argument("--shared", type=Path, default=None, help="folder of the recordings")
+    given = options.parse_args(arguments)
+    if shared_folder(given.shared) is None:
+        return
+    rows: list[dict[str, Any]] = []
+    minutes = {}
+    for regimes in QUICK_SETS if given.quick else SETS:
+        print(f"{regimes.data} ...", file=sys.stderr, flush=True)
+        with tempfile.TemporaryDirectory() as folder:
+            found = transferred(regimes, Path(folder), given.quick, given.seed)
+        minutes[regimes.title] = found["data"]["minutes"]
+        rows += rows_of(regimes, found)
+    names = [OURS, *RIVALS]
+    print("\nRMSE k steps ahead on the end of the second recording, units of the logs")
+    heads = ["set", "target", "k", *(METHODS[name].label for name in names)]
+    table(heads, [[row["set"], row["target"], row["horizon"], *(row["rmse"][n] for n in names)] for row in rows])
+    finish("transfer_real", list(verdicts_of(rows, given.quick)), given.seed, {"minutes": minutes, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
