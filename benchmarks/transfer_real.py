@@ -11,11 +11,12 @@ The recordings are no part of the repository: their folder is given by --shared 
 
 from __future__ import annotations
 
+import json
 import statistics
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,8 @@ from real_recordings import EXAMPLES, PRESET, QUICK, shared_folder
 
 OURS, NONE = "full", "direct"
 RIVALS = (NONE, "scratch", "ridge_arx", "replay")
-SPEC = FinetuneSpec(batch=8)  # seconds of logs do not hold more lanes
+RATES = (3e-3, 1e-2, 3e-2)  # the validation part chooses
+SPEC = FinetuneSpec(batch=8, rounds=20)  # seconds of logs do not hold more lanes
 CHANGES = ('split={kind="time"}', "training.refit=none")
 
 
@@ -66,9 +68,19 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(QUICK if quick else ())]
     experiment = load_experiment(EXAMPLES / regimes.settings, PRESET, changes)
     train(DataSource.of(work / "source"), experiment, work / "run")
-    spec = FinetuneSpec(batch=8, rounds=2) if quick else SPEC
-    order = Order(spec=spec, method=OURS, rivals=RIVALS)
-    return finetune(work / "run", DataSource.of(work / "target"), order, work / "tuned")
+    specs = [replace(SPEC, rounds=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
+    logs = DataSource.of(work / "target")
+    tried = {work / f"tuned_{number}": Order(spec=spec, method=OURS) for number, spec in enumerate(specs)}
+    for folder, order in tried.items():
+        finetune(work / "run", logs, order, folder)
+    best = min(tried, key=validation)
+    return finetune(work / "run", logs, replace(tried[best], rivals=RIVALS), best)  # what is trained is read
+
+
+def validation(folder: Path) -> float:
+    """Least validation error of a training, in standard deviations."""
+    rows = (folder / "history.jsonl").read_text(encoding="utf-8").splitlines()
+    return min(float(json.loads(row)["validation_score"]) for row in rows)
 
 
 def rows_of(regimes: Regimes, found: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -99,18 +111,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if shared_folder(given.shared) is None:
         return
     rows: list[dict[str, Any]] = []
-    minutes = {}
+    kept: dict[str, Any] = {}
     for regimes in QUICK_SETS if given.quick else SETS:
         print(f"{regimes.data} ...", file=sys.stderr, flush=True)
         with tempfile.TemporaryDirectory() as folder:
             found = transferred(regimes, Path(folder), given.quick, given.seed)
-        minutes[regimes.title] = found["data"]["minutes"]
+        kept[regimes.title] = {"minutes": found["data"]["minutes"], "rate": found["settings"]["rate"]}
         rows += rows_of(regimes, found)
     names = [OURS, *RIVALS]
     print("\nRMSE k steps ahead on the end of the second recording, units of the logs")
     heads = ["set", "target", "k", *(METHODS[name].label for name in names)]
     table(heads, [[row["set"], row["target"], row["horizon"], *(row["rmse"][n] for n in names)] for row in rows])
-    finish("transfer_real", list(verdicts_of(rows, given.quick)), given.seed, {"minutes": minutes, "rows": rows})
+    finish("transfer_real", list(verdicts_of(rows, given.quick)), given.seed, {"sets": kept, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ def finetune(
     bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
     logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, a folder of logs, or a data-set file.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished one goes on.")],
-    method: Annotated[str, typer.Option(help="The method whose network is kept.")] = "two_phase",
+    method: Annotated[str, typer.Option(help="The method whose network is kept.")] = "full",
     rivals: Annotated[
         str, typer.Option(help="Comma-separated methods to compare with, 'all' or 'none'.")
     ] = "ridge_arx",

@@ -62,7 +62,7 @@ class Order:
     """
 
     spec: FinetuneSpec
-    method: str = "two_phase"
+    method: str = "full"
     rivals: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
 

@@ -31,13 +31,14 @@ class GoOn:
     def __init__(self, start: Predictor, held: Collection[str] = ()) -> None:
         self.start, self.held = start, frozenset(held)
         self._frozen: list[nn.Parameter] = []
+        self._freed: list[nn.Parameter] = []
 
     def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
         """The training series as they are."""
         return list(known)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
-        """Take over weights and scaling, and hold what does not learn.
+        """Take over weights and scaling, let a by-pass learn that did not, and hold what does not learn.
 
         Raises:
             ConfigError: the start has other specs, or nothing is left to learn.
@@ -45,8 +46,10 @@ class GoOn:
         continue_from(net, self.start)
         named = dict(net.named_parameters())
         self._frozen = [p for name, p in named.items() if name in self.held and p.requires_grad]
-        for parameter in self._frozen:
-            parameter.requires_grad_(False)
+        # A by-pass that kept its regression in the source's training describes the source's machine.
+        self._freed = [p for name, p in named.items() if name not in self.held and not p.requires_grad]
+        for parameter in (*self._frozen, *self._freed):
+            parameter.requires_grad_(not parameter.requires_grad)
         if not any(parameter.requires_grad for parameter in named.values()):
             raise ConfigError("fine-tuning: every parameter is held, so nothing can learn; hold fewer")
         return True
@@ -56,9 +59,9 @@ class GoOn:
         return objective.evaluate(moment.answer, moment.future, moment.features, moment.valid)
 
     def end(self, net: Predictor) -> None:
-        """Let go of what was held."""
-        for parameter in self._frozen:
-            parameter.requires_grad_(True)
+        """Let go of what was held, and hold what was freed."""
+        for parameter in (*self._frozen, *self._freed):
+            parameter.requires_grad_(not parameter.requires_grad)
 
 
 class LowRank:
@@ -115,6 +118,7 @@ class LowRank:
         del net.adapters
         for parameter in self._frozen:
             parameter.requires_grad_(True)
+        self.base.end(net)
         self._handles, self._changes = [], []
 
     def _swap(self, changes: list[tuple[Matrix, _Change]], part: nn.Module) -> None:

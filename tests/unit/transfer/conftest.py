@@ -69,6 +69,12 @@ def written() -> Callable[[Path, list[Recording]], Path]:
 
 
 @pytest.fixture(scope="session")
+def settings() -> tuple[str, ...]:
+    """Settings of a small network."""
+    return SETTINGS
+
+
+@pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on the first machine; tests leave it as it is."""
     folder = tmp_path_factory.mktemp("source")

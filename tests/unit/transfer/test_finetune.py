@@ -1,5 +1,6 @@
 """Fine-tuning: what is carried, what is held, what comes out, and that it goes on after a stop to the same bits."""
 
+import copy
 import dataclasses
 import json
 import math
@@ -11,19 +12,23 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from edp.cli import app
+from edp.config import load_experiment
 from edp.data.chunks import ChunkSpec
 from edp.errors import BundleError, ConfigError, StorageError
 from edp.losses import Drift, Smoothness
 from edp.models.decomposition import decompose
+from edp.sources import DataSource
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.optimizers import Soap
 from edp.training.spec import TrainingSpec
 from edp.transfer import METHODS, FinetuneSpec, Order, Watchers, finetune
+from edp.transfer.both_worlds import BothSpec, BothWorlds
 from edp.transfer.case import tuned as tuning
+from edp.transfer.lessons import GoOn, LowRank
 from edp.transfer.scores import errors_of, measure, skew
 from edp.transfer.source import read_source, target_experiment, task_settings
-from edp.workflow import evaluate
+from edp.workflow import evaluate, train
 
 UPDATES = ("training.updates=25",)
 BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
@@ -32,7 +37,8 @@ BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
 @pytest.fixture(scope="module")
 def tuned(run, target, small, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned") / "run"
-    return folder, finetune(run, target, Order(spec=small, rivals=tuple(METHODS), changes=UPDATES), folder)
+    order = Order(spec=small, method="two_phase", rivals=tuple(METHODS), changes=UPDATES)
+    return folder, finetune(run, target, order, folder)
 
 
 class Pulled(Exception):
@@ -114,7 +120,7 @@ def test_low_rank_changes_have_their_rank_and_leave_an_ordinary_network(tuned, r
 
 def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
     whole, _ = tuned
-    order = Order(spec=small, changes=UPDATES)
+    order = Order(spec=small, method="two_phase", changes=UPDATES)
     for stop in (1, 3):
         seen = []
 
@@ -129,8 +135,9 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, smal
     ends = [load_bundle(folder).predictor.state_dict() for folder in (whole, tmp_path / "run")]
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
     assert set(found["methods"]) == {"two_phase", "direct"}
+    other = dataclasses.replace(order, spec=dataclasses.replace(small, head_rate=1e-3))
     with pytest.raises(StorageError, match="holds another run"):
-        finetune(run, target, Order(spec=dataclasses.replace(small, head_rate=1e-3), changes=UPDATES), tmp_path / "run")
+        finetune(run, target, other, tmp_path / "run")
 
 
 def test_a_stopped_adversarial_training_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
@@ -163,7 +170,7 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
         (tmp_path / "alone" / file.name).write_bytes(file.read_bytes())
     notes = []
     changes = ("training.updates=2", "training.chunks.length=32")
-    order = Order(spec=small, rivals=("adversarial",), changes=changes)
+    order = Order(spec=small, method="two_phase", rivals=("adversarial",), changes=changes)
     found = finetune(tmp_path / "alone", target, order, tmp_path / "run", Watchers(on_note=notes.append))
     assert list(found["methods"]["two_phase"]["worlds"]) == ["target"]
     assert any("bundle without the run" in note for note in notes)
@@ -250,6 +257,34 @@ def test_windows_are_drawn_together_for_smoothness_and_chunks_walked_again():
     assert tuning(TrainingSpec(chunks=ChunkSpec(length=8, burn_in=100)), spec).chunks.carried == 13
 
 
+@pytest.mark.parametrize("method", ["full", "two_phase", "low_rank", "linear_probe"])
+def test_a_bypass_that_kept_its_regression_learns_the_target(
+    settings, target, small, made_by, written, tmp_path, method
+):
+    blocks = 'model.blocks=[{kind="linear_bypass", taps=4, start="ridge", trained=false}]'
+    logs = DataSource.of(written(tmp_path / "logs", [made_by(f"s{i}", i, (0.2, -0.1)) for i in range(4)]))
+    train(logs, load_experiment(preset="quick", overrides=(*settings, blocks)), tmp_path / "run")
+    order = Order(spec=small, method=method, changes=("training.updates=10",))
+    finetune(tmp_path / "run", target, order, tmp_path / "out")
+    before, after = (load_bundle(tmp_path / name).predictor for name in ("run", "out"))
+    same = torch.equal(before.bypass.weight, after.bypass.weight)
+    assert same == (method == "linear_probe")
+    flags = [{name: p.requires_grad for name, p in net.named_parameters()} for net in (before, after)]
+    assert flags[0] == flags[1]
+
+
+def test_lessons_leave_every_parameter_as_free_as_it_was(run):
+    source = read_source(run).predictor
+    spec = read_source(run).experiment.training
+    source.heads.biases[-1].requires_grad_(False)
+    for lesson in (GoOn(source), LowRank(source, 2), BothWorlds(source, [], BothSpec())):
+        net = copy.deepcopy(source)
+        lesson.begin(net, spec)
+        assert net.heads.biases[-1].requires_grad == (not isinstance(lesson, LowRank))
+        lesson.end(net)
+        assert [name for name, p in net.named_parameters() if not p.requires_grad] == ["heads.biases.1"]
+
+
 def test_skew_and_squares_are_those_of_scipy(tiny):
     rng = np.random.default_rng(0)
     predictions = [
@@ -267,18 +302,18 @@ def test_skew_and_squares_are_those_of_scipy(tiny):
 
 
 def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
-    options = ["--head-epochs", "1", "--epochs", "1", "--batch", "4", "--rivals", "none", "--set", "training.updates=3"]
+    options = ["--rounds", "2", "--batch", "4", "--rivals", "none", "--set", "training.updates=3"]
     call = ["finetune", str(run), str(target.path), "--out", str(tmp_path / "run"), *options]
     told = CliRunner().invoke(app, call)
     assert told.exit_code == 0, told.output
     assert "next: edp evaluate" in told.output
     facts = read_json(tmp_path / "run" / "transfer.json")
-    assert set(facts["methods"]) == {"two_phase", "direct"}
+    assert set(facts["methods"]) == {"full", "direct"}
     assert math.isfinite(facts["methods"]["direct"]["worlds"]["target"]["2"]["mean"]["mse"])
     page = (tmp_path / "run" / "transfer.html").read_text(encoding="utf-8")
     assert "Before and after" in page
     assert {path.name for path in (tmp_path / "run" / "tables").iterdir()} >= {"pair_k2.csv", "methods_k5.md"}
-    assert (tmp_path / "run" / "pictures" / "errors_two_phase_k5.svg").is_file()
+    assert (tmp_path / "run" / "pictures" / "errors_full_k5.svg").is_file()
 
 
 def test_a_network_in_whole_numbers_is_refused(run, tmp_path):

@@ -40,12 +40,8 @@ def of_network(network: Predictor, learned: int) -> Made:
 
 
 def size_of(network: Predictor, names: Sequence[str] | None = None) -> int:
-    """Parameters of a network that training changes, or those of them that are named."""
-    return sum(
-        parameter.numel()
-        for name, parameter in network.named_parameters()
-        if parameter.requires_grad and (names is None or name in names)
-    )
+    """Parameters of a network, or those of them that are named."""
+    return sum(value.numel() for name, value in network.named_parameters() if names is None or name in names)
 
 
 class Method(Protocol):
