@@ -15,6 +15,8 @@ from edp.errors import DataError, closest
 from edp.signals import Channel
 
 FloatArray = NDArray[np.float32]
+MACHINE = "machine"
+"""Where the meta of a recording says which machine it is of."""
 
 
 @dataclass(frozen=True, eq=False)

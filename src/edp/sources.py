@@ -12,7 +12,7 @@ from edp.config import Table, build, plain_tree, read_toml
 from edp.errors import ConfigError, DataError
 from edp.logs import DataQuality, compare, find_recordings, look_into, read_data_set, read_recording, unique_names
 from edp.logs.repair import Repair
-from edp.recording import Recording
+from edp.recording import MACHINE, Recording
 from edp.signals import SignalMap
 
 
@@ -25,12 +25,14 @@ class RecordingEntry:
         name: unique name; the file's stem by default.
         rows: ``[start, stop]`` to use a part of the log.
         map: signal map for this log: a table, or the path of a map file; the data set's map by default.
+        machine: which machine was recorded, where parts are divided by machine.
     """
 
     path: str
     name: str | None = None
     rows: tuple[int, int] | None = None
     map: str | SignalMap | None = None
+    machine: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,10 +127,12 @@ class Log:
     repair: Repair | None = None
     name: str | None = None
     rows: tuple[int, int] | None = None
+    machine: str = ""
 
     def read(self) -> Recording:
         """The recording."""
-        return read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
+        found = read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
+        return replace(found, meta={**found.meta, MACHINE: self.machine}) if self.machine else found
 
 
 def load_signal_map(path: str | Path) -> SignalMap:
@@ -168,7 +172,14 @@ def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> 
     shared, allowed = signal_map or resolved(settings.map), repair or settings.repair
     return [
         # An absolute path stands for itself.
-        Log(path.parent / _expanded(entry.path, path), resolved(entry.map) or shared, allowed, entry.name, entry.rows)
+        Log(
+            path.parent / _expanded(entry.path, path),
+            resolved(entry.map) or shared,
+            allowed,
+            entry.name,
+            entry.rows,
+            entry.machine,
+        )
         for entry in settings.recordings
     ]
 

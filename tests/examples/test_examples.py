@@ -15,6 +15,7 @@ import pytest
 from edp.cli import app
 from edp.cli.console import run_app
 from edp.cli.finetune import finetune
+from edp.cli.pretrain import pretrain
 from edp.compress import DistillationSpec
 from edp.config import TAGGED, TaskSettings, load_experiment
 from edp.data.chunks import ChunkSpec
@@ -24,6 +25,7 @@ from edp.evaluation.judge import JudgeSpec
 from edp.logs import write_recording
 from edp.losses import AdaptiveWeights
 from edp.models.predictor import ModelSpec
+from edp.pretraining import PRETRAININGS, MetaSpec
 from edp.recording import Recording
 from edp.screening import ForestSpec, ScreeningSpec
 from edp.search.ground import Ground
@@ -150,6 +152,17 @@ def test_finetune_page_names_every_option_with_its_default_and_every_method():
     for entry in dataclasses.fields(FinetuneSpec):
         if entry.name != "check_signs":
             assert options[entry.name].default == entry.default, entry.name
+
+
+def test_foundation_page_names_every_option_with_its_default_and_every_method():
+    page = (ROOT / "docs" / "foundation.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\| `(\w+)` \| `(.+?)` \|", page, re.MULTILINE)
+    assert shown == [(entry.name, str(entry.default)) for entry in dataclasses.fields(MetaSpec)]
+    named = re.findall(r"^\| `(\w+)` \| (?!`)", page, re.MULTILINE)
+    assert set(named) == set(PRETRAININGS)
+    options = inspect.signature(pretrain).parameters
+    for entry in dataclasses.fields(MetaSpec):
+        assert options[entry.name].default == entry.default, entry.name
 
 
 def test_search_page_names_every_phase_and_key_and_shows_the_examples():

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -5,7 +7,7 @@ from hypothesis import strategies as st
 
 from edp.data.features import FeatureSet
 from edp.data.prepared import prepare
-from edp.data.splits import SPLITS, ByBlocks, ByRecording, ByTime
+from edp.data.splits import SPLITS, ByBlocks, ByMachine, ByRecording, ByTime
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
@@ -42,7 +44,7 @@ def check(split, given_recordings, gap):
 @given(
     samples=st.lists(st.integers(300, 1500), min_size=1, max_size=6),
     gap=st.integers(1, 20),
-    kind=st.sampled_from(list(SPLITS)),
+    kind=st.sampled_from([kind for kind in SPLITS if kind != "machines"]),
     seed=st.integers(0, 5),
 )
 def test_parts_are_disjoint_with_a_gap(samples, gap, kind, seed):
@@ -132,3 +134,54 @@ def test_prepared_data_keep_window_and_horizon_between_parts_and_know_their_chan
     assert prepare(logged, task, ByTime(), window=20).digest == data.digest
     assert prepare(logged, task, ByTime(), window=21).digest != data.digest
     assert prepare(recordings(1000, 801), task, ByTime(), window=20).digest != data.digest
+
+
+def of_machines(*owners, masses=()):
+    masses = masses or [None] * len(owners)
+    return [
+        dataclasses.replace(r, meta={"machine": owner} | ({} if mass is None else {"mass_t": mass}))
+        for r, owner, mass in zip(recordings(*[100] * len(owners)), owners, masses, strict=True)
+    ]
+
+
+@settings(max_examples=40, deadline=None)
+@given(owners=st.lists(st.sampled_from("ABCDEFGH"), min_size=3, max_size=30), seed=st.integers(0, 5))
+def test_no_machine_is_in_two_parts(owners, seed):
+    logged = of_machines(*owners)
+    spec = ByMachine(seed=seed)
+    if len(set(owners)) < 3:
+        with pytest.raises(DataError, match="at least three"):
+            spec.split(logged, 5)
+        return
+    split = spec.split(logged, 5)
+    check(split, logged, 5)
+    held = [{owners[s.recording] for s in stretches} for stretches in parts_of(split).values()]
+    assert sum(map(len, held)) == len(set(owners)) == len(set.union(*held))
+    assert sum(map(len, parts_of(split).values())) == len(owners)
+    assert spec.split(logged, 5) == split
+
+
+def test_machines_are_held_out_by_name_and_by_mass():
+    logged = of_machines("M1", "m1", "m2", "m3", "m4", "m5", masses=(10.0, 10.0, 12.0, 14.0, None, 30.0))
+    split = ByMachine(validation=("M5",), test=("m4",), test_masses=(11.0, 15.0)).split(logged, 5)
+    assert [[s.recording for s in part] for part in parts_of(split).values()] == [[0, 1], [5], [2, 3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "told"),
+    [
+        ({"test": ("m6",)}, DataError, "there is no machine 'm6'"),
+        ({"test": ("m1",), "validation": ("M1",)}, DataError, "m1 would validate and test"),
+        ({"test_masses": (1.0, 2.0)}, DataError, "they go from 10 to 30 t"),
+        ({"test_masses": (2.0, 1.0)}, ConfigError, "the lightest and the heaviest"),
+        ({"test_masses": (2.0,)}, ConfigError, "the lightest and the heaviest"),
+    ],
+)
+def test_machines_that_cannot_be_held_out_are_refused(options, error, told):
+    with pytest.raises(error, match=told):
+        ByMachine(**options).split(of_machines("m1", "m2", "m3", masses=(10.0, 20.0, 30.0)), 5)
+
+
+def test_a_recording_without_a_machine_cannot_be_divided_by_machine():
+    with pytest.raises(DataError, match=r"'r0' .* does not say which machine .* machine = "):
+        ByMachine().split(recordings(100, 100, 100), 5)

@@ -21,6 +21,7 @@ from edp.sim import (
     simulate,
     simulate_many,
 )
+from edp.sim.family import member_mass
 from edp.sim.machine_files import parse_machine
 from edp.sim.plan import hand_out
 from edp.sim.sensors import filtered_derivative
@@ -68,6 +69,13 @@ def test_scenarios_refuse_bad_values(change, message):
 def test_a_step_must_divide_the_sample_time():
     with pytest.raises(ConfigError, match="does not divide the sample time"):
         simulate(Scenario(step_s=3e-4))
+
+
+def test_a_recording_of_a_family_knows_its_machine_and_mass():
+    recording = simulate(Scenario(machine="family-3-1-12-14", duration_s=0.5))
+    assert recording.meta["machine"] == "family-3-1-12-14"
+    assert recording.meta["mass_t"] == round(member_mass(3, 1, 12.0, 14.0), 3)
+    assert "mass_t" not in simulate(Scenario(duration_s=0.5)).meta
 
 
 @pytest.mark.parametrize("excitation", list(EXCITATIONS))

@@ -81,6 +81,14 @@ def listed(logs, *entries, head='map = "map.toml"\n'):
     return path
 
 
+def test_a_data_set_file_says_which_machine_a_log_is_of(logs):
+    entries = [f'path = "{path.name}"\nmachine = "Digger {i}"' for i, path in enumerate(sorted(logs.glob("*.csv"))[:2])]
+    found = DataSource.of(
+        listed(logs, *[entry.replace('path = "', f'path = "{logs.name}/') for entry in entries])
+    ).read()
+    assert [recording.meta["machine"] for recording in found] == ["Digger 0", "Digger 1"]
+
+
 def test_a_run_holds_all_that_repeats_it(logs, tmp_path):
     bundle = train(source_of(logs), experiment(), tmp_path / "run")
     facts = json.loads((tmp_path / "run" / "provenance.json").read_text())

@@ -19,6 +19,7 @@ from edp.cli import (
     footprint,
     inspect,
     parity,
+    pretrain,
     quantise,
     report,
     screen,
@@ -46,6 +47,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.add_typer(search.app, name="search")
 app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)
+app.command("pretrain")(pretrain.pretrain)
 app.command("finetune")(finetune.finetune)
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)

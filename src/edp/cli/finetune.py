@@ -40,6 +40,10 @@ def finetune(
     source_weight: Annotated[float, typer.Option(help="Weight of the source's loss, where it is replayed.")] = 1.0,
     soft: Annotated[float, typer.Option(help="Share of that loss that the source's network teaches.")] = 0.5,
     reversal: Annotated[float, typer.Option(help="Weight of the reversed gradient of the adversary.")] = 0.1,
+    inner_rate: Annotated[
+        float, typer.Option(help="Rate of few steps; 0: the source's own, where it was meta-learned.")
+    ] = 0.0,
+    inner_steps: Annotated[int, typer.Option(help="Most steps of the method of few steps.")] = 30,
     any_sign: Annotated[bool, typer.Option("--any-sign", help="Take logs of another sign convention.")] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting of the trainings, for example training.updates=100.")
@@ -76,6 +80,8 @@ def finetune(
         source_weight=source_weight,
         soft=soft,
         reversal=reversal,
+        inner_rate=inner_rate,
+        inner_steps=inner_steps,
         check_signs=not any_sign,
     )
     order = Order(spec=spec, method=method, rivals=_named(rivals, tuple(METHODS)), changes=tuple(changes))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,22 @@ class Batch:
     def targets_seen(self) -> int:
         """Ticks with a loss."""
         return int(self.valid.sum())
+
+
+Piece = tuple[Any, Any, Any, Any]
+"""Inputs, future targets, validity and lesson of some ticks."""
+
+
+class Sampler(Protocol):
+    """Where the batches of a training come from."""
+
+    def epoch(self, number: int) -> Iterator[Batch]:
+        """The batches of epoch `number`, as a function of it and a seed alone."""
+        ...
+
+    def updates(self, number: int = 0) -> int:
+        """How many batches an epoch has."""
+        ...
 
 
 class ChunkSampler:
@@ -190,7 +206,7 @@ class ChunkSampler:
                 else:  # A lane that has run out: nothing counts.
                     rows.append(self._cut(self.series[0], 0, 0, length))
                     resets.append(True)
-            yield _stack(rows, resets)
+            yield stack(rows, resets)
 
     def _windows(self, rng: np.random.Generator, number: int) -> Iterator[Batch]:
         length, together = self.spec.length, self.spec.consecutive
@@ -206,7 +222,7 @@ class ChunkSampler:
                 start = int(offsets[i] + (j - (ends[i - 1] if i else 0)) * together)
                 part, origin = self._stretch(int(i), start, start + length + together - 1, chance)
                 rows += [self._cut(part, start + late - origin, 0, length - 1) for late in range(together)]
-            yield _stack(rows, [True] * len(rows))
+            yield stack(rows, [True] * len(rows))
 
     def _groups(self, part: Series, offset: int) -> int:
         """How many groups of consecutive windows a series holds from `offset` on."""
@@ -228,18 +244,29 @@ class ChunkSampler:
             part = augmentation.apply(part, self.deviation, rng)
         return part, start
 
-    def _cut(self, part: Series, at: int, age: int, burn_in: int) -> tuple[Any, Any, Any, Any]:
-        """Inputs, future targets, validity and lesson of a chunk; rows past the end repeat the last, count nothing."""
-        length = self.spec.length
-        inside = at + length + max(self.horizons) <= part.samples
-        rows = np.arange(at, at + length)
-        valid = (rows - at + age >= burn_in) & (rows + max(self.horizons) < part.samples)
-        if inside:
-            future = np.stack([part.targets[at + k : at + k + length] for k in self.horizons], axis=1)
-            return part.inputs[at : at + length], future, valid, _rows(part.taught, rows)
-        last = part.samples - 1
-        future = np.stack([part.targets[np.minimum(rows + k, last)] for k in self.horizons], axis=1)
-        return part.inputs[np.minimum(rows, last)], future, valid, _rows(part.taught, np.minimum(rows, last))
+    def _cut(self, part: Series, at: int, age: int, burn_in: int) -> Piece:
+        return cut(part, range(at, at + self.spec.length), self.horizons, burn_in - age)
+
+
+def cut(part: Series, ticks: range, horizons: tuple[int, ...], silent: int) -> Piece:
+    """Inputs, future targets, validity and lesson of a piece of a series.
+
+    Args:
+        part: the series.
+        ticks: its rows; those past the end repeat the last, and count nothing.
+        horizons: look-ahead samples.
+        silent: so many of its first ticks have no loss.
+    """
+    at, length = ticks.start, len(ticks)
+    inside = at + length + max(horizons) <= part.samples
+    rows = np.arange(at, at + length)
+    valid = (rows - at >= silent) & (rows + max(horizons) < part.samples)
+    if inside:
+        future = np.stack([part.targets[at + k : at + k + length] for k in horizons], axis=1)
+        return part.inputs[at : at + length], future, valid, _rows(part.taught, rows)
+    last = part.samples - 1
+    future = np.stack([part.targets[np.minimum(rows + k, last)] for k in horizons], axis=1)
+    return part.inputs[np.minimum(rows, last)], future, valid, _rows(part.taught, np.minimum(rows, last))
 
 
 def _rows(taught: NDArray[np.float32] | None, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
@@ -250,7 +277,8 @@ def _ticks(lane: list[tuple[int, int, int]]) -> int:
     return sum(stop - start for _, start, stop in lane)
 
 
-def _stack(rows: list[tuple[Any, Any, Any, Any]], resets: list[bool]) -> Batch:
+def stack(rows: list[Piece], resets: list[bool]) -> Batch:
+    """Pieces side by side."""
     *columns, taught = zip(*rows, strict=True)
     inputs, future, valid = (np.stack(parts) for parts in columns)
     return Batch(inputs, future, valid, np.array(resets), None if taught[0] is None else np.stack(taught))

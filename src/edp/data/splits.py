@@ -11,12 +11,14 @@ from typing import Protocol
 import numpy as np
 
 from edp.errors import ConfigError, DataError, closest
-from edp.recording import Recording
+from edp.recording import MACHINE, Recording
 from edp.registry import Registry
 
 PARTS = ("train", "validation", "test")
 FAMILY = "excitation"
 """Where the meta of a simulated recording says how it was driven."""
+MASS = "mass_t"
+"""Where the meta says the mass of the machine, where that is known."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,95 @@ class ByBlocks:
         if self.validation_share <= 0:
             return "train"
         return "validation" if other % max(2, round(1 / self.validation_share)) == 0 else "train"
+
+
+@SPLITS.register("machines")
+@dataclass(frozen=True, kw_only=True)
+class ByMachine:
+    """Whole machines, drawn at random with a seed, named, or by mass: those that validate and test never train.
+
+    Simulated recordings say their machine in their meta, a data-set file says it of each log (``machine = "..."``).
+
+    Attributes:
+        validation_share: share of the machines that validate (when not named).
+        test_share: share that tests (when neither named nor chosen by mass).
+        seed: of the draw.
+        validation: names of machines that validate; `test` likewise.
+        test_masses: machines from the first to the second mass, in t, test too; their size is never trained on.
+    """
+
+    validation_share: float = 0.1
+    test_share: float = 0.15
+    seed: int = 0
+    validation: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    test_masses: tuple[float, ...] = ()
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Divide by machine.
+
+        Raises:
+            ConfigError: a range of masses that is none.
+            DataError: a recording without a machine, a machine that is not there, or fewer than three machines.
+        """
+        owners = [machine_of(recording) for recording in recordings]
+        machines = sorted(set(owners))
+        if len(machines) < 3:
+            raise DataError(
+                f"split: {len(recordings)} recording(s) of {len(machines)} machine(s) ({', '.join(machines)}); at "
+                "least three are needed, to train, to validate and to test on: give recordings of more machines (edp "
+                'simulate --family), or split by recording (kind = "recordings")'
+            )
+        named = [[name.lower() for name in part] for part in (self.validation, self.test)]
+        for wanted in itertools.chain(*named):
+            if wanted not in machines:
+                raise DataError(f"split: there is no machine '{wanted}'{closest(wanted, machines)}")
+        validation, test = named[0], [*named[1], *self._heavy(recordings, owners)]
+        both = sorted(set(validation) & set(test))
+        if both:
+            raise DataError(f"split: {', '.join(both)} would validate and test; keep each machine in one part")
+        free = [name for name in machines if name not in {*validation, *test}]
+        drawn = [free[i] for i in np.random.default_rng(self.seed).permutation(len(free))]
+        if not test:
+            test, drawn = _take(drawn, self.test_share, len(machines))
+        if not validation:
+            validation, drawn = _take(drawn, self.validation_share, len(machines))
+        held = {"train": set(drawn), "validation": set(validation), "test": set(test)}
+        whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
+        parts = {part: [s for s in whole if owners[s.recording] in names] for part, names in held.items()}
+        return _checked(parts, recordings)
+
+    def _heavy(self, recordings: Sequence[Recording], owners: Sequence[str]) -> list[str]:
+        """Machines whose mass lies in the range that tests."""
+        if not self.test_masses:
+            return []
+        if len(self.test_masses) != 2 or not self.test_masses[0] <= self.test_masses[1]:
+            raise ConfigError(
+                f"split: test_masses = {list(self.test_masses)}; the lightest and the heaviest in t must be given"
+            )
+        low, high = self.test_masses
+        masses = {owner: r.meta.get(MASS) for owner, r in zip(owners, recordings, strict=True)}
+        found = [owner for owner, mass in masses.items() if mass is not None and low <= float(mass) <= high]
+        if not found:
+            known = [float(mass) for mass in masses.values() if mass is not None]
+            span = f"they go from {min(known):g} to {max(known):g} t" if known else "no recording says its mass"
+            raise DataError(f"split: no machine lies within test_masses = {list(self.test_masses)}; {span}")
+        return found
+
+
+def machine_of(recording: Recording) -> str:
+    """The machine that a recording is of, in lower case.
+
+    Raises:
+        DataError: the recording does not say it.
+    """
+    name = str(recording.meta.get(MACHINE, "")).strip().lower()
+    if not name:
+        raise DataError(
+            f"recording '{recording.name}' ({recording.source}) does not say which machine it is of; list the logs in "
+            'a data-set file (.toml) with machine = "..." in each [[recordings]]'
+        )
+    return name
 
 
 def _spread(names: Sequence[str], families: Mapping[str, str]) -> list[str]:

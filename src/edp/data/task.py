@@ -10,7 +10,7 @@ import numpy as np
 from edp.data.features import Derived, FeatureSet, column, kind_of
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
-from edp.recording import Recording
+from edp.recording import MACHINE, Recording
 from edp.signals import Kind
 
 
@@ -133,4 +133,5 @@ class Task:
                     f"{int(bad[:, which].sum())} missing or infinite value(s), the first at row {start + row}; "
                     'mend the log or ask for a repair (nan = "hold")'
                 )
-        return Series(name or recording.name, inputs, np.ascontiguousarray(targets))
+        machine = str(recording.meta.get(MACHINE, "")).lower()
+        return Series(name or recording.name, inputs, np.ascontiguousarray(targets), machine=machine)

@@ -62,17 +62,31 @@ def _from_file(path: Path, changed: int) -> Machine:
 
 @cache
 def _built_in(name: str) -> Machine:
-    member = FAMILY.fullmatch(name)
+    member = _member(name)
     if member is not None:
-        masses = MASSES_T
-        if member[3] is not None:
-            masses = float(member[3].replace("P", ".")), float(member[4].replace("P", "."))
-        return family_member(int(member[1]), int(member[2]), *masses)
+        return family_member(*member)
     known = machine_names()
     if name not in known:
         raise ConfigError(f"unknown machine '{name}'{closest(name, known)}; or give the path of a .toml file")
     source = resources.files("edp.sim").joinpath("machines").joinpath(f"{name.lower()}.toml")
     return parse_machine(source.read_text(encoding="utf-8"), source.name)
+
+
+def _member(name: str) -> tuple[int, int, float, float] | None:
+    """Seed, index and range of masses (t) of a machine of a family, by its name; None for any other machine."""
+    found = FAMILY.fullmatch(name.upper())
+    if found is None:
+        return None
+    low, high = MASSES_T
+    if found[3] is not None:
+        low, high = float(found[3].replace("P", ".")), float(found[4].replace("P", "."))
+    return int(found[1]), int(found[2]), low, high
+
+
+def known_mass(name: str) -> float | None:
+    """Operating weight (t) of a machine of a family; None for any other, whose file does not say it."""
+    member = _member(name)
+    return None if member is None else member_mass(*member)
 
 
 def family_member(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]) -> Machine:

@@ -15,6 +15,7 @@ from edp.sim import pose, sensors, soil
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.jit import rehearsal
 from edp.sim.machine import Machine
+from edp.sim.machine_files import known_mass
 from edp.sim.parameters import pack
 from edp.sim.plant import Plant
 from edp.sim.scenario import Scenario, SimulationError, plain
@@ -196,6 +197,9 @@ def _recording(
     truth = sensors.truth_signals(log)
     extra = {name: channel for name, channel in {**EXTRA_CHANNELS, **GROUND_CHANNELS}.items() if name in truth}
     facts = {key: value for key, value in plain(scenario).items() if key != "name"}
+    mass = known_mass(scenario.machine)
+    if mass is not None:
+        facts["mass_t"] = round(mass, 3)
     values = np.empty((len(log), len(TABLE_A1) + len(extra)), np.float32)
     values[:, : len(TABLE_A1)] = measured
     for n, name in enumerate(extra, start=len(TABLE_A1)):

@@ -5,21 +5,22 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import Any
 
 import torch
 
-from edp.data.chunks import Batch, ChunkSampler
+from edp.data.chunks import Batch, ChunkSampler, Sampler
 from edp.data.prepared import Prepared
+from edp.data.series import Series
 from edp.errors import ConfigError, DataError
 from edp.models.predictor import ModelSpec, build_model, trainable
 from edp.runs import RunFolder
 from edp.streaming import State, detach_state, reset_where
 from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, load_checkpoint, save_checkpoint
-from edp.training.lesson import Lesson, Moment
+from edp.training.lesson import Episodic, Lesson, Moment
 from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Event, Fitted, TrainingError
 from edp.training.ridge_start import start_bypass
@@ -99,7 +100,7 @@ class Loop:
         check_training(data.task, model, spec)
         known = data.train if refitted is None else [*data.train, *data.validation]
         lessons = known if lesson is None else lesson.series(data.task, known)
-        self.sampler = ChunkSampler(lessons, data.task.horizons, spec.chunks, spec.seed, spec.augmentations)
+        self.sampler = self._sampler(lessons)
         for part in data.validation:
             if part.samples <= spec.chunks.burn_in + data.task.reach:
                 raise DataError(
@@ -128,6 +129,13 @@ class Loop:
             started and refitted is None
         ):  # The regression is a candidate itself: training must improve on it to be kept.
             self.progress.best_score = self._validate()[0]
+
+    def _sampler(self, series: Sequence[Series]) -> Sampler:
+        """Where batches come from: carried chunks or windows, or what the lesson deals out."""
+        task, spec = self.data.task, self.spec
+        if isinstance(self.lesson, Episodic):
+            return self.lesson.sampler(series, task, spec)
+        return ChunkSampler(series, task.horizons, spec.chunks, spec.seed, spec.augmentations)
 
     def fit(self, on_event: Callable[[Event], None]) -> Fitted:
         self._resume()
@@ -241,15 +249,18 @@ class Loop:
             state = reset_where(reset, initial, state)
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * self._factor()
-        answer, features, hidden, state = self.net.expose(x, state)
         future, valid = (torch.from_numpy(part).to(self.device) for part in (batch.future, batch.valid))
-        if self.lesson is None or batch.taught is None:
-            loss = self.objective.evaluate(answer, future, features, valid)
+        if isinstance(self.lesson, Episodic):
+            loss = self.lesson.episode(self.net, self.objective, (x, future, valid))
         else:
-            taught = torch.from_numpy(batch.taught).to(self.device)
-            done = self.progress.updates / (self.updates * self.spec.epochs)
-            moment = Moment(answer, future, features, hidden, valid, taught, done)
-            loss = self.lesson.loss(self.objective, moment)
+            answer, features, hidden, state = self.net.expose(x, state)
+            if self.lesson is None or batch.taught is None:
+                loss = self.objective.evaluate(answer, future, features, valid)
+            else:
+                taught = torch.from_numpy(batch.taught).to(self.device)
+                done = self.progress.updates / (self.updates * self.spec.epochs)
+                moment = Moment(answer, future, features, hidden, valid, taught, done)
+                loss = self.lesson.loss(self.objective, moment)
         self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):
@@ -329,6 +340,8 @@ class Loop:
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.average[name])
         try:
+            if isinstance(self.lesson, Episodic):
+                return self.lesson.judge(self.net, self.objective, self.data)
             return validation_scores(self.net, self.data.validation, self.spec, self.data)
         finally:
             with torch.no_grad():

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
+from edp.data.chunks import Sampler
+from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.losses import Answer
@@ -63,4 +65,25 @@ class Lesson(Protocol):
 
     def end(self, net: Predictor) -> None:
         """Take back what `begin` did to the network beside its weights; it has the best ones now."""
+        ...
+
+
+@runtime_checkable
+class Episodic(Lesson, Protocol):
+    """A lesson that deals out its own batches, each of which is learned from and judged within one update."""
+
+    def sampler(self, series: Sequence[Series], task: Task, spec: TrainingSpec) -> Sampler:
+        """Where the batches come from; all streams of a batch start from reset.
+
+        Raises:
+            DataError: the series cannot be dealt out so.
+        """
+        ...
+
+    def episode(self, net: Predictor, objective: Objective, batch: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """What a batch costs, a scalar with the gradient to go down; inputs, future targets and validity come in."""
+        ...
+
+    def judge(self, net: Predictor, objective: Objective, data: Prepared) -> tuple[float, float, float]:
+        """What chooses the best epoch, as `edp.training.validation.validation_scores` gives it; `net` is left as is."""
         ...

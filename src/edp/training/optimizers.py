@@ -55,6 +55,26 @@ class AdamW:
         return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
 
 
+@OPTIMIZERS.register("sgd")
+@dataclass(frozen=True, kw_only=True)
+class Sgd:
+    """Plain gradient descent: what a network was meta-learned for.
+
+    Attributes:
+        learning_rate: base rate.
+    """
+
+    learning_rate: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not self.learning_rate > 0:
+            raise ConfigError(f"sgd: learning_rate = {self.learning_rate}; learning_rate > 0 must hold")
+
+    def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
+        """The optimiser on all parameters."""
+        return torch.optim.SGD([parameter for _, parameter in named], lr=self.learning_rate)
+
+
 @OPTIMIZERS.register("discriminative")
 @dataclass(frozen=True, kw_only=True)
 class Discriminative:

@@ -27,6 +27,8 @@ class FinetuneSpec:
         source_weight: of the source's loss beside the target's, of methods that replay it.
         soft: share of that loss that compares with what the source's network says, of the method that distils.
         reversal: weight of the reversed gradient of the classifier of worlds, of the adversarial method.
+        inner_rate: learning rate of the method of few steps; 0 for that of the source's meta-learning, or 0.5.
+        inner_steps: most steps of that method.
         check_signs: refuse logs in which a target moves against the pilot pressures that moved it in the source.
 
     Raises:
@@ -48,6 +50,8 @@ class FinetuneSpec:
     source_weight: float = 1.0
     soft: float = 0.5
     reversal: float = 0.1
+    inner_rate: float = 0.0
+    inner_steps: int = 30
     check_signs: bool = True
 
     def __post_init__(self) -> None:
@@ -61,6 +65,11 @@ class FinetuneSpec:
             raise ConfigError(
                 f"finetune: head_rate = {self.head_rate}, backbone_rate = {self.backbone_rate}, rate = {self.rate}, "
                 f"depth_decay = {self.depth_decay}; rates > 0 and 0 < depth_decay <= 1 must hold"
+            )
+        if self.inner_rate < 0 or self.inner_steps < 1:
+            raise ConfigError(
+                f"finetune: inner_rate = {self.inner_rate}, inner_steps = {self.inner_steps}; a rate of at least 0 and "
+                "at least one step must hold"
             )
         if not self.source_weight > 0 or not 0 < self.soft <= 1 or not self.reversal > 0:
             raise ConfigError(

@@ -2,6 +2,7 @@
 
 from edp.transfer.methods.base import METHODS, Made, Method
 from edp.transfer.methods.direct import Direct
+from edp.transfer.methods.few_steps import FewSteps
 from edp.transfer.methods.full import Full
 from edp.transfer.methods.linear_probe import LinearProbe
 from edp.transfer.methods.low_rank import Adapters
@@ -15,6 +16,7 @@ __all__ = [
     "Adapters",
     "Adversarial",
     "Direct",
+    "FewSteps",
     "Full",
     "LinearProbe",
     "Made",

@@ -1,0 +1,87 @@
+"""``edp pretrain``: one network over many machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
+
+
+def pretrain(
+    data: Annotated[Path, typer.Argument(help="Recordings of many machines: a folder of logs, or a data-set file.")],
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run in it goes on.")],
+    method: Annotated[str, typer.Option(help="joint, fomaml, maml or reptile.")] = "joint",
+    start: Annotated[
+        Path | None, typer.Option(help="Run folder or bundle to begin with; by default at random.")
+    ] = None,
+    inner_rate: Annotated[float, typer.Option(help="Of the meta-learners: rate of a step of adaptation.")] = 0.5,
+    inner_steps: Annotated[int, typer.Option(help="Steps of adaptation to a machine.")] = 3,
+    shots: Annotated[int, typer.Option(help="Pieces of a machine to adapt on, and as many to judge by.")] = 4,
+    head_only: Annotated[bool, typer.Option("--head-only", help="Adapt the head alone (ANIL).")] = False,
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset.")] = None,
+    preset: Annotated[str, typer.Option(help="quick, small, standard or thesis.")] = "standard",
+    changes: Annotated[
+        list[str], typer.Option("--set", help="One setting, for example split.test_masses=[12,17].")
+    ] = [],  # noqa: B006
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Train one network over many machines, and judge it on machines that it never saw.
+
+    Whole machines validate and test. What comes out is a run: fine-tune, judge, report and export it. Stop it at any
+    moment (Ctrl-C): the same command goes on.
+
+    Example: `edp simulate data/many --scenario examples/scenarios/many_machines.toml`, then
+    `edp pretrain data/many --out runs/foundation --set split.test_masses=[12,17]`
+    """
+    from edp.config import load_experiment
+    from edp.pretraining import MetaSpec, Pretrain
+    from edp.pretraining import pretrain as make
+
+    meta = MetaSpec(inner_rate=inner_rate, inner_steps=inner_steps, shots=shots, head_only=head_only)
+    order = Pretrain(method=method, meta=meta, start=start)
+    experiment = load_experiment(config, preset, ['split.kind="machines"', *changes])
+    with progress(as_json) as shown:
+        steps = Steps(as_json)
+        display = TrainingDisplay(shown, steps)
+        found = make(
+            source_of(data, signal_map, repair),
+            experiment,
+            order,
+            folder,
+            display.on_event,
+            lambda text: steps.say(text, force=True),
+        )
+
+    def show() -> None:
+        _tables(found)
+        out.print(f"next: edp finetune {folder} LOGS --out RUN, or edp evaluate {folder}")
+
+    emit(as_json, found | {"run": str(folder)}, show)
+
+
+def _tables(found: dict[str, Any]) -> None:
+    """Machines of each part, and the errors on those that test."""
+    rows = [[part, *(f"{facts[key]:g}" for key in facts)] for part, facts in found["data"].items()]
+    table(f"{found['label']} over many machines", ["part", "machines", "recordings", "minutes"], rows)
+    out.print()
+    unseen = found["unseen"]
+    rows = [
+        [
+            f"{row['seconds']:g}",
+            f"{row['mae']:.3f}",
+            f"{100 * row['change']:+.1f}",
+            "" if row["change_error"] is None else f"{196 * row['change_error']:.1f}",
+        ]
+        for row in unseen["contexts"]
+    ]
+    title = (
+        f"Machines that were never seen ({len(unseen['machines'])}), k = {found['horizon']}: error by the time since "
+        f"the state was reset, {unseen['ticks']} ticks"
+    )
+    table(title, ["seconds since reset", "MAE (report units)", "change [%]", "95 % [±%]"], rows)

@@ -1,0 +1,106 @@
+"""Episodes: from each of some machines, pieces to adapt on and other pieces to judge the adapted network by."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.chunks import Batch, ChunkSpec, Piece, cut, stack
+from edp.data.series import Series
+from edp.errors import ConfigError, DataError
+
+
+class EpisodeSampler:
+    """Batches of episodes as a pure function of (seed, epoch). Each epoch has every machine once or nearly so.
+
+    The lanes of a batch are ``machines`` groups of ``2 * shots`` pieces of ``spec.length`` ticks, each from reset: the
+    first half of a group is the support that a network adapts on, the second half the query. No tick is in both.
+
+    Args:
+        series: training stretches that know their machine.
+        horizons: look-ahead samples.
+        spec: length of a piece, lanes of a batch, burn-in.
+        shots: pieces of support, and of query, of a machine.
+        seed: root of the random order.
+
+    Raises:
+        ConfigError: windows, a batch that is no multiple of ``2 * shots``, or pieces no longer than the burn-in.
+        DataError: a series without a machine, or a machine with too few ticks for an episode.
+    """
+
+    def __init__(
+        self, series: Sequence[Series], horizons: Sequence[int], spec: ChunkSpec, shots: int, seed: int
+    ) -> None:
+        self.series, self.horizons, self.spec = list(series), tuple(horizons), spec
+        self.shots, self.seed = shots, seed
+        if spec.regime != "chunk" or shots < 1 or spec.batch % (2 * shots) or spec.length <= spec.burn_in:
+            raise ConfigError(
+                f"episodes: regime = '{spec.regime}', length = {spec.length}, burn_in = {spec.burn_in}, batch = "
+                f"{spec.batch}, shots = {shots}; chunks longer than the burn-in and a batch that is a multiple of "
+                "2 * shots must hold"
+            )
+        self.machines = spec.batch // (2 * shots)
+        self.owned = by_machine(self.series)
+        needed = 2 * shots
+        for machine, places in self.owned.items():
+            found = sum(self._pieces(self.series[place], 0) for place in places)
+            if found < needed:
+                raise DataError(
+                    f"machine '{machine}' has {sum(self.series[place].samples for place in places)} ticks, enough for "
+                    f"{found} pieces of {spec.length}; an episode needs {needed}: give longer recordings, fewer shots "
+                    "or a smaller training.chunks.length"
+                )
+
+    def updates(self, number: int = 0) -> int:
+        """Batches of an epoch."""
+        return -(-len(self.owned) // self.machines)
+
+    def epoch(self, number: int) -> Iterator[Batch]:
+        """The batches of epoch `number`; the last one takes machines again where they do not fill it."""
+        rng = np.random.default_rng([self.seed, number])
+        names = list(self.owned)
+        order = [names[i] for i in rng.permutation(len(names))]
+        for first in range(0, len(order), self.machines):
+            group = [order[(first + i) % len(order)] for i in range(self.machines)]
+            rows = [piece for machine in group for piece in self._episode(machine, rng)]
+            yield stack(rows, [True] * len(rows))
+
+    def _pieces(self, part: Series, offset: int) -> int:
+        """How many pieces with a loss on all but the burn-in a series has from `offset` on."""
+        return max(0, (part.samples - offset - max(self.horizons)) // self.spec.length)
+
+    def _episode(self, machine: str, rng: np.random.Generator) -> list[Piece]:
+        places = self.owned[machine]
+        offsets = rng.integers(0, self.spec.length, len(places))  # cut elsewhere in each episode
+        starts = self._starts(places, offsets)
+        if len(starts) < 2 * self.shots:  # this machine has no piece to spare
+            starts = self._starts(places, np.zeros_like(offsets))
+        chosen = [starts[i] for i in rng.permutation(len(starts))[: 2 * self.shots]]
+        length, burn_in = self.spec.length, self.spec.burn_in
+        return [cut(self.series[i], range(at, at + length), self.horizons, burn_in) for i, at in chosen]
+
+    def _starts(self, places: Sequence[int], offsets: NDArray[np.int64]) -> list[tuple[int, int]]:
+        return [
+            (place, int(offset) + n * self.spec.length)
+            for place, offset in zip(places, offsets, strict=True)
+            for n in range(self._pieces(self.series[place], int(offset)))
+        ]
+
+
+def by_machine(series: Sequence[Series]) -> dict[str, list[int]]:
+    """Places of the series of each machine, machines in the order in which they come.
+
+    Raises:
+        DataError: a series that does not know its machine.
+    """
+    owned: dict[str, list[int]] = {}
+    for place, part in enumerate(series):
+        if not part.machine:
+            raise DataError(
+                f"recording '{part.name}' does not say which machine it is of; list the logs in a data-set file "
+                '(.toml) with machine = "..." in each [[recordings]]'
+            )
+        owned.setdefault(part.machine, []).append(place)
+    return owned

@@ -1,0 +1,142 @@
+"""What memory is worth: the error at the same ticks after a reset so many seconds before them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.errors import ConfigError, DataError
+from edp.models.predictor import Predictor
+from edp.models.running import stream_predictions
+from edp.signals import KINDS, Kind
+
+CONTEXTS_S = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
+BLOCK_S, EVERY_S = 0.5, 5.0
+LANES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Contexts:
+    """Errors by the time since reset, at the same ticks for all.
+
+    Attributes:
+        seconds: from the reset to the first scored tick of a block.
+        machines: names; recordings that do not say theirs are a machine each.
+        errors: mean absolute error ``(context, machine, horizon, target)``, report units.
+        ticks: scored ticks of all machines.
+        dropped: contexts that were asked for and are longer than all series.
+    """
+
+    seconds: tuple[float, ...]
+    machines: tuple[str, ...]
+    errors: NDArray[np.float64]
+    ticks: int
+    dropped: tuple[float, ...] = ()
+
+    def mean(self, horizon: int = 0) -> NDArray[np.float64]:
+        """Mean over targets and machines, ``(context,)``."""
+        return self.errors[:, :, horizon].mean(axis=(1, 2))
+
+    def gain(self, horizon: int = 0) -> NDArray[np.float64]:
+        """Change of the error from the shortest context: mean over machines and standard error, ``(context, 2)``."""
+        each = self.errors[:, :, horizon].mean(axis=2)
+        change = each / each[:1] - 1.0
+        count = change.shape[1]
+        error = change.std(axis=1, ddof=1) / np.sqrt(count) if count > 1 else np.full(len(change), np.nan)
+        return np.stack([change.mean(axis=1), error], axis=1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; the errors are means over targets of the first horizon."""
+        gains = self.gain()
+        rows = [
+            {
+                "seconds": seconds,
+                "mae": float(self.mean()[i]),
+                "change": float(gains[i, 0]),
+                "change_error": None if np.isnan(gains[i, 1]) else float(gains[i, 1]),
+            }
+            for i, seconds in enumerate(self.seconds)
+        ]
+        each = {name: float(self.errors[-1, i, 0].mean()) for i, name in enumerate(self.machines)}
+        return {"contexts": rows, "machines": each, "ticks": self.ticks, "dropped": list(self.dropped)}
+
+
+def context_errors(
+    predictor: Predictor,
+    series: Sequence[Series],
+    kinds: Sequence[Kind],
+    seconds: Sequence[float] = CONTEXTS_S,
+    on_done: Callable[[float], None] | None = None,
+) -> Contexts:
+    """Errors of a network on blocks of half a second, by how long before them its state was reset.
+
+    A block begins every five seconds of a series, where the longest context fits before it.
+
+    Args:
+        predictor: the network.
+        series: what it is judged on; series that are too short for the longest context are left out.
+        kinds: of the targets, for report units.
+        seconds: contexts; those longer than all series are dropped.
+        on_done: called with each context once it is measured.
+
+    Raises:
+        ConfigError: no context, or one that is not positive.
+        DataError: no series is long enough for the shortest.
+    """
+    rate = predictor.task.rate_hz
+    wanted = sorted(set(seconds))
+    if not wanted or wanted[0] <= 0:
+        raise ConfigError(f"contexts of {list(seconds)} s; at least one, all positive, must hold")
+    block, step, reach = round(BLOCK_S * rate), round(EVERY_S * rate), predictor.task.reach
+    longest = max((part.samples for part in series), default=0) - block - reach
+    kept = [s for s in wanted if round(s * rate) <= longest]
+    if not kept:
+        raise DataError(
+            f"the longest recording allows a context of {max(0, longest) / rate:g} s before a block of {BLOCK_S:g} s; "
+            f"the shortest that was asked for is {wanted[0]:g} s: give longer recordings"
+        )
+    first = max(1, round(kept[-1] * rate))
+    blocks = [(part, at) for part in series for at in range(first, part.samples - block - reach + 1, step)]
+    factors = np.array([KINDS[kind].report_factor for kind in kinds])
+    owners = [part.machine or part.name for part, _ in blocks]
+    machines = tuple(dict.fromkeys(owners))
+    place = np.array([machines.index(owner) for owner in owners])
+    errors = []
+    for context in kept:
+        found = _block_errors(predictor, blocks, max(1, round(context * rate)), block) * factors
+        errors.append(np.stack([found[place == i].mean(axis=(0, 1)) for i in range(len(machines))]))
+        if on_done is not None:
+            on_done(context)
+    ticks = len(blocks) * block
+    return Contexts(tuple(kept), machines, np.stack(errors), ticks, tuple(s for s in wanted if s not in kept))
+
+
+def _block_errors(
+    predictor: Predictor, blocks: Sequence[tuple[Series, int]], context: int, size: int
+) -> NDArray[np.float64]:
+    """Absolute errors ``(block, tick, horizon, target)``, SI units, after a reset `context` ticks before each block."""
+    pieces = [
+        replace(
+            part,
+            inputs=part.inputs[at - context : at + size],
+            targets=part.targets[at - context : at + size],
+            taught=None,
+        )
+        for part, at in blocks
+    ]
+    said = stream_predictions(predictor, pieces, LANES)
+    horizons = predictor.task.horizons
+    return np.stack(
+        [
+            np.abs(
+                values[context:].astype(np.float64)
+                - np.stack([part.targets[at + k : at + k + size] for k in horizons], axis=1)
+            )
+            for values, (part, at) in zip(said, blocks, strict=True)
+        ]
+    )

@@ -1,0 +1,76 @@
+"""The inner loop: some steps of plain gradient descent on a few pieces, as a function of the weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from edp.models.predictor import Predictor
+from edp.streaming import State
+from edp.training.objective import Objective
+
+Weights = dict[str, Tensor]
+Pieces = tuple[Tensor, Tensor, Tensor]
+"""Inputs ``(batch, time, input)`` and future targets ``(batch, time, horizon, target)`` in SI units, validity."""
+
+
+class _Exposed(nn.Module):
+    """`Predictor.expose` as the call of a module, which is what can be computed with other weights."""
+
+    def __init__(self, net: Predictor) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, x: Tensor, state: State) -> tuple[Any, Tensor, Tensor, State]:
+        return self.net.expose(x, state)
+
+
+def loss_with(net: Predictor, weights: Mapping[str, Tensor], objective: Objective, pieces: Pieces) -> Tensor:
+    """The loss of a network with other weights on pieces from reset.
+
+    Args:
+        net: the network.
+        weights: by name of the parameter; those that are not given are the network's own.
+        objective: the loss.
+        pieces: what it is taken on.
+    """
+    x, future, valid = pieces
+    with torch.no_grad():
+        state = net.initial_state(len(x), x)
+    named = {f"net.{name}": tensor for name, tensor in weights.items()}
+    answer, features, _, _ = functional_call(_Exposed(net), named, (x, state))
+    return objective.evaluate(answer, future, features, valid)
+
+
+def adapt(
+    net: Predictor,
+    start: Weights,
+    objective: Objective,
+    support: Pieces,
+    steps: Sequence[float],
+    second_order: bool = False,
+) -> Weights:
+    """``w <- w - rate * gradient of the support's loss``, once for each rate of `steps`.
+
+    Args:
+        net: the network.
+        start: the weights that adapt, by name; all others stay.
+        objective: the loss.
+        support: the pieces to adapt on.
+        steps: the rate of each step.
+        second_order: keep what a gradient through the steps needs, through their gradients too. Without it the
+            result depends on `start` by nothing but the sum, as first-order methods take it.
+    """
+    weights = start
+    for rate in steps:
+        loss = loss_with(net, weights, objective, support)
+        found = torch.autograd.grad(loss, list(weights.values()), create_graph=second_order, allow_unused=True)
+        weights = {
+            name: tensor if slope is None else tensor - rate * slope
+            for (name, tensor), slope in zip(weights.items(), found, strict=True)
+        }
+    return weights
