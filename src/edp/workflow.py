@@ -33,9 +33,10 @@ from edp.evaluation.judge import Evaluation, JudgeSpec, judge
 from edp.evaluation.traced import check_counted
 from edp.evaluation.worth import Worths, WorthSpec
 from edp.evaluation.worth import channel_worths as measure_worths
-from edp.export import make_target
+from edp.export import TARGETS, make_target
 from edp.models.integer import IntegerPredictor
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination, describe
+from edp.onboard import Adaptation
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, run_key
 from edp.sources import DataSource
@@ -310,24 +311,25 @@ def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footpr
         EdpError: neither a bundle nor valid settings, a budget that no network of these inputs and targets meets, or a
             part that counts other work than it does.
     """
-    predictor, name = _predictor_of(path)
+    predictor, name, adaptation = _predictor_of(path)
     check_counted(predictor)
     if budget is not None:
         alone = replace(predictor.spec, blocks=(), physics=None)
         check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
-    return footprint(predictor), name
+    return footprint(predictor, adaptation), name
 
 
-def _predictor_of(path: str | Path) -> tuple[Predictor, str]:
+def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
     source = Path(path)
     if source.suffix == ".toml":
         experiment = load_experiment(source)
         task = experiment.task.resolve(100.0, physics=experiment.model.physics)
-        return _untrained(experiment.model, task), source.stem
-    predictor = load_bundle(source).predictor
+        return _untrained(experiment.model, task), source.stem, None
+    bundle = load_bundle(source)
+    predictor = bundle.predictor
     # Whole numbers have the counts of the network that they were made of.
     counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
-    return counted, describe(predictor.spec)
+    return counted, describe(predictor.spec), bundle.adaptation
 
 
 def export_bundle(
@@ -343,6 +345,11 @@ def export_bundle(
         EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
     """
     return make_target(to, options).write(load_bundle(path), name, Path(folder))
+
+
+def unheld_adaptation(path: str | Path, to: str) -> bool:
+    """Whether a bundle has an adaptation that the form `to` leaves out."""
+    return load_bundle(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
 
 
 def _untrained(model: ModelSpec, task: Any) -> Predictor:
@@ -364,4 +371,5 @@ __all__ = [
     "simulate_data_set",
     "train",
     "trained_run",
+    "unheld_adaptation",
 ]

@@ -13,7 +13,7 @@ from edp.models.outputs import OUTPUTS
 from edp.models.predictor import Predictor, build_model
 from edp.models.running import stream_intervals, stream_predictions
 from edp.signals import Kind
-from edp.training.bundle import HEADER, INTEGER_SCHEMA, SCHEMA, Bundle, load_bundle, make_bundle, save_bundle
+from edp.training.bundle import ADAPTED_SCHEMA, HEADER, SCHEMA, Bundle, load_bundle, make_bundle, save_bundle
 
 
 def network(tiny, model, seed=1):
@@ -92,8 +92,8 @@ def edit(folder, **changes):
 
 
 def test_a_newer_schema_is_refused(folder):
-    edit(folder, schema=INTEGER_SCHEMA + 1)
-    with pytest.raises(BundleError, match=rf"schema {INTEGER_SCHEMA + 1}.*install a newer EDP"):
+    edit(folder, schema=ADAPTED_SCHEMA + 1)
+    with pytest.raises(BundleError, match=rf"schema {ADAPTED_SCHEMA + 1}.*install a newer EDP"):
         load_bundle(folder)
 
 

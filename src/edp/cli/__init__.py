@@ -9,6 +9,7 @@ import typer
 
 from edp import __version__
 from edp.cli import (
+    adapt,
     animate,
     compress,
     demo,
@@ -49,6 +50,8 @@ app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)
 app.command("pretrain")(pretrain.pretrain)
 app.command("finetune")(finetune.finetune)
+app.command("adapt")(adapt.adapt)
+app.command("replay")(adapt.replay)
 app.command("footprint")(footprint.footprint)
 app.command("export")(export.export)
 app.command("parity")(parity.parity)

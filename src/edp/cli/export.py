@@ -25,13 +25,15 @@ def export(
 
     Example: `edp export runs/first --to c --out firmware/predictor`
     """
-    from edp.workflow import export_bundle
+    from edp.workflow import export_bundle, unheld_adaptation
 
     files = export_bundle(bundle, to, folder, name, dict(map(_option, changes or [])))
 
     def show() -> None:
         for file in files:
             out.print(str(file))
+        if unheld_adaptation(bundle, to):
+            out.print(f"note: the form '{to}' holds the network alone; its adaptation is held by c")
         out.print(f"written: {files[0].parent.resolve()}; read {files[0].name} first")
         if (files[0].parent / "CMakeLists.txt").is_file():
             where, build = files[0].parent, files[0].parent / "build"

@@ -10,6 +10,7 @@ import torch
 from edp.errors import ConfigError
 from edp.evaluation.controller import CORES, FORMATS, Budget, Estimate, estimate
 from edp.models.predictor import Predictor
+from edp.onboard import Adaptation
 from edp.streaming import Cost, state_numbers
 
 
@@ -79,10 +80,12 @@ class Footprint:
         ]
 
 
-def footprint(predictor: Predictor) -> Footprint:
-    """Count a predictor's parameters, multiply-accumulates, activations and state."""
+def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Footprint:
+    """Count a predictor's parameters, multiply-accumulates, activations and state, those of its adaptation included."""
     costs, window = predictor.costs(), predictor.spec.window
     state = state_numbers(predictor.initial_state(1, torch.zeros(1)))
+    if adaptation is not None:
+        costs, state = [*costs, adaptation_cost(adaptation)], state + adaptation.state_numbers
     column = sum(cost.per_column for cost in costs)
     once = sum(cost.per_prediction for cost in costs)
     folded = sum(cost.parameters - cost.foldable for cost in costs)
@@ -99,6 +102,19 @@ def footprint(predictor: Predictor) -> Footprint:
         window=window,
         rows=tuple(_row(cost, window) for cost in costs),
         estimates=tuple(estimate(costs, state, name) for name in FORMATS),
+    )
+
+
+def adaptation_cost(adaptation: Adaptation) -> Cost:
+    """What an adaptation costs: constants, and multiply-accumulates of a tick that learns."""
+    constants = sum(values.size for values in adaptation.arrays().values()) + adaptation.rest.size
+    return Cost(
+        f"adaptation, {adaptation.features} features",
+        constants,
+        per_prediction=adaptation.macs,
+        width_in=len(adaptation.offset),
+        width_out=adaptation.unit.size,
+        per_time_step=False,
     )
 
 

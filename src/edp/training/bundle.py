@@ -11,25 +11,32 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
 from safetensors.torch import load, save
 
 from edp import __version__
 from edp.data.prepared import Prepared
 from edp.data.scaling import Scaler
 from edp.data.task import Task
-from edp.errors import BundleError, StorageError
+from edp.errors import BundleError, ConfigError, StorageError
 from edp.integer import Formats
 from edp.integer.quantise import weights_of
 from edp.models.integer import IntegerPredictor
 from edp.models.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain
 from edp.models.predictor import Predictor
+from edp.onboard import Adaptation
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, read_json, write_bytes, write_json
 
 SCHEMA = 2
 INTEGER_SCHEMA = 3
 """Of a bundle in whole numbers, which older versions would read as one in float32."""
+ADAPTED_SCHEMA = 4
+"""Of a bundle with an adaptation, which older versions would leave out; its network may be in whole numbers."""
 HEADER = "bundle.json"
+ARRAYS = ("weights", "integers", "adaptation")
+"""Beginnings of the names of a bundle's files of arrays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +50,7 @@ class Bundle:
         descriptions: description of each target.
         provenance: data digest, environment, settings, training time.
         scores: held-out scores of the network, by horizon and target; empty before evaluation.
+        adaptation: how its predictions are corrected on board, where they are.
     """
 
     predictor: Predictor
@@ -51,6 +59,7 @@ class Bundle:
     descriptions: tuple[str, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
     scores: Mapping[str, Any] = field(default_factory=dict)
+    adaptation: Adaptation | None = None
 
     @property
     def task(self) -> Task:
@@ -115,11 +124,17 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     }
     kept = {weights}
     if isinstance(predictor, IntegerPredictor):
-        entry = _write_integers(predictor, path)
+        entry = _write_arrays(path, "integers", _integers_bytes(predictor))
         kept.add(entry["file"])
         header |= {"number_format": form, "formats": dict(predictor.formats.fracs), "integers": entry}
+    if bundle.adaptation is not None:
+        entry = _write_arrays(path, "adaptation", save_arrays(bundle.adaptation.arrays()))
+        kept.add(entry["file"])
+        header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     write_json(path / HEADER, header)
-    for old in (*path.glob("weights-*.safetensors"), *path.glob("integers-*.safetensors")):
+    for old in (
+        found for what in ("weights", "integers", "adaptation") for found in path.glob(f"{what}-*.safetensors")
+    ):
         if old.name not in kept:
             old.unlink(missing_ok=True)
     return path
@@ -130,11 +145,10 @@ def _integers_bytes(predictor: IntegerPredictor) -> bytes:
     return save(held)
 
 
-def _write_integers(predictor: IntegerPredictor, path: Path) -> dict[str, str]:
-    """Write the 8-bit weights; returns file and digest."""
-    data = _integers_bytes(predictor)
+def _write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
+    """Write arrays beside the weights; returns file and digest."""
     digest = hashlib.blake2b(data, digest_size=16).hexdigest()
-    file = f"integers-{digest[:12]}.safetensors"
+    file = f"{what}-{digest[:12]}.safetensors"
     write_bytes(path / file, data)
     return {"file": file, "blake2b": digest}
 
@@ -159,22 +173,33 @@ def load_bundle(folder: str | Path) -> Bundle:
         texts = tuple(c["description"] for c in header["outputs"])
         predictor = Predictor(task, spec, blank_scaler(task))
         predictor.load_state_dict(load(data))
-        if header["schema"] == INTEGER_SCHEMA:
+        if header["schema"] == INTEGER_SCHEMA or "number_format" in header:
             integers = {name: x.numpy() for name, x in load(_weights(path, header["integers"])).items()}
             predictor = IntegerPredictor(predictor, Formats(header["formats"], integers))
-        return Bundle(predictor.eval(), inputs, kinds, texts, header["provenance"], header["scores"])
+        adaptation = _adaptation(header["adaptation"], task, path) if header["schema"] == ADAPTED_SCHEMA else None
+        return Bundle(predictor.eval(), inputs, kinds, texts, header["provenance"], header["scores"], adaptation)
     except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError, StorageError) as error:
         raise BundleError(f"bundle '{path}' is damaged: {error}; restore it or train again") from error
 
 
+def _adaptation(entry: Mapping[str, Any], task: Task, path: Path) -> Adaptation:
+    try:
+        found = Adaptation.from_plain(entry, load_arrays(_weights(path, entry["arrays"])))
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    if (len(found.offset), len(found.columns), found.horizons) != (len(task.inputs), len(task.targets), task.horizons):
+        raise ValueError("its adaptation belongs to another task")
+    return found
+
+
 def _check_schema(header: Any, path: Path) -> None:
     schema = header.get("schema") if isinstance(header, dict) else None
-    if schema not in (SCHEMA, INTEGER_SCHEMA):
-        newer = isinstance(schema, int) and schema > INTEGER_SCHEMA
+    if schema not in (SCHEMA, INTEGER_SCHEMA, ADAPTED_SCHEMA):
+        newer = isinstance(schema, int) and schema > ADAPTED_SCHEMA
         older = isinstance(schema, int) and 0 < schema < SCHEMA
         raise BundleError(
-            f"bundle '{path}' has schema {schema}, this version of EDP ({__version__}) reads {SCHEMA} and "
-            f"{INTEGER_SCHEMA}; "
+            f"bundle '{path}' has schema {schema}, this version of EDP ({__version__}) reads {SCHEMA} to "
+            f"{ADAPTED_SCHEMA}; "
             + ("install a newer EDP" if newer else "train again" if older else "the header is not that of a bundle")
         )
 

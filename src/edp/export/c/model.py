@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edp import __version__
 from edp.errors import ExportError
-from edp.export.c import integer_calls, tangents
+from edp.export.c import adaptation, integer_calls, tangents
 from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, slot, structs
 from edp.export.c.layout import laid
 from edp.export.c.plan import Plan, plan
@@ -63,6 +63,7 @@ class Model:
         graph: its layers.
         plan: places in the work memory.
         changes: places of their changes, where the model has tangents.
+        adapts: whether the bundle's adaptation is written beside it.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Model:
     graph: Graph
     plan: Plan
     changes: Plan | None = None
+    adapts: bool = False
 
     @property
     def whole(self) -> bool:
@@ -79,13 +81,16 @@ class Model:
     @property
     def runtime(self) -> tuple[str, ...]:
         """Files of the runtime that it needs."""
-        more = integer_calls.FILES if self.whole else ()
-        return RUNTIME + more + (() if self.changes is None else tangents.FILES)
+        more: tuple[str, ...] = integer_calls.FILES if self.whole else ()
+        more += () if self.changes is None else tangents.FILES
+        return RUNTIME + more + (adaptation.FILES if self.adapts else ())
 
     @property
     def sources(self) -> tuple[str, ...]:
         """C files that a program with this model compiles."""
-        own = (f"{self.name}.c",) if self.changes is None else (f"{self.name}.c", f"{self.name}_tangent.c")
+        own: tuple[str, ...] = (f"{self.name}.c",)
+        own += () if self.changes is None else (f"{self.name}_tangent.c",)
+        own += (f"{self.name}_adaptation.c",) if self.adapts else ()
         return own + tuple(name for name in self.runtime if name.endswith(".c"))
 
     def weights(self) -> str:
@@ -152,6 +157,7 @@ class Model:
             **self._work(),
             **self._code(),
             **({} if self.changes is None else self._tangent(self.changes)),
+            **self._adaptation(),
         }
 
     def _what(self) -> str:
@@ -228,6 +234,12 @@ class Model:
             "tangent_copies": indented(copies, " " * 12),
         }
 
+    def _adaptation(self) -> dict[str, object]:
+        law = self.bundle.adaptation
+        if not self.adapts or law is None:
+            return {}
+        return adaptation.values(law, self.name.upper(), len(self.bundle.predictor.output.coverages))
+
     def state_bytes(self) -> int:
         """Of the state, without what a compiler may put between its parts."""
         slots = sum(max(1, part.size) * part.number.bytes for _, part in self.graph.slots() if part.name != "age")
@@ -266,13 +278,14 @@ def limits(predictor: Predictor) -> tuple[NDArray[np.float64], NDArray[np.float6
     return low, high
 
 
-def make_model(name: str, bundle: Bundle, tangent: bool = False) -> Model:
+def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = False) -> Model:
     """A model ready to be written.
 
     Args:
         name: C prefix of the model.
         bundle: the trained network.
         tangent: with tangents.
+        adapts: with the bundle's adaptation, where it has one.
 
     Raises:
         ExportError: a part of the network has no form as a layer, or a tangent of whole numbers is asked for.
@@ -283,7 +296,7 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False) -> Model:
         raise ExportError("a network in whole numbers is a staircase and has no tangent; export the float run")
     graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
     changes = plan(graph, tangents.tangent_scratch_of) if tangent else None
-    return Model(name, bundle, graph, plan(graph), changes)
+    return Model(name, bundle, graph, plan(graph), changes, adapts and bundle.adaptation is not None)
 
 
 def has_ring(layer: Layer) -> bool:

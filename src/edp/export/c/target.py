@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import ClassVar
 
 from edp.errors import ExportError
 from edp.export.base import TARGETS
@@ -24,14 +25,17 @@ class CTarget:
 
     Attributes:
         tangent: with ``NAME_tangent.h`` and ``NAME_tangent.c``: how predictions change with inputs and past; float32.
+        adapts: whether this form holds the adaptation of a bundle that has one: ``NAME_adaptation.h`` and ``.c``.
     """
+
+    adapts: ClassVar[bool] = True
 
     tangent: bool = False
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
         check_name(name)
-        model = make_model(name, bundle, self.tangent)
+        model = make_model(name, bundle, self.tangent, adapts=True)
         made = core_files(model) | {
             f"{name}_golden.h": golden(model),
             "host_test.c": model.fill("host_test.c.in"),
@@ -55,6 +59,8 @@ def core_files(model: Model) -> dict[str, str]:
     }
     if model.changes is not None:
         made |= {f"{name}_tangent.{end}": model.fill(f"model_tangent.{end}.in") for end in ("h", "c")}
+    if model.adapts:
+        made |= {f"{name}_adaptation.{end}": model.fill(f"model_adaptation.{end}.in") for end in ("h", "c")}
     if model.whole:
         made["edp_tables.h"] = tables_header()
     for file in model.runtime:

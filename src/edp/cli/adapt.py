@@ -1,0 +1,108 @@
+"""``edp adapt`` and ``edp replay``: a correction that is learned on board, and what it would have been worth."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+
+def adapt(
+    run: Annotated[Path, typer.Argument(help="Run folder of edp train, finetune, distil, compress or quantise.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder of the new run.")],
+    rank: Annotated[int, typer.Option(help="Directions of the inputs that corrections may use.")] = 18,
+    forgetting: Annotated[float, typer.Option(help="Seconds of motion after which 1/e is left of a lesson.")] = 60.0,
+    noise: Annotated[float, typer.Option(help="Variance of errors that nothing explains; less: faster.")] = 100.0,
+    prior: Annotated[float, typer.Option(help="Spread of coefficients, in units of the network's errors.")] = 0.3,
+    limit: Annotated[float, typer.Option(help="Largest correction, in units of the network's errors.")] = 3.0,
+    rest: Annotated[float, typer.Option(help="Share of the targets' spread within which nothing moves.")] = 0.05,
+    judged: Annotated[float, typer.Option(help="Seconds of motion over which the correction is judged.")] = 10.0,
+    margin: Annotated[float, typer.Option(help="Share by which it must be worse to be taken back.")] = 0.05,
+    as_json: JsonFlag = False,
+) -> None:
+    """Give a run a small, bounded correction that learns on board: export and replay then have it.
+
+    Its limits and directions are fitted to the run's own recordings; the network stays as it is.
+
+    Example: `edp adapt runs/first --out runs/first_adapted`
+    """
+    from edp.adaptation import adapt as make
+    from edp.onboard import AdaptationSpec
+
+    spec = AdaptationSpec(
+        rank=rank,
+        forgetting_s=forgetting,
+        noise=noise,
+        prior=prior,
+        limit=limit,
+        rest=rest,
+        judged_s=judged,
+        margin=margin,
+    )
+    made, facts = make(run, folder, spec)
+
+    def show() -> None:
+        out.print(f"{made.features} features, {made.macs:,} multiply-accumulates a tick; {folder}")
+        out.print("its test recordings, each from nothing:")
+        replay_tables(facts)
+        out.print(f"next: edp replay {folder} LOGS, edp export {folder} --to c --out firmware/predictor")
+
+    emit(as_json, {"folder": str(folder), "features": made.features, "macs": made.macs, "replay": facts}, show)
+
+
+def replay(
+    run: Annotated[Path, typer.Argument(help="Run folder of edp adapt, or its bundle.")],
+    logs: Annotated[Path, typer.Argument(help="Logs: a log, a folder of logs, or a data-set file.")],
+    carry: Annotated[
+        bool, typer.Option(help="Keep what was learned from one log to the next, as on one machine.")
+    ] = False,
+    frozen: Annotated[bool, typer.Option("--frozen", help="Learn nothing.")] = False,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Run logs through a network and its adaptation, tick by tick: the error with and without, over time in motion.
+
+    Example: `edp replay runs/first_adapted logs/monday --carry`
+    """
+    from edp.adaptation import replay_run
+
+    steps, began = Steps(as_json), time.monotonic()
+    with progress(as_json) as shown:
+        bar = shown.add_task("replay", total=1.0, note="reading recordings")
+
+        def on_recording(name: str, done: int, count: int) -> None:
+            left = (time.monotonic() - began) / done * (count - done) if done else 0.0
+            shown.update(bar, completed=done / count, note=f"{done}/{count}, {name}")
+            steps.say(f"replay: {done}/{count} done, now {name}" + (f", {duration(left)} left" if done else ""))
+
+        facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, on_recording)
+
+    emit(as_json, facts, lambda: replay_tables(facts))
+
+
+def replay_tables(facts: dict[str, Any]) -> None:
+    """Print a table a horizon: MAE with and without adaptation over time in motion, and by target."""
+    units = {target["unit"] for target in facts["targets"]}
+    unit = units.pop() if len(units) == 1 else "mixed units"
+    heads = ["seconds of motion", "without", "adapted", "change", *(target["name"] for target in facts["targets"])]
+    for horizon in sorted({row["horizon"] for row in facts["mae"]}):
+        rows = []
+        for row in facts["mae"]:
+            if row["horizon"] == horizon:
+                rows.append(_line(row))
+        table(f"MAE k = {horizon} ahead, {unit}; by target: without / adapted", heads, rows)
+    out.print(f"taken back in {facts['fallback']:.1%} of the ticks; {facts['taught']:,} ticks taught")
+
+
+def _line(row: dict[str, Any]) -> list[str]:
+    base, adapted = (sum(row[of]) / len(row[of]) for of in ("base", "adapted"))
+    when = f"over {row['from_s']:g}" if row["to_s"] is None else f"{row['from_s']:g} to {row['to_s']:g}"
+    change = f"{100 * (adapted / base - 1):+.1f} %" if base else "-"
+    pairs = [f"{b:.3g} / {a:.3g}" for b, a in zip(row["base"], row["adapted"], strict=True)]
+    return [when, f"{base:.4g}", f"{adapted:.4g}", change, *pairs]

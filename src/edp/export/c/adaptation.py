@@ -1,0 +1,76 @@
+"""The on-board adaptation of a model as text: its constants, and what its templates are filled with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edp.export.c.text import array, filled, number
+from edp.onboard import Adaptation
+
+FILES = ("edp_adaptation.h", "edp_adaptation.c")
+POINTERS = ("offset", "scale", "directions", "middle", "spread", "rest", "change", "unit")
+NUMBERS = ("keep", "keep_squared", "refresh", "prior", "noise", "limit", "bound", "rate", "worse", "better")
+
+
+def values(law: Adaptation, upper: str, intervals: int) -> dict[str, object]:
+    """What the templates of an adaptation are filled with besides what its model gives.
+
+    Args:
+        law: the adaptation.
+        upper: name of the model in capitals.
+        intervals: how many it states.
+    """
+    targets, inputs, n = len(law.columns), len(law.offset), law.features
+    row = n + 2 * targets
+    work = targets + law.spec.rank + max(inputs, row)
+    most = law.unit * law.numbers["limit"]
+    sizes = {"inputs": inputs, "targets": targets, "rank": law.spec.rank, "features": n}
+    entries = [*POINTERS, "columns", *(f"{size}u" for size in sizes.values())]
+    entries += [number(law.numbers[name]) for name in NUMBERS]
+    rows = [f"    float rows_{k}[{k * row}];" for k in law.horizons]
+    return {
+        "adaptation_digest": law.digest,
+        "adapt_marker": int(law.digest[:8], 16) | 1,
+        "ahead": ", ".join(map(str, law.horizons)),
+        "adapt_ahead": ", ".join(f"{k}u" for k in law.horizons),
+        "reach": law.reach,
+        "rank": law.spec.rank,
+        "features": n,
+        "forgetting": f"{law.spec.forgetting_s:g}",
+        "judged": f"{law.spec.judged_s:g}",
+        "margin": f"{100 * law.spec.margin:g}",
+        "adapt_macs": law.macs,
+        "adapt_flash": constant_bytes(law),
+        "adapt_ram": 4 * (5 + len(law.horizons) + law.state_numbers + work),
+        "adapt_rows": "\n".join(rows),
+        "adapt_pointers": ", ".join(f"a->rows_{k}" for k in law.horizons),
+        "adapt_work": work,
+        "adapt_constants": _constants(law),
+        "adapt_law": filled(entries),
+        "adapt_most": ",\n".join(f"    {{{', '.join(map(number, of))}}}" for of in most),
+        "adapt_intervals": _intervals(upper) if intervals else "",
+    }
+
+
+def constant_bytes(law: Adaptation) -> int:
+    """Of the constants."""
+    held = sum(values.nbytes for values in law.arrays().values()) + law.rest.nbytes
+    return held + 2 * len(law.columns) + 4 * (len(law.horizons) + len(NUMBERS) + 4)
+
+
+def _constants(law: Adaptation) -> str:
+    made = []
+    for name in POINTERS:
+        held = np.atleast_1d(getattr(law, name)).ravel()
+        # C has no array of nothing: without directions one number stands there that is never read.
+        made.append(array("float", name, map(number, held if held.size else np.zeros(1))))
+    made.append(array("uint16_t", "columns", (f"{column}u" for column in law.columns)))
+    return "\n".join(made)
+
+
+def _intervals(upper: str) -> str:
+    """Bounds of intervals move with the prediction."""
+    lines = [f"for (uint32_t i = 0; i < {upper}_INTERVALS; i++) {{"]
+    for bound in ("lower", "upper"):
+        lines.append(f"    adapted->{bound}[i][h][j] = out->{bound}[i][h][j] + correction[j];")
+    return "\n".join(" " * 16 + line for line in [*lines, "}"])
