@@ -143,7 +143,7 @@ def built(bundle: Bundle, folder: Path, driver: Path, *flags: str) -> None:
 
 
 def driven(folder: Path, part: Series) -> tuple[Rows, Rows]:
-    """Predictions of the C code without and with adaptation, ``(time, target)``; tests hold its bits to the reference."""
+    """Predictions of the C code without and with adaptation ``(time, target)``; they are the bits of the reference."""
     learning = np.ones((part.samples, 1), dtype=np.float32)
     feed = np.concatenate([part.inputs, learning], axis=1).astype(np.float32).tobytes()
     done = subprocess.run([folder / "program"], input=feed, check=True, capture_output=True)

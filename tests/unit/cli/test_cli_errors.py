@@ -166,8 +166,8 @@ def test_an_unknown_baseline(edp, trained):
 def test_a_bundle_of_a_newer_schema(edp, trained):
     header = trained / "bundle" / "bundle.json"
     held = json.loads(header.read_text())
-    header.write_text(json.dumps(held | {"schema": held["schema"] + 2}))
-    refused(edp("footprint", trained), f"schema {held['schema'] + 2}", "reads 2 and 3", "newer EDP")
+    header.write_text(json.dumps(held | {"schema": held["schema"] + 3}))
+    refused(edp("footprint", trained), f"schema {held['schema'] + 2}", "reads 2 to 4", "newer EDP")
 
 
 def test_damaged_weights(edp, trained):

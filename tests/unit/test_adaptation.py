@@ -1,0 +1,171 @@
+"""A run with an adaptation: fitted, kept in its bundle, replayed, streamed, counted, and refused where it cannot be."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from edp.adaptation import adapt, fit_adaptation, replay
+from edp.cli import app
+from edp.config import load_experiment
+from edp.errors import BundleError, ConfigError, ExportError
+from edp.models import AdaptedStream
+from edp.onboard import AdaptationSpec, Status
+from edp.storage import read_json, write_json
+from edp.training import load_bundle, save_bundle
+from edp.training.bundle import ADAPTED_SCHEMA, SCHEMA
+from edp.workflow import evaluate, footprint_of, train, trained_run
+
+SETTINGS = (
+    'task.features={name="levers", channels=["speed", "lever"]}',
+    'task.targets=["speed"]',
+    "task.horizons=[2]",
+    "training.epochs=1",
+    "training.updates=4",
+    'training.optimizer={kind="adamw"}',
+    'training.chunks={regime="chunk",length=32,batch=4,burn_in=10}',
+    'model.backbone={kind="hybrid",channels=[4],kernel=2,units=4}',
+    "model.head.hidden=4",
+    "model.blocks=[]",
+    "model.window=10",
+    "judge.history=4",
+    'judge.baselines=["persistence"]',
+)
+SPEC = AdaptationSpec(rank=1, noise=1.0)
+
+
+@pytest.fixture(scope="module")
+def run(lever_sessions, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("source") / "run"
+    train(lever_sessions, load_experiment(None, "quick", list(SETTINGS)), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def adapted(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("adapted") / "run"
+    return folder, *adapt(run, folder, SPEC)
+
+
+def test_its_numbers_are_those_of_the_runs_recordings(run, adapted):
+    _, made, _ = adapted
+    bundle, _, _, data = trained_run(run)
+    inputs = np.concatenate([part.inputs for part in data.train])
+    np.testing.assert_allclose(made.offset, inputs.mean(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(made.scale, inputs.std(axis=0), rtol=1e-4)
+    assert made.columns == (bundle.task.inputs.index("speed"),)
+    assert made.directions[0, made.columns[0]] == 0  # the target is a feature of its own
+    lever = bundle.task.inputs.index("lever")
+    np.testing.assert_allclose(abs(made.directions[0, lever]), 1.0, rtol=1e-3)  # the only other input, of spread 1
+    assert made.middle[0] == 0  # a velocity at rest
+
+
+def test_a_bundle_keeps_it_and_a_damaged_one_is_refused(run, adapted, tmp_path):
+    folder, made, _ = adapted
+    bundle = load_bundle(folder)
+    assert bundle.adaptation.digest == made.digest
+    header = read_json(folder / "bundle" / "bundle.json")
+    assert header["schema"] == ADAPTED_SCHEMA
+    assert read_json(run / "bundle" / "bundle.json")["schema"] == SCHEMA
+    assert load_bundle(run).adaptation is None
+    copy = save_bundle(bundle, tmp_path / "copy")
+    (arrays,) = copy.glob("adaptation-*.safetensors")
+    arrays.write_bytes(arrays.read_bytes()[:-1] + b"x")
+    with pytest.raises(BundleError, match="do not match their digest"):
+        load_bundle(copy)
+    save_bundle(bundle, copy)
+    held = read_json(copy / "bundle.json")
+    held["adaptation"]["horizons"] = [3]
+    write_json(copy / "bundle.json", held)
+    with pytest.raises(BundleError, match="another task"):
+        load_bundle(copy)
+    save_bundle(dataclasses.replace(bundle, adaptation=None), copy)
+    assert not list(copy.glob("adaptation-*"))
+
+
+def test_a_stream_and_a_replay_give_the_same_numbers(run, adapted):
+    folder, made, _ = adapted
+    bundle, data = load_bundle(folder), trained_run(run)[3]
+    part = data.test[0]
+    held = replay(bundle.predictor, made, [part]).recordings[0]
+    stream = AdaptedStream(bundle.predictor, bundle.adaptation)
+    found = []
+    for row in part.inputs:
+        found.append(stream.step(row))
+        np.testing.assert_allclose(found[-1] - stream.correction, held.base[len(found) - 1], atol=1e-5)
+    np.testing.assert_allclose(np.stack(found), held.adapted, atol=1e-4)
+    assert np.abs(held.adapted - held.base).max() > 0
+    assert stream.status is not Status.NONE
+    theta = stream.adapter.theta.copy()
+    stream.reset()
+    np.testing.assert_array_equal(stream.adapter.theta, theta)  # what was learned stays
+    stream.learn = False
+    for row in part.inputs:
+        stream.step(row)
+    np.testing.assert_array_equal(stream.adapter.theta, theta)
+
+
+def test_what_was_learned_can_be_carried_from_one_recording_to_the_next(run, adapted):
+    _, made, _ = adapted
+    bundle, _, _, data = trained_run(run)
+    alone, carried = (replay(bundle.predictor, made, data.train[:2], carry=carry) for carry in (False, True))
+    np.testing.assert_array_equal(alone.recordings[0].adapted, carried.recordings[0].adapted)
+    assert not np.array_equal(alone.recordings[1].adapted, carried.recordings[1].adapted)
+    frozen = replay(bundle.predictor, made, data.train[:1], learn=False).recordings[0]
+    np.testing.assert_array_equal(frozen.adapted, frozen.base)
+
+
+def test_an_adapted_run_is_judged_and_counted_and_stays_adapted(run, adapted):
+    folder, made, _ = adapted
+    evaluate(folder)
+    assert load_bundle(folder).adaptation.digest == made.digest
+    with_, without = footprint_of(folder)[0], footprint_of(run)[0]
+    assert with_.macs_tick - without.macs_tick == made.macs
+    assert with_.state_bytes - without.state_bytes == 4 * made.state_numbers
+    assert read_json(folder / "footprint.json")["macs_tick"] == with_.macs_tick
+
+
+def test_commands_say_what_it_is_worth(run, adapted, lever_sessions, tmp_path):
+    folder, _, _ = adapted
+    runner = CliRunner(env={"COLUMNS": "200"})
+    done = runner.invoke(app, ["adapt", str(run), "--out", str(tmp_path / "a"), "--rank", "1", "--json"])
+    assert done.exit_code == 0, done.output
+    facts = json.loads(done.stdout)
+    assert facts["features"] == 5
+    shown = runner.invoke(app, ["replay", str(folder), str(lever_sessions.path), "--carry"])
+    assert shown.exit_code == 0, shown.output
+    assert "0 to 10" in shown.output
+    assert "ticks taught" in shown.output
+    onnx = runner.invoke(app, ["export", str(folder), "--to", "onnx", "--out", str(tmp_path / "onnx")])
+    assert "holds the network alone" in onnx.output
+    c = runner.invoke(app, ["export", str(folder), "--to", "c", "--out", str(tmp_path / "c")])
+    assert "predictor_adaptation.h" in c.output
+    assert "holds the network alone" not in c.output
+
+
+def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, lever_sessions, tmp_path):
+    with pytest.raises(ExportError, match="would be lost"):
+        adapt(run, run, SPEC)
+    out = tmp_path / "out"
+    with pytest.raises(ConfigError, match="only 1 inputs"):
+        adapt(run, out, AdaptationSpec(rank=2))
+    assert not out.exists()
+    bundle, _, _, data = trained_run(run)
+    blind = dataclasses.replace(data.task, targets=("other",), mode="absolute")
+    with pytest.raises(ConfigError, match="other is predicted, but not measured"):
+        fit_adaptation(bundle.predictor, dataclasses.replace(data, task=blind), SPEC)
+    done = CliRunner().invoke(app, ["replay", str(run), str(lever_sessions.path)])
+    assert isinstance(done.exception, BundleError)
+    assert "edp adapt" in str(done.exception)
+
+
+def test_the_options_that_the_docs_list_are_those_of_the_code():
+    text = (Path(__file__).parents[2] / "docs/adaptation.md").read_text()
+    listed = dict(re.findall(r"^\| `(\w+)` \| `([\d.]+)` \|", text, re.M))
+    assert listed == {name: str(value) for name, value in dataclasses.asdict(AdaptationSpec()).items()}
