@@ -7,8 +7,7 @@ source.
 
 Three questions. Zero-shot: the error on C14's logs in air and soil, and in clay, which no network saw. Few minutes: the
 error after 1, 2 and 5 minutes of other logs of C14, from either start, and in a few steps of gradient descent from a
-meta-learned one. Memory: the error by how long before it the state was reset, on held-out machines and on C14; once
-more for the foundation network trained on with gradients through 10 s.
+meta-learned one. Memory: the error by how long before it the state was reset, on held-out machines and on C14.
 
 Every training is a run below ``--work``, so that a stopped benchmark goes on.
 """
@@ -55,7 +54,6 @@ STARTS = {
     "m22": "M22 in free air",
     "family": "foundation",
     "meta": "meta-learned",
-    "long": "foundation, trained on with long gradients",
 }
 
 
@@ -136,14 +134,8 @@ def trained(bench: Bench, name: str) -> Predictor:
             pretrain(
                 bench.source(name), bench.experiment(epochs, updates, *HELD_OUT), Pretrain(), bench.run(name), tell
             )
-        elif name == "long":
-            # The foundation network trained on, its gradients through 10 s instead of 1.3.
-            rate = 'training.optimizer={kind="soap",learning_rate=2e-3}'
-            pieces = ("training.chunks.batch=4", "training.chunks.length=1024")
-            experiment = bench.experiment(max(1, epochs // 2), max(1, updates // 4), *HELD_OUT, *pieces, rate)
-            pretrain(bench.source("family"), experiment, Pretrain(start=bench.run("family")), bench.run(name), tell)
         elif name == "meta":
-            # A third of the updates, each of which takes support and query pieces four times.
+            # A twelfth of the updates: each of them goes through twice the ticks, and three times more to adapt.
             rate = 'training.optimizer={kind="soap",learning_rate=1e-3}'
             pieces = ("training.chunks.batch=16", "training.chunks.length=256")
             experiment = bench.experiment(max(1, epochs // 2), max(1, updates // 6), *HELD_OUT, *pieces, rate)
@@ -275,7 +267,7 @@ def judge(bench: Bench) -> None:
     rows = [[STARTS[name], *(found[target][name]["mae"] for target in found)] for name in names]
     table(["network", *found], [*rows, ["persistence", *(found[target]["m22"]["persistence"] for target in found)]])
     tuned = show_minutes(bench)
-    remembered = show_memory(bench, ["family"] if quick else ["family", "long"])
+    remembered = show_memory(bench, ["family"])
     last = next(reversed(tuned["m22, full"]))
     contexts = remembered["family, held out"]["contexts"]
     mae = {name: row["mae"] for name, row in found["c14"].items()}
