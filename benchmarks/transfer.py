@@ -17,20 +17,19 @@ import argparse
 import hashlib
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
-from common import Verdict, finish, kept, parser, table, verdict
+from common import finish, kept, parser
 from edp.config import load_experiment
 from edp.data.prepared import Prepared, prepare
 from edp.data_sets import find_data_set_limit
 from edp.models.predictor import build_model
-from edp.report.drawing import BLUE, DROPPED, INK, write_drawings
+from edp.report.drawing import write_drawings
 from edp.sim.limit import LimitSpec
 from edp.storage import make_folder
 from edp.training.bundle import blank_scaler
@@ -40,21 +39,19 @@ from edp.transfer.methods import Made
 from edp.transfer.scores import errors_of, measure
 from edp.transfer.source import Source, read_source, target_experiment
 from edp.workflow import DataSource, SimulationOrder, simulate_data_set, train
+from transfer_views import HORIZON, KEYS, NONE, OURS, SOILS, draw, interval, show, verdicts_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "examples" / "scenarios" / "c14_soil.toml"
-HORIZON = "10"
 SKIP = 50  # ticks of start-up that are not judged
 LOG_MIN = 1.25  # of a log, of which four fifths train and validate
-OURS, NONE = "full", "direct"
 MAIN = (OURS, "scratch", "ridge_arx")  # with every seed
-SOILS = ("sandy_loam", "clay")  # one that logs of the target hold, and one that none holds
-BASES = {  # as options of the network; what they read of the pose is measured on both machines
+BASES = {  # as options of the network
     "none": "",
     "kinematic": '{kind="kinematic", pose="strokes"}',
     "force": '{kind="hybrid", coupled=true, fade_s=0.03, pose="strokes"}',
+    "kinematic of angles": '{kind="kinematic", pose="angles"}',
 }
-KEYS = ("mae", "r2", "bias", "rmse", "mse", "skew", "p95", "p99")
 
 
 @dataclass(frozen=True)
@@ -205,12 +202,6 @@ def divided(source: Source, logs: DataSource) -> Prepared:
     return prepare(logs.read(), source.bundle.task, experiment.split, source.predictor.spec.window)
 
 
-def interval(values: Sequence[float]) -> float:
-    """Half the width of the 95 % interval of a mean."""
-    count = len(values)
-    return float(stdtrit(count - 1, 0.975) * np.std(values, ddof=1) / count**0.5) if count > 1 else float("nan")
-
-
 def curves_of(world: World, size: Size, seeds: Sequence[int]) -> dict[str, Any]:
     """Each method by minutes: mean over seeds, each seed, and the interval over the logs that test."""
     grid = {NONE: (0,), **size.grid, **dict.fromkeys(size.rest, (size.logs,))}
@@ -234,7 +225,8 @@ def together(cells: Sequence[dict[str, Any]]) -> dict[str, Any]:
     logs = np.mean([cell["logs"] for cell in cells], axis=0)
     own = {world: averaged([cell[world] for cell in cells]) for world in ("target", "source") if world in cells[0]}
     cost = float(np.mean([cell["cpu_s"] for cell in cells]))
-    return {"mae": float(np.mean(maes)), "seeds": maes, "interval": interval(logs), "cpu_s": cost, "worlds": own}
+    figures = {"mae": float(np.mean(maes)), "seeds": maes, "interval": interval(logs), "cpu_s": cost}
+    return figures | {"worlds": own, "logs": logs.tolist()}
 
 
 def averaged(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -265,16 +257,20 @@ def soils_of(world: World, size: Size, seed: int) -> dict[str, dict[str, float]]
 def physics_of(world: World, size: Size, seed: int) -> dict[str, dict[str, float]]:
     """Small networks with and without a base: on their own machine, as they are on the other, and after its logs."""
     found: dict[str, dict[str, float]] = {}
+    # The scenario's logs hold no pose, as those of most machines; a base has to read one.
+    logs = DataSource.of(world.work / "c14_pose")
+    simulate_data_set(logs.path, order_of(LOG_MIN * size.logs, size.logs, seed + 100, truth="with"))
     for base, options in BASES.items():
         fixed = ["task.horizons=[10]", "training.threads=1", "training.patience=0", *size.small]
         changes = [*fixed, *([f"model.physics={options}"] if options else [])]
-        folder = make_folder(world.work / f"physics_{base}")
+        folder = make_folder(world.work / f"physics_{base.replace(' ', '_')}")
         train(DataSource.of(world.work / "m22"), load_experiment(None, "quick", changes), folder / "source")
         source = read_source(folder / "source")
         machines = ("M22", "C14") if options else ("M22",)
         for machine in machines:
             begun = source if machine == "M22" else of_machine(source, machine)
-            other = replace(world, source=begun, data=divided(begun, world.logs), work=make_folder(folder / machine))
+            place = make_folder(folder / machine)
+            other = replace(world, source=begun, logs=logs, data=divided(begun, logs), work=place)
             few = min(5, size.logs)
             cells = {NONE: other.cell(NONE, 0, seed), OURS: other.cell(OURS, few, seed)}
             found[f"{base}, {machine}" if options else base] = {
@@ -294,105 +290,6 @@ def of_machine(source: Source, machine: str) -> Source:
     return replace(source, bundle=replace(source.bundle, predictor=moved.eval()))
 
 
-def closed(mae: float, direct: float, limit: float) -> float:
-    """Share of the way from direct transfer to the limit of predictability."""
-    return (direct - mae) / (direct - limit)
-
-
-def show(found: dict[str, Any], size: Size) -> None:
-    """Print all tables."""
-    curves, limit = found["curves"], found["limit"]
-    direct = curves[NONE][0]["mae"]
-    minutes = sorted({m for sizes in curves.values() for m in sizes})
-    print(f"\nk = {HORIZON}: mean absolute error on the test parts by minutes of logs, mm/s; the limit is {limit:.3g}")
-    cells = {
-        method: {m: f"{row['mae']:.3g} +- {row['interval']:.2g}" for m, row in rows.items()}
-        for method, rows in curves.items()
-    }
-    table(
-        ["method", *map(str, minutes)],
-        [[METHODS[m].label, *(held.get(n, "-") for n in minutes)] for m, held in cells.items()],
-    )
-    print(f"\nall {size.logs} min of logs, both worlds")
-    rows = []
-    for method, sizes in curves.items():
-        held = sizes[max(sizes)]
-        for world, scores in held["worlds"].items():
-            for name, row in scores.items():
-                figures = [row.get(key, "-") for key in KEYS]
-                rows.append([METHODS[method].label, world, name, *figures])
-    table(["method", "world", "cylinder", *KEYS], rows)
-    print("\nof the way from direct transfer to the limit: ", end="")
-    print(", ".join(f"{m} {closed(s[max(s)]['mae'], direct, limit):.0%}" for m, s in curves.items() if m != NONE))
-    print("\ndigs and levelling of new logs, mm/s")
-    table(
-        ["method", *SOILS],
-        [[METHODS[m].label, *(found["soils"][soil][m] for soil in SOILS)] for m in found["soils"][SOILS[0]]],
-    )
-    print("\nsmall networks with a physics base and its geometry, mm/s")
-    heads = ["base", "on M22", "C14 as it is", "C14 fine-tuned"]
-    table(heads, [[name, row["own"], row[NONE], row[OURS]] for name, row in found["physics"].items()])
-
-
-def verdicts_of(curves: dict[str, Any], size: Size, quick: bool) -> Iterator[Verdict]:
-    """Every goal that this run can speak to."""
-    direct, ours = curves[NONE][0], curves[OURS]
-    best = ours[size.logs]
-    yield verdict("fine-tuned over direct transfer, all logs", best["mae"], direct["mae"], "<= 0.36", "mm/s", quick)
-    rows = [row for name, row in best["worlds"]["target"].items() if name != "mean"]
-    yield verdict("least R2 of a cylinder, all logs", min(row["r2"] for row in rows), 1.0, ">= 0.97", "1", quick)
-    bias = max(abs(row["bias"]) / row["mae"] for row in rows)
-    yield verdict("largest bias over MAE of a cylinder", bias, 1.0, "<= 0.05", "1", quick)
-    for minutes in sorted(set(ours) & set(curves["scratch"])):
-        alone = curves["scratch"][minutes]["mae"]
-        yield verdict(
-            f"fine-tuned over from scratch, {minutes} min", ours[minutes]["mae"], alone, "<= 1", "mm/s", quick
-        )
-    few = min(5, size.logs)
-    least = min(rows[few]["mae"] for rows in curves.values() if few in rows)
-    yield verdict(f"best with {few} min over fine-tuned with all", least, best["mae"], "<= 1.1", "mm/s", quick)
-    if "replay" in curves:
-        both = curves["replay"][size.logs]["worlds"]
-        yield verdict(
-            "both worlds: in the target", both["target"]["mean"]["mae"], best["mae"], "<= 1.05", "mm/s", quick
-        )
-        own = direct["worlds"]["source"]["mean"]["mae"]
-        yield verdict("both worlds: in the source", both["source"]["mean"]["mae"], own, "<= 1.05", "mm/s", quick)
-
-
-def draw(figure: Any, curves: dict[str, Any], limit: float) -> None:
-    """Error by minutes of logs."""
-    axes = figure.subplots()
-    figure.set_size_inches(7.2, 4.2)
-    direct = curves[NONE][0]["mae"]
-    axes.axhline(direct, color=DROPPED, linestyle="--", linewidth=1.2)
-    axes.annotate("direct transfer", (1, direct), xytext=(0, 4), textcoords="offset points", color=DROPPED)
-    axes.axhline(limit, color=DROPPED, linestyle=":", linewidth=1.2)
-    axes.annotate("limit of predictability", (1, limit), xytext=(0, 4), textcoords="offset points", color=DROPPED)
-    inks = dict(zip((OURS, "scratch", "ridge_arx"), (BLUE, INK, "#b45309"), strict=True))
-    marks = dict(zip((m for m in curves if m not in inks), "sD^vP*X", strict=False))
-    for method, sizes in curves.items():
-        if method == NONE:
-            continue
-        minutes = sorted(sizes)
-        label, maes = METHODS[method].label, [sizes[m]["mae"] for m in minutes]
-        if method in inks:
-            reach = [sizes[m]["interval"] for m in minutes]
-            axes.errorbar(minutes, maes, yerr=reach, color=inks[method], marker="o", capsize=3, label=label)
-        else:
-            axes.plot(minutes, maes, color="#66717d", marker=marks[method], linestyle=":", linewidth=0.8, label=label)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    ticks = sorted({m for sizes in curves.values() for m in sizes} - {0})
-    axes.set_xticks(ticks, [str(m) for m in ticks])
-    axes.set_yticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
-    axes.minorticks_off()
-    axes.set_xlabel("Minutes of the target's logs that train and validate")
-    axes.set_ylabel("Mean absolute error, mm/s")
-    axes.set_title("From M22 in free air to a worn C14 in soil, 100 ms ahead")
-    axes.legend(frameon=False, fontsize=8)
-
-
 def run(arguments: argparse.Namespace, work: Path) -> None:
     """All parts, in `work`."""
     quick, seed = arguments.quick, arguments.seed
@@ -408,9 +305,9 @@ def run(arguments: argparse.Namespace, work: Path) -> None:
         "soils": kept(work / "cells" / "soils.json", lambda: soils_of(world, size, seed)),
         "physics": kept(work / "cells" / "physics.json", lambda: physics_of(world, size, seed)),
     }
-    show(found, size)
+    show(found, size.logs)
     write_drawings(arguments.pictures or work, {"transfer_curves": lambda figure: draw(figure, curves, limit)})
-    finish("transfer", list(verdicts_of(curves, size, quick)), seed, found)
+    finish("transfer", list(verdicts_of(curves, size.logs, quick)), seed, found)
 
 
 def main() -> None:
