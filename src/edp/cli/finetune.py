@@ -104,7 +104,7 @@ def finetune(
 def _named(rivals: str, every: tuple[str, ...]) -> tuple[str, ...]:
     """Names of methods from the text of ``--rivals``."""
     special = {"all": every, "none": ()}
-    return special[rivals] if rivals in special else tuple(name for name in rivals.split(",") if name)
+    return special[rivals] if rivals in special else tuple(name.strip() for name in rivals.split(",") if name.strip())
 
 
 def _tables(facts: Transfer) -> None:
