@@ -16,7 +16,7 @@ from edp.storage import read_json
 COMMANDS = [command.name for command in app.registered_commands]
 EXPECTED = [
     *("demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "distil", "compress", "footprint"),
-    *("quantise", "export", "parity", "pretrain", "finetune", "report"),
+    *("quantise", "export", "parity", "pretrain", "finetune", "adapt", "replay", "report"),
 ]
 
 
