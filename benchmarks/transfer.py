@@ -69,6 +69,7 @@ class Size:
         seeds: trainings of each.
         small: changes of the preset ``quick`` for the networks with physics bases.
         soil_min: minutes of each soil.
+        bases: physics bases that are tried.
     """
 
     preset: str
@@ -81,6 +82,7 @@ class Size:
     seeds: int
     small: tuple[str, ...]
     soil_min: float
+    bases: tuple[str, ...] = tuple(BASES)
 
     @property
     def logs(self) -> int:
@@ -119,6 +121,7 @@ QUICK = replace(
     seeds=1,
     small=("training.epochs=1", "training.updates=2"),
     soil_min=2.5,
+    bases=("none", "kinematic of angles"),
 )
 
 
@@ -260,7 +263,7 @@ def physics_of(world: World, size: Size, seed: int) -> dict[str, dict[str, float
     # The scenario's logs hold no pose, as those of most machines; a base has to read one.
     logs = DataSource.of(world.work / "c14_pose")
     simulate_data_set(logs.path, order_of(LOG_MIN * size.logs, size.logs, seed + 100, truth="with"))
-    for base, options in BASES.items():
+    for base, options in ((name, BASES[name]) for name in size.bases):
         fixed = ["task.horizons=[10]", "training.threads=1", "training.patience=0", *size.small]
         changes = [*fixed, *([f"model.physics={options}"] if options else [])]
         folder = make_folder(world.work / f"physics_{base.replace(' ', '_')}")

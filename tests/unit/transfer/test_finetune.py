@@ -302,13 +302,13 @@ def test_skew_and_squares_are_those_of_scipy(tiny):
 
 
 def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
-    options = ["--rounds", "2", "--batch", "4", "--rivals", "none", "--set", "training.updates=3"]
+    options = ["--rounds", "2", "--batch", "4", "--rivals", "direct, ridge_arx", "--set", "training.updates=3"]
     call = ["finetune", str(run), str(target.path), "--out", str(tmp_path / "run"), *options]
     told = CliRunner().invoke(app, call)
     assert told.exit_code == 0, told.output
     assert "next: edp evaluate" in told.output
     facts = read_json(tmp_path / "run" / "transfer.json")
-    assert set(facts["methods"]) == {"full", "direct"}
+    assert set(facts["methods"]) == {"full", "direct", "ridge_arx"}
     assert math.isfinite(facts["methods"]["direct"]["worlds"]["target"]["2"]["mean"]["mse"])
     page = (tmp_path / "run" / "transfer.html").read_text(encoding="utf-8")
     assert "Before and after" in page
