@@ -64,7 +64,7 @@ class Size:
     ticks: int
 
 
-SIZES = {True: Size(6.0, 14, 3, 60, 10.5, 60_000), False: Size(120.0, 60, 24, 250, 17.5, DAY)}
+SIZES = {True: Size(6.0, 14, 2, 30, 8.5, 60_000), False: Size(120.0, 60, 24, 250, 17.5, DAY)}
 
 
 def machines(folder: Path) -> dict[str, tuple[str, str]]:
