@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.console import JsonFlag, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from edp.training import Event
 
 
@@ -59,8 +57,13 @@ def compress(
     )
     source = None if data is None else source_of(data, signal_map, repair)
     with progress(as_json) as shown:
-        display = _Display(shown, Steps(as_json), as_json)
-        found = search(bundle, spec, folder, source, Watchers(display.on_note, display.on_training))
+        display = SeriesDisplay(shown, as_json, "compress", "network")
+
+        def on_training(name: str, done: int, count: int, event: Event) -> None:
+            display.done, display.count = done, max(1, count)
+            display.on_training(name, event)
+
+        found = search(bundle, spec, folder, source, Watchers(display.on_note, on_training))
     page = write_compression_page(folder)
     facts = read_compression(folder)
     best = found.best
@@ -89,22 +92,3 @@ def _tables(facts: Any) -> None:
     out.print(words.headline(facts))
     for line in words.verdict(facts):
         out.print(line)
-
-
-class _Display:
-    """Shows which network is being made, and the time left of its training."""
-
-    def __init__(self, shown: Progress, steps: Steps, quiet: bool) -> None:
-        self.shown, self.steps, self.quiet = shown, steps, quiet
-        self.bar = shown.add_task("compress", total=1.0, note="reading recordings")
-
-    def on_note(self, text: str) -> None:
-        """Print a sentence."""
-        if not self.quiet:
-            out.print(text)
-
-    def on_training(self, name: str, done: int, count: int, event: Event) -> None:
-        """Show an event of a training."""
-        note = f"{name}, network {done + 1} of at most {count}, epoch {event.epoch}/{event.epochs}"
-        self.shown.update(self.bar, completed=min(1.0, (done + event.share) / max(1, count)), note=note)
-        self.steps.say(f"compress: {note}, {duration(event.seconds_left)} left of it", force=event.row is not None)

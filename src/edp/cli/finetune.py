@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
-from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.console import JsonFlag, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from edp.report.transfer_facts import Transfer
-    from edp.training import Event
 
 
 def finetune(
@@ -87,8 +84,8 @@ def finetune(
     order = Order(spec=spec, method=method, rivals=_named(rivals, tuple(METHODS)), changes=tuple(changes))
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:
-        display = _Display(shown, Steps(as_json), as_json)
-        watchers = Watchers(display.on_note, display.on_training, display.on_method)
+        display = SeriesDisplay(shown, as_json, "finetune", "method")
+        watchers = Watchers(display.on_note, display.on_training, display.on_next)
         found = make(bundle, source, order, folder, watchers)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
@@ -117,29 +114,3 @@ def _tables(facts: Transfer) -> None:
     out.print(words.headline(facts))
     for line in words.verdict(facts):
         out.print(line)
-
-
-class _Display:
-    """Shows which method is at work, and the time left of its training."""
-
-    def __init__(self, shown: Progress, steps: Steps, quiet: bool) -> None:
-        self.shown, self.steps, self.quiet = shown, steps, quiet
-        self.bar = shown.add_task("finetune", total=1.0, note="reading recordings")
-        self.done, self.count = 0, 1
-
-    def on_note(self, text: str) -> None:
-        """Print a sentence."""
-        if not self.quiet:
-            out.print(text)
-
-    def on_method(self, name: str, done: int, count: int) -> None:
-        """A method begins."""
-        self.done, self.count = done, count
-        self.shown.update(self.bar, completed=done / count, note=name)
-        self.steps.say(f"finetune: method {done + 1} of {count}, {name}", force=True)
-
-    def on_training(self, name: str, event: Event) -> None:
-        """Show an event of a training."""
-        note = f"{name}, method {self.done + 1} of {self.count}, epoch {event.epoch}/{event.epochs}"
-        self.shown.update(self.bar, completed=(self.done + event.share) / self.count, note=note)
-        self.steps.say(f"finetune: {note}, {duration(event.seconds_left)} left of it", force=event.row is not None)

@@ -109,3 +109,38 @@ class TrainingDisplay:
         note = f"{stage}epoch {event.epoch}/{event.epochs}, {event.targets_per_s:,.0f} targets/s{score}"
         self.shown.update(self.bar, completed=event.share, note=note)
         self.steps.say(f"train: {note}, {duration(event.seconds_left)} left", force=event.row is not None)
+
+
+class SeriesDisplay:
+    """Shows which of several trainings is at work, and the time left of it.
+
+    Args:
+        shown: progress display.
+        quiet: print nothing on standard output or error.
+        command: name of the command.
+        each: what one of them is made for, such as ``method``.
+    """
+
+    def __init__(self, shown: Progress, quiet: bool, command: str, each: str) -> None:
+        self.shown, self.quiet, self.command, self.each = shown, quiet, command, each
+        self.steps = Steps(quiet)
+        self.bar = shown.add_task(command, total=1.0, note="reading recordings")
+        self.done, self.count = 0, 1
+
+    def on_note(self, text: str) -> None:
+        """Print a sentence."""
+        if not self.quiet:
+            out.print(text)
+
+    def on_next(self, name: str, done: int, count: int) -> None:
+        """Another one begins, after `done` of at most `count`."""
+        self.done, self.count = done, max(1, count)
+        self.shown.update(self.bar, completed=min(1.0, done / self.count), note=name)
+        self.steps.say(f"{self.command}: {self.each} {done + 1} of {count}, {name}", force=True)
+
+    def on_training(self, name: str, event: Event) -> None:
+        """Show an event of the training that is at work."""
+        note = f"{name}, {self.each} {self.done + 1} of {self.count}, epoch {event.epoch}/{event.epochs}"
+        self.shown.update(self.bar, completed=min(1.0, (self.done + event.share) / self.count), note=note)
+        left = duration(event.seconds_left)
+        self.steps.say(f"{self.command}: {note}, {left} left of it", force=event.row is not None)
