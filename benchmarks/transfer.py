@@ -5,7 +5,7 @@ and soil. Every log of the target is a minute that trains and validates and a qu
 minutes there are fewer logs, and the test parts stay those of all. Asked are: each method's error by minutes of logs;
 all methods with all logs, in both worlds (the form of Table 4.10); what becomes of it in a soil that no log holds; and
 whether a physics base carries over from one machine to the other (RQ1 of the thesis), with the geometry of the source
-and with that of the target.
+and with that of the target. With ``--foundation`` a network of many machines (``edp pretrain``) is a second start.
 
 A seed draws the logs with which the few minutes begin, and every training. Intervals are over the logs that test.
 Every training is a cell, kept below ``--work`` when it is done, so that a long benchmark can be stopped and goes on.
@@ -32,7 +32,7 @@ from edp.models.predictor import build_model
 from edp.report.drawing import write_drawings
 from edp.sim.limit import LimitSpec
 from edp.storage import make_folder
-from edp.training.bundle import blank_scaler
+from edp.training.bundle import blank_scaler, weights_digest
 from edp.transfer import METHODS, FinetuneSpec
 from edp.transfer.case import Case
 from edp.transfer.methods import Made
@@ -240,6 +240,14 @@ def averaged(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def foundation_of(world: World, run: Path, seeds: Sequence[int]) -> dict[str, Any]:
+    """The same as `curves_of` from a network of many machines: as it is, and fine-tuned."""
+    begun = read_source(run / "bundle")  # without its run, whose recordings are of many machines
+    place = make_folder(world.work / f"foundation_{weights_digest(begun.predictor)[:12]}")
+    size = replace(world.size, grid={OURS: world.size.grid[OURS]}, rest=())
+    return curves_of(replace(world, source=begun, data=divided(begun, world.logs), work=place, size=size), size, seeds)
+
+
 def soils_of(world: World, size: Size, seed: int) -> dict[str, dict[str, float]]:
     """Error in digs and levelling of one soil that the logs hold and of one that they do not, mm/s, by method."""
     made = {name: world.made(name, 0 if name == NONE else size.logs, seed) for name in (NONE, OURS, "ridge_arx")}
@@ -301,8 +309,11 @@ def run(arguments: argparse.Namespace, work: Path) -> None:
     spec = LimitSpec(horizons=(10,), **({"moments": 4, "branches": 4} if quick else {"moments": 120}))
     order = order_of(LOG_MIN * size.logs, size.logs, seed + 100)
     limit = find_data_set_limit(work / "c14", order, spec)["commands_unknown"]["mae"][0][-1]
-    curves = curves_of(world, size, range(seed, seed + size.seeds))
+    seeds = range(seed, seed + size.seeds)
+    curves = curves_of(world, size, seeds)
+    foundation = foundation_of(world, arguments.foundation, seeds) if arguments.foundation else {}
     found = {
+        "foundation": foundation,
         "limit": limit,
         "curves": curves,
         "soils": kept(work / "cells" / "soils.json", lambda: soils_of(world, size, seed)),
@@ -310,7 +321,7 @@ def run(arguments: argparse.Namespace, work: Path) -> None:
     }
     show(found, size.logs)
     write_drawings(arguments.pictures or work, {"transfer_curves": lambda figure: draw(figure, curves, limit)})
-    finish("transfer", list(verdicts_of(curves, size.logs, quick)), seed, found)
+    finish("transfer", list(verdicts_of(curves, foundation, size.logs, quick)), seed, found)
 
 
 def main() -> None:
@@ -318,6 +329,7 @@ def main() -> None:
     made = parser(__doc__ or "")
     made.add_argument("--work", type=Path, default=None, help="folder that keeps data and finished cells")
     made.add_argument("--seeds", type=int, default=2, help="trainings of the main methods")
+    made.add_argument("--foundation", type=Path, default=None, help="run folder of edp pretrain; a second start")
     made.add_argument("--pictures", type=Path, default=None, help="folder of the chart; else that of --work")
     arguments = made.parse_args()
     if arguments.work is not None:

@@ -47,6 +47,8 @@ def show(found: dict[str, Any], minutes_of_all: int) -> None:
         pairs = {m: np.subtract(curves[OURS][m]["logs"], row["logs"]) for m, row in curves.get(rival, {}).items()}
         said = ", ".join(f"{m} min {gain.mean():+.2f} +- {interval(gain):.2f}" for m, gain in pairs.items())
         print(f"{METHODS[OURS].label} less {METHODS[rival].label.lower()}, log by log: {said}")
+    for minutes, row in sorted(m for sizes in found["foundation"].values() for m in sizes.items()):
+        print(f"from the network of many machines, {minutes} min: {row['mae']:.3g} +- {row['interval']:.2g}")
     print(f"\nall {minutes_of_all} min of logs, both worlds")
     rows = []
     for method, sizes in curves.items():
@@ -68,7 +70,9 @@ def show(found: dict[str, Any], minutes_of_all: int) -> None:
     table(heads, [[name, row["own"], row[NONE], row[OURS]] for name, row in found["physics"].items()])
 
 
-def verdicts_of(curves: dict[str, Any], minutes_of_all: int, quick: bool) -> Iterator[Verdict]:
+def verdicts_of(
+    curves: dict[str, Any], foundation: dict[str, Any], minutes_of_all: int, quick: bool
+) -> Iterator[Verdict]:
     """Every goal that this run can speak to."""
     direct, ours = curves[NONE][0], curves[OURS]
     best = ours[minutes_of_all]
@@ -83,8 +87,13 @@ def verdicts_of(curves: dict[str, Any], minutes_of_all: int, quick: bool) -> Ite
             f"fine-tuned over from scratch, {minutes} min", ours[minutes]["mae"], alone, "<= 1", "mm/s", quick
         )
     few = min(5, minutes_of_all)
-    least = min(rows[few]["mae"] for rows in curves.values() if few in rows)
+    least = min(rows[few]["mae"] for rows in [*curves.values(), *foundation.values()] if few in rows)
     yield verdict(f"best with {few} min over fine-tuned with all", least, best["mae"], "<= 1.1", "mm/s", quick)
+    if foundation:
+        zero = foundation[NONE][0]["mae"]
+        yield verdict("network of many machines over direct transfer", zero, direct["mae"], "<= 0.6", "mm/s", quick)
+        all_logs = foundation[OURS][minutes_of_all]["mae"]
+        yield verdict("the same fine-tuned over direct transfer", all_logs, direct["mae"], "<= 0.36", "mm/s", quick)
     if "replay" in curves:
         both = curves["replay"][minutes_of_all]["worlds"]
         yield verdict(
