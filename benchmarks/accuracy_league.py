@@ -24,14 +24,13 @@ import argparse
 import dataclasses
 import math
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import Verdict, finish, kept, parser, table, verdict
+from common import Verdict, finish, in_folder, kept, parser, table, verdict
 from edp.config import Experiment, load_experiment
 from edp.data.prepared import Prepared
 from edp.data_sets import find_data_set_limit
@@ -351,11 +350,7 @@ def main() -> None:
     if arguments.quick:
         short = {"budget": 1.0, "horizons": [10], "seeds": 1, "converge": []}
         vars(arguments).update(short | {"rivals": RIVALS[-1:], "baselines": BASELINES[:2]})
-    if arguments.work is not None:
-        run(arguments, make_folder(arguments.work))
-        return
-    with tempfile.TemporaryDirectory() as temporary:
-        run(arguments, Path(temporary))
+    in_folder(arguments.work, lambda work: run(arguments, work))
 
 
 if __name__ == "__main__":

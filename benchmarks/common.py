@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.runs import command_line, environment
-from edp.storage import read_json, write_json
+from edp.storage import make_folder, read_json, write_json
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -97,3 +98,12 @@ def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return str(value)
+
+
+def in_folder(folder: Path | None, run: Callable[[Path], None]) -> None:
+    """Run in a folder that stays, or in one that is gone afterwards."""
+    if folder is not None:
+        run(make_folder(folder))
+        return
+    with tempfile.TemporaryDirectory() as temporary:
+        run(Path(temporary))

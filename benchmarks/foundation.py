@@ -15,7 +15,6 @@ Every training is a run below ``--work``, so that a stopped benchmark goes on.
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ import numpy as np
 import torch
 
 from accuracy_league import kept
-from common import Verdict, finish, parser, table, verdict
+from common import Verdict, finish, in_folder, parser, table, verdict
 from edp.config import Experiment, load_experiment
 from edp.data.series import Series
 from edp.evaluation.context import context_errors
@@ -251,11 +250,8 @@ def main() -> None:
     made.add_argument("--work", type=Path, default=None, help="folder of runs and results; a stopped benchmark goes on")
     arguments = made.parse_args()
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as scratch:
-        work = arguments.work or Path(scratch)
-        work.mkdir(parents=True, exist_ok=True)
-        bench = Bench(work, arguments.data or work / "data", arguments.seed, arguments.quick)
-        judge(bench)
+    data, seed, quick = arguments.data, arguments.seed, arguments.quick
+    in_folder(arguments.work, lambda work: judge(Bench(work, data or work / "data", seed, quick)))
 
 
 def judge(bench: Bench) -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from common import finish, kept, parser
+from common import finish, in_folder, kept, parser
 from edp.config import load_experiment
 from edp.data.prepared import Prepared, prepare
 from edp.data_sets import find_data_set_limit
@@ -332,11 +331,7 @@ def main() -> None:
     made.add_argument("--foundation", type=Path, default=None, help="run folder of edp pretrain; a second start")
     made.add_argument("--pictures", type=Path, default=None, help="folder of the chart; else that of --work")
     arguments = made.parse_args()
-    if arguments.work is not None:
-        run(arguments, make_folder(arguments.work))
-        return
-    with tempfile.TemporaryDirectory() as temporary:
-        run(arguments, Path(temporary))
+    in_folder(arguments.work, lambda work: run(arguments, work))
 
 
 if __name__ == "__main__":

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 
 
@@ -72,15 +71,8 @@ def replay(
     """
     from edp.adaptation import replay_run
 
-    steps, began = Steps(as_json), time.monotonic()
     with progress(as_json) as shown:
-        bar = shown.add_task("replay", total=1.0, note="reading recordings")
-
-        def on_recording(name: str, done: int, count: int) -> None:
-            left = (time.monotonic() - began) / done * (count - done) if done else 0.0
-            shown.update(bar, completed=done / count, note=f"{done}/{count}, {name}")
-            steps.say(f"replay: {done}/{count} done, now {name}" + (f", {duration(left)} left" if done else ""))
-
+        on_recording = counted(shown, Steps(as_json), "replay", "done")
         facts = replay_run(run, source_of(logs, signal_map, repair), carry, not frozen, on_recording)
 
     emit(as_json, facts, lambda: replay_tables(facts))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
 
 if TYPE_CHECKING:
@@ -72,16 +72,8 @@ def run_worths(run: Path, source: DataSource | None = None, quiet: bool = False)
     """Take channels away with a progress display."""
     from edp.workflow import channel_worths
 
-    steps, began = Steps(quiet), time.monotonic()
     with progress(quiet) as shown:
-        bar = shown.add_task("worth", total=1.0, note="")
-
-        def on_group(name: str, done: int, groups: int) -> None:
-            left = (time.monotonic() - began) / done * (groups - done) if done else 0.0
-            shown.update(bar, completed=done / groups, note=f"{done}/{groups}, {name}")
-            tail = f", {duration(left)} left" if done else ""
-            steps.say(f"worth: {done}/{groups} taken away, now {name}{tail}")
-
+        on_group = counted(shown, Steps(quiet), "worth", "taken away")
         found, _ = channel_worths(run, source, on_group=on_group)
     return found
 

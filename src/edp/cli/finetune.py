@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 
 def finetune(
+    context: typer.Context,
     bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
     logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, a folder of logs, or a data-set file.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished one goes on.")],
@@ -61,26 +63,8 @@ def finetune(
     from edp.transfer import METHODS, FinetuneSpec, Order, Watchers
     from edp.transfer import finetune as make
 
-    spec = FinetuneSpec(
-        head_epochs=head_epochs,
-        epochs=epochs,
-        head_rate=head_rate,
-        backbone_rate=backbone_rate,
-        depth_decay=depth_decay,
-        rounds=rounds,
-        rate=rate,
-        batch=batch,
-        smoothness=smoothness,
-        weight_decay=weight_decay,
-        patience=patience,
-        rank=rank,
-        source_weight=source_weight,
-        soft=soft,
-        reversal=reversal,
-        inner_rate=inner_rate,
-        inner_steps=inner_steps,
-        check_signs=not any_sign,
-    )
+    named = [field.name for field in fields(FinetuneSpec) if field.name in context.params]
+    spec = FinetuneSpec(**{name: context.params[name] for name in named}, check_signs=not any_sign)
     order = Order(spec=spec, method=method, rivals=_named(rivals, tuple(METHODS)), changes=tuple(changes))
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:

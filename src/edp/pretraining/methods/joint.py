@@ -47,4 +47,4 @@ class _From:
         return objective.evaluate(moment.answer, moment.future, moment.features, moment.valid)
 
     def end(self, net: Predictor) -> None:
-        pass
+        """Nothing was done to the network beside its weights."""
