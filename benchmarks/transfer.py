@@ -30,6 +30,7 @@ from edp.data_sets import find_data_set_limit
 from edp.models.predictor import build_model
 from edp.report.drawing import write_drawings
 from edp.sim.limit import LimitSpec
+from edp.sim.soil import material_names
 from edp.storage import make_folder
 from edp.training.bundle import blank_scaler, weights_digest
 from edp.transfer import METHODS, FinetuneSpec
@@ -38,7 +39,7 @@ from edp.transfer.methods import Made
 from edp.transfer.scores import errors_of, measure
 from edp.transfer.source import Source, read_source, target_experiment
 from edp.workflow import DataSource, SimulationOrder, simulate_data_set, train
-from transfer_views import HORIZON, KEYS, NONE, OURS, SOILS, draw, interval, show, verdicts_of
+from transfer_views import HORIZON, KEYS, NONE, OURS, SOILS, WORLDS, draw, interval, show, verdicts_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "examples" / "scenarios" / "c14_soil.toml"
@@ -94,7 +95,7 @@ FULL = Size(
     source_min=240.0,
     source=("training.epochs=12", "training.updates=600"),
     spec=FinetuneSpec(),
-    replayed=60,
+    replayed=400,
     grid={
         OURS: (1, 2, 5, 10, 20, 45),
         "scratch": (1, 2, 5, 10, 20, 45),
@@ -162,12 +163,22 @@ class World:
         """In the target, in each log of it (mean absolute error, mm/s), and in the source if asked for."""
         said = made.predict(self.data)
         found: dict[str, Any] = {"target": measure(said, self.data, SKIP)[HORIZON], "logs": []}
+        for ground, places in grounds(self.data).items():
+            parts = replace(self.data, test=[self.data.test[i] for i in places])
+            found[ground] = measure([said[i] for i in places], parts, SKIP)[HORIZON]
         for place, part in enumerate(self.data.test):
             error = errors_of(said[place : place + 1], replace(self.data, test=[part]), SKIP)[HORIZON]
             found["logs"].append(float(np.abs(error).mean()))
         if both and self.source.data is not None:
             found["source"] = measure(made.predict(self.source.data), self.source.data, SKIP)[HORIZON]
         return found
+
+
+def grounds(data: Prepared) -> dict[str, list[int]]:
+    """Places of the logs in free air and of those in soil, whose names end with its material."""
+    soil = [any(part.name.split("[")[0].endswith(material) for material in material_names()) for part in data.test]
+    found = {"air": [i for i, dug in enumerate(soil) if not dug], "soil": [i for i, dug in enumerate(soil) if dug]}
+    return {ground: places for ground, places in found.items() if places}
 
 
 def shortened(data: Prepared, minutes: int, seed: int) -> Prepared:
@@ -225,7 +236,7 @@ def together(cells: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Means over seeds."""
     maes = [cell["target"]["mean"]["mae"] for cell in cells]
     logs = np.mean([cell["logs"] for cell in cells], axis=0)
-    own = {world: averaged([cell[world] for cell in cells]) for world in ("target", "source") if world in cells[0]}
+    own = {world: averaged([cell[world] for cell in cells]) for world in WORLDS if world in cells[0]}
     cost = float(np.mean([cell["cpu_s"] for cell in cells]))
     figures = {"mae": float(np.mean(maes)), "seeds": maes, "interval": interval(logs), "cpu_s": cost}
     return figures | {"worlds": own, "logs": logs.tolist()}

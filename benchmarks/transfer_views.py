@@ -15,6 +15,7 @@ from edp.transfer import METHODS
 HORIZON = "10"
 OURS, NONE = "full", "direct"
 KEYS = ("mae", "r2", "bias", "rmse", "mse", "skew", "p95", "p99")
+WORLDS = ("target", "air", "soil", "source")  # the target's logs, those in free air and in soil, the source's
 SOILS = ("sandy_loam", "clay")  # one that logs of the target hold, and one that none holds
 
 
@@ -51,12 +52,12 @@ def show(found: dict[str, Any], minutes_of_all: int) -> None:
         print(f"from the network of many machines, {minutes} min: {row['mae']:.3g} +- {row['interval']:.2g}")
     print(f"\nall {minutes_of_all} min of logs, both worlds")
     rows = []
-    for method, sizes in curves.items():
-        held = sizes[max(sizes)]
-        for world, scores in held["worlds"].items():
+    held = {METHODS[method].label: sizes[max(sizes)] for method, sizes in curves.items()}
+    held |= {f"{METHODS[m].label}, of many machines": sizes[max(sizes)] for m, sizes in found["foundation"].items()}
+    for label, scored in held.items():
+        for world, scores in scored["worlds"].items():
             for name, row in scores.items():
-                figures = [row.get(key, "-") for key in KEYS]
-                rows.append([METHODS[method].label, world, name, *figures])
+                rows.append([label, world, name, *(row.get(key, "-") for key in KEYS)])
     table(["method", "world", "cylinder", *KEYS], rows)
     print("\nof the way from direct transfer to the limit: ", end="")
     print(", ".join(f"{m} {closed(s[max(s)]['mae'], direct, limit):.0%}" for m, s in curves.items() if m != NONE))
@@ -80,6 +81,18 @@ def verdicts_of(
     rows = [row for name, row in best["worlds"]["target"].items() if name != "mean"]
     yield verdict("least R2 of a cylinder, all logs", min(row["r2"] for row in rows), 1.0, ">= 0.97", "1", quick)
     bias = max(abs(row["bias"]) / row["mae"] for row in rows)
+    if "air" in best["worlds"]:
+        air, before = best["worlds"]["air"], direct["worlds"]["air"]
+        yield verdict(
+            "fine-tuned over direct transfer, logs in free air",
+            air["mean"]["mae"],
+            before["mean"]["mae"],
+            "<= 0.36",
+            "mm/s",
+            quick,
+        )
+        least = min(row["r2"] for name, row in air.items() if name != "mean")
+        yield verdict("least R2 of a cylinder, logs in free air", least, 1.0, ">= 0.97", "1", quick)
     yield verdict("largest bias over MAE of a cylinder", bias, 1.0, "<= 0.05", "1", quick)
     for minutes in sorted(set(ours) & set(curves["scratch"])):
         alone = curves["scratch"][minutes]["mae"]

@@ -104,6 +104,7 @@ def _leave_out(values: dict[str, Any], given: dict[str, Any]) -> Iterator[str]:
         yield f"family of {values.pop('family')} machines, and machine {given['machine']} was asked for"
     if not given.get("family", values.get("family", 0)):
         values.pop("masses", None)
+        values.pop("scatter", None)
 
 
 def suffix_of(form: str) -> str:

@@ -8,18 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edp.errors import ConfigError
-from edp.sim import load_machine, machine_family, over_family, plan_data_set, simulate
-from edp.sim.family import scaled_machine
+from edp.sim import DataSetSpec, load_machine, machine_family, over_family, plan_data_set, simulate
+from edp.sim.family import WIDEST, Draws, scaled_machine
 from edp.sim.machine_checks import check_machine
 from edp.sim.plant import Plant
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**31), st.floats(10.0, 50.0))
-def test_every_member_passes_the_checks(seed, mass_t):
-    machine = scaled_machine(load_machine("M22"), mass_t, np.random.default_rng(seed))
+@given(st.integers(0, 2**31), st.floats(10.0, 50.0), st.floats(0.1, WIDEST))
+def test_every_member_passes_the_checks(seed, mass_t, scatter):
+    draws = Draws(np.random.default_rng(seed), scatter)
+    machine = scaled_machine(load_machine("M22"), mass_t, draws)
     check_machine(machine, "member")
-    check_machine(scaled_machine(load_machine("C14"), mass_t, np.random.default_rng(seed), "x", 14.7), "member")
+    check_machine(scaled_machine(load_machine("C14"), mass_t, draws, "x", 14.7), "member")
 
 
 class Middle:
@@ -32,7 +33,7 @@ class Middle:
 
 def test_the_laws_of_scaling():
     base = load_machine("M22")
-    twice = scaled_machine(base, 8 * 21.7, Middle())
+    twice = scaled_machine(base, 8 * 21.7, Draws(Middle()))
     assert twice.bodies.length == pytest.approx(2 * np.array(base.bodies.length))
     assert twice.bodies.mass == pytest.approx(8 * np.array(base.bodies.mass))
     assert twice.bodies.inertia == pytest.approx(32 * np.array(base.bodies.inertia))
@@ -76,6 +77,28 @@ def test_members_of_another_range_are_loaded_by_name():
     assert max(m.bodies.mass[0] for m in light) < load_machine("M22").bodies.mass[0]
     with pytest.raises(ConfigError, match="unknown machine"):
         load_machine("family-5-2-10")
+
+
+def test_scatter_widens_what_is_not_wear():
+    usual, wide = machine_family(20, 3), machine_family(20, 3, scatter=2.0)
+    assert usual == machine_family(20, 3, scatter=1.0)
+    assert [m.name for m in wide] == [f"family-3-{i}-x2" for i in range(20)]
+    assert load_machine("FAMILY-3-4-x2") == wide[4]
+    assert load_machine("family-3-4-10-20-x1p5") == machine_family(5, 3, 10.0, 20.0, 1.5)[4]
+
+    def proportions(machines):
+        return np.array([np.divide(m.bodies.length, m.bodies.com_y) for m in machines])
+
+    law = np.divide(load_machine("M22").bodies.length, load_machine("M22").bodies.com_y)
+    np.testing.assert_allclose(proportions(wide) - law, 2 * (proportions(usual) - law), rtol=1e-9)
+    assert [m.pumps.volumetric_efficiency for m in wide] == [m.pumps.volumetric_efficiency for m in usual]
+    for scatter in (0.0, -1.0, 2.6, float("nan")):
+        with pytest.raises(ConfigError, match="scatter"):
+            machine_family(1, 0, scatter=scatter)
+        with pytest.raises(ConfigError, match="scatter"):
+            DataSetSpec(family=2, scatter=scatter)
+    with pytest.raises(ConfigError, match="say how many machines"):
+        DataSetSpec(scatter=2.0)
 
 
 def test_a_data_set_of_a_family_takes_turns():

@@ -43,6 +43,7 @@ def finetune(
         float, typer.Option(help="Rate of few steps; 0: the source's own, where it was meta-learned.")
     ] = 0.0,
     inner_steps: Annotated[int, typer.Option(help="Most steps of the method of few steps.")] = 30,
+    center: Annotated[bool, typer.Option(help="Take the mean error over the training logs out of the network.")] = True,
     any_sign: Annotated[bool, typer.Option("--any-sign", help="Take logs of another sign convention.")] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting of the trainings, for example training.updates=100.")

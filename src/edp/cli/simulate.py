@@ -29,6 +29,9 @@ def simulate(
         int | None, typer.Option(help="So many random machines, M22 scaled and scattered, in place of one.")
     ] = None,
     masses: Annotated[str | None, typer.Option(help="Of --family: range of masses in t; default: 10-50.")] = None,
+    scatter: Annotated[
+        float | None, typer.Option(help="Of --family: how widely machines differ beside their size; default: 1.")
+    ] = None,
     material: Annotated[
         list[str] | None,
         typer.Option(
@@ -63,6 +66,7 @@ def simulate(
     from edp.data_sets import SimulationOrder, suffix_of
 
     given = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
+    given["scatter"] = scatter
     tables = {
         "masses": None if masses is None else _range(masses),
         "materials": dict.fromkeys(material, 1.0) if material else None,

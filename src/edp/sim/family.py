@@ -15,12 +15,13 @@ chassis                  pitch frequency s^-1/2, lifting moment s^4
 =======================  ======================================================================
 
 Front proportions, masses, valves, friction, leakage and wear scatter about the laws. A cylinder and its pins are
-scaled as one, so that joint ranges and the shape of the lever arms stay and every linkage closes.
+scaled as one, so that joint ranges and the shape of the lever arms stay and every linkage closes. ``scatter`` widens
+all ranges about their middles but those of wear and oil, which span new to worn machines as they are.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,14 +35,45 @@ GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 LIGHTEST_T, HEAVIEST_T = 1.0, 200.0
 MASSES_T = (10.0, 50.0)
 """Range of masses of a family, unless another is asked for."""
+WIDEST = 2.5
+"""Most scatter: three times the ranges of pump and hoses would reach below zero."""
 
 
-def member_name(seed: int, index: int, masses_t: tuple[float, float] = MASSES_T) -> str:
-    """``family-<seed>-<index>``; where the range is not the usual one, ``-<low>-<high>`` in t, such as ``-10-12p5``."""
-    if tuple(masses_t) == MASSES_T:
-        return f"family-{seed}-{index}"
-    low, high = (f"{mass:.3f}".rstrip("0").rstrip(".").replace(".", "p") for mass in masses_t)
-    return f"family-{seed}-{index}-{low}-{high}"
+@dataclass(frozen=True)
+class Draws:
+    """Random factors of one machine.
+
+    Attributes:
+        rng: source of the scatter.
+        scatter: factor on the width of every range but those of wear.
+    """
+
+    rng: np.random.Generator
+    scatter: float = 1.0
+
+    def uniform(self, low: float, high: float, size: int | None = None) -> Any:
+        """Evenly from a range about a law, widened."""
+        more = 0.5 * (self.scatter - 1.0) * (high - low)
+        return self.rng.uniform(low - more, high + more, size)
+
+    def wear(self, low: float, high: float) -> float:
+        """Evenly from new to worn."""
+        return float(self.rng.uniform(low, high))
+
+
+def member_name(seed: int, index: int, masses_t: tuple[float, float] = MASSES_T, scatter: float = 1.0) -> str:
+    """``family-<seed>-<index>``; with ``-<low>-<high>`` in t and ``-x<scatter>`` where these are not the usual ones.
+
+    Such as ``family-0-3-10-12p5`` and ``family-0-3-x1p5``.
+    """
+    name = f"family-{seed}-{index}"
+    if tuple(masses_t) != MASSES_T:
+        name += "".join(f"-{_written(mass)}" for mass in masses_t)
+    return name if scatter == 1.0 else f"{name}-x{_written(scatter)}"
+
+
+def _written(value: float) -> str:
+    return f"{value:.3f}".rstrip("0").rstrip(".").replace(".", "p")
 
 
 def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]) -> float:
@@ -61,14 +93,14 @@ def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float
 
 
 def scaled_machine(
-    base: Machine, mass_t: float, rng: np.random.Generator, name: str = "", base_mass_t: float = BASE_MASS_T
+    base: Machine, mass_t: float, draws: Draws, name: str = "", base_mass_t: float = BASE_MASS_T
 ) -> Machine:
     """A machine of another mass by the laws above.
 
     Args:
         base: the parameter set to scale.
         mass_t: operating weight of the new machine, t.
-        rng: source of the scatter.
+        draws: the scatter.
         name: of the new machine; built from base and mass when empty.
         base_mass_t: operating weight of `base`, t.
 
@@ -78,9 +110,9 @@ def scaled_machine(
     if not LIGHTEST_T <= mass_t <= HEAVIEST_T:
         raise ConfigError(f"machine of {mass_t} t; choose from {LIGHTEST_T:g} to {HEAVIEST_T:g} t")
     s = (mass_t / base_mass_t) ** (1.0 / 3.0)
-    front = s * rng.uniform(0.94, 1.06, 3)  # boom, arm, bucket
-    linkage = s * rng.uniform(0.95, 1.05, 3)  # pins and stroke of each cylinder
-    bodies = _bodies(base.bodies, s, front, rng)
+    front = s * draws.uniform(0.94, 1.06, 3)  # boom, arm, bucket
+    linkage = s * draws.uniform(0.95, 1.05, 3)  # pins and stroke of each cylinder
+    bodies = _bodies(base.bodies, s, front, draws)
     return replace(
         base,
         name=name or f"{base.name}-{mass_t:.0f}t",
@@ -89,16 +121,16 @@ def scaled_machine(
         boom_cylinder=_triangle(base.boom_cylinder, linkage[0]),
         arm_cylinder=_triangle(base.arm_cylinder, linkage[1]),
         bucket_linkage=_bucket_linkage(base.bucket_linkage, linkage[2], base.bodies.length[1], bodies.length[1]),
-        cylinders=_cylinders(base.cylinders, s, linkage, rng),
-        friction=_friction(base, s, rng),
+        cylinders=_cylinders(base.cylinders, s, linkage, draws),
+        friction=_friction(base, s, draws),
         oil=replace(
             base.oil,
-            air_fraction=base.oil.air_fraction * rng.uniform(0.8, 2.0),
+            air_fraction=base.oil.air_fraction * draws.wear(0.8, 2.0),
             heat_capacity=base.oil.heat_capacity * s**3,
             cooling=base.oil.cooling * s**2,
         ),
-        pumps=_pumps(base, s, rng),
-        valves=_valves(base.valves, s, rng),
+        pumps=_pumps(base, s, draws),
+        valves=_valves(base.valves, s, draws),
         bucket=replace(
             base.bucket,
             width=base.bucket.width * s,
@@ -123,9 +155,9 @@ def _times(values: Triple, factor: Any) -> Triple:
     return first, second, third
 
 
-def _bodies(bodies: Bodies, s: float, front: Any, rng: np.random.Generator) -> Bodies:
+def _bodies(bodies: Bodies, s: float, front: Any, draws: Draws) -> Bodies:
     stretch = front / s
-    heavier = s**3 * stretch * rng.uniform(0.95, 1.05, 3)  # a longer boom of the same section weighs more
+    heavier = s**3 * stretch * draws.uniform(0.95, 1.05, 3)  # a longer boom of the same section weighs more
     return Bodies(
         length=_times(bodies.length, front),
         mass=_times(bodies.mass, heavier),
@@ -159,43 +191,43 @@ def _bucket_linkage(pins: BucketLinkage, size: float, old_arm: float, new_arm: f
     )
 
 
-def _cylinders(cylinders: Cylinders, s: float, linkage: Any, rng: np.random.Generator) -> Cylinders:
-    wear = np.exp(rng.uniform(np.log(0.7), np.log(4.0)))
-    width = s * rng.uniform(0.96, 1.04, 3)
+def _cylinders(cylinders: Cylinders, s: float, linkage: Any, draws: Draws) -> Cylinders:
+    wear = np.exp(draws.wear(np.log(0.7), np.log(4.0)))
+    width = s * draws.uniform(0.96, 1.04, 3)
     return replace(
         cylinders,
         bore=_times(cylinders.bore, width),
         rod=_times(cylinders.rod, width),
         stroke=_times(cylinders.stroke, linkage),
-        hose_volume=_times(cylinders.hose_volume, s**3 * rng.uniform(0.8, 1.25, 3)),
+        hose_volume=_times(cylinders.hose_volume, s**3 * draws.uniform(0.8, 1.25, 3)),
         dead_length=cylinders.dead_length * s,
         cushion_length=_times(cylinders.cushion_length, linkage),
         stop_stiffness=cylinders.stop_stiffness * s,
-        piston_leakage=_times(cylinders.piston_leakage, s * wear * rng.uniform(0.7, 1.4, 3)),
-        spool_leakage=_times(cylinders.spool_leakage, s * wear * rng.uniform(0.7, 1.4, 3)),
+        piston_leakage=_times(cylinders.piston_leakage, s * wear * draws.uniform(0.7, 1.4, 3)),
+        spool_leakage=_times(cylinders.spool_leakage, s * wear * draws.uniform(0.7, 1.4, 3)),
     )
 
 
-def _friction(base: Machine, s: float, rng: np.random.Generator) -> Any:
-    friction, wear = base.friction, rng.uniform(0.8, 1.6)
+def _friction(base: Machine, s: float, draws: Draws) -> Any:
+    friction, wear = base.friction, draws.wear(0.8, 1.6)
     return replace(
         friction,
         coulomb_fraction=friction.coulomb_fraction * wear,
         static_fraction=friction.static_fraction * wear,
-        viscous=_times(friction.viscous, s**2 * wear * rng.uniform(0.85, 1.15, 3)),
+        viscous=_times(friction.viscous, s**2 * wear * draws.uniform(0.85, 1.15, 3)),
         bristle_stiffness=_times(friction.bristle_stiffness, s**2),
         bristle_damping=_times(friction.bristle_damping, s**2),
     )
 
 
-def _pumps(base: Machine, s: float, rng: np.random.Generator) -> Any:
+def _pumps(base: Machine, s: float, draws: Draws) -> Any:
     pumps = base.pumps
     return replace(
         pumps,
-        max_flow=pumps.max_flow * s**2 * rng.uniform(0.93, 1.07),
-        volumetric_efficiency=float(rng.uniform(0.90, 0.98)),
-        power_limit=pumps.power_limit * s**2 * rng.uniform(0.93, 1.07),
-        time_constant=pumps.time_constant * np.sqrt(s) * rng.uniform(0.8, 1.3),
+        max_flow=pumps.max_flow * s**2 * draws.uniform(0.93, 1.07),
+        volumetric_efficiency=draws.wear(0.90, 0.98),
+        power_limit=pumps.power_limit * s**2 * draws.uniform(0.93, 1.07),
+        time_constant=pumps.time_constant * np.sqrt(s) * draws.uniform(0.8, 1.3),
         line_volume=pumps.line_volume * s**3,
         relief_slope=pumps.relief_slope * s**2,
         bypass=(pumps.bypass[0] * s**2, pumps.bypass[1]),
@@ -207,27 +239,27 @@ def _ratings(ratings: Ratings, factor: Any) -> Ratings:
     return boom, arm, bucket
 
 
-def _valves(valves: Valves, s: float, rng: np.random.Generator) -> Valves:
-    quicker = rng.uniform(0.88, 1.12) / np.sqrt(s)
-    later = np.sqrt(s) * rng.uniform(0.9, 1.15)
-    wear = rng.uniform(-0.01, 0.035)
+def _valves(valves: Valves, s: float, draws: Draws) -> Valves:
+    quicker = draws.uniform(0.88, 1.12) / np.sqrt(s)
+    later = np.sqrt(s) * draws.uniform(0.9, 1.15)
+    wear = draws.wear(-0.01, 0.035)
     changed: dict[str, Any] = {}
     for key in ("pilot_frequency", "spool_frequency", "conflux_spool_frequency"):
         changed[key] = _times(getattr(valves, key), quicker)
     for key in ("dead_band_extend", "dead_band_retract", "conflux_dead_band_extend", "conflux_dead_band_retract"):
-        band = np.asarray(getattr(valves, key)) + wear + rng.uniform(-0.01, 0.01, 3)
+        band = np.asarray(getattr(valves, key)) + wear + draws.uniform(-0.01, 0.01, 3)
         changed[key] = _times((1.0, 1.0, 1.0), np.clip(band, 0.04, 0.35))
     for key in (
         *("meter_in_extend", "meter_in_retract", "conflux_in_extend", "conflux_in_retract"),
         *("meter_out_extend", "meter_out_retract", "regeneration_extend", "regeneration_retract"),
     ):
-        changed[key] = _ratings(getattr(valves, key), s**2 * rng.uniform(0.9, 1.1, 3))
+        changed[key] = _ratings(getattr(valves, key), s**2 * draws.uniform(0.9, 1.1, 3))
     return replace(
         valves,
         **changed,
         dead_time=_times(valves.dead_time, later),
         conflux_extra_dead_time=float(valves.conflux_extra_dead_time * later),
-        hysteresis=float(valves.hysteresis * rng.uniform(0.8, 1.6)),
+        hysteresis=float(valves.hysteresis * draws.uniform(0.8, 1.6)),
         port_relief_slope=valves.port_relief_slope * s**2,
         anti_cavitation=(valves.anti_cavitation[0] * s**2, valves.anti_cavitation[1]),
     )

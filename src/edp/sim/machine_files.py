@@ -13,12 +13,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from edp.errors import ConfigError, closest
-from edp.sim.family import MASSES_T, member_mass, member_name, scaled_machine
+from edp.sim.family import MASSES_T, WIDEST, Draws, member_mass, member_name, scaled_machine
 from edp.sim.machine import SECTIONS, Machine
 from edp.sim.machine_checks import check_machine
 
 Section = TypeVar("Section")
-FAMILY = re.compile(r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?")
+FAMILY = re.compile(
+    r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?(?:-X(\d(?:P\d{1,3})?))?"
+)
 """A machine of a family, see `member_name`: it needs no file."""
 LISTS = {"Triple": 3, "Ratings": 3, "Rating": 2, "tuple[float, float]": 2}
 """Length of a list by the type of its key."""
@@ -72,44 +74,50 @@ def _built_in(name: str) -> Machine:
     return parse_machine(source.read_text(encoding="utf-8"), source.name)
 
 
-def _member(name: str) -> tuple[int, int, float, float] | None:
-    """Seed, index and range of masses (t) of a machine of a family, by its name; None for any other machine."""
+def _member(name: str) -> tuple[int, int, float, float, float] | None:
+    """Seed, index, range of masses (t) and scatter of a machine of a family, by its name; None for any other."""
     found = FAMILY.fullmatch(name.upper())
     if found is None:
         return None
-    low, high = MASSES_T
-    if found[3] is not None:
-        low, high = float(found[3].replace("P", ".")), float(found[4].replace("P", "."))
-    return int(found[1]), int(found[2]), low, high
+    usual = (*MASSES_T, 1.0)
+    low, high, scatter = (
+        middle if text is None else float(text.replace("P", "."))
+        for text, middle in zip(found.group(3, 4, 5), usual, strict=True)
+    )
+    return int(found[1]), int(found[2]), low, high, scatter
 
 
 def known_mass(name: str) -> float | None:
     """Operating weight (t) of a machine of a family; None for any other, whose file does not say it."""
     member = _member(name)
-    return None if member is None else member_mass(*member)
+    return None if member is None else member_mass(*member[:4])
 
 
-def family_member(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]) -> Machine:
+def family_member(
+    seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1], scatter: float = 1.0
+) -> Machine:
     """Machine `index` of the family of `seed`: M22 scaled to a mass from `low_t` to `high_t`, with scatter.
 
-    It is also `load_machine(member_name(seed, index, (low_t, high_t)))`, such as "family-0-3" and "family-0-3-10-20".
+    It is also `load_machine` of its `member_name`, such as "family-0-3" and "family-0-3-10-20-x2".
 
     Raises:
-        ConfigError: the range of masses is empty or out of bounds.
+        ConfigError: the range of masses is empty or out of bounds, or the scatter is.
     """
-    rng = np.random.default_rng([seed, 1 + index])
+    if not 0.0 < scatter <= WIDEST:
+        raise ConfigError(f"family with scatter = {scatter}; must be above 0 and at most {WIDEST:g}")
+    draws = Draws(np.random.default_rng([seed, 1 + index]), scatter)
     mass = member_mass(seed, index, low_t, high_t)
-    name = member_name(seed, index, (low_t, high_t))
-    machine = scaled_machine(_built_in("M22"), mass, rng, name)
+    name = member_name(seed, index, (low_t, high_t), scatter)
+    machine = scaled_machine(_built_in("M22"), mass, draws, name)
     check_machine(machine, name)
     return machine
 
 
 def machine_family(
-    count: int, seed: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1]
+    count: int, seed: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1], scatter: float = 1.0
 ) -> tuple[Machine, ...]:
     """`count` machines from `low_t` to `high_t`, each with its own scatter; the same seed gives the same machines."""
-    return tuple(family_member(seed, index, low_t, high_t) for index in range(count))
+    return tuple(family_member(seed, index, low_t, high_t, scatter) for index in range(count))
 
 
 def parse_machine(text: str, where: str) -> Machine:

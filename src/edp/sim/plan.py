@@ -18,7 +18,7 @@ from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.sim import soil
 from edp.sim.excitation import EXCITATIONS
-from edp.sim.family import MASSES_T, member_mass, member_name
+from edp.sim.family import MASSES_T, WIDEST, member_mass, member_name
 from edp.sim.machine_files import load_machine
 from edp.sim.scenario import START_STROKES, Scenario, SimulationError
 from edp.sim.simulate import simulate
@@ -49,6 +49,7 @@ class DataSetSpec:
         seed: root of every random choice.
         family: how many random machines take turns in place of `machine`; 0 for none.
         masses: lightest and heaviest machine of the family, t.
+        scatter: how widely the machines of the family scatter about the laws of scaling: a factor, at most 2.5.
         mix: share of the recordings by excitation.
         materials: share of the recordings of families that work the ground (grading, dig) by soil; ``air`` is none.
             The other families always move in free air.
@@ -68,6 +69,7 @@ class DataSetSpec:
     seed: int = 0
     family: int = 0
     masses: tuple[float, float] = MASSES_T
+    scatter: float = 1.0
     mix: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_MIX))
     materials: Mapping[str, float] = field(default_factory=dict)
     rate_hz: float = 100.0
@@ -85,6 +87,13 @@ class DataSetSpec:
             raise ConfigError(f"family = {self.family} machines; must be at least 0")
         if not self.family and tuple(self.masses) != MASSES_T:
             raise ConfigError(f"masses = {list(self.masses)} are those of a family; say how many machines with family")
+        if not self.family and self.scatter != 1.0:
+            raise ConfigError(f"scatter = {self.scatter} is that of a family; say how many machines with family")
+        if not 0.0 < self.scatter <= WIDEST or self.scatter != round(self.scatter, 3):
+            raise ConfigError(
+                f"scatter = {self.scatter}; must be above 0 and at most {WIDEST:g}, with at most three decimals: names "
+                "of machines hold it"
+            )
         member_mass(self.seed, 0, *self.masses)
         if any(mass != round(mass, 3) for mass in self.masses):
             raise ConfigError(f"masses = {list(self.masses)} t must be whole kilograms: names of machines hold them")
@@ -122,7 +131,7 @@ class DataSetSpec:
             )
             for i in range(self.recordings)
         )
-        return over_family(plan, self.family, self.seed, self.masses) if self.family else plan
+        return over_family(plan, self.family, self.seed, self.masses, self.scatter) if self.family else plan
 
     def _soils(self, excitations: Sequence[str]) -> list[str]:
         """The material of each recording; empty for free air. Each family gets all of them in turn."""
@@ -168,7 +177,11 @@ def plan_data_set(
 
 
 def over_family(
-    scenarios: Sequence[Scenario], count: int, seed: int, masses: tuple[float, float] = MASSES_T
+    scenarios: Sequence[Scenario],
+    count: int,
+    seed: int,
+    masses: tuple[float, float] = MASSES_T,
+    scatter: float = 1.0,
 ) -> tuple[Scenario, ...]:
     """The same scenarios on `count` machines of other sizes, which take turns in each excitation; see `machine_family`.
 
@@ -178,7 +191,7 @@ def over_family(
     if count < 1:
         raise ConfigError(f"family = {count} machines; at least one is needed")
     turns = {place: turn % count for turn, place in enumerate(_by_family([s.excitation for s in scenarios]))}
-    names = [member_name(seed, turns[i], masses) for i in range(len(scenarios))]
+    names = [member_name(seed, turns[i], masses, scatter) for i in range(len(scenarios))]
     return tuple(replace(s, machine=n, name=_named(s.name, n)) for s, n in zip(scenarios, names, strict=True))
 
 

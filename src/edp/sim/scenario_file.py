@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, closest
+from edp.sim.family import WIDEST
 from edp.sim.plan import DataSetSpec
 
 FILE_KEYS = ("format", "layout", "truth")
 WHOLE = {"recordings": (1, 100_000), "seed": (0, 2**63), "family": (0, 1000)}
-NUMBERS = {"minutes": (0.0, 1e6), "rate_hz": (1.0, 1000.0), "step_s": (0.0, 2.5e-3)}
+NUMBERS = {"minutes": (0.0, 1e6), "rate_hz": (1.0, 1000.0), "step_s": (0.0, 2.5e-3), "scatter": (0.0, WIDEST)}
 """Bounds; the lower one of numbers itself is not allowed where it is 0."""
 TABLES = ("mix", "materials", "sensors")
 

@@ -18,6 +18,7 @@ from edp.training import Event
 from edp.training.lesson import Lesson
 from edp.training.optimizers import OptimizerSpec, Soap
 from edp.training.spec import TrainingSpec
+from edp.transfer.centring import Centred
 from edp.transfer.source import Source
 from edp.transfer.spec import FinetuneSpec
 from edp.workflow import Teaching, train
@@ -56,6 +57,7 @@ class Case:
         facts: Mapping[str, Any] | None = None,
         phase: str = "",
         judged: Sequence[Series] = (),
+        centred: bool = True,
     ) -> Predictor:
         """Train in the method's folder, or for a phase in a folder within; what was stopped goes on.
 
@@ -66,11 +68,15 @@ class Case:
             facts: plain values that decide the lesson beside the source.
             phase: name of a phase that a later one goes on from.
             judged: further series that choose the best epoch.
+            centred: whether the mean error over the target's logs may be taken out at the end, if the specs ask for it.
         """
         teaching = None
         if lesson is not None:
-            make = lesson
-            teaching = Teaching({"method": name, "source": self.source.facts, **(facts or {})}, lambda data: make())
+            make, told = lesson, {"method": name, "source": self.source.facts, **(facts or {})}
+            if centred and self.spec.center and not phase:
+                teaching = Teaching({**told, "centred": True}, lambda data: Centred(make()))
+            else:
+                teaching = Teaching(told, lambda data: make())
         experiment = replace(self.experiment, training=training)
         folder = self.folder / "phases" / phase if phase else self.folder
         data = replace(self.data, validation=[*self.data.validation, *judged])

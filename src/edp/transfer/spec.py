@@ -29,6 +29,7 @@ class FinetuneSpec:
         reversal: weight of the reversed gradient of the classifier of worlds, of the adversarial method.
         inner_rate: learning rate of the method of few steps; 0 for that of the source's meta-learning, or 0.5.
         inner_steps: most steps of that method.
+        center: take the mean error over the logs that train out of the network that comes out.
         check_signs: refuse logs in which a target moves against the pilot pressures that moved it in the source.
 
     Raises:
@@ -52,6 +53,7 @@ class FinetuneSpec:
     reversal: float = 0.1
     inner_rate: float = 0.0
     inner_steps: int = 30
+    center: bool = True
     check_signs: bool = True
 
     def __post_init__(self) -> None:

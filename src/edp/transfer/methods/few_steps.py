@@ -39,6 +39,6 @@ class FewSteps:
             average=NoAverage(),
             updates=1,
         )
-        network = case.train("few_steps", training, lambda: GoOn(source.predictor, held))
+        network = case.train("few_steps", training, lambda: GoOn(source.predictor, held), centred=False)
         names = [name for name, _ in network.named_parameters() if name not in held]
         return of_network(network, size_of(network, names))

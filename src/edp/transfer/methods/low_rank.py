@@ -21,7 +21,9 @@ class Adapters:
     def make(self, case: Case) -> Made:
         """Train the changes."""
         rank = case.spec.rank
-        network = case.train("low_rank", case.tuning(), lambda: LowRank(case.source.predictor, rank), {"rank": rank})
+        network = case.train(
+            "low_rank", case.tuning(), lambda: LowRank(case.source.predictor, rank), {"rank": rank}, centred=False
+        )
         return of_network(network, sum(change_size(m.values.shape, m.axes, rank) for m in matrices_of(network)))
 
 

@@ -67,7 +67,12 @@ def train_both(case: Case, name: str, spec: BothSpec) -> Made:
     least = 4 * (max(source.predictor.spec.window, case.experiment.training.chunks.burn_in) + case.data.task.reach)
     judged = share(source.data.validation, sum(part.samples for part in case.data.validation), least)
     network = case.train(
-        name, case.tuning(), lambda: BothWorlds(source.predictor, kept, spec), asdict(spec), judged=judged
+        name,
+        case.tuning(),
+        lambda: BothWorlds(source.predictor, kept, spec),
+        asdict(spec),
+        judged=judged,
+        centred=False,
     )
     return of_network(network, size_of(network))
 
