@@ -67,21 +67,8 @@ def pretrain(
 
 def _tables(found: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
-    rows = [[part, *(f"{facts[key]:g}" for key in facts)] for part, facts in found["data"].items()]
-    table(f"{found['label']} over many machines", ["part", "machines", "recordings", "minutes"], rows)
-    out.print()
-    unseen = found["unseen"]
-    rows = [
-        [
-            f"{row['seconds']:g}",
-            f"{row['mae']:.3f}",
-            f"{100 * row['change']:+.1f}",
-            "" if row["change_error"] is None else f"{196 * row['change_error']:.1f}",
-        ]
-        for row in unseen["contexts"]
-    ]
-    title = (
-        f"Machines that were never seen ({len(unseen['machines'])}), k = {found['horizon']}: error by the time since "
-        f"the state was reset, {unseen['ticks']} ticks"
-    )
-    table(title, ["seconds since reset", "MAE (report units)", "change [%]", "95 % [±%]"], rows)
+    from edp.report.foundation import contexts_sheet, parts_sheet
+
+    for sheet in (parts_sheet(found), contexts_sheet(found)):
+        table(sheet.caption, sheet.heads(), sheet.texts())
+        out.print()

@@ -46,6 +46,7 @@ class Facts:
 
     Attributes:
         limit: the limit of predictability of the run's data, see `edp.report.limit`.
+        foundation: errors on machines that were never seen, of a run over many machines, see `edp.report.foundation`.
         predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI.
     """
 
@@ -58,6 +59,7 @@ class Facts:
     predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
     limit: Mapping[str, Any] | None = None
+    foundation: Mapping[str, Any] | None = None
 
     @property
     def targets(self) -> tuple[Target, ...]:
@@ -127,6 +129,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         predictions={} if "predictions.safetensors" in absent else _read_predictions(folder),
         absent=absent,
         limit=read_limit(None if limit is None else Path(limit), provenance),
+        foundation=_read_foundation(folder),
     )
     _check_predictions(facts)
     return facts
@@ -165,6 +168,18 @@ def _read_object(path: Path) -> Mapping[str, Any]:
     if not isinstance(value, dict):
         raise StorageError(f"'{path}' holds a {type(value).__name__}; it must be one JSON object")
     return value
+
+
+def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
+    """What `edp pretrain` found; None where the run is another."""
+    path = folder / "foundation.json"
+    if not path.is_file():
+        return None
+    found = _read_object(path)
+    unseen = found.get("unseen")
+    if not {"label", "horizon", "data"} <= found.keys() or not {"contexts", "machines"} <= set(unseen or ()):
+        raise StorageError(f"'{path}' does not hold what `edp pretrain` writes; run that command once more")
+    return found
 
 
 def _read_predictions(folder: Path) -> dict[str, dict[str, NDArray[np.floating]]]:

@@ -13,6 +13,7 @@ from plotly.offline import get_plotlyjs
 
 from edp.report import facts as run
 from edp.report import tables
+from edp.report.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.report.plots import DOTS_AT_MOST, plots_of
 from edp.report.style import Plot
 from edp.report.templates import template
@@ -70,6 +71,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "intervals": tables.interval_table(facts),
         "spread": run.spread_text(facts),
         "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
+        "unseen": foundation_tables(facts),
         "worst": tables.worst_recordings_table(facts),
         **shown(plots),
         "checks": tables.budget_checks(facts),
@@ -81,6 +83,16 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
         "absent": facts.absent,
     }
+
+
+def foundation_tables(facts: run.Facts) -> dict[str, tables.Table]:
+    """Machines that were never seen, of a run over many machines; empty for any other."""
+    found = facts.foundation
+    if found is None:
+        return {}
+    unit = facts.unit or "report units"
+    made = (parts_sheet(found), contexts_sheet(found, unit), machines_sheet(found, unit))
+    return {sheet.name: sheet.table() for sheet in made}
 
 
 def shown(plots: Mapping[str, Plot]) -> dict[str, Any]:

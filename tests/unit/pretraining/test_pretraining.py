@@ -1,6 +1,8 @@
 """Pretraining: machines apart, gradients of the meta-learners, and that it goes on after a stop to the same bits."""
 
 import dataclasses
+import re
+import shutil
 
 import numpy as np
 import pytest
@@ -9,10 +11,11 @@ import torch
 from edp.config import load_experiment
 from edp.data.chunks import stack
 from edp.data.episodes import EpisodeSampler
-from edp.errors import BundleError, ConfigError, DataError
+from edp.errors import BundleError, ConfigError, DataError, StorageError
 from edp.models.decomposition import decompose
 from edp.models.predictor import build_model
 from edp.pretraining import PRETRAININGS, MetaSpec, Pretrain, pretrain
+from edp.report import build_report
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.adaptation import adapt, loss_with
@@ -74,6 +77,24 @@ def test_every_method_leaves_a_run_and_errors_on_machines_that_it_never_saw(made
     assert found["unseen"]["dropped"] == [10.0, 30.0, 60.0]
     assert all(np.isfinite(row["mae"]) for row in contexts)
     assert (evaluate(folder, baselines=()) / "scores.json").is_file()
+
+
+def test_the_report_shows_the_machines_that_were_never_seen(made, tmp_path):
+    folder, found = made
+    copied = tmp_path / "run"
+    shutil.copytree(folder, copied)
+    page = build_report(copied).read_text()
+    assert '<section id="unseen">' in page
+    for name, mae in found["unseen"]["machines"].items():
+        shown = re.search(rf"<td>{name}</td><td>([\d.]+)</td>", page)
+        assert float(shown[1]) == pytest.approx(mae, rel=5e-3), name
+    for row in found["unseen"]["contexts"]:
+        assert f"<td>{row['mae']:.3f}</td>" in page
+    (copied / "foundation.json").write_text('{"label": "Joint"}')
+    with pytest.raises(StorageError, match="edp pretrain"):
+        build_report(copied)
+    (copied / "foundation.json").unlink()
+    assert '<section id="unseen">' not in build_report(copied).read_text()
 
 
 def test_a_stopped_pretraining_goes_on_to_the_same_bits(made, machines, experiment, tmp_path):
