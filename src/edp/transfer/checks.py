@@ -14,6 +14,7 @@ from edp.data.scaling import CONSTANT
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import DataError, closest
+from edp.models.frontend import FrontEnd
 from edp.recording import Recording
 from edp.signals import KINDS, Kind
 
@@ -21,6 +22,8 @@ SEARCHED_S = 0.5
 """Longest lag from a pilot pressure to the motion that it commands."""
 TOGETHER = 0.3
 """Correlation from which the direction of a motion counts as known."""
+FAR = 100.0
+"""How many times larger or smaller a channel may be than the source's; units differ by more, machines by less."""
 CONVENTION = {
     ("BmUp", "CylVels_1"): 1,
     ("BmDwn", "CylVels_1"): -1,
@@ -111,6 +114,40 @@ def check_moving(data: Prepared) -> None:
                 "that does not move. Look for a frozen sensor or a wrong column with edp inspect, or give logs in "
                 "which every target moves"
             )
+
+
+def check_units(data: Prepared, scaler: FrontEnd) -> None:
+    """Refuse logs with channels that are hundreds of times as large, or as small, as the source's.
+
+    A machine that rests is no wrong unit: smallness counts only where all channels of a kind, two or more, have it.
+
+    Args:
+        data: of the target.
+        scaler: of the source, with the middle and spread of each channel that it reads.
+
+    Raises:
+        DataError: which channels, how large they are here and there, and what to change.
+    """
+    names = data.task.features.channels
+    offset, width = (values[: len(names)].detach().double().cpu().numpy() for values in (scaler.offset, scaler.width))
+    there = np.abs(offset) + 2.0 * width
+    logged = np.concatenate([np.abs(part.inputs[:, : len(names)]) for part in data.train])
+    here = np.quantile(logged, 0.99, axis=0).astype(np.float64)
+    wrong = here > FAR * there
+    kinds = np.array([channel.kind for channel in data.inputs[: len(names)]])
+    for kind in dict.fromkeys(kinds):
+        same = (kinds == kind) & (here > 0.0)
+        if same.sum() >= 2 and (here[same] * FAR < there[same]).all():
+            wrong |= same
+    if wrong.any():
+        said = "; ".join(
+            f"{names[i]} up to {here[i]:.3g}, in the source about {there[i]:.3g} {KINDS[data.inputs[i].kind].si_unit}"
+            for i in np.flatnonzero(wrong)
+        )
+        raise DataError(
+            f"channels of the logs are more than {FAR:g} times as large or as small as those that the network learned "
+            f'from: {said}. Say the unit of these columns in the signal map (--map), such as unit = "bar"'
+        )
 
 
 def check_signs(data: Prepared, source: Prepared | None) -> list[str]:

@@ -22,7 +22,7 @@ from edp.storage import make_folder, write_bytes, write_json
 from edp.training import Diverged, Event
 from edp.training.bundle import weights_digest
 from edp.transfer.case import Case, tuned
-from edp.transfer.checks import check_channels, check_lengths, check_moving, check_signs
+from edp.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
 from edp.transfer.methods import METHODS, Made, Method
 from edp.transfer.scores import distributions, errors_of, excerpts, measure
 from edp.transfer.source import Source, read_source, target_experiment
@@ -158,6 +158,7 @@ def _target(source: Source, logs: DataSource, experiment: Experiment, order: Ord
     data = prepare(recordings, task, experiment.split, window)
     check_lengths(data, tuned(experiment.training, order.spec).chunks, window)
     check_moving(data)
+    check_units(data, source.predictor.front)
     notes = []
     if order.spec.check_signs:
         notes += check_signs(data, source.data)

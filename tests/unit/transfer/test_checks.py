@@ -10,7 +10,7 @@ from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
 from edp.sources import DataSource
 from edp.transfer import Order, finetune
-from edp.transfer.checks import CONVENTION, Pair, check_signs, correlation
+from edp.transfer.checks import CONVENTION, Pair, check_signs, check_units, correlation
 from edp.transfer.source import read_source
 
 
@@ -45,6 +45,25 @@ def test_every_missing_channel_of_every_log_is_named(refused, made_by):
 def test_another_rate_is_refused_with_the_setting_that_mends_it(refused, made_by):
     slow = dataclasses.replace(made_by("a", 1, (0.3, -0.2)), rate_hz=50.0)
     assert "runs at 100 Hz, the logs have another rate: 'a' 50 Hz; set rate_hz = 100" in refused(slow)
+
+
+@pytest.mark.parametrize(("columns", "factor"), [((0, 1), 1e-5), ((0,), 1e5), ((2, 3), 1e3)])
+def test_another_unit_is_refused_by_channel(refused, made_by, columns, factor):
+    recording = made_by("a", 1, (0.3, -0.2))
+    recording.values[:, columns] *= factor
+    told = refused(recording)
+    assert "100 times" in told
+    assert "unit =" in told
+    for column, channel in enumerate(recording.channels):
+        assert (f"{channel.name} up to" in told) == (column in columns)
+
+
+def test_one_quiet_channel_is_no_other_unit(run, made_by):
+    source = read_source(run)
+    recording = made_by("a", 1, (0.3, -0.2))
+    recording.values[:, 0] *= 1e-5
+    series = source.bundle.task.series(recording)
+    check_units(dataclasses.replace(source.data, train=[series]), source.predictor.front)
 
 
 @pytest.mark.parametrize("samples", [30, 80])
