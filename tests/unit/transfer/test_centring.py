@@ -13,7 +13,7 @@ from edp.models.predictor import build_model
 from edp.models.running import stream_intervals, stream_predictions
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler
-from edp.transfer import Order, finetune
+from edp.transfer import Order, centring, finetune
 from edp.transfer.centring import DEAREST, centre
 from edp.transfer.source import read_source
 
@@ -90,12 +90,16 @@ def test_nothing_is_done_without_a_whole_window_or_at_too_high_a_price(world):
     assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
 
 
-def test_a_fine_tuned_network_is_centred_unless_it_is_not_asked_for(run, target, small, tmp_path):
-    means = {}
-    for center in (True, False):
-        folder = tmp_path / str(center)
+def test_a_fine_tuned_network_is_centred_unless_it_is_not_asked_for_or_logs_are_short(
+    run, target, small, tmp_path, monkeypatch
+):
+    last = {}
+    for name, center, shortest in (("yes", True, 1.0), ("no", False, 1.0), ("short", True, 1e3)):
+        monkeypatch.setattr(centring, "SHORTEST_S", shortest)
+        folder = tmp_path / name
         order = Order(spec=replace(small, center=center), method="full", rivals=(), changes=("training.updates=25",))
         finetune(run, target, order, folder)
         net = load_bundle(folder / "bundle").predictor
-        means[center] = net.heads.biases[-1].detach().clone()
-    assert not torch.equal(means[True], means[False])
+        last[name] = net.heads.biases[-1].detach().clone()
+    assert not torch.equal(last["yes"], last["no"])
+    assert torch.equal(last["short"], last["no"])
