@@ -24,7 +24,7 @@ from edp.training.spec import TrainingSpec
 ROUNDS = 6  # one is enough unless the heads end in a function that bends
 LEAST_ANSWER = 0.1
 CLOSE = 0.005  # of the mean absolute error that may be left
-SHORTEST_S = 30.0  # of logs; on 13 s of a positioning axis the mean of pulses cost a tenth of the error elsewhere
+SHORTEST_S = 30.0  # of logs: the mean error of fewer says little of other logs
 DEAREST = 1.01  # most that it may cost of the mean absolute error
 
 
