@@ -47,7 +47,6 @@ from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_dat
 from embedded_step import on_board
 
 PROGRAMS = Path(__file__).parents[1] / "tests/export"
-BEHIND_S = 60.0
 DAY = 8_640_000
 Rows = NDArray[np.float64]
 
@@ -61,10 +60,11 @@ class Size:
     epochs: int
     updates: int
     test_minutes: float
+    behind_s: float
     ticks: int
 
 
-SIZES = {True: Size(6.0, 14, 2, 30, 8.5, 60_000), False: Size(120.0, 60, 24, 250, 17.5, DAY)}
+SIZES = {True: Size(6.0, 14, 2, 30, 8.5, 10.0, 60_000), False: Size(120.0, 60, 24, 250, 17.5, 60.0, DAY)}
 
 
 def machines(folder: Path) -> dict[str, tuple[str, str]]:
@@ -132,10 +132,10 @@ def rivals(predictor: Predictor, law: Adaptation, part: Series, base: Rows) -> d
     return {"offset and gain": base + law.unit[0] * gain, "full, no bounds": base + law.unit[0] * whole}
 
 
-def scored(made: Rows, part: Series, law: Adaptation, window: int) -> float:
-    """MAE in mm/s behind `BEHIND_S` of motion, mean over targets."""
+def scored(made: Rows, part: Series, law: Adaptation, window: int, behind_s: float) -> float:
+    """MAE in mm/s behind so many seconds of motion, mean over targets."""
     k = law.horizons[0]
-    known = (motion_s(law, part.targets)[:-k] >= BEHIND_S) & (np.arange(len(part.targets) - k) >= window)
+    known = (motion_s(law, part.targets)[:-k] >= behind_s) & (np.arange(len(part.targets) - k) >= window)
     return 1e3 * float(np.abs(made[:-k] - part.targets[k:])[known].mean())
 
 
@@ -158,7 +158,7 @@ def driven(folder: Path, part: Series) -> tuple[Rows, Rows]:
 
 
 def recovery(
-    bundle: Bundle, law: Adaptation, tests: dict[str, DataSource], folder: Path
+    bundle: Bundle, law: Adaptation, tests: dict[str, DataSource], folder: Path, behind_s: float
 ) -> dict[str, dict[str, float]]:
     """MAE of each way by scenario, mean over recordings; `folder` holds the program."""
     predictor, found = bundle.predictor, {}
@@ -169,16 +169,16 @@ def recovery(
             base, adapted = driven(folder, part)
             ways = {"frozen": base, "adapted": adapted}
             for way, made in (ways | rivals(predictor, law, part, base)).items():
-                rows.setdefault(way, []).append(scored(made, part, law, predictor.spec.window))
+                rows.setdefault(way, []).append(scored(made, part, law, predictor.spec.window, behind_s))
         found[name] = {way: float(np.mean(values)) for way, values in rows.items()}
     return found
 
 
-def frozen_mae(bundle: Bundle, law: Adaptation, source: DataSource) -> float:
+def frozen_mae(bundle: Bundle, law: Adaptation, source: DataSource, behind_s: float) -> float:
     series = [bundle.task.series(recording) for recording in source.read()]
     made = stream_predictions(bundle.predictor, series)
-    pairs = zip(made, series, strict=True)
-    return float(np.mean([scored(y[:, 0].astype(float), s, law, bundle.predictor.spec.window) for y, s in pairs]))
+    window, pairs = bundle.predictor.spec.window, zip(made, series, strict=True)
+    return float(np.mean([scored(y[:, 0].astype(float), s, law, window, behind_s) for y, s in pairs]))
 
 
 def instructions(bundle: Bundle) -> tuple[int, int]:
@@ -249,13 +249,13 @@ def study(folder: Path, size: Size, seed: int, quick: bool) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         program = Path(temporary)
         built(bundle, program, PROGRAMS / "adaptation_driver.c")
-        found = recovery(bundle, law, tests, program)
+        found = recovery(bundle, law, tests, program, size.behind_s)
     verdicts, details = judged(found, quick), {"mae": found, "options": law.to_plain()}
     if not quick:
         details["trained after the change"] = attainable = {}
         for name in (name for name in cases if name != "before"):
             taught = simulated(folder / f"changed {name}", cases[name], size.minutes, size.recordings, seed + 3)
-            own = frozen_mae(trained(folder / f"network {name}", taught, size, seed), law, tests[name])
+            own = frozen_mae(trained(folder / f"network {name}", taught, size, seed), law, tests[name], size.behind_s)
             attainable[name] = own
             print(f"{name}: a network trained after the change alone has an MAE of {own:.3f} mm/s there")
     without, with_ = instructions(bundle)
