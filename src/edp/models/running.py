@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -33,13 +33,20 @@ def mean_error(predictor: Predictor, series: Sequence[Series]) -> float:
 
     Not a number where no series is longer than that.
     """
-    skip, errors = predictor.spec.window, []
+    errors = [np.abs(error).mean(axis=0) for _, error in stream_errors(predictor, series)]
+    return float(np.mean(errors)) if errors else math.nan
+
+
+def stream_errors(predictor: Predictor, series: Sequence[Series]) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Place of a horizon and errors ``(time, target)`` in SI units; each series from reset, after a whole window.
+
+    Series that are no longer than window and horizon are passed over.
+    """
+    skip = predictor.spec.window
     for predicted, part in zip(stream_predictions(predictor, series), series, strict=True):
         for place, k in enumerate(predictor.task.horizons):
             if part.samples > skip + k:
-                known = predicted[skip : part.samples - k, place]
-                errors.append(np.abs(known - part.targets[skip + k :]).mean(axis=0))
-    return float(np.mean(errors)) if errors else math.nan
+                yield place, predicted[skip : part.samples - k, place] - part.targets[skip + k :]
 
 
 def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.models.predictor import Predictor
-from edp.models.running import stream_predictions
+from edp.models.running import stream_errors
 from edp.training.lesson import Lesson, Moment
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec
@@ -102,14 +102,11 @@ def _shift(net: Predictor, change: NDArray[np.float64]) -> None:
 
 def _errors(net: Predictor, series: Sequence[Series]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean error and mean absolute error, SI units, ``(horizon, target)``; NaN where nothing can be judged."""
-    skip, horizons = net.spec.window, net.task.horizons
-    total, size = (np.zeros((len(horizons), len(net.task.targets))) for _ in range(2))
-    ticks = np.zeros((len(horizons), 1))
-    for said, part in zip(stream_predictions(net, series), series, strict=True):
-        for place, k in enumerate(horizons):
-            error = said[skip : max(skip, part.samples - k), place].astype(np.float64) - part.targets[skip + k :]
-            total[place] += error.sum(axis=0)
-            size[place] += np.abs(error).sum(axis=0)
-            ticks[place] += len(error)
+    horizons, targets = len(net.task.horizons), len(net.task.targets)
+    total, size, ticks = np.zeros((horizons, targets)), np.zeros((horizons, targets)), np.zeros((horizons, 1))
+    for place, error in stream_errors(net, series):
+        total[place] += error.sum(axis=0, dtype=np.float64)
+        size[place] += np.abs(error).sum(axis=0, dtype=np.float64)
+        ticks[place] += len(error)
     with np.errstate(invalid="ignore"):
         return total / ticks, size / ticks
