@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
@@ -14,13 +13,14 @@ from typing import Any
 import pydantic
 import tomli_w
 
+from edp import storage
 from edp.blocks import BLOCKS
 from edp.data.augment import AUGMENTATIONS
 from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS, Derived, FeatureSet
 from edp.data.splits import SPLITS, ByRecording, SplitSpec
 from edp.data.task import TargetMode, Task
-from edp.errors import ConfigError, StorageError, closest
+from edp.errors import ConfigError, closest
 from edp.evaluation.judge import JudgeSpec
 from edp.losses import LOSSES, TERMS
 from edp.models.activations import ACTIVATIONS
@@ -59,6 +59,8 @@ TAGGED: Mapping[str, Registry[type]] = {
 USUAL_KIND = {"head": "mlp"}
 """What a table without ``kind`` means, where that is not an error."""
 
+SHOWN_CHANGE = 200
+"""Of a ``--set``, in messages."""
 PRESETS = ("quick", "small", "standard", "thesis")
 Table = dict[str, Any]
 
@@ -164,7 +166,8 @@ def preset_table(name: str) -> Table:
     """
     if name not in PRESETS:
         raise ConfigError(f"there is no preset '{name}'{closest(name, PRESETS)}")
-    return tomllib.loads(resources.files("edp").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8"))
+    text = resources.files("edp").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8")
+    return storage.parse_toml(text, f"preset '{name}'", ConfigError)
 
 
 def experiment_toml(experiment: Experiment) -> str:
@@ -191,19 +194,12 @@ def _plain_fields(value: Any) -> Table:
 
 
 def read_toml(path: str | Path) -> Table:
-    """A TOML file.
+    """A settings file.
 
     Raises:
-        StorageError: it cannot be read.
-        ConfigError: it is not TOML.
+        ConfigError: it cannot be read, is beyond the bounds of `edp.storage.read_toml`, or is not TOML.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            return tomllib.load(stream)
-    except OSError as error:
-        raise StorageError(f"cannot read settings '{path}': {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"'{path}' is not valid TOML: {error}") from error
+    return storage.read_toml(path, error=ConfigError)
 
 
 def merged(base: Table, change: Mapping[str, Any]) -> Table:
@@ -238,13 +234,11 @@ def override(text: str) -> Table:
     key, sign, value = text.partition("=")
     if not sign or not key.strip():
         raise ConfigError(f"--set '{text}': write key.path=value, for example training.epochs=10")
+    where = f"--set '{text[:SHOWN_CHANGE]}'"
     try:
-        return tomllib.loads(f"{key.strip()} = {value.strip()}")
-    except tomllib.TOMLDecodeError:
-        try:
-            return tomllib.loads(f'{key.strip()} = "{value.strip()}"')
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigError(f"--set '{text}' is not understood: {error}") from error
+        return storage.parse_toml(f"{key.strip()} = {value.strip()}", where, ConfigError)
+    except ConfigError:
+        return storage.parse_toml(f'{key.strip()} = "{value.strip()}"', where, ConfigError)
 
 
 T = typing.TypeVar("T")

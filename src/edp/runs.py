@@ -15,7 +15,7 @@ from typing import Any
 
 from edp import __version__
 from edp.errors import BusyError, StorageError
-from edp.storage import hold, make_folder, read_json, remove_unfinished, write_bytes, write_json
+from edp.storage import hold, make_folder, object_with, read_object, remove_unfinished, write_bytes, write_json
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
 
@@ -82,8 +82,8 @@ class RunFolder:
         """
         identity = self.file("run.json")
         if identity.exists():
-            held = read_json(identity)
-            if held.get("key") != key:
+            held = read_object(identity, ("key",))
+            if held["key"] != key:
                 raise StorageError(
                     f"run folder '{self.path}' holds another run (other settings, data or version); nothing was "
                     "changed. Choose another folder with --out, or remove this one"
@@ -100,11 +100,31 @@ class RunFolder:
     def status(self) -> dict[str, Any]:
         """Where the run stands; empty where nothing was written yet."""
         held = self.file("status.json")
-        return dict(read_json(held)) if held.exists() else {}
+        return read_object(held, ("status", "time")) if held.exists() else {}
 
     def write_history(self, rows: list[dict[str, Any]]) -> None:
         """Write all epochs so far, a JSON line each."""
         write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def read_provenance(folder: str | Path) -> dict[str, Any]:
+    """Where a run comes from, with all that the commands on a trained run need of it.
+
+    Raises:
+        StorageError: not a run folder, or its provenance is damaged.
+    """
+    file = Path(folder) / "provenance.json"
+    if not file.is_file():
+        raise StorageError(f"'{folder}' is not a run folder: it has no {file.name}; give the folder of edp train")
+    held = read_object(file, ("data", "seconds"))
+    data = object_with(held["data"], ("source", "reader", "digest"), f"'{file}', data,")
+    reader = object_with(data["reader"], ("path",), f"'{file}', data.reader,")
+    texts = {"data.reader.path": reader["path"], "data.digest": data["digest"], "data.source": data["source"]}
+    wrong = [name for name, value in texts.items() if not isinstance(value, str)]
+    wrong += [] if isinstance(held["seconds"], int | float) else ["seconds"]
+    if wrong:
+        raise StorageError(f"'{file}' is damaged: {', '.join(wrong)} is of another kind; restore it or train again")
+    return held
 
 
 def command_line() -> str:

@@ -22,7 +22,7 @@ from edp.errors import ConfigError, closest
 from edp.recording import Recording
 from edp.signals import Kind
 from edp.sources import DataSource
-from edp.storage import make_folder, read_json, write_json
+from edp.storage import make_folder, read_object, write_json
 from edp.streaming import parameters_of
 from edp.training import Bundle, Event
 from edp.workflow import evaluate, train
@@ -266,7 +266,7 @@ class _Finished:
             len(bundle.task.features.features),
             parameters_of(bundle.predictor),
             float(bundle.provenance["seconds"]),
-            read_json(run / "scores.json"),
+            read_object(run / "scores.json", ("models", "targets")),
         )
 
 

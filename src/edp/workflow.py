@@ -25,7 +25,7 @@ from edp.data.prepared import Prepared, prepare
 from edp.data.spectrum import LAGS
 from edp.data.splits import SPLITS
 from edp.data_sets import SimulationOrder, simulate_data_set
-from edp.errors import DataError, StorageError
+from edp.errors import DataError
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import Footprint, check_possible, footprint
@@ -38,9 +38,9 @@ from edp.models.integer import IntegerPredictor
 from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination, describe
 from edp.onboard import Adaptation
 from edp.report import build_report
-from edp.runs import RunFolder, command_line, environment, run_key
+from edp.runs import RunFolder, command_line, environment, read_provenance, run_key
 from edp.sources import DataSource
-from edp.storage import make_folder, read_json, write_bytes, write_json
+from edp.storage import make_folder, read_object, write_bytes, write_json
 from edp.training import Bundle, Diverged, Event, Fitted, fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler, weights_digest
 from edp.training.fit import thread_count
@@ -235,9 +235,7 @@ def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepa
         EdpError: not a run folder of EDP, or its recordings changed since.
     """
     bundle = load_bundle(folder)
-    if not (folder / "provenance.json").is_file():
-        raise StorageError(f"'{folder}' is not a run folder: it has no provenance.json; give the folder of edp train")
-    provenance = read_json(folder / "provenance.json")
+    provenance = read_provenance(folder)
     experiment = load_experiment(folder / "config.toml", preset=None)
     torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
     data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment)
@@ -284,7 +282,7 @@ def _kept(folder: Path, key: str) -> dict[str, Any] | None:
     """Scores of an earlier judgement of the same things."""
     if not (folder / "scores.json").is_file() or not (folder / "predictions.safetensors").is_file():
         return None
-    scores = read_json(folder / "scores.json")
+    scores = read_object(folder / "scores.json")
     return scores if scores.get("key") == key else None
 
 

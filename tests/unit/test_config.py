@@ -219,10 +219,10 @@ def test_data_set_files(tmp_path):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(StorageError, match=r"none\.toml"):
+    with pytest.raises(ConfigError, match=r"none\.toml' cannot be read"):
         load_experiment(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="not valid TOML"):
+    with pytest.raises(ConfigError, match="not UTF-8"):
         load_experiment(tmp_path / "binary.toml")
 
 

@@ -39,7 +39,7 @@ def test_paths_are_relative_to_the_settings_file(tmp_path, monkeypatch):
     assert experiment.task.resolve(100.0).features.features == ("CylVels_1", "CylVels_2", "CylVels_3")
     monkeypatch.chdir(tmp_path / "sets")
     assert load_experiment(overrides=["task.features=few.toml"]).task.features.name == "few"
-    with pytest.raises(StorageError, match=r"cannot read the feature set 'sets/few.toml'.*relative to that file"):
+    with pytest.raises(ConfigError, match=r"the feature set 'sets/few.toml' cannot be read.*relative to that file"):
         load_experiment(overrides=["task.features=sets/few.toml"])
 
 

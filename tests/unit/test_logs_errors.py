@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import struct
-import tempfile
 import zlib
 from pathlib import Path
 
@@ -191,10 +190,10 @@ def test_each_writer_reports_a_full_disk_as_os_error(suffix):
 
 
 def test_read_only_folder(tmp_path, monkeypatch):
-    def refuse(**_):
+    def refuse(target):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(tempfile, "mkstemp", refuse)
+    monkeypatch.setattr("edp.storage.writing._temporary", refuse)
     with pytest.raises(StorageError, match="Permission denied"):
         write_recording(make(), tmp_path / "a.csv")
 

@@ -58,5 +58,5 @@ def test_json_round_trip_and_refusals(tmp_path):
     path.write_text('{"a": [1, ')
     with pytest.raises(StorageError, match="not valid JSON"):
         read_json(path)
-    with pytest.raises(StorageError, match="cannot read"):
+    with pytest.raises(StorageError, match="cannot be read"):
         read_json(tmp_path / "none.json")

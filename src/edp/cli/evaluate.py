@@ -53,7 +53,7 @@ def run_evaluation(
     run: Path, source: DataSource | None = None, names: list[str] | None = None, quiet: bool = False
 ) -> tuple[Path, dict[str, Any]]:
     """Judge with a progress display; returns the folder of the scores and the scores."""
-    from edp.storage import read_json
+    from edp.storage import read_object
     from edp.workflow import evaluate as judge_run
 
     steps, began = Steps(quiet, every_s=0.0), time.monotonic()
@@ -65,7 +65,7 @@ def run_evaluation(
             steps.say(f"evaluate: {name}, {duration(time.monotonic() - began)} so far")
 
         folder = judge_run(run, source, names, on_step)
-    return folder, read_json(folder / "scores.json")
+    return folder, read_object(folder / "scores.json")
 
 
 def run_worths(run: Path, source: DataSource | None = None, quiet: bool = False) -> Worths:

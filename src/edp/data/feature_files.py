@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from edp.data.features import FeatureSet
-from edp.errors import ConfigError, StorageError
+from edp.errors import ConfigError
+from edp.storage import read_toml
 
 SUFFIX = ".toml"
 
@@ -25,20 +25,14 @@ def read_set_table(path: str | Path) -> dict[str, Any]:
     The names of its keys and the values are checked where the settings are.
 
     Raises:
-        StorageError: the file cannot be read.
-        ConfigError: it is not TOML.
+        ConfigError: the file cannot be read, or is not TOML.
     """
     source = Path(path)
-    try:
-        with source.open("rb") as stream:
-            table = tomllib.load(stream)
-    except OSError as error:
-        raise StorageError(
-            f"cannot read the feature set '{source}': {error.strerror or error}; task.features is a name (FG1, FG2, "
-            "all), a table, or the path of a feature-set file, which in a settings file is relative to that file"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the feature set '{source}' is not valid TOML: {error}") from error
+    advice = (
+        "; task.features is a name (FG1, FG2, all), a table, or the path of a feature-set file, which in a settings "
+        "file is relative to that file"
+    )
+    table = read_toml(source, f"the feature set '{source}'", ConfigError, advice)
     return {"name": source.stem, "channels": [], "derived": [], "hidden": []} | table
 
 

@@ -14,8 +14,8 @@ from edp.data.series import Series
 from edp.errors import ConfigError, StorageError
 from edp.losses import LOSSES
 from edp.models.predictor import Predictor
+from edp.runs import read_provenance
 from edp.sources import DataSource
-from edp.storage import read_json
 from edp.training import Bundle, Event, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.lesson import Lesson
@@ -109,7 +109,7 @@ def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, E
         raise ConfigError(
             "settings of the task or the model cannot be changed here: a student has those of its teacher"
         )
-    return bundle.predictor, experiment, DataSource.from_plain(read_json(folder / "provenance.json")["data"]["reader"])
+    return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder)["data"]["reader"])
 
 
 def order_facts(order: Order) -> dict[str, Any]:

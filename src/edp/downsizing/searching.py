@@ -20,7 +20,7 @@ from edp.models.predictor import Predictor
 from edp.runs import RunFolder, run_key
 from edp.signals import KINDS
 from edp.sources import DataSource
-from edp.storage import make_folder, read_json, write_json
+from edp.storage import make_folder, read_object, write_json
 from edp.training import Event, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.lesson import Lesson
@@ -97,7 +97,7 @@ class DiskBench(Bench):
         facts |= {"start": None if start is None else weights_digest(start)}
         run = self.folder / order.name
         done, self.done = self.done, self.done + 1
-        status = read_json(run / "status.json")["status"] if (run / "status.json").is_file() else ""
+        status = read_object(run / "status.json", ("status",))["status"] if (run / "status.json").is_file() else ""
         if status == "finished":
             bundle = load_bundle(run)
             if bundle.provenance.get("lesson") == facts:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, closest
+from edp.storage import read_toml
 from edp.streaming import Cost
 
 STACK_BYTES = 1_024  # an allowance: a tick was seen to take 340 (``benchmarks/controller_memory.py``)
@@ -108,12 +108,7 @@ def load_budget(path: str | Path) -> Budget:
     Raises:
         ConfigError: the file cannot be read, or holds something else than a budget.
     """
-    try:
-        held = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"budget '{path}' cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"budget '{path}' is not valid TOML: {error}") from error
+    held = read_toml(path, f"budget '{path}'", ConfigError)
     known = [entry.name for entry in fields(Budget)]
     wrong = [f"unknown key '{key}'{closest(key, known)}" for key in held if key not in known]
     for key in set(held) & set(known):

@@ -9,8 +9,8 @@ from types import TracebackType
 from typing import IO
 
 from edp.errors import BusyError, StorageError
-from edp.ledger.record import FINAL, Record
-from edp.storage import hold, make_folder, write_bytes
+from edp.ledger.record import FINAL, RECORD_BYTES, Record
+from edp.storage import hold, make_folder, read_bytes, write_bytes
 
 
 def claim(folder: str | Path, key: str) -> Claim:
@@ -61,7 +61,7 @@ def leave_arrival(folder: str | Path, record: Record) -> None:
 def whole(file: Path) -> Record | None:
     """The final record in a file, where it is one."""
     try:
-        record = Record.from_bytes(file.read_bytes())
+        record = Record.from_bytes(read_bytes(file, RECORD_BYTES))
     except (OSError, ValueError, KeyError, TypeError, StorageError):
         return None
     return record if record.key == file.stem and record.status in FINAL else None

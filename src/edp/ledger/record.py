@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from enum import StrEnum
 from functools import cache, cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 
 from edp import __version__
 from edp.errors import ConfigError, NotFiniteError, StorageError
+from edp.storage import object_with, parse_json
 
 SCHEMA = 1
 UNREAD = ("cli", "selection.py", "trials.py", "workflow.py", "report", "screening", "stats", "search")
@@ -162,14 +163,22 @@ class Record:
 
         Raises:
             ValueError: cut off or changed.
-            StorageError: written by a later version.
+            StorageError: written by a later version, or nothing that any version writes.
         """
-        plain = json.loads(body_of(data))
+        plain = object_with(parse_json(body_of(data).decode(), "a record"), ("schema",), "a record")
         if plain["schema"] != SCHEMA:
             raise StorageError(f"a record of schema {plain['schema']} was written by a later version of EDP; update it")
-        identity = Identity(**plain["identity"])
+        object_with(plain, PARTS, "a record")
+        parts = [one.name for one in fields(Identity)]
+        held = object_with(plain["identity"], parts, "a record's identity")
+        measured = object_with(plain["measured"], (), "a record's measured part")
+        if not isinstance(plain["key"], str) or not isinstance(plain["message"], str):
+            raise StorageError("a record is damaged: its key or message is no text")
+        if not isinstance(plain["result"], dict | None):
+            raise StorageError("a record is damaged: its result is no table")
+        identity = Identity(**{name: held[name] for name in parts})
         identity.__dict__["key"] = plain["key"]  # the checksum covers it, so it is not hashed again
-        return Record(identity, Status(plain["status"]), plain["result"], plain["message"], plain["measured"])
+        return Record(identity, Status(plain["status"]), plain["result"], plain["message"], measured)
 
 
 def body_of(data: bytes) -> bytes:
@@ -186,6 +195,10 @@ def body_of(data: bytes) -> bytes:
     return body
 
 
+PARTS = ("schema", "key", "identity", "status", "result", "message", "measured")
+"""Of a record in its file."""
+RECORD_BYTES = 16 * 2**20
+"""Most that the file of a record has; a result is some hundred numbers."""
 START, BEFORE = b'{"checksum":"', b'","record":'
 HEAD = len(START) + 32 + len(BEFORE)
 

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edp.storage import write_bytes
+from edp.errors import StorageError
+from edp.storage import read_bytes, write_bytes
 
 SUFFIX = ".state"
 START = b"edp state 1 "
+STATE_BYTES = 4 * 2**30
+"""Most that the file of a state has: weights and optimiser of a network of 300 million parameters."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,8 @@ def read_state(file: str | Path) -> bytes | None:
     """The state in a file; None where there is no file or it is no whole state of the training that it is named for."""
     path = Path(file)
     try:
-        data = path.read_bytes()
-    except OSError:
+        data = read_bytes(path, STATE_BYTES)
+    except StorageError:
         return None
     size = len(_head("0" * 32, b""))
     state = data[size:]

@@ -6,16 +6,25 @@ import json
 import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from edp.errors import BusyError, ConfigError, StorageError
 from edp.ledger.claims import free_dead_claims, whole
-from edp.ledger.record import FINAL, SCHEMA, Record, Status, body_of, canonical, digest_of
+from edp.ledger.record import FINAL, RECORD_BYTES, SCHEMA, Record, Status, body_of, canonical, digest_of
 from edp.ledger.states import SUFFIX, left_state, read_state
-from edp.storage import hold, make_folder, read_json, remove_unfinished, storage_error, write_bytes, write_json
+from edp.storage import (
+    hold,
+    make_folder,
+    read_bytes,
+    read_object,
+    remove_unfinished,
+    storage_error,
+    write_bytes,
+    write_json,
+)
 
 
 @dataclass(frozen=True)
@@ -29,7 +38,17 @@ class Damage:
 def read_records(folder: str | Path) -> tuple[dict[str, Record], list[Damage]]:
     """All records of a ledger, whoever holds it, and the damaged files; nothing is changed."""
     whole, damaged = _read(Path(folder, "records"))
-    return {key: Record.from_bytes(data) for key, data in whole.items()}, damaged
+    return {key: _taken_apart(Path(folder, "records", f"{key}.json"), whole[key]) for key in whole}, damaged
+
+
+def _taken_apart(file: Path, data: bytes) -> Record:
+    try:
+        return Record.from_bytes(data)
+    except (ValueError, StorageError) as error:
+        raise StorageError(
+            f"'{file}' has the right checksum and is no record of this version: {error}; remove it to have that "
+            "training done again"
+        ) from error
 
 
 def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
@@ -40,8 +59,7 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
     for name in names:
         key, file = name[: -len(".json")], f"{folder}/{name}"
         try:
-            with open(file, "rb", buffering=0) as stream:
-                data = stream.read()
+            data = read_bytes(file, RECORD_BYTES)
             body = body_of(data)
             if f'"schema":{SCHEMA},"status":"'.encode() not in body[-48:]:
                 Record.from_bytes(data)  # says which schema it is
@@ -50,10 +68,12 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
             found[key] = data
         except (ValueError, KeyError, TypeError) as error:
             damaged.append(Damage(Path(file), str(error)))
-        except FileNotFoundError:  # set apart by its holder since it was listed
-            continue
-        except OSError as error:
-            raise storage_error(Path(file), error, "read") from error
+        except StorageError as error:
+            if not os.path.lexists(file):  # set apart by its holder since it was listed
+                continue
+            if os.path.isfile(file):
+                raise
+            damaged.append(Damage(Path(file), str(error)))
     return found, damaged
 
 
@@ -65,6 +85,14 @@ class Opening:
     judged: tuple[str, ...]
     why: str
     time: str
+
+
+def _opening(file: Path) -> Opening:
+    held = read_object(file, (part.name for part in fields(Opening)))
+    judged = held["judged"]
+    if not isinstance(judged, list) or not all(isinstance(key, str) for key in judged):
+        raise StorageError(f"'{file}' is damaged: judged must be a list of keys; restore it")
+    return Opening(str(held["box"]), tuple(judged), str(held["why"]), str(held["time"]))
 
 
 class Ledger:
@@ -133,7 +161,7 @@ class Ledger:
     def get(self, key: str) -> Record | None:
         """What became of a training, lost ones too."""
         if key in self._unread:
-            self._records[key] = Record.from_bytes(self._unread.pop(key))
+            self._records[key] = _taken_apart(self.path / "records" / f"{key}.json", self._unread.pop(key))
         return self._records.get(key)
 
     def finished(self, key: str) -> Record | None:
@@ -200,7 +228,7 @@ class Ledger:
         if not file.exists():
             write_json(file, wanted)
             return False
-        held = read_json(file)
+        held = read_object(file)
         other = sorted(part for part in {*held, *wanted} if held.get(part) != wanted.get(part))
         if other:
             raise ConfigError(
@@ -236,8 +264,7 @@ class Ledger:
 
     def openings(self, box: str | None = None) -> list[Opening]:
         """Looks into one lock-box or all, oldest first."""
-        plain = [read_json(file) for file in sorted((self.path / "openings").glob("*.json"))]
-        found = [Opening(**(one | {"judged": tuple(one["judged"])})) for one in plain]
+        found = [_opening(file) for file in sorted((self.path / "openings").glob("*.json"))]
         return [one for one in found if box in (None, one.box)]
 
     def _enter_arrivals(self) -> None:
@@ -247,6 +274,8 @@ class Ledger:
             if whole(file) is None:
                 self._move(file, "quarantine")
             elif whole(target) is None:  # absent, damaged or of a lost training
+                if os.path.lexists(target) and not target.is_file():
+                    self._move(target, "quarantine")
                 file.replace(target)
             else:
                 file.unlink()

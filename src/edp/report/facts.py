@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError, StorageError
 from edp.report.limit import limit_line, read_limit
 from edp.report.wording import decimals_for, listed, number, percent
-from edp.storage import read_json
+from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
 
 NETWORK = "network"
 TRUTH = "truth"
@@ -116,12 +115,12 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         raise StorageError(f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}")
 
     def json_part(name: str) -> Any:
-        return None if name in absent else _read_object(folder / name)
+        return None if name in absent else read_object(folder / name)
 
     provenance = json_part("provenance.json")
     facts = Facts(
         folder=folder,
-        config=None if "config.toml" in absent else _read_text(folder / "config.toml"),
+        config=None if "config.toml" in absent else read_text(folder / "config.toml", SETTINGS_BYTES),
         provenance=provenance,
         history=() if "history.jsonl" in absent else read_history(folder / "history.jsonl"),
         scores=json_part("scores.json"),
@@ -141,33 +140,19 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     Raises:
         StorageError: another line than the last is not a JSON object.
     """
-    lines = [(row, line) for row, line in enumerate(_read_text(path).splitlines(), 1) if line.strip()]
+    lines = [(row, line) for row, line in enumerate(read_text(path, JSON_BYTES).splitlines(), 1) if line.strip()]
     epochs: list[Mapping[str, Any]] = []
     for place, (row, line) in enumerate(lines, 1):
         try:
-            epoch = json.loads(line)
-        except ValueError as error:
+            epoch = parse_json(line, f"'{path}' line {row}", finite=False)
+        except StorageError:
             if place == len(lines):
                 break
-            raise StorageError(f"'{path}' line {row} is not valid JSON ({error}); remove or mend the line") from error
+            raise
         if not isinstance(epoch, dict):
             raise StorageError(f"'{path}' line {row} holds {line[:40]!r}; each line must be one JSON object")
         epochs.append(epoch)
     return tuple(epochs)
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise StorageError(f"cannot read '{path}': {error}") from error
-
-
-def _read_object(path: Path) -> Mapping[str, Any]:
-    value = read_json(path)
-    if not isinstance(value, dict):
-        raise StorageError(f"'{path}' holds a {type(value).__name__}; it must be one JSON object")
-    return value
 
 
 def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
@@ -175,7 +160,7 @@ def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
     path = folder / "foundation.json"
     if not path.is_file():
         return None
-    found = _read_object(path)
+    found = read_object(path)
     unseen = found.get("unseen")
     if not {"label", "horizon", "data"} <= found.keys() or not {"contexts", "machines"} <= set(unseen or ()):
         raise StorageError(f"'{path}' does not hold what `edp pretrain` writes; run that command once more")

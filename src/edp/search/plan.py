@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -28,6 +27,7 @@ from edp.search.phases.isolation import DEFAULT_BACKBONE, arm_settings
 from edp.search.settings import SearchSpec
 from edp.search.space import DIMENSIONS, THESIS, Choice, Range, Real, Space, applicable, apply
 from edp.search.trainings import settings_of
+from edp.storage import parse_toml
 
 PRESETS = ("quick", "standard", "thesis")
 
@@ -65,7 +65,8 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     if preset not in PRESETS:
         raise ConfigError(f"there is no preset '{preset}' of a search{closest(preset, PRESETS)}")
     text = resources.files("edp.search").joinpath(f"presets/{preset}.toml").read_text(encoding="utf-8")
-    table, where = tomllib.loads(text), f"preset '{preset}' of the search"
+    where = f"preset '{preset}' of the search"
+    table = parse_toml(text, where, ConfigError)
     if path is not None:
         table, where = merged(table, _with_files(read_toml(path), Path(path).parent)), f"'{path}'"
     for change in overrides:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from dataclasses import fields
 from functools import cache
 from importlib import resources
@@ -16,6 +15,7 @@ from edp.errors import ConfigError, closest
 from edp.sim.family import MASSES_T, WIDEST, Draws, member_mass, member_name, scaled_machine
 from edp.sim.machine import SECTIONS, Machine
 from edp.sim.machine_checks import check_machine
+from edp.storage import SETTINGS_BYTES, parse_toml, read_text
 
 Section = TypeVar("Section")
 FAMILY = re.compile(
@@ -55,11 +55,7 @@ def load_machine(name: str) -> Machine:
 @cache
 def _from_file(path: Path, changed: int) -> Machine:
     """`changed` is the file's time stamp, so that an edited file is read anew."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"machine file {path} cannot be read: {error}") from error
-    return parse_machine(text, path.name)
+    return parse_machine(read_text(path, SETTINGS_BYTES, f"machine file {path}", ConfigError), path.name)
 
 
 @cache
@@ -126,10 +122,7 @@ def parse_machine(text: str, where: str) -> Machine:
     Raises:
         ConfigError: not TOML, a key is missing or unknown, or a value cannot be (see `machine_checks`).
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"machine file {where} is not valid TOML: {error}") from error
+    table = parse_toml(text, f"machine file {where}", ConfigError)
     parts: dict[str, Any] = {
         key: _section(SECTIONS[key], value, f"{where} [{key}]") if key in SECTIONS else value
         for key, value in table.items()

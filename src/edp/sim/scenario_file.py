@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 from edp.errors import ConfigError, closest
 from edp.sim.family import WIDEST
 from edp.sim.plan import DataSetSpec
+from edp.storage import read_toml
 
 FILE_KEYS = ("format", "layout", "truth")
 WHOLE = {"recordings": (1, 100_000), "seed": (0, 2**63), "family": (0, 1000)}
@@ -30,12 +30,7 @@ def read_scenario_file(path: str | Path) -> tuple[dict[str, Any], dict[str, str]
     """
     source = Path(path)
     where = f"scenario file {source}"
-    try:
-        table = tomllib.loads(source.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{where} cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where} is not valid TOML: {error}") from error
+    table = read_toml(source, where, ConfigError)
     known = [entry.name for entry in fields(DataSetSpec)]
     for key in table:
         if key not in (*known, "files"):

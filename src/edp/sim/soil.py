@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass, fields
 from functools import cache
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ from edp.errors import ConfigError, closest
 from edp.sim import layout as at
 from edp.sim import terramechanics
 from edp.sim.machine import Machine
+from edp.storage import SETTINGS_BYTES, parse_toml, read_text
 
 Array = NDArray[np.float64]
 SPACING_M = 0.05
@@ -92,10 +91,7 @@ def load_material(name: str) -> Material:
         ConfigError: no such material (the closest name is offered), or a value is missing, unknown or out of bounds.
     """
     if name.endswith(".toml"):
-        try:
-            return parse_material(Path(name).read_text(encoding="utf-8"), name)
-        except OSError as error:
-            raise ConfigError(f"material file {name} cannot be read: {error.strerror or error}") from error
+        return parse_material(read_text(name, SETTINGS_BYTES, f"material file {name}", ConfigError), name)
     known = material_names()
     if name not in known:
         raise ConfigError(f"unknown material '{name}'{closest(name, known)}; there are {', '.join(known)}")
@@ -109,10 +105,7 @@ def parse_material(text: str, where: str) -> Material:
     Raises:
         ConfigError: not TOML, or a value is missing, unknown or out of bounds.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"material file {where} is not valid TOML: {error}") from error
+    table = parse_toml(text, f"material file {where}", ConfigError)
     known = [field.name for field in fields(Material)]
     for key in table:
         if key not in known:

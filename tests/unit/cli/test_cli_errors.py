@@ -189,7 +189,7 @@ def test_a_full_disk(train_on, logs, tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("edp.storage.os.fsync", full)
+    monkeypatch.setattr("edp.storage.writing.os.fsync", full)
     refused(train_on(logs), "cannot write", "No space left on device", "free space")
     monkeypatch.undo()
     assert not list(tmp_path.rglob("*.tmp"))
@@ -207,7 +207,7 @@ def test_a_folder_that_may_not_be_written(edp, trained, monkeypatch):
     def read_only(*args, **options):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("edp.storage.tempfile.mkstemp", read_only)
+    monkeypatch.setattr("edp.storage.writing._temporary", read_only)
     refused(edp("report", trained), "cannot write", "report.html", "Permission denied", "choose a folder")
 
 

@@ -73,7 +73,7 @@ def test_what_json_would_change_is_refused(identity_of, value):
 
 def test_the_code_and_threads_are_parts_of_a_key(tmp_path):
     package = tmp_path / "edp"
-    shutil.copytree(Path(edp.storage.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(Path(edp.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
 
     def told():
         command = "from edp.ledger import code_version; print(code_version())"
@@ -221,7 +221,7 @@ def test_an_error_while_writing_leaves_no_temporary_file(identity_of, tmp_path, 
 
     with Ledger(tmp_path) as ledger:
         with monkeypatch.context() as patch:
-            patch.setattr(edp.storage.os, "fsync", full)
+            patch.setattr(edp.storage.writing.os, "fsync", full)
             with pytest.raises(StorageError, match="No space left"):
                 ledger.put(Record(identity_of(), Status.DONE, {"score": 1.0}))
         assert list((tmp_path / "records").iterdir()) == []

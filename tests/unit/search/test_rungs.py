@@ -184,7 +184,7 @@ def test_a_disk_that_is_full_stops_the_search_and_loses_nothing(order, tmp_path,
             written(handle)
 
         with monkeypatch.context() as patch:
-            patch.setattr(edp.storage.os, "fsync", full)
+            patch.setattr(edp.storage.writing.os, "fsync", full)
             outcome = do([second])[0]
         assert outcome.status == Status.LOST  # which stops a search, and is tried again by the next
         assert "No space left" in outcome.message

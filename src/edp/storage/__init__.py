@@ -1,0 +1,46 @@
+"""Files of EDP's own kinds: read within bounds, written whole, and locked."""
+
+from edp.storage.locks import held_by, hold
+from edp.storage.reading import (
+    JSON_BYTES,
+    SETTINGS_BYTES,
+    object_with,
+    parse_json,
+    parse_toml,
+    read_bytes,
+    read_json,
+    read_object,
+    read_text,
+    read_toml,
+)
+from edp.storage.writing import (
+    check_writable,
+    make_folder,
+    remove_unfinished,
+    replacing,
+    storage_error,
+    write_bytes,
+    write_json,
+)
+
+__all__ = [
+    "JSON_BYTES",
+    "SETTINGS_BYTES",
+    "check_writable",
+    "held_by",
+    "hold",
+    "make_folder",
+    "object_with",
+    "parse_json",
+    "parse_toml",
+    "read_bytes",
+    "read_json",
+    "read_object",
+    "read_text",
+    "read_toml",
+    "remove_unfinished",
+    "replacing",
+    "storage_error",
+    "write_bytes",
+    "write_json",
+]

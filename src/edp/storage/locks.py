@@ -1,0 +1,120 @@
+"""Locks: one process at a time writes to a folder; the end of a process, however it comes, frees what it held."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import re
+import stat
+import time
+from pathlib import Path
+from typing import IO
+
+from edp.errors import BusyError, StorageError
+from edp.storage.writing import storage_error
+
+OURS = re.compile(r"\d{1,10} on [^\n]{1,255} since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d|\x00*")
+"""What a lock file holds: its last holder; nothing, or the zeros of a disk that lost power, before the first one."""
+HOLDER_BYTES = 400
+"""Most that it has."""
+_OPEN = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_ADVICE = "nothing was changed: remove it, if nothing of yours needs it, and try again"
+
+
+def hold(path: str | Path) -> IO[str]:
+    """Lock a file for this process; closing it, or the end of the process, however it ends, frees it.
+
+    A link, folder, pipe or device in the place of the file is refused, and so is a file that holds anything else: only
+    what is nothing but a lock is written to, and only once it is locked. A holder may remove the file
+    before it closes it: who waited for the removed one then locks the new one.
+
+    Raises:
+        BusyError: another process holds it; the message says which.
+        StorageError: the file cannot be written, or is no lock file.
+    """
+    lock = Path(path)
+    while True:
+        stream = _opened(lock)
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = _holder(stream)
+            stream.close()
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+                raise storage_error(lock, error, "lock") from error
+            raise BusyError(f"'{lock}' is held by process {holder}") from None
+        if still_ours(lock, stream):
+            break
+        stream.close()
+    _check_ours(lock, stream)
+    try:
+        stream.truncate(0)
+        stream.write(f"{os.getpid()} on {os.uname().nodename} since {time.strftime('%Y-%m-%d %H:%M:%S')}")
+        stream.flush()
+    except OSError as error:
+        stream.close()
+        raise storage_error(lock, error, "write") from error
+    return stream
+
+
+def still_ours(path: str | Path, stream: IO[str]) -> bool:
+    """Whether the file at `path` is the one that `hold` locked; it is not once somebody removed or replaced it."""
+    try:
+        there, here = os.lstat(path), os.fstat(stream.fileno())
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise storage_error(Path(path), error, "read") from error
+    return (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
+
+
+def held_by(path: str | Path) -> str | None:
+    """Who holds a file that `hold` locks, None for nobody; nothing is changed."""
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | _OPEN), encoding="utf-8", errors="replace") as stream:
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+                return None
+            try:
+                fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except OSError:
+                return _holder(stream)
+    except OSError:
+        return None
+    return None
+
+
+def _opened(lock: Path) -> IO[str]:
+    """The lock file, made where there is none, as a stream that appends; nothing in it is changed."""
+    try:
+        handle = os.open(lock, os.O_RDWR | os.O_APPEND | os.O_CREAT | _OPEN, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise StorageError(f"'{lock}' is a symbolic link, which is not followed for a lock; {_ADVICE}") from error
+        if error.errno in (errno.EISDIR, errno.ENXIO):
+            raise StorageError(
+                f"'{lock}' is not a lock file but a folder, pipe, socket or device; {_ADVICE}"
+            ) from error
+        raise storage_error(lock, error, "write") from error
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise StorageError(f"'{lock}' is not a lock file but a pipe, socket or device; {_ADVICE}")
+    return os.fdopen(handle, "a+", encoding="utf-8", errors="replace")
+
+
+def _check_ours(lock: Path, stream: IO[str]) -> None:
+    """Refuse to write into what is not a lock, such as a file that got this name by a hard link."""
+    content, names = _read(stream), os.fstat(stream.fileno()).st_nlink
+    if OURS.fullmatch(content) is None or (names > 1 and not content):
+        stream.close()
+        why = "has another name, too" if not content else "holds something else"
+        raise StorageError(f"'{lock}' is not a lock file: it {why}; {_ADVICE}")
+
+
+def _read(stream: IO[str]) -> str:
+    stream.seek(0)
+    return stream.read(HOLDER_BYTES)
+
+
+def _holder(stream: IO[str]) -> str:
+    return _read(stream).strip() or "unknown"

@@ -1,0 +1,240 @@
+"""Reading EDP's own kinds of files within bounds.
+
+Settings, manifests, scores and headers may come from a stranger or from a damaged disk. They are read from regular
+files only, up to a size, a depth and a number of digits; what is beyond ends in one message, never in a hang.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+from collections import Counter
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import Any
+
+from edp.errors import EdpError, StorageError
+
+JSON_BYTES = 64 * 2**20
+"""Of a JSON file; larger ones are not EDP's own."""
+SETTINGS_BYTES = 4 * 2**20
+"""Of a TOML file; reading one of this size takes seconds."""
+DEPTH = 60
+"""Of tables and lists in each other; EDP's own files need 10."""
+DIGITS = 40
+"""Of a whole number; the 128 bits of a random generator's state take 39."""
+_KEY = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*+{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{DEPTH}}}", re.MULTILINE)
+"""A dotted key deeper than `DEPTH`, on which the standard library's reader spends the third power of its parts."""
+
+
+def read_bytes(path: str | Path, limit: int, where: str = "", error: type[EdpError] = StorageError) -> bytes:
+    """The whole content of a regular file, or of a link to one; a pipe or a device is refused, not waited for.
+
+    Args:
+        path: of the file.
+        limit: most bytes; a larger file is refused before its bytes are read.
+        where: what to call the file in messages.
+        error: kind of error to raise.
+
+    Raises:
+        EdpError: `error`; missing, unreadable, not a regular file, or too large.
+    """
+    where = where or f"'{path}'"
+    try:
+        _check_regular(os.stat(path), limit, where, error)  # opening a device may already do something
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        with open(handle, "rb", buffering=0) as stream:
+            _check_regular(os.fstat(handle), limit, where, error)
+            parts, size = [], 0
+            while part := stream.read(min(2**20, limit + 1 - size)):
+                parts.append(part)
+                size += len(part)
+    except OSError as failure:
+        raise error(f"{where} cannot be read: {failure.strerror or failure}") from failure
+    except ValueError as failure:  # a NUL in the path
+        raise error(f"{where} cannot be read: {failure}") from failure
+    if size > limit:
+        raise error(_too_large(where, size, limit))
+    return b"".join(parts)
+
+
+def _check_regular(status: os.stat_result, limit: int, where: str, error: type[EdpError]) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
+        raise error(f"{where} cannot be read: it is {kind}; a regular file must be there")
+    if status.st_size > limit:
+        raise error(_too_large(where, status.st_size, limit))
+
+
+def _too_large(where: str, size: int, limit: int) -> str:
+    return f"{where} cannot be read: it has {size:,} bytes or more, and a file of this kind at most {limit:,}"
+
+
+def read_text(path: str | Path, limit: int, where: str = "", error: type[EdpError] = StorageError) -> str:
+    """The text of a regular file in UTF-8; see `read_bytes`.
+
+    Raises:
+        EdpError: `error`; not readable, too large, not UTF-8, or with a byte-order mark in front.
+    """
+    where = where or f"'{path}'"
+    try:
+        return read_bytes(path, limit, where, error).decode("utf-8")
+    except UnicodeDecodeError as failure:
+        raise error(f"{where} cannot be read: not UTF-8 ({failure.reason} at byte {failure.start})") from failure
+
+
+def read_json(path: str | Path, where: str = "", error: type[EdpError] = StorageError) -> Any:
+    """A JSON file; see `parse_json`.
+
+    Raises:
+        EdpError: `error`; the file is missing, unreadable, beyond its bounds, or not JSON.
+    """
+    where = where or f"'{path}'"
+    return parse_json(read_text(path, JSON_BYTES, where, error), where, error)
+
+
+def read_object(
+    path: str | Path, keys: Iterable[str] = (), where: str = "", error: type[EdpError] = StorageError
+) -> dict[str, Any]:
+    """A JSON file that holds one object.
+
+    Args:
+        path: of the file.
+        keys: what it must hold.
+        where: what to call the file in messages.
+        error: kind of error to raise.
+
+    Raises:
+        EdpError: `error`; as `read_json`, or it holds something else.
+    """
+    where = where or f"'{path}'"
+    return object_with(read_json(path, where, error), keys, where, error)
+
+
+def object_with(value: Any, keys: Iterable[str], where: str, error: type[EdpError] = StorageError) -> dict[str, Any]:
+    """`value`, which is checked to be an object with these keys.
+
+    Raises:
+        EdpError: `error`; the message says what it is, or which keys it lacks.
+    """
+    if not isinstance(value, dict):
+        kind = {type(None): "null", list: "a list", str: "a text"}.get(type(value), "a value")
+        raise error(f"{where} is damaged: it holds {kind} where an object must be; restore it or write it again")
+    missing = [key for key in keys if key not in value]
+    if missing:
+        raise error(f"{where} is damaged: it lacks {', '.join(missing)}; restore it or write it again")
+    return value
+
+
+def parse_json(text: str, where: str, error: type[EdpError] = StorageError, finite: bool = True) -> Any:
+    """The value that JSON stands for.
+
+    Args:
+        text: the JSON.
+        where: what to call it in messages.
+        error: kind of error to raise.
+        finite: refuse NaN and infinity, which are not JSON; Python writes them all the same.
+
+    Raises:
+        EdpError: `error`; not JSON, nested too deep, a key twice in an object, or a number beyond all use.
+    """
+    try:
+        _refuse_mark(text)
+        real = _finite if finite else float
+        value = json.loads(text, object_pairs_hook=_distinct, parse_int=_whole, parse_float=real, parse_constant=real)
+        _check_tree(value)
+    except RecursionError as failure:
+        raise error(f"{where} is not valid JSON: nested deeper than {DEPTH}") from failure
+    except ValueError as failure:
+        raise error(f"{where} is not valid JSON ({failure}); it may be cut off or edited by hand") from failure
+    return value
+
+
+def read_toml(
+    path: str | Path, where: str = "", error: type[EdpError] = StorageError, advice: str = ""
+) -> dict[str, Any]:
+    """The table of a TOML file; see `parse_toml`.
+
+    Args:
+        path: of the file.
+        where: what to call the file in messages.
+        error: kind of error to raise.
+        advice: added to the message of a file that cannot be read.
+
+    Raises:
+        EdpError: `error`; the file is missing, unreadable, beyond its bounds, or not TOML.
+    """
+    where = where or f"'{path}'"
+    try:
+        text = read_text(path, SETTINGS_BYTES, where, error)
+    except EdpError as failure:
+        raise error(f"{failure}{advice}") from failure
+    return parse_toml(text, where, error)
+
+
+def parse_toml(text: str, where: str, error: type[EdpError] = StorageError) -> dict[str, Any]:
+    """The table that TOML stands for.
+
+    Raises:
+        EdpError: `error`; not TOML, nested too deep, or a number beyond all use.
+    """
+    try:
+        _refuse_mark(text)
+        if DEEP_KEY.search(text) is not None:
+            raise ValueError(f"a key of more than {DEPTH} parts")
+        table = tomllib.loads(text)
+        _check_tree(table)
+    except RecursionError as failure:
+        raise error(f"{where} is not valid TOML: nested deeper than {DEPTH}") from failure
+    except ValueError as failure:  # TOMLDecodeError, too
+        raise error(f"{where} is not valid TOML: {failure}") from failure
+    return table
+
+
+def _refuse_mark(text: str) -> None:
+    if text.startswith("\ufeff"):
+        raise ValueError("it begins with a byte-order mark; save it as UTF-8 without one")
+
+
+def _distinct(pairs: Collection[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"the key {twice[:40]!r} stands twice in one object")
+    return table
+
+
+def _whole(text: str) -> int:
+    if len(text) > DIGITS + 1:
+        raise ValueError(f"a number of {len(text)} digits; at most {DIGITS} must hold")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {text[:40]} is not finite")
+    return value
+
+
+def _check_tree(value: Any) -> None:
+    """Refuse what is nested too deep for those who walk through it, and whole numbers that nothing can hold."""
+    level, bound = [value], 10**DIGITS
+    for _ in range(DEPTH + 1):
+        below: list[Any] = []
+        for part in level:
+            if isinstance(part, dict):
+                below.extend(part.values())
+            elif isinstance(part, list):
+                below.extend(part)
+            elif isinstance(part, int) and abs(part) > bound:
+                raise ValueError(f"a number of more than {DIGITS} digits")
+        if not below:
+            return
+        level = below
+    raise ValueError(f"nested deeper than {DEPTH}")

@@ -1,0 +1,108 @@
+"""Writing files so that a kill or a full disk leaves either the old file or the new one, never half of one."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+
+
+def storage_error(path: Path, error: OSError, doing: str) -> StorageError:
+    """A message that says what could not be done, where and why."""
+    reason = error.strerror or str(error)
+    return StorageError(f"cannot {doing} '{path}': {reason}; free space or choose a folder you may write to")
+
+
+def make_folder(path: str | Path) -> Path:
+    """Create a folder and its parents.
+
+    Raises:
+        StorageError: the folder cannot be created (read-only parent, a file in the way).
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise storage_error(folder, error, "create folder") from error
+    return folder
+
+
+def check_writable(folder: str | Path) -> Path:
+    """Make a folder and see that files can be written there, before a long job begins; nothing is left.
+
+    Raises:
+        StorageError: it cannot be made or written.
+    """
+    path = make_folder(folder)
+    try:
+        handle, name = _temporary(path / "writable")
+        try:
+            os.write(handle, b"edp")
+        finally:
+            os.close(handle)
+            os.unlink(name)
+    except OSError as error:
+        raise storage_error(path, error, "write into") from error
+    return path
+
+
+def _temporary(target: Path) -> tuple[int, str]:
+    """A new file beside `target`, with the rights that the user's umask leaves to any new file."""
+    while True:
+        name = f"{target.parent}/.{target.name[:80]}.{secrets.token_hex(6)}.tmp"
+        with contextlib.suppress(FileExistsError):
+            return os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), name
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; on success it is synced and renamed over `path`, else removed.
+
+    Raises:
+        StorageError: the disk is full, the folder is read-only, a folder is in the way, or the rename failed.
+    """
+    target = Path(path)
+    make_folder(target.parent)
+    temporary: Path | None = None
+    try:
+        handle, name = _temporary(target)
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        with temporary.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        temporary.replace(target)
+        temporary = None
+    except IsADirectoryError as error:
+        raise StorageError(f"cannot write '{target}': a folder of this name is in the way; remove or rename it") from (
+            error
+        )
+    except OSError as error:
+        raise storage_error(target, error, "write") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a process that was killed while it wrote has left; only for who holds the folder."""
+    for rest in folder.glob(".*.tmp"):
+        if rest.is_file() and not rest.is_symlink():
+            rest.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a whole file atomically."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write JSON atomically; NaN and infinity are refused, they are not JSON."""
+    write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
