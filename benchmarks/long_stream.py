@@ -26,11 +26,12 @@ from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.export.c.target import CTarget
-from edp.export.golden import SHARE, ends
+from edp.export.golden import SHARE
 from edp.integer import calibrate
 from edp.models import ModelSpec, build_model
 from edp.models.backbones import HybridSpec
 from edp.models.heads import MlpHead
+from edp.models.input_range import usual_range
 from edp.models.integer import IntegerPredictor
 from edp.models.predictor import Predictor
 from edp.signals import TABLE_A1, Kind
@@ -55,7 +56,7 @@ class Signal:
     """
 
     def __init__(self, predictor: Predictor, seed: int, pieces: int) -> None:
-        self.centre, self.spread = ends(predictor)
+        self.centre, self.spread = usual_range(predictor)
         self.seed, self.ticks = seed, pieces * PIECE
 
     def _noise(self, piece: int) -> NDArray[np.float32]:

@@ -18,8 +18,8 @@ def main(data: str, run: str, *changes: str) -> None:
     stream = Stream(bundle.predictor)
     names = [channel.name for channel in bundle.inputs]
     for row in source.read()[0].select(names)[:100]:
-        ahead = stream.step(row)  # (horizon, target), SI units
-    print("after 1 s:", dict(zip(bundle.task.targets, ahead[0].tolist(), strict=True)), "m/s, 100 ms ahead")
+        tick = stream.step(row)  # prediction (horizon, target), intervals, status
+    print("after 1 s:", dict(zip(bundle.task.targets, tick.prediction[0].tolist(), strict=True)), "m/s, 100 ms ahead")
 
 
 if __name__ == "__main__":

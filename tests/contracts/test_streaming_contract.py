@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import torch
 
-from edp.models.running import Stream
+from edp.models.stream import Stream
 from edp.streaming import detach_state, map_state, reset_where, state_numbers
 
 TICKS = 24
@@ -65,7 +65,7 @@ def test_a_step_a_chunk_and_a_window_agree_at_the_last_sample(structure, predict
         step = stream.step(row)
     assert stream.warm
     torch.testing.assert_close(chunk[:, -1], whole[:, -1], rtol=0, atol=1e-10)
-    np.testing.assert_allclose(step, whole[0, -1].float().numpy(), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(step.prediction, whole[0, -1].float().numpy(), rtol=1e-6, atol=1e-7)
 
 
 def test_reset_forgets_everything_in_the_streams_it_is_asked_for(structure, predictor_of):

@@ -19,7 +19,7 @@ from edp.models.backbones import LstmSpec
 from edp.models.heads import MlpHead
 from edp.models.outputs import OUTPUTS, Laplace, Normal, Quantiles
 from edp.models.predictor import ModelSpec, build_model
-from edp.models.running import Stream
+from edp.models.stream import Stream
 from edp.training.averages import AVERAGES
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec, check_training
@@ -220,16 +220,18 @@ def test_a_stream_gives_the_same_intervals_tick_by_tick(output):
         bounds, _ = net.intervals(x, net.initial_state(1, x))
     stream = Stream(net)
     for row in x[0]:
-        lower, upper = stream.step_interval(row, net.output.coverages[-1])
-    np.testing.assert_allclose(np.stack([lower, upper]), bounds[0, -1, -1].float().numpy(), rtol=1e-5, atol=1e-6)
+        tick = stream.step(row)
+    np.testing.assert_allclose(
+        np.stack(tick.interval(net.output.coverages[-1])), bounds[0, -1, -1].float().numpy(), rtol=1e-5, atol=1e-6
+    )
     with pytest.raises(ConfigError, match=r"no interval of coverage 0.123; this network has 0.9"):
-        stream.step_interval(row, 0.123)
+        tick.interval(0.123)
 
 
 def test_a_point_has_no_intervals():
     net = network("point").eval()
-    with pytest.raises(ConfigError, match="a point output has no intervals"):
-        Stream(net).step_interval(np.zeros(3), 0.9)
+    with pytest.raises(ConfigError, match="this network has none: its output is a point"):
+        Stream(net).step(np.zeros(len(net.task.inputs))).interval(0.9)
 
 
 @pytest.mark.parametrize("output", STATED)

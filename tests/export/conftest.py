@@ -16,8 +16,9 @@ from torch.func import jvp
 
 from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
-from edp.export.golden import ends, random_inputs
+from edp.export.golden import random_inputs
 from edp.export.simulink import SimulinkTarget
+from edp.models.input_range import usual_range
 from edp.models.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
@@ -108,7 +109,7 @@ STEP = 1e-5
 
 
 def random_changes(predictor, ticks, directions, seed=9):
-    _, spread = ends(predictor)
+    _, spread = usual_range(predictor)
     return np.random.default_rng(seed).normal(size=(ticks, directions, len(spread))) * spread
 
 

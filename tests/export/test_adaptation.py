@@ -12,7 +12,8 @@ import pytest
 from edp.export import TARGETS
 from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
-from edp.export.golden import ends, random_inputs
+from edp.export.golden import random_inputs
+from edp.models.input_range import usual_range
 from edp.onboard import Adaptation, AdaptationSpec, Adapter, Status
 from edp.onboard.law import CLIP, FEATURE_LIMIT, MOST_ERROR
 
@@ -24,7 +25,7 @@ MISSED, KEPT, DAMAGED, FROZEN, LEARN = 2.0, 3.0, 4.0, 0.0, 1.0
 def adapted(bundle, **options):
     """A bundle with an adaptation as wide as its network."""
     task, predictor = bundle.task, bundle.predictor
-    centre, spread = ends(predictor)
+    centre, spread = usual_range(predictor)
     columns = tuple(task.inputs.index(name) for name in task.targets)
     spec = AdaptationSpec(**({"rank": 3, "noise": 5.0, "judged_s": 0.3, "forgetting_s": 5.0} | options))
     shape = (len(task.horizons), len(task.targets))

@@ -12,13 +12,13 @@ from edp.errors import ConfigError, ExportError
 from edp.export import TARGETS
 from edp.export.c.calls import CALLS, Calls
 from edp.export.c.integer_calls import INTEGER_CALLS
-from edp.export.c.model import LIMIT
 from edp.export.c.plan import plan
 from edp.export.c.target import CTarget
 from edp.export.c.text import identifiers, number
-from edp.export.golden import SHARE, ends, random_inputs, stream, tolerance
+from edp.export.golden import SHARE, random_inputs, stream, tolerance
 from edp.graph import Graph, Layer, memory
 from edp.graph.reference import STEPS
+from edp.models.input_range import LIMIT, usual_range
 
 
 def differs_by(c, program, predictor, ticks):
@@ -87,7 +87,7 @@ def test_no_input_makes_a_prediction_that_is_not_finite(c, bad, program_of, bund
 
 def test_inputs_at_their_limits_are_predicted(c, program_of, bundle_of):
     predictor = bundle_of("hybrid+all").predictor
-    centre, spread = ends(predictor)
+    centre, spread = usual_range(predictor)
     signs = np.random.default_rng(1).choice([-0.99, 0.99], size=(200, len(centre)))
     found = c.stream(program_of("hybrid+all"), (centre + signs * LIMIT * spread).astype(np.float32))
     assert np.isfinite(found).all()

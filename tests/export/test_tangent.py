@@ -14,8 +14,9 @@ from edp.export.c.integer_calls import INTEGER_CALLS
 from edp.export.c.model import make_model
 from edp.export.c.plan import plan
 from edp.export.c.tangents import TANGENTS, Tangents
-from edp.export.golden import ends, random_inputs
+from edp.export.golden import random_inputs
 from edp.graph import Graph, Layer
+from edp.models.input_range import usual_range
 
 DRIVER = Path(__file__).with_name("tangent_driver.c")
 MISSED = -12345.0
@@ -103,7 +104,7 @@ def test_held_changes_are_those_of_inputs_that_stay(bundle_of, tangent_of, chang
 def test_the_tick_alone_is_a_column_of_its_jacobian(bundle_of, tangent_of, torch_changes):
     """All inputs at once, each a direction, with the past as it was."""
     predictor = bundle_of("hybrid+all").predictor
-    inputs, (_, spread) = random_inputs(predictor, 30, seed=6), ends(predictor)
+    inputs, (_, spread) = random_inputs(predictor, 30, seed=6), usual_range(predictor)
     unit = np.tile(np.diag(spread), (30, 1, 1))
     _, found = tangent_of("hybrid+all")(inputs, unit, "alone")
     for column in (0, len(spread) - 1):

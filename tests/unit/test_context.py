@@ -8,7 +8,7 @@ import pytest
 from edp.errors import ConfigError, DataError
 from edp.evaluation.context import context_errors
 from edp.models.predictor import build_model
-from edp.models.running import Stream
+from edp.models.stream import Stream
 from edp.signals import Kind
 
 KINDS = [Kind.VELOCITY] * 3
@@ -35,7 +35,7 @@ def test_errors_are_those_of_streams_that_were_reset_before_each_block(network, 
         for part, at in blocks:
             stream = Stream(network)
             for t in range(at - context, at + 10):
-                said = stream.step(part.inputs[t])
+                said = stream.step(part.inputs[t]).prediction
                 if t >= at:
                     truth = np.stack([part.targets[t + k] for k in (1, 3)])
                     errors[part.machine].append(1e3 * np.abs(said - truth))

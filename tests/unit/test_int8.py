@@ -14,7 +14,8 @@ from edp.errors import BundleError, ExportError
 from edp.models.backbones import HybridSpec
 from edp.models.heads import GluHead
 from edp.models.predictor import ModelSpec, build_model
-from edp.models.running import Stream, stream_predictions
+from edp.models.running import stream_predictions
+from edp.models.stream import Stream
 from edp.training.bundle import blank_scaler, make_bundle, save_bundle
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
@@ -46,7 +47,7 @@ def test_a_stream_sees_the_numbers_of_a_chunk(tiny, network):
     quantised = dynamic_int8(network).predictor
     whole = stream_predictions(quantised, tiny.test)[0][:60]
     stream = Stream(quantised)
-    ticks = np.stack([stream.step(row) for row in tiny.test[0].inputs[:60]])
+    ticks = np.stack([stream.step(row).prediction for row in tiny.test[0].inputs[:60]])
     assert np.median(np.abs(ticks - whole)) < 1e-6 * np.abs(whole).max()
 
 

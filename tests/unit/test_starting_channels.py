@@ -15,7 +15,7 @@ from edp.errors import ConfigError
 from edp.evaluation.judge import JudgeSpec, baseline_task, judge
 from edp.models.plain import task_from_plain, task_to_plain
 from edp.models.predictor import build_model
-from edp.models.running import Stream
+from edp.models.stream import Stream
 from edp.signals import Channel, Kind
 from edp.training.fit import fit
 from edp.training.optimizers import AdamW
@@ -98,7 +98,7 @@ def test_any_split_gives_the_same_numbers(cut, predictor):
         second, _ = predictor.predict(x[:, cut:], state)
     torch.testing.assert_close(torch.cat([first, second], 1), run(predictor, x), rtol=0, atol=1e-12)
     stream = Stream(predictor)
-    steps = np.stack([stream.step(row) for row in x[0]])
+    steps = np.stack([stream.step(row).prediction for row in x[0]])
     np.testing.assert_allclose(steps, run(predictor, x)[0].float().numpy(), rtol=1e-6, atol=1e-7)
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edp.models.input_range import usual_range
 from edp.models.integer import IntegerPredictor
 from edp.models.predictor import Predictor
 
 GOLDEN_TICKS = 200
 SHARE = 1e-5
 """How far another form may be from PyTorch, in standard deviations of the target and as a share of the value."""
-Array = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
 
@@ -35,7 +35,7 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
 
 def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:
     """Smooth random inputs ``(tick, input)`` in the usual range of each channel, SI units."""
-    centre, spread = ends(predictor)
+    centre, spread = usual_range(predictor)
     rng = np.random.default_rng(seed)
     noise = rng.normal(size=(ticks, len(centre)))
     value = rng.normal(size=len(centre))
@@ -57,29 +57,3 @@ def stream(predictor: Predictor, inputs: Rows) -> Rows:
             bounds, _ = predictor.intervals(x, predictor.initial_state(1, x))
             parts += [bounds[0, :, :, side].flatten(1) for side in (0, 1)]
         return torch.cat(parts, dim=1).float().cpu().numpy()
-
-
-def ends(predictor: Predictor) -> tuple[Array, Array]:
-    """Middle and width of each input's usual range in SI units, as the scaler tells them.
-
-    A channel that only a derived one reads has the width of that one's change; one that only a physics base reads has
-    what is usual for it.
-    """
-    front, features = predictor.front, predictor.task.features
-    offset, width = (part.detach().cpu().double().numpy() for part in (front.offset, front.width))
-    centre, spread = np.zeros(front.inputs), np.full(front.inputs, 1e6)
-    logged, hidden = len(features.channels), len(features.hidden)
-    centre[:logged], spread[:logged] = offset[:logged], width[:logged]
-    for number_, entry in enumerate(features.derived):
-        source = features.inputs.index(entry.source)
-        change = width[logged + number_] / (predictor.task.rate_hz if entry.how == "derivative" else 1.0)
-        if source >= logged:
-            spread[source] = min(spread[source], change)
-    first, count = logged + hidden, len(features.starting)
-    at = slice(front.lasting, front.lasting + count)
-    centre[first : first + count], spread[first : first + count] = offset[at], width[at]
-    if predictor.physics is not None:
-        usual = predictor.physics.usual()
-        for column, name in enumerate(predictor.task.inputs[front.sources :], front.sources):
-            centre[column], spread[column] = usual.get(name, (centre[column], spread[column]))
-    return centre, spread

@@ -2,6 +2,16 @@
 
 from edp.models.adapted import AdaptedStream
 from edp.models.predictor import ModelSpec, Predictor, build_model
-from edp.models.running import Stream, stream_predictions
+from edp.models.running import stream_predictions
+from edp.models.stream import Stream, StreamStatus, StreamTick
 
-__all__ = ["AdaptedStream", "ModelSpec", "Predictor", "Stream", "build_model", "stream_predictions"]
+__all__ = [
+    "AdaptedStream",
+    "ModelSpec",
+    "Predictor",
+    "Stream",
+    "StreamStatus",
+    "StreamTick",
+    "build_model",
+    "stream_predictions",
+]

@@ -70,8 +70,18 @@ class IntegerPredictor(Predictor):
     def intervals(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``, lower then upper, and the next state."""
         results, new = self._run(x, state)
+        return self._sides(results, x), new
+
+    def predict_with_intervals(self, x: Tensor, state: State) -> tuple[Tensor, Tensor | None, State]:
+        """What `predict` and `intervals` give, from one pass; None for the bounds of an output that has none."""
+        results, new = self._run(x, state)
+        bounds = self._sides(results, x) if self.output.coverages else None
+        return self._shaped(results["prediction"], x), bounds, new
+
+    def _sides(self, results: dict[str, np.ndarray], x: Tensor) -> Tensor:
+        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``."""
         sides = [self._shaped(results[side], x, len(self.output.coverages)) for side in ("lower", "upper")]
-        return torch.stack(sides, dim=3), new
+        return torch.stack(sides, dim=3)
 
     def expose(self, x: Tensor, state: State) -> NoReturn:
         """Not in whole numbers.

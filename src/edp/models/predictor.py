@@ -169,11 +169,21 @@ class Predictor(Streaming):
         The coverages are those of ``spec.output.coverages``, in their order.
         """
         answer, features, new = self.run(x, state)
+        return self._bounds(answer, features), new
+
+    def predict_with_intervals(self, x: Tensor, state: State) -> tuple[Tensor, Tensor | None, State]:
+        """What `predict` and `intervals` give, from one pass; None for the bounds of an output that has none."""
+        answer, features, new = self.run(x, state)
+        bounds = self._bounds(answer, features) if self.output.coverages else None
+        return self.code.decode(answer.center, features), bounds, new
+
+    def _bounds(self, answer: Answer, features: Tensor) -> Tensor:
+        """Bounds in SI units ``(batch, time, coverage, 2, horizon, target)``."""
         bounds = [
             torch.stack([self.code.decode(bound, features) for bound in self.output.interval(answer, which)], dim=2)
             for which in range(len(self.output.coverages))
         ]
-        return torch.stack(bounds, dim=2), new
+        return torch.stack(bounds, dim=2)
 
     def lower(self, build: Builder, x: str) -> str:
         """Predictions in SI units, ``horizon * target`` numbers."""

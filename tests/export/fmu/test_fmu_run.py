@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from edp.export.c.model import HOLD_TICKS
-from edp.export.golden import ends, random_inputs
+from edp.export.golden import random_inputs
+from edp.models.input_range import usual_range
 
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy: pip install 'excavator-dynamics-predictor[dev]'")
 from fmpy.fmi1 import FMICallException  # noqa: E402
@@ -186,7 +187,7 @@ def change_in_pytorch(predictor, rows, along, share=1e-4):
 @pytest.mark.parametrize("network", ["hybrid+all", "gru+quantiles", "lstm+hybrid physics"])
 def test_derivatives_are_those_of_pytorch(network, version, unit, bundle_of):
     predictor = bundle_of(network).predictor
-    rows, (_, spread) = random_inputs(predictor, 40, 0), ends(predictor)
+    rows, (_, spread) = random_inputs(predictor, 40, 0), usual_range(predictor)
     made = unit(network, version).start()
     assert re.search(r'DirectionalDerivatives?="true"', (made.folder / "modelDescription.xml").read_text())
     made.stream(rows[:-1])

@@ -19,7 +19,7 @@ def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, t
     assert isinstance(network, IntegerPredictor)
     other = load_bundle(trained).predictor
     row = network.front.offset.numpy()[: network.front.inputs]
-    assert Stream(network).step(row).shape == Stream(other).step(row).shape
+    assert Stream(network).step(row).prediction.shape == Stream(other).step(row).prediction.shape
     scores = edp("evaluate", whole, "--baselines", "persistence", "--json").json
     held = edp("evaluate", trained, "--baselines", "persistence", "--json").json
     mae = [run["models"]["network"]["overall"]["10"]["mean"]["mae"] for run in (scores, held)]

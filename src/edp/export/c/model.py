@@ -9,7 +9,6 @@ from importlib import resources
 from string import Template
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from edp import __version__
@@ -19,22 +18,16 @@ from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, s
 from edp.export.c.layout import laid
 from edp.export.c.plan import Plan, plan
 from edp.export.c.text import array, filled, identifiers, indented, number
-from edp.export.golden import ends
 from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.graph import Graph, Layer, memory
 from edp.graph.base import Number
+from edp.models.input_range import HOLD_TICKS, LIMIT, input_limits
 from edp.models.integer import IntegerPredictor
-from edp.models.predictor import Predictor
 from edp.models.predictor import describe as describe_network
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
 CLIPPED = "    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n"
-HOLD_TICKS = 5
-"""Missed or bad ticks in a row that are held."""
-LIMIT = 1e6
-"""Standard widths beyond which an input is rejected: far from any signal, and no sum of float32 overflows."""
-LARGEST = 3.0e38
 COUNTED = (
     memory.Difference,
     memory.Starting,
@@ -122,7 +115,7 @@ class Model:
 
     def _values(self) -> dict[str, object]:
         task, predictor = self.bundle.task, self.bundle.predictor
-        low, high = limits(predictor)
+        low, high = input_limits(predictor)
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -269,13 +262,6 @@ def _listed(entries: Sequence[tuple[str, str]]) -> str:
     """Lines of an enumeration with a comment each."""
     wide = max(len(entry) for entry, _ in entries)
     return "\n".join(f"    {entry:<{wide}} /* {text.replace('*/', '* /')} */" for entry, text in entries)
-
-
-def limits(predictor: Predictor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least and largest accepted value of each input, SI units."""
-    centre, spread = ends(predictor)
-    low, high = (np.clip(centre + side * LIMIT * spread, -LARGEST, LARGEST) for side in (-1.0, 1.0))
-    return low, high
 
 
 def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = False) -> Model:

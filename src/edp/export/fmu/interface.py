@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from edp.export.c.model import Model
-from edp.export.golden import ends
+from edp.models.input_range import usual_range
 from edp.signals import KINDS, Kind
 
 Form = Literal["real", "whole", "flag"]
@@ -51,7 +51,7 @@ OWN = (
 
 def variables(model: Model) -> list[Variable]:
     """Inputs, predictions and bounds in the order of the model's C structures, then those of the FMU itself."""
-    _, spread = ends(model.bundle.predictor)
+    _, spread = usual_range(model.bundle.predictor)
     made = [
         Variable(entry.name, "input", entry.description, kind=entry.kind, nominal=_nominal(width))
         for entry, width in zip(model.bundle.inputs, spread, strict=True)

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from edp import __version__
-from edp.export.c.model import HOLD_TICKS, Model, limits
+from edp.export.c.model import Model
 from edp.export.c.text import indented
 from edp.export.description import SCHEMA, Description
 from edp.export.hashes import model_hash, scale_hash
 from edp.export.simulink.native import Native, functions_for, matlab_names
 from edp.graph.base import Number
+from edp.models.input_range import HOLD_TICKS, input_limits
 from edp.models.predictor import describe as describe_network
 
 RULES = {
@@ -91,7 +92,7 @@ class Folder:
 
     def tables(self) -> dict[str, Any]:
         """What the MAT file holds besides the golden recording."""
-        low, high = limits(self.model.bundle.predictor)
+        low, high = input_limits(self.model.bundle.predictor)
         made: dict[str, Any] = {"edp": self.content()}
         if self.native is not None:
             ends = {"low": low, "high": high}

@@ -7,34 +7,30 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-import torch
 
 from edp.export.golden import Rows
-from edp.models.running import Stream
+from edp.models.stream import Stream, StreamTick
 from edp.parity.base import FORMS, Case, Ran, timed
 
 
 @FORMS.register("torch_ticks")
 class TorchTicks:
-    """`edp.models.running.Stream`."""
+    """`edp.models.stream.Stream`."""
 
     title: ClassVar[str] = "PyTorch, tick by tick"
 
     def run(self, case: Case, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.parity.base.Form`."""
-        predictor = case.bundle.predictor
-        running, coverages = Stream(predictor), predictor.output.coverages
+        running = Stream(case.bundle.predictor)
 
         def ticks() -> Rows:
             running.reset()
-            return np.array([running.step(row).ravel() for row in case.inputs], dtype=np.float32)
+            return np.array([_numbers(running.step(row)) for row in case.inputs], dtype=np.float32)
 
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # a tick is too small to be shared out
-        try:
-            found, seconds = timed(ticks)
-        finally:
-            torch.set_num_threads(threads)
-        numbers = found.shape[1]
-        note = "bounds of intervals are not among them" if coverages else ""
-        return [("", Ran(found, seconds / len(found), case.wanted[:, :numbers], case.allowed[:numbers], note))]
+        found, seconds = timed(ticks)
+        return [("", Ran(found, seconds / len(found)))]
+
+
+def _numbers(tick: StreamTick) -> Rows:
+    """Predictions, then lower and upper bounds, in the order of `edp.export.golden.stream`."""
+    return np.concatenate([tick.prediction.ravel(), tick.lower.ravel(), tick.upper.ravel()])
