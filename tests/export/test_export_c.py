@@ -14,7 +14,8 @@ from edp.export.c.calls import CALLS, Calls
 from edp.export.c.integer_calls import INTEGER_CALLS
 from edp.export.c.plan import plan
 from edp.export.c.target import CTarget
-from edp.export.c.text import identifiers, number
+from edp.export.c.text import number
+from edp.export.escape import c_names
 from edp.export.golden import SHARE, random_inputs, stream, tolerance
 from edp.graph import Graph, Layer, memory
 from edp.graph.reference import STEPS
@@ -189,4 +190,4 @@ def test_numbers_survive_as_text():
     values = np.float32([0.1, 1e-30, -3.4e38, 1.0, 123456789, 2**-140, 0.0])
     assert [np.float32(number(v).removesuffix("f")) for v in values] == list(values)
     assert all(number(v).endswith("f") and ("." in number(v) or "e" in number(v)) for v in values)
-    assert identifiers(["a b", "a-b", "a_b"]) == ["a_b", "a_b_1", "a_b_2"]
+    assert c_names(["a b", "a-b", "a_b"], 40) == ["a_b", "a_b_1", "a_b_2"]

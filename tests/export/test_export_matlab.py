@@ -13,10 +13,11 @@ import scipy.io
 
 from edp.export.c.model import make_model
 from edp.export.description import as_mat
+from edp.export.escape import matlab_names
 from edp.export.golden import random_inputs, stream, tolerance
 from edp.export.simulink import native as native_file
 from edp.export.simulink.folder import Folder
-from edp.export.simulink.native import WRITERS, functions_for, matlab_names
+from edp.export.simulink.native import WRITERS, functions_for
 from edp.graph import memory
 from edp.graph.reference import STEPS
 

@@ -14,7 +14,7 @@ from edp.config import (
     plain_tree,
 )
 from edp.data.task import TargetMode
-from edp.errors import ConfigError, DataError, StorageError
+from edp.errors import ConfigError, DataError
 from edp.logs.repair import Repair
 from edp.models.heads import GluHead, MlpHead
 from edp.models.plain import model_from_plain, model_to_plain

@@ -7,7 +7,7 @@ import pytest
 from edp.config import FeatureSettings, experiment_toml, load_experiment
 from edp.data.feature_files import read_set_table, set_text
 from edp.data.features import FG2, Derived, FeatureSet
-from edp.errors import ConfigError, StorageError
+from edp.errors import ConfigError
 from edp.signals import Kind
 
 ODD = FeatureSet(

@@ -125,7 +125,10 @@ def as_mat(variables: Mapping[str, Any]) -> bytes:
 
 
 def _for_matlab(value: Any) -> Any:
-    """Lists as rows of numbers or as cells."""
+    """Lists as rows of numbers or as cells; text that UTF-8 holds."""
+    if isinstance(value, str):
+        # A lone surrogate has no UTF-8, in which text is written.
+        return value.encode("utf-8", "replace").decode()
     if isinstance(value, Mapping):
         return {key: _for_matlab(entry) for key, entry in value.items()}
     if not isinstance(value, list):

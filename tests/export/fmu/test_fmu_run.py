@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import re
 
 import numpy as np
@@ -166,6 +167,28 @@ def test_states_roll_back_to_the_same_bits(version, unit, bundle_of):
         with pytest.raises(FMICallException):
             read(wrong)
         assert "serialised state" in other.told[-1][1]
+
+
+@both
+def test_a_state_of_another_fmu_is_refused_wherever_it_is_given(version, unit, bundle_of):
+    rows = random_inputs(bundle_of("hybrid+all").predictor, 30, 0)
+    made, stranger = unit("hybrid+all", version).start(), unit("gru+quantiles", version).start()
+    made.stream(rows[:10])
+    foreign = stranger.fmu.getFMUState()
+    before = made.fmu.serializeFMUState(own := made.fmu.getFMUState())
+    get = made.fmu.fmi2GetFMUstate if version == 2 else made.fmu.fmi3GetFMUState
+    for call in (
+        lambda: made.fmu.setFMUState(foreign),
+        lambda: made.fmu.serializeFMUState(foreign),
+        lambda: get(made.fmu.component, ctypes.byref(foreign)),
+    ):
+        with pytest.raises(FMICallException):
+            call()
+        assert "another FMU" in made.told[-1][1]
+    made.fmu.freeFMUState(own)
+    assert made.fmu.serializeFMUState(made.fmu.getFMUState()) == before  # nothing was taken over
+    stranger.fmu.setFMUState(foreign)  # its own takes it
+    stranger.fmu.freeFMUState(foreign)
 
 
 def change_in_pytorch(predictor, rows, along, share=1e-4):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edp.export.c.text import array, filled, number
+from edp.export.escape import Code
 from edp.onboard import Adaptation
 
 FILES = ("edp_adaptation.h", "edp_adaptation.c")
@@ -42,12 +43,12 @@ def values(law: Adaptation, upper: str, intervals: int) -> dict[str, object]:
         "adapt_macs": law.macs,
         "adapt_flash": constant_bytes(law),
         "adapt_ram": 4 * (5 + len(law.horizons) + law.state_numbers + work),
-        "adapt_rows": "\n".join(rows),
-        "adapt_pointers": ", ".join(f"a->rows_{k}" for k in law.horizons),
+        "adapt_rows": Code("\n".join(rows)),
+        "adapt_pointers": Code(", ".join(f"a->rows_{k}" for k in law.horizons)),
         "adapt_work": work,
         "adapt_constants": _constants(law),
         "adapt_law": filled(entries),
-        "adapt_most": ",\n".join(f"    {{{', '.join(map(number, of))}}}" for of in most),
+        "adapt_most": Code(",\n".join(f"    {{{', '.join(map(number, of))}}}" for of in most)),
         "adapt_intervals": _intervals(upper) if intervals else "",
     }
 
@@ -58,19 +59,19 @@ def constant_bytes(law: Adaptation) -> int:
     return held + 2 * len(law.columns) + 4 * (len(law.horizons) + len(NUMBERS) + 4)
 
 
-def _constants(law: Adaptation) -> str:
+def _constants(law: Adaptation) -> Code:
     made = []
     for name in POINTERS:
         held = np.atleast_1d(getattr(law, name)).ravel()
         # C has no array of nothing: without directions one number stands there that is never read.
         made.append(array("float", name, map(number, held if held.size else np.zeros(1))))
     made.append(array("uint16_t", "columns", (f"{column}u" for column in law.columns)))
-    return "\n".join(made)
+    return Code("\n".join(made))
 
 
-def _intervals(upper: str) -> str:
+def _intervals(upper: str) -> Code:
     """Bounds of intervals move with the prediction."""
     lines = [f"for (uint32_t i = 0; i < {upper}_INTERVALS; i++) {{"]
     for bound in ("lower", "upper"):
         lines.append(f"    adapted->{bound}[i][h][j] = out->{bound}[i][h][j] + correction[j];")
-    return "\n".join(" " * 16 + line for line in [*lines, "}"])
+    return Code("\n".join(" " * 16 + line for line in [*lines, "}"]))

@@ -8,6 +8,7 @@ from typing import Any
 from edp.errors import ExportError
 from edp.export.c.plan import Plan, scratch_number
 from edp.export.c.text import call, identifier, number
+from edp.export.escape import c_comment
 from edp.graph import Graph, Layer, layers, memory
 from edp.graph.base import INPUT, Number
 from edp.graph.layers import runs as neighbours
@@ -233,4 +234,4 @@ def describe(layer: Layer) -> str:
     """A comment on what a layer is: its name, kind and shapes."""
     shapes = [f"{name} {' x '.join(map(str, values.shape))}" for name, values in layer.tensors().items()]
     size = f"{layer.width} numbers" if layer.width else "no value"
-    return f"/* {layer.name}: {type(layer).__name__}, {'; '.join([size, *shapes])} */"
+    return f"/* {c_comment(layer.name)}: {type(layer).__name__}, {'; '.join([size, *shapes])} */"

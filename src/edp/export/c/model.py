@@ -6,7 +6,6 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
-from string import Template
 from typing import Any
 
 from numpy.typing import NDArray
@@ -17,8 +16,10 @@ from edp.export.c import adaptation, integer_calls, tangents
 from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, slot, structs
 from edp.export.c.layout import laid
 from edp.export.c.plan import Plan, plan
-from edp.export.c.text import array, filled, identifiers, indented, number
+from edp.export.c.text import array, filled, indented, number
+from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.hashes import little_endian, model_hash, scale_hash
+from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
 from edp.graph import Graph, Layer, memory
 from edp.graph.base import Number
 from edp.models.input_range import HOLD_TICKS, LIMIT, input_limits
@@ -27,7 +28,7 @@ from edp.models.predictor import describe as describe_network
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
-CLIPPED = "    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n"
+CLIPPED = Code("    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n")
 COUNTED = (
     memory.Difference,
     memory.Starting,
@@ -108,10 +109,10 @@ class Model:
         parts.append(array("edp_table", "tables", tables))
         return "\n".join(parts) + "\n"
 
-    def fill(self, template: str) -> str:
+    def fill(self, template: str) -> Code:
         """A template with everything in its place."""
         text = resources.files("edp.export.c").joinpath(f"templates/{template}").read_text()
-        return Template(text).substitute(self._values())
+        return fill(text, self._values())
 
     def _values(self) -> dict[str, object]:
         task, predictor = self.bundle.task, self.bundle.predictor
@@ -119,7 +120,7 @@ class Model:
         return {
             "name": self.name,
             "NAME": self.name.upper(),
-            "title": describe_network(predictor.spec),
+            "title": c_comment(describe_network(predictor.spec)),
             "version": __version__,
             "model_hash": model_hash(self.graph),
             "scale_hash": scale_hash(predictor),
@@ -140,7 +141,7 @@ class Model:
             "ram": self.state_bytes(),
             "runtime": "edp_integer.h" if self.whole else "edp_runtime.h",
             "counters": CLIPPED if self.whole else "",
-            "clear_counters": "    s->clipped = 0u;\n" if self.whole else "",
+            "clear_counters": Code("    s->clipped = 0u;\n") if self.whole else "",
             "sources": " ".join(self.sources),
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
@@ -153,26 +154,28 @@ class Model:
             **self._adaptation(),
         }
 
-    def _what(self) -> str:
+    def _what(self) -> Code:
         task = self.bundle.task
         when = ", ".join(f"{k} ticks ({1000 * k / task.rate_hz:g} ms)" for k in task.horizons)
-        lines = [f" *   prediction[h][t]  {', '.join(task.targets)}, SI units, for each of {when} ahead"]
+        targets = ", ".join(map(c_comment, task.targets))
+        lines = [f" *   prediction[h][t]  {targets}, SI units, for each of {when} ahead"]
         covered = ", ".join(f"{100 * c:g} %" for c in self.bundle.predictor.output.coverages)
         if covered:
             lines.append(f" *   lower, upper[i][h][t]  bounds of intervals meant to hold {covered} of the true values")
-        return "\n".join(lines)
+        return Code("\n".join(lines))
 
     def _enums(self) -> dict[str, str]:
         task, upper = self.bundle.task, self.name.upper()
+        most = C_SIGNIFICANT - len(f"{upper}_OUT_")
         inputs = [
             (f"{upper}_IN_{name} = {i},", f"{channel.unit}; {channel.description}")
             for i, (name, channel) in enumerate(
-                zip(identifiers([c.name for c in self.bundle.inputs]), self.bundle.inputs, strict=True)
+                zip(c_names((c.name for c in self.bundle.inputs), most), self.bundle.inputs, strict=True)
             )
         ]
         targets = [
             (f"{upper}_OUT_{name} = {i},", text)
-            for i, (name, text) in enumerate(zip(identifiers(task.targets), self.bundle.descriptions, strict=True))
+            for i, (name, text) in enumerate(zip(c_names(task.targets, most), self.bundle.descriptions, strict=True))
         ]
         ahead = [
             (f"{upper}_AHEAD_{k} = {i},", f"{k} ticks, {1000 * k / task.rate_hz:g} ms")
@@ -258,10 +261,10 @@ class Model:
         return {"compute": indented(lines[1:]), "finish": indented(end), "output_fields": indented(members)}
 
 
-def _listed(entries: Sequence[tuple[str, str]]) -> str:
+def _listed(entries: Sequence[tuple[str, str]]) -> Code:
     """Lines of an enumeration with a comment each."""
     wide = max(len(entry) for entry, _ in entries)
-    return "\n".join(f"    {entry:<{wide}} /* {text.replace('*/', '* /')} */" for entry, text in entries)
+    return Code("\n".join(f"    {entry:<{wide}} /* {c_comment(text)} */" for entry, text in entries))
 
 
 def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = False) -> Model:
@@ -274,7 +277,8 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
         adapts: with the bundle's adaptation, where it has one.
 
     Raises:
-        ExportError: a part of the network has no form as a layer, or a tangent of whole numbers is asked for.
+        ExportError: a part of the network has no form as a layer, a tangent of whole numbers is asked for, or a size is
+            beyond the numbers of C.
     """
     predictor = bundle.predictor
     whole = isinstance(predictor, IntegerPredictor)
@@ -282,7 +286,30 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
         raise ExportError("a network in whole numbers is a staircase and has no tangent; export the float run")
     graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
     changes = plan(graph, tangents.tangent_scratch_of) if tangent else None
-    return Model(name, bundle, graph, plan(graph), changes, adapts and bundle.adaptation is not None)
+    model = Model(name, bundle, graph, plan(graph), changes, adapts and bundle.adaptation is not None)
+    _check(model)
+    return model
+
+
+def _check(model: Model) -> None:
+    """Refuse what the C code cannot count.
+
+    Raises:
+        ExportError: a size is beyond the numbers of the generated code.
+    """
+    graph, law = model.graph, model.bundle.adaptation
+    check_numbers(model.bundle)
+    layers = {f"ticks that '{x.name}' remembers": getattr(x, "window", getattr(x, "ticks", 0)) for x in graph.layers}
+    constants = sum(values.nbytes for _, _, values in graph.tensors())
+    check_sizes({"window": graph.window, "bytes of constants": constants, "bytes of the state": model.state_bytes()})
+    check_sizes(layers)
+    calls = Calls(graph, model.plan)
+    chosen = {x.name: max(x.columns) + 1 for x in graph.layers if needs_columns(calls, x)}  # type: ignore[attr-defined]
+    check_sizes({f"numbers that '{name}' chooses from": size for name, size in chosen.items()}, MOST_COLUMNS)
+    if model.adapts and law is not None:
+        sizes = {"bytes of the adaptation's memory": 4 * law.state_numbers, "its horizons": max(law.horizons)}
+        check_sizes(sizes)
+        check_sizes({"inputs from which its targets are read": int(max(law.columns)) + 1}, MOST_COLUMNS)
 
 
 def has_ring(layer: Layer) -> bool:

@@ -12,10 +12,21 @@ from edp.errors import ExportError
 from edp.export.base import TARGETS
 from edp.export.c.integer_calls import tables_header
 from edp.export.c.model import Model, make_model
-from edp.export.c.text import KEYWORDS, filled, number
+from edp.export.c.text import filled, number
+from edp.export.escape import C_WORDS, LONGEST_NAME, MATLAB_WORDS, visible
+from edp.export.folder import write_export
 from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
-from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
+
+_HEADERS = """
+assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic stdbool
+stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar unistd wchar wctype
+mex matrix tmwtypes simstruc cg_sfun rtwtypes windows
+"""
+_OWN = "in out s work work16 work32 main host_test fuzz example_task fmu_model simulink stub_run stub_main driver"
+_CMAKE = "all clean depend edit_cache help install package package_source preinstall rebuild_cache test"
+RESERVED = C_WORDS | MATLAB_WORDS | frozenset(re.findall(r"\w+", f"{_HEADERS} {_OWN} {_CMAKE}"))
+"""Names that a model cannot have: keywords, headers that ``NAME.h`` would hide, words of its files, CMake's targets."""
 
 
 @TARGETS.register("c")
@@ -43,10 +54,7 @@ class CTarget:
             "example_task.c": model.fill("example_task.c.in"),
             "CMakeLists.txt": model.fill("CMakeLists.txt.in"),
         }
-        path = make_folder(folder)
-        for file, text in made.items():
-            write_bytes(path / file, text.encode())
-        return [path / file for file in made]
+        return write_export(folder, {file: text.encode() for file, text in made.items()})
 
 
 def core_files(model: Model) -> dict[str, str]:
@@ -74,10 +82,11 @@ def check_name(name: str) -> None:
     Raises:
         ExportError: it cannot.
     """
-    if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in KEYWORDS or name.startswith("edp_"):
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in RESERVED or name.startswith("edp_"):
         raise ExportError(
-            f"name '{name}' is the prefix of C functions and files: up to 31 lower-case letters, digits, underscores, "
-            "a letter first, no word of C, not beginning with edp_; give another one with --name"
+            f"name '{visible(name, LONGEST_NAME)}' is the prefix of C functions and files: up to 31 lower-case "
+            "letters, digits, underscores, a letter first, not beginning with edp_, no word of C, C++ or MATLAB, no "
+            "header of C, no target of CMake; give another one with --name"
         )
 
 

@@ -7,6 +7,7 @@ from itertools import groupby
 from edp.export.c.model import has_ring
 from edp.export.c.text import call, identifier, indented, number
 from edp.export.casadi.states import Place, counts, is_ring, places, start
+from edp.export.escape import Code
 from edp.graph import Graph, Layer, memory
 from edp.graph.memory import UNSEEN
 
@@ -37,12 +38,12 @@ def blanks(graph: Graph, name: str) -> dict[str, object]:
         "NAME": name.upper(),
         "states": sizes[0],
         "outputs": len(every),
-        "names": ", ".join(f'"{result}"' for result in every),
-        "names_out_in": ", ".join(f'"out_{result}"' for result in every),
-        "names_jacobian": ", ".join(f'"jac_{result}_{by}"' for result in every for by in "xu"),
-        "shapes": ", ".join(f"{{{size}, 1, 1}}" for size in sizes),
-        "jacobians": ", ".join(f"{{{size}, {by}, 1}}" for size in sizes for by in (sizes[0], graph.inputs)),
-        "members": ", ".join(members),
+        "names": Code(", ".join(f'"{result}"' for result in every)),
+        "names_out_in": Code(", ".join(f'"out_{result}"' for result in every)),
+        "names_jacobian": Code(", ".join(f'"jac_{result}_{by}"' for result in every for by in "xu")),
+        "shapes": Code(", ".join(f"{{{size}, 1, 1}}" for size in sizes)),
+        "jacobians": Code(", ".join(f"{{{size}, {by}, 1}}" for size in sizes for by in (sizes[0], graph.inputs))),
+        "members": Code(", ".join(members)),
         "prediction": every.index("prediction"),
         "predictions": sizes[every.index("prediction")],
         "load": indented(load),

@@ -6,7 +6,6 @@ import io
 from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,10 @@ from edp.export.c.target import check_name, core_files
 from edp.export.casadi.external import blanks
 from edp.export.casadi.states import places, start
 from edp.export.description import Description, as_json, float_graph, golden
+from edp.export.escape import fill
+from edp.export.folder import write_export
 from edp.graph import Graph, Layer, memory
 from edp.graph import layers as plain
-from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
 
 RULES = {
@@ -69,10 +69,7 @@ class CasadiTarget:
             f"{name}_casadi.c": external(graph, name).encode(),
         }
         made |= {file: text.encode() for file, text in core_files(model).items()}
-        path = make_folder(folder)
-        for file, what in made.items():
-            write_bytes(path / file, what)
-        return [path / file for file in made]
+        return write_export(folder, made)
 
 
 def content(described: Description) -> dict[str, Any]:
@@ -116,4 +113,4 @@ def packed(data: dict[str, np.ndarray]) -> bytes:
 def external(graph: Graph, name: str) -> str:
     """The C file that CasADi calls."""
     text = resources.files("edp.export.casadi").joinpath("external.c.in").read_text()
-    return Template(text).substitute(blanks(graph, name) | {"version": __version__})
+    return fill(text, blanks(graph, name) | {"version": __version__})

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from edp.export.c.model import Model
+from edp.export.escape import LONGEST_NAME, LONGEST_TEXT, shown_names, visible
 from edp.models.input_range import usual_range
 from edp.signals import KINDS, Kind
 
@@ -73,7 +74,8 @@ def _predictions(model: Model) -> list[Variable]:
         for row, ticks in zip(widths, task.horizons, strict=True):
             when = f"{ticks} ticks ({1000 * ticks / task.rate_hz:g} ms) after the inputs of the last step"
             for at, name in enumerate(task.targets):
-                about = " ".join(part for part in (bundle.descriptions[at], f"[{name}] {when}{text}") if part)
+                what = f"[{visible(name, LONGEST_NAME)}] {when}{text}"
+                about = " ".join(part for part in (visible(bundle.descriptions[at]), what) if part)
                 kind = bundle.target_kinds[at]
                 made.append(Variable(f"{name}_ahead_{ticks}{ending}", "output", about, "real", kind, _nominal(row[at])))
     return made
@@ -85,12 +87,9 @@ def _nominal(width: float) -> float:
 
 
 def _unique(listed: list[Variable]) -> list[Variable]:
-    """The same with names that differ, of one line each."""
-    taken: set[str] = set()
-    made = []
-    for entry in listed:
-        plain = " ".join(entry.name.split())
-        name = next(n for k in range(len(listed) + 1) if (n := f"{plain}_{k}" if k else plain) not in taken)
-        taken.add(name)
-        made.append(Variable(name, entry.causality, entry.description, entry.form, entry.kind, entry.nominal))
-    return made
+    """The same with names and descriptions of printable characters; names differ."""
+    names = shown_names(entry.name for entry in listed)
+    return [
+        replace(entry, name=name, description=visible(entry.description, 2 * LONGEST_TEXT))
+        for name, entry in zip(names, listed, strict=True)
+    ]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from html import escape
-
+from edp.export.escape import xml_text
 from edp.export.fmu.describe import About
 
 RULES = (
@@ -25,10 +24,10 @@ RULES = (
 def page(about: About) -> bytes:
     """The page: what goes in and out, and the rules."""
     window = about.facts["window"]
-    rules = "".join(f"<li>{escape(t.format(step=about.step_s, window=window, name=about.name))}</li>" for t in RULES)
+    rules = "".join(f"<li>{xml_text(t.format(step=about.step_s, window=window, name=about.name))}</li>" for t in RULES)
     rows = "".join(
-        f"<tr><td>{escape(entry.name)}</td><td>{entry.causality}</td>"
-        f"<td>{escape(entry.unit) if entry.form == 'real' else ''}</td><td>{escape(entry.description)}</td></tr>"
+        f"<tr><td>{xml_text(entry.name)}</td><td>{entry.causality}</td>"
+        f"<td>{xml_text(entry.unit) if entry.form == 'real' else ''}</td><td>{xml_text(entry.description)}</td></tr>"
         for entry in about.listed
     )
     derivatives = (
@@ -36,7 +35,7 @@ def page(about: About) -> bytes:
         if about.derivatives
         else "Directional derivatives are not provided."
     )
-    name, title = escape(about.name), escape(about.title)
+    name, title = xml_text(about.name), xml_text(about.title)
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{name}</title></head><body>\n'
         f"<h1>{name}</h1>\n<p>{title}, {about.rate_hz:g} Hz, in SI units. {derivatives}</p>\n<ul>{rules}</ul>\n"

@@ -10,19 +10,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from string import Template
 
 from edp.errors import ExportError
 from edp.export.base import TARGETS
 from edp.export.c.model import Model, make_model
 from edp.export.c.target import check_name, core_files
 from edp.export.description import Description, as_json
+from edp.export.escape import Code, c_string, fill, visible
 from edp.export.fmu.build import PLATFORMS, Sources, libraries
 from edp.export.fmu.describe import About, build_description, fmi2, fmi3
 from edp.export.fmu.interface import Variable, variables
 from edp.export.fmu.page import page
+from edp.export.folder import write_export
 from edp.models.integer import IntegerPredictor
-from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
 
 COMMON = ("edp_fmu.h", "edp_fmu.c")
@@ -76,13 +76,12 @@ class FmuTarget:
         common = _c_files((*core, *COMMON))
         own = {version: _c_files(OWN[version]) for version in versions}
         built = libraries(Sources(name, core | plumbing, common, own), BINARIES[self.binaries])
-        path, made = make_folder(folder), []
+        made = {}
         for version in versions:
             sources = core | {file: plumbing[file] for file in (*COMMON, *OWN[version])}
             content = _files(version, about, sources, Description(name, bundle, model.graph))
-            made.append(path / f"{name}_fmi{version}.fmu")
-            write_bytes(made[-1], _packed(content | built[version]))
-        return made
+            made[f"{name}_fmi{version}.fmu"] = _packed(content | built[version])
+        return write_export(folder, made)
 
 
 def _files(version: int, about: About, sources: Mapping[str, str], described: Description) -> dict[str, bytes]:
@@ -108,24 +107,18 @@ def _about(model: Model, listed: list[Variable], core: Mapping[str, str]) -> Abo
     facts["horizons_ticks"] = " ".join(map(str, model.bundle.task.horizons))
     token = "{" + str(uuid.UUID(bytes=state.digest())) + "}"
     return About(
-        model.name, token, described["network"], described["rate_hz"], listed, model.changes is not None, facts
+        model.name, token, visible(described["network"]), described["rate_hz"], listed, model.changes is not None, facts
     )
 
 
 def _header(model: Model, about: About) -> str:
     """What binds the plumbing to the model."""
     text = resources.files("edp.export.fmu").joinpath("templates/fmu_model.h.in").read_text()
-    names = ", ".join(_c_string(entry.name) for entry in about.listed if entry.causality == "input")
-    given = {"name": model.name, "NAME": model.name.upper(), "token": about.token}
+    names = Code(", ".join(c_string(entry.name) for entry in about.listed if entry.causality == "input"))
+    given: dict[str, object] = {"name": model.name, "NAME": model.name.upper(), "token": Code(about.token)}
     given |= {"rate": repr(about.rate_hz), "step": repr(about.step_s), "names": names}
-    given["tangent"] = TANGENT.format(model.name) if about.derivatives else ""
-    return Template(text).substitute(given)
-
-
-def _c_string(text: str) -> str:
-    """A literal; what is not plain ASCII is written in octal digits."""
-    plain = (chr(b) if 32 <= b < 127 and chr(b) not in '"\\?' else f"\\{b:03o}" for b in text.encode())
-    return f'"{"".join(plain)}"'
+    given["tangent"] = Code(TANGENT.format(model.name)) if about.derivatives else ""
+    return fill(text, given)
 
 
 def _plumbing(*names: str) -> dict[str, str]:

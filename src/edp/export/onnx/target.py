@@ -9,11 +9,13 @@ from pathlib import Path
 from edp.errors import ExportError
 from edp.export.base import TARGETS
 from edp.export.description import Description, as_json, as_mat, float_graph, golden
+from edp.export.escape import LONGEST_NAME, visible
+from edp.export.folder import write_export
 from edp.export.onnx.metadata import content, notes, with_full_starts
 from edp.export.onnx.nodes import DEFAULT_OPSET, OPSETS
 from edp.export.onnx.step import states_of, step_model
 from edp.export.onnx.window import window_model
-from edp.storage import make_folder, write_bytes
+from edp.export.sizes import check_numbers
 from edp.training.bundle import Bundle
 
 
@@ -36,9 +38,10 @@ class OnnxTarget:
         """See `edp.export.ExportTarget`."""
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name):
             raise ExportError(
-                f"name '{name}' is that of files and graphs: up to 31 lower-case letters, digits, underscores, a "
-                "letter first; give another one with --name"
+                f"name '{visible(name, LONGEST_NAME)}' is that of files and graphs: up to 31 lower-case letters, "
+                "digits, underscores, a letter first; give another one with --name"
             )
+        check_numbers(bundle)
         graph = float_graph(bundle.predictor, "ONNX")
         described, states = Description(name, bundle, graph), states_of(graph)
         targets, carried = len(bundle.task.targets), notes(described)
@@ -50,7 +53,4 @@ class OnnxTarget:
         tables = {"edp": with_full_starts(about, states), "golden": golden(bundle.predictor, graph.window)}
         made = {f"{name}.json": as_json(about), f"{name}.mat": as_mat(tables)}
         made |= {f"{name}_{kind}.onnx": data for kind, data in files.items()}
-        path = make_folder(folder)
-        for file, data in made.items():
-            write_bytes(path / file, data)
-        return [path / file for file in made]
+        return write_export(folder, made)

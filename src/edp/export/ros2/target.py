@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from string import Template
-from xml.sax.saxutils import escape
+from typing import Any
 
 from edp import __version__
 from edp.export.base import TARGETS
 from edp.export.c.model import Model, make_model
 from edp.export.c.target import check_name, core_files
 from edp.export.description import Description, as_json
+from edp.export.escape import Code, fill, markdown_text, shown_names, xml_text, yaml_scalar
+from edp.export.folder import write_export
 from edp.export.hashes import model_hash
 from edp.models.predictor import describe as describe_network
 from edp.signals import Kind
-from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
 
 MODULES = ("core.py", "node.py", "replay.py", "build.py")
@@ -40,45 +41,68 @@ class Ros2Target:
         model = make_model(name, bundle)
         package = f"{name}_ros"
         here = resources.files("edp.export.ros2")
-        blanks = _blanks(model, package)
+        about = _content(Description(name, bundle, model.graph))
+        blanks = _blanks(model, package, about)
 
-        def fill(template: str) -> str:
-            return Template(here.joinpath(f"templates/{template}.in").read_text()).substitute(blanks)
+        def filled(template: str) -> str:
+            title = describe_network(bundle.predictor.spec)
+            escaped = {"title": (markdown_text if template.endswith(".md") else xml_text)(title)}
+            return fill(here.joinpath(f"templates/{template}.in").read_text(), blanks | escaped)
 
         made = {
-            "README.md": fill("README.md"),
-            "package.xml": fill("package.xml"),
-            "setup.py": fill("setup.py"),
-            "setup.cfg": fill("setup.cfg"),
+            "README.md": filled("README.md"),
+            "package.xml": filled("package.xml"),
+            "setup.py": filled("setup.py"),
+            "setup.cfg": filled("setup.cfg"),
             f"resource/{package}": "",
-            "config/params.yaml": fill("params.yaml"),
-            "launch/predictor.launch.py": fill("predictor.launch.py"),
+            "config/params.yaml": filled("params.yaml"),
+            "launch/predictor.launch.py": filled("predictor.launch.py"),
             f"{package}/__init__.py": "",
-            f"{package}/model.json": as_json(Description(name, bundle, model.graph).content()).decode(),
-            f"{package}/csrc/{name}_ros.c": fill("shim.c"),
+            f"{package}/model.json": as_json(about).decode(),
+            f"{package}/csrc/{name}_ros.c": filled("shim.c"),
         }
         made |= {f"{package}/{file}": here.joinpath(f"package/{file}").read_text() for file in MODULES}
         made |= {f"{package}/csrc/{file}": text for file, text in core_files(model).items()}
-        path = make_folder(folder)
-        for file, text in made.items():
-            make_folder((path / file).parent)
-            write_bytes(path / file, text.encode())
-        return [path / file for file in made]
+        return write_export(folder, {file: text.encode() for file, text in made.items()})
 
 
-def _blanks(model: Model, package: str) -> dict[str, object]:
-    task = model.bundle.task
-    sources = [f'      - "{channel.name}={_source(channel.name, channel.kind)}"' for channel in model.bundle.inputs]
+def _content(described: Description) -> dict[str, Any]:
+    """The description, with names that fit into parameters and messages.
+
+    They are `shown_names` without ``=``, which ends the name in a parameter, and do not begin as a formula of a
+    spreadsheet does; a name that was replaced is kept as ``original``.
+    """
+    about = described.content()
+    for side in ("inputs", "targets"):
+        given = [entry["name"] for entry in about[side]]
+        names = shown_names(_plain(name) for name in given)
+        about[side] = [
+            entry | {"name": name} | ({} if name == old else {"original": old})
+            for entry, name, old in zip(about[side], names, given, strict=True)
+        ]
+    return about
+
+
+def _plain(name: str) -> str:
+    plain = name.replace("=", "_")
+    return f"_{plain}" if plain.startswith(("+", "-", "@")) else plain
+
+
+def _blanks(model: Model, package: str, about: Mapping[str, Any]) -> dict[str, object]:
+    task, inputs = model.bundle.task, [entry["name"] for entry in about["inputs"]]
+    sources = [
+        f"      - {yaml_scalar(f'{name}={_source(name, channel.kind)}')}"
+        for name, channel in zip(inputs, model.bundle.inputs, strict=True)
+    ]
     return {
         "name": model.name,
         "package": package,
         "version": __version__,
-        "title": escape(describe_network(model.bundle.predictor.spec)),
         "model_hash": model_hash(model.graph),
         "rate": float(task.rate_hz),
         "tick_ms": f"{1000 / task.rate_hz:g}",
-        "targets": ", ".join(task.targets),
-        "sources": "\n".join(sources),
+        "targets": Code(", ".join(markdown_text(entry["name"]) for entry in about["targets"])),
+        "sources": Code("\n".join(sources)),
     }
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,9 @@ from edp import __version__
 from edp.export.c.model import Model
 from edp.export.c.text import indented
 from edp.export.description import SCHEMA, Description
+from edp.export.escape import LONGEST_NAME, Code, fill, markdown_text, matlab_names, visible
 from edp.export.hashes import model_hash, scale_hash
-from edp.export.simulink.native import Native, functions_for, matlab_names
+from edp.export.simulink.native import Native, functions_for
 from edp.graph.base import Number
 from edp.models.input_range import HOLD_TICKS, input_limits
 from edp.models.predictor import describe as describe_network
@@ -32,8 +32,8 @@ RULES = {
 STATUS = ("ok", "warming", "held", "restarted", "not_reset")
 """What a tick has done, by number."""
 FIRST = {
-    True: "form = 'native';",
-    False: "forms = {'sfun', 'octave'};\n    form = forms{1 + (exist('OCTAVE_VERSION', 'builtin') > 0)};",
+    True: Code("form = 'native';"),
+    False: Code("forms = {'sfun', 'octave'};\n    form = forms{1 + (exist('OCTAVE_VERSION', 'builtin') > 0)};"),
 }
 """The form that is compared if none is asked for: with plain MATLAB code, without."""
 C_FILES = ("sfun.c", "call.h", "call.c")
@@ -111,7 +111,7 @@ class Folder:
 
     def _fill(self, part: str) -> str:
         text = resources.files("edp.export.simulink").joinpath(f"templates/{part}.in").read_text()
-        return Template(text).substitute(self._values)
+        return fill(text, self._values)
 
     @cached_property
     def _values(self) -> Mapping[str, object]:
@@ -122,7 +122,7 @@ class Folder:
         return {
             "name": model.name,
             "NAME": model.name.upper(),
-            "title": describe_network(model.bundle.predictor.spec),
+            "title": markdown_text(describe_network(model.bundle.predictor.spec)),
             "version": __version__,
             "schema": SCHEMA,
             "model_hash": model_hash(graph),
@@ -137,8 +137,8 @@ class Folder:
             "inputs": graph.inputs,
             "numbers": sum(rows * columns for rows, columns in self.described.shapes.values()),
             "results": len(graph.results),
-            "sources": ", ".join(f"'{file}'" for file in sources),
-            "selected": ",".join(fields),
+            "sources": Code(", ".join(f"'{file}'" for file in sources)),
+            "selected": Code(",".join(fields)),
             "state_bytes": model.state_bytes(),
             "words": self.words,
             **self._ports(),
@@ -153,7 +153,7 @@ class Folder:
         short += sum(kind is Number.INT16 for kind in self.model.plan.sizes)
         return (self.model.state_bytes() + 2 * short + 7) // 4
 
-    def _ports(self) -> dict[str, str]:
+    def _ports(self) -> dict[str, object]:
         """Result ports of the S-function and results of the C Caller's function."""
         sizes: list[str] = []
         give: list[str] = []
@@ -179,14 +179,14 @@ class Folder:
             "sizes": indented(sizes),
             "give": indented(give),
             "copy": indented(copies),
-            "ports": "\n *               ".join(ports),
-            "arguments": ", ".join(arguments),
-            "columns": "; of bounds interval by interval" if many else "",
-            "out_names": ", ".join(f"'{meaning}'" for meaning in self.described.shapes),
+            "ports": Code("\n *               ".join(ports)),
+            "arguments": Code(", ".join(arguments)),
+            "columns": Code("; of bounds interval by interval") if many else "",
+            "out_names": Code(", ".join(f"'{meaning}'" for meaning in self.described.shapes)),
             "ports_count": str(count + 2),
         }
 
-    def _matlab(self) -> dict[str, str]:
+    def _matlab(self) -> dict[str, object]:
         """Code of the tick, and of the comparison with the golden recording."""
         shapes = self.described.shapes
         forms = {"octave": "found = {0}_octave(net.golden.inputs);", "sfun": "found = {0}_simulate(net.golden.inputs);"}
@@ -195,25 +195,31 @@ class Folder:
         if self.window:
             forms["onnx"] = "found = {0}_onnx(net.golden.inputs);\n        wanted = double(net.golden.window);"
         cases = "\n".join(f"    case '{form}'\n        {line.format(self.model.name)}" for form, line in forms.items())
-        values = {
-            "cases": cases,
-            "forms": " or ".join(f"'{form}'" for form in forms),
+        values: dict[str, object] = {
+            "cases": Code(cases),
+            "forms": Code(" or ".join(f"'{form}'" for form in forms)),
             "form_names": ", ".join(forms),
             "first_form": FIRST[self.native is not None],
             "exact": "Whole numbers must be the same." if self.model.whole else "",
-            "layout": "; ".join(f"{meaning} {r} x {c} (horizons by targets)" for meaning, (r, c) in shapes.items()),
+            "layout": Code(
+                "; ".join(f"{meaning} {r} x {c} (horizons by targets)" for meaning, (r, c) in shapes.items())
+            ),
             "bounds": ", OUT.lower and OUT.upper bounds" if len(shapes) > 1 else "",
-            "nothing": "\n".join(f"out.{meaning} = nan({r}, {c}, 'single');" for meaning, (r, c) in shapes.items()),
-            "shaped": "\n".join(
-                f"out.{meaning} = reshape(found.{meaning}, {c}, {r}).';" for meaning, (r, c) in shapes.items()
+            "nothing": Code(
+                "\n".join(f"out.{meaning} = nan({r}, {c}, 'single');" for meaning, (r, c) in shapes.items())
+            ),
+            "shaped": Code(
+                "\n".join(
+                    f"out.{meaning} = reshape(found.{meaning}, {c}, {r}).';" for meaning, (r, c) in shapes.items()
+                )
             ),
         }
         if self.native is None:
             return values
         code = self.native.code()
-        return values | {"code": code, "given": self.native.results(), "functions": functions_for(code).rstrip()}
+        return values | {"code": code, "given": self.native.results(), "functions": functions_for(code)}
 
-    def _readme(self, about: Mapping[str, Any]) -> dict[str, str]:
+    def _readme(self, about: Mapping[str, Any]) -> dict[str, object]:
         """Tables of the README."""
         name, there = self.model.name, self._there()
         rows = [f"| `{name}_{part}` | {what} | {needs} |" for part, (what, needs) in ABOUT.items() if part in there]
@@ -225,11 +231,12 @@ class Folder:
         ]
         table = ["| Input | Unit | Bus element | What it is |", "|---|---|---|---|"]
         for entry in about["inputs"]:
-            text = entry["description"].replace("|", "\\|")
-            table.append(f"| {entry['name']} | {entry['unit']} | {entry['field']} | {text} |")
-        checked = "`${name}_golden('octave')` runs the S-function in GNU Octave against stand-ins of Simulink's headers"
+            shown = markdown_text(visible(entry["name"], LONGEST_NAME))
+            about_it = markdown_text(entry["description"])
+            table.append(f"| {shown} | {entry['unit']} | {entry['field']} | {about_it} |")
+        checked = f"`{name}_golden('octave')` runs the S-function in GNU Octave against stand-ins of Simulink's headers"
         if self.native is not None:
-            checked += ", and `${name}_golden('native')` the plain MATLAB code"
+            checked += f", and `{name}_golden('native')` the plain MATLAB code"
         missing = "" if self.window else "\n\nThe ONNX window is not in this folder."
         if self.model.whole:
             missing = (
@@ -237,11 +244,11 @@ class Folder:
             )
         first = f" `{name}_golden` then compares the plain MATLAB code with PyTorch."
         return {
-            "first_check": first if self.native is not None else "",
-            "files": "\n".join(rows),
-            "inputs_table": "\n".join(table),
-            "checked": Template(checked).substitute(name=name) + "." + missing,
-            "onnx_unchecked": f" the import of `{name}_window.onnx`," if self.window else "",
+            "first_check": Code(first) if self.native is not None else "",
+            "files": Code("\n".join(rows)),
+            "inputs_table": Code("\n".join(table)),
+            "checked": Code(checked + "." + missing),
+            "onnx_unchecked": Code(f" the import of `{name}_window.onnx`,") if self.window else "",
         }
 
     def _there(self) -> set[str]:

@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ExportError
-from edp.export.c.text import identifier
+from edp.export.escape import Code, matlab_comment, matlab_names
 from edp.graph import Array, Graph, Layer, layers, memory
 from edp.graph.base import INPUT
 from edp.graph.layers import Function, runs
 
-LONGEST = 63
-"""Characters of a MATLAB name."""
 LONGEST_LAYER = 47
 """Characters of a layer's part of it; names of constants and slots come behind."""
 MOST_PIECES = 8
@@ -36,16 +34,6 @@ FUNCTIONS = {
     Function.POSITIVE: "positive({x})",
 }
 """Element-wise functions by name."""
-
-
-def matlab_names(names: Sequence[str]) -> list[str]:
-    """Names as MATLAB names, different ones for different names: letters, digits, underscores, a letter first."""
-    made: list[str] = []
-    for name in map(identifier, names):
-        plain = name if re.match(r"[A-Za-z]", name) else f"x{name}"
-        tries = (plain[:LONGEST] if not n else f"{plain[: LONGEST - 6]}_{n}" for n in range(len(names) + 1))
-        made.append(next(found for found in tries if found not in made))
-    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +97,7 @@ class Native:
             self._fields[name, slot.name]: _column(self.graph.start(name, slot)) for name, slot in self.graph.slots()
         }
 
-    def code(self) -> str:
+    def code(self) -> Code:
         """The statements of a tick: from ``in`` and states ``s`` to values ``v`` and the next states.
 
         Raises:
@@ -123,16 +111,17 @@ class Native:
                     f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in MATLAB; these have: "
                     f"{', '.join(sorted(kind.__name__ for kind in WRITERS))}"
                 )
-            lines.append(f"% {layer.name}: {type(layer).__name__}, {layer.width or 'no'} numbers")
+            lines.append(f"% {matlab_comment(layer.name)}: {type(layer).__name__}, {layer.width or 'no'} numbers")
             lines += write(self, layer, [self.value(name) for name in layer.inputs])
-        return "\n".join(lines)
+        return Code("\n".join(lines))
 
-    def results(self) -> str:
+    def results(self) -> Code:
         """The statement that lists the results."""
-        return "; ".join(f"out.{meaning} = {self.value(value)}" for meaning, value in self.graph.results.items()) + ";"
+        listed = (f"out.{meaning} = {self.value(value)}" for meaning, value in self.graph.results.items())
+        return Code("; ".join(listed) + ";")
 
 
-def functions_for(code: str) -> str:
+def functions_for(code: str) -> Code:
     """The functions that code calls, and those that they call."""
     text = resources.files("edp.export.simulink").joinpath("templates/layers.m.in").read_text()
     known = {}
@@ -146,7 +135,7 @@ def functions_for(code: str) -> str:
         for name in set(re.findall(r"\b(\w+)\(", search.pop())) & set(known) - wanted:
             wanted.add(name)
             search.append(known[name])
-    return "\n".join(part for name, part in known.items() if name in wanted)
+    return Code("\n".join(part for name, part in known.items() if name in wanted).rstrip())
 
 
 Write = Callable[[Native, Any, Sequence[str]], list[str]]
@@ -163,16 +152,17 @@ def _simple(pattern: str) -> Write:
     def write(native: Native, layer: Any, x: Sequence[str]) -> list[str]:
         names = {part: native.constant(layer, part) for part in native.laid(layer)}
         names |= {f"s_{slot.name}": native.slot(layer.name, slot.name) for slot in layer.slots}
-        plain = {key: _plain(value) for key, value in vars(layer).items() if key not in names}
+        plain = {key: _plain(value) for key, value in vars(layer).items() if isinstance(value, int | float)}
         return [pattern.format(*x, y=native.value(layer.name), **(plain | names))]
 
     return write
 
 
-def _plain(value: object) -> object:
+def _plain(value: float) -> str:
+    """A number of a layer; text never becomes code."""
     if isinstance(value, bool):
         return str(value).lower()
-    return f"{np.float32(value):.9g}" if isinstance(value, float) else value
+    return f"{np.float32(value):.9g}" if isinstance(value, float) else str(value)
 
 
 def _gather(native: Native, layer: layers.Gather, x: Sequence[str]) -> list[str]:

@@ -11,11 +11,11 @@ from edp.export.base import TARGETS
 from edp.export.c.model import make_model
 from edp.export.c.target import check_name, core_files
 from edp.export.description import as_json, as_mat, float_graph, golden
+from edp.export.folder import write_export
 from edp.export.onnx.metadata import notes
 from edp.export.onnx.nodes import OPSETS
 from edp.export.onnx.window import window_model
 from edp.export.simulink.folder import Folder
-from edp.storage import make_folder, write_bytes
 from edp.training.bundle import Bundle
 
 LONGEST_NAME = 20
@@ -61,7 +61,4 @@ class SimulinkTarget:
         files |= {f"core/{file}": text.encode() for file, text in core_files(model).items()}
         stubs = resources.files("edp.export.simulink").joinpath("stub")
         files |= {f"octave/{file}": stubs.joinpath(file).read_bytes() for file in STUBS}
-        path = make_folder(folder)
-        for file, data in files.items():
-            write_bytes(path / file, data)
-        return [path / file for file in files]
+        return write_export(folder, files)

@@ -13,6 +13,7 @@ import scipy.io
 
 from edp.export.c.model import make_model
 from edp.export.description import float_graph
+from edp.export.escape import matlab_string
 from edp.export.golden import Rows
 from edp.export.simulink import SimulinkTarget
 from edp.parity.base import FORMS, NAME, ROUNDS, Case, Ran, called, need
@@ -24,7 +25,7 @@ NATIVE = f"net = {NAME}_load(); found = {NAME}_stream(net, rows);"
 NATIVE_TIMED = f"{NAME}_stream(net, rows);"
 BLOCK = f"found = {NAME}_octave(rows);"
 BLOCK_TIMED = f"{NAME}_octave(repmat(rows, {REPEATS}, 1));"
-PROGRAM = Template("""addpath('${folder}'); load('rows.mat');
+PROGRAM = Template("""addpath(${folder}); load('rows.mat');
 ${run}
 seconds = Inf;
 for round = 1:${rounds}
@@ -68,7 +69,7 @@ def _octave(case: Case, folder: Path, run: str, timed: str) -> tuple[Rows, float
     program = need("octave-cli", "octave")
     SimulinkTarget(window=False).write(case.bundle, NAME, folder)
     scipy.io.savemat(folder / "rows.mat", {"rows": case.inputs})
-    text = PROGRAM.substitute(folder=folder, run=run, timed=timed, rounds=ROUNDS)
+    text = PROGRAM.substitute(folder=matlab_string(folder), run=run, timed=timed, rounds=ROUNDS)
     (folder / "parity_program.m").write_text(text)
     called([program, "--norc", "--quiet", "parity_program.m"], folder)
     made = scipy.io.loadmat(folder / "found.mat")

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from edp.export.escape import python_literal
 from edp.export.ros2 import Ros2Target
 from edp.parity.base import FORMS, NAME, ROUNDS, Case, Ran, called, need
 
@@ -42,7 +43,7 @@ class Ros2Core:
         compiler = need("cc", "gcc libc6-dev")
         Ros2Target().write(case.bundle, NAME, folder)
         (folder / "run.py").write_text(PROGRAM)
-        called([sys.executable, "-c", f"from {NAME}_ros.core import build; build('{compiler}')"], folder)
+        called([sys.executable, "-c", f"from {NAME}_ros.core import build; build({python_literal(compiler)})"], folder)
         said = json.loads(called([sys.executable, "run.py", ROUNDS], folder, json.dumps(case.inputs.tolist()).encode()))
         found = [np.concatenate([np.ravel(part) for part in tick]) for tick in said[0]]
         return [("", Ran(np.array(found, np.float32), said[1]))]

@@ -285,10 +285,10 @@ FMI2_EXPORT fmi2Status FMI2(GetFMUstate)(fmi2Component c, fmi2FMUstate *FMUstate
     if ((c == NULL) || (FMUstate == NULL)) {
         return fmi2Error;
     }
-    edp_fmu_memory *kept = *FMUstate;
-    const bool done = edp_fmu_save(of(c), &kept);
+    edp_fmu_saved *kept = *FMUstate;
+    const edp_fmu_status done = edp_fmu_save(of(c), &kept);
     *FMUstate = kept;
-    return done ? fmi2OK : absent(c, "no memory for a saved state");
+    return (fmi2Status)done;
 }
 
 FMI2_EXPORT fmi2Status FMI2(SetFMUstate)(fmi2Component c, fmi2FMUstate FMUstate) {
@@ -320,7 +320,7 @@ FMI2_EXPORT fmi2Status FMI2(DeSerializeFMUstate)(fmi2Component c, const fmi2Byte
     if ((c == NULL) || (FMUstate == NULL)) {
         return fmi2Error;
     }
-    edp_fmu_memory *kept = NULL;
+    edp_fmu_saved *kept = NULL;
     const edp_fmu_status done = edp_fmu_read(of(c), serializedState, size, &kept);
     *FMUstate = kept;
     return (fmi2Status)done;

@@ -170,10 +170,10 @@ FMI3_EXPORT fmi3Status FMI3(GetFMUState)(fmi3Instance instance, fmi3FMUState *FM
     if ((instance == NULL) || (FMUState == NULL)) {
         return fmi3Error;
     }
-    edp_fmu_memory *kept = *FMUState;
-    const bool done = edp_fmu_save(of(instance), &kept);
+    edp_fmu_saved *kept = *FMUState;
+    const edp_fmu_status done = edp_fmu_save(of(instance), &kept);
     *FMUState = kept;
-    return done ? fmi3OK : (fmi3Status)edp_fmu_wrong(of(instance), "no memory for a saved state");
+    return (fmi3Status)done;
 }
 
 FMI3_EXPORT fmi3Status FMI3(SetFMUState)(fmi3Instance instance, fmi3FMUState FMUState) {
@@ -205,7 +205,7 @@ FMI3_EXPORT fmi3Status FMI3(DeserializeFMUState)(fmi3Instance instance, const fm
     if ((instance == NULL) || (FMUState == NULL)) {
         return fmi3Error;
     }
-    edp_fmu_memory *kept = NULL;
+    edp_fmu_saved *kept = NULL;
     const edp_fmu_status done = edp_fmu_read(of(instance), serializedState, size, &kept);
     *FMUState = kept;
     return (fmi3Status)done;

@@ -229,21 +229,47 @@ edp_fmu_status edp_fmu_get_flag(const edp_fmu *f, uint32_t ref, bool *value) {
 
 /* ---- saved states ------------------------------------------------------------------------------------------------- */
 
-bool edp_fmu_save(const edp_fmu *f, edp_fmu_memory **kept) {
-    if (*kept == NULL) {
-        *kept = malloc(sizeof **kept);
+/* Whether a saved state has this FMU's token. Read up to the first difference only: one of another FMU may be shorter. */
+static bool ours(const edp_fmu_saved *kept) {
+    const char *const token = FMU_TOKEN;
+    size_t same = 0;
+    while ((same < sizeof kept->token) && (kept->token[same] == token[same])) {
+        same++;
     }
-    if (*kept != NULL) {
-        (void)memcpy(*kept, &f->now, sizeof f->now);
-    }
-    return *kept != NULL;
+    return same == sizeof kept->token;
 }
 
-edp_fmu_status edp_fmu_restore(edp_fmu *f, const edp_fmu_memory *kept) {
+/* An empty state with the token; NULL without memory. */
+static edp_fmu_saved *made(void) {
+    edp_fmu_saved *const kept = malloc(sizeof *kept);
+    if (kept != NULL) {
+        (void)memset(kept, 0, sizeof *kept);
+        (void)memcpy(kept->token, FMU_TOKEN, sizeof kept->token);
+    }
+    return kept;
+}
+
+edp_fmu_status edp_fmu_save(const edp_fmu *f, edp_fmu_saved **kept) {
+    if (*kept == NULL) {
+        *kept = made();
+        if (*kept == NULL) {
+            return edp_fmu_wrong(f, "no memory for a saved state");
+        }
+    } else if (!ours(*kept)) {
+        return edp_fmu_wrong(f, "the state to write over is one of another FMU");
+    }
+    (void)memcpy(&(*kept)->memory, &f->now, sizeof f->now);
+    return EDP_FMU_OK;
+}
+
+edp_fmu_status edp_fmu_restore(edp_fmu *f, const edp_fmu_saved *kept) {
     if (kept == NULL) {
         return edp_fmu_wrong(f, "there is no state to restore");
     }
-    (void)memcpy(&f->now, kept, sizeof f->now);
+    if (!ours(kept)) {
+        return edp_fmu_wrong(f, "the state to restore is one of another FMU");
+    }
+    (void)memcpy(&f->now, &kept->memory, sizeof f->now);
     return EDP_FMU_OK;
 }
 
@@ -259,17 +285,20 @@ static heading heading_of(const void *bytes) {
     return made;
 }
 
-edp_fmu_status edp_fmu_write(const edp_fmu *f, const edp_fmu_memory *kept, void *bytes, size_t size) {
+edp_fmu_status edp_fmu_write(const edp_fmu *f, const edp_fmu_saved *kept, void *bytes, size_t size) {
     if ((kept == NULL) || (bytes == NULL) || (size < edp_fmu_bytes())) {
         return edp_fmu_wrong(f, "a state cannot be serialised: none was given, or the place for it is too small");
     }
-    const heading head = heading_of(kept);
+    if (!ours(kept)) {
+        return edp_fmu_wrong(f, "the state to serialise is one of another FMU");
+    }
+    const heading head = heading_of(&kept->memory);
     (void)memcpy(bytes, &head, sizeof head);
-    (void)memcpy((char *)bytes + sizeof head, kept, sizeof *kept);
+    (void)memcpy((char *)bytes + sizeof head, &kept->memory, sizeof kept->memory);
     return EDP_FMU_OK;
 }
 
-edp_fmu_status edp_fmu_read(const edp_fmu *f, const void *bytes, size_t size, edp_fmu_memory **kept) {
+edp_fmu_status edp_fmu_read(const edp_fmu *f, const void *bytes, size_t size, edp_fmu_saved **kept) {
     if ((bytes == NULL) || (size != edp_fmu_bytes())) {
         return edp_fmu_wrong(f, "these bytes have not the length of a serialised state of this FMU");
     }
@@ -278,11 +307,11 @@ edp_fmu_status edp_fmu_read(const edp_fmu *f, const void *bytes, size_t size, ed
     if (memcmp(bytes, &head, sizeof head) != 0) {
         return edp_fmu_wrong(f, "these bytes are no serialised state of this FMU, or are damaged");
     }
-    *kept = malloc(sizeof **kept);
+    *kept = made();
     if (*kept == NULL) {
         return edp_fmu_wrong(f, "no memory for a saved state");
     }
-    (void)memcpy(*kept, content, sizeof **kept);
+    (void)memcpy(&(*kept)->memory, content, sizeof (*kept)->memory);
     return EDP_FMU_OK;
 }
 

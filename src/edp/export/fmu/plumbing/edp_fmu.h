@@ -43,6 +43,12 @@ typedef struct {
     FMU_STATE state;
 } edp_fmu_memory;
 
+/* A saved state; the token in front says whose it is. */
+typedef struct {
+    char token[sizeof FMU_TOKEN];
+    edp_fmu_memory memory;
+} edp_fmu_saved;
+
 typedef struct edp_fmu edp_fmu;
 
 /* Hands a message to the importer. */
@@ -76,13 +82,13 @@ edp_fmu_status edp_fmu_set_real(edp_fmu *f, uint32_t ref, double value);
 edp_fmu_status edp_fmu_get_whole(const edp_fmu *f, uint32_t ref, int32_t *value);
 edp_fmu_status edp_fmu_get_flag(const edp_fmu *f, uint32_t ref, bool *value);
 
-/* `kept` is made if it is NULL; false without memory. */
-bool edp_fmu_save(const edp_fmu *f, edp_fmu_memory **kept);
-edp_fmu_status edp_fmu_restore(edp_fmu *f, const edp_fmu_memory *kept);
+/* `kept` is made if it is NULL. States of another FMU are refused here and in what follows. */
+edp_fmu_status edp_fmu_save(const edp_fmu *f, edp_fmu_saved **kept);
+edp_fmu_status edp_fmu_restore(edp_fmu *f, const edp_fmu_saved *kept);
 size_t edp_fmu_bytes(void);
-edp_fmu_status edp_fmu_write(const edp_fmu *f, const edp_fmu_memory *kept, void *bytes, size_t size);
+edp_fmu_status edp_fmu_write(const edp_fmu *f, const edp_fmu_saved *kept, void *bytes, size_t size);
 /* `kept` is made. */
-edp_fmu_status edp_fmu_read(const edp_fmu *f, const void *bytes, size_t size, edp_fmu_memory **kept);
+edp_fmu_status edp_fmu_read(const edp_fmu *f, const void *bytes, size_t size, edp_fmu_saved **kept);
 
 /* The seed of an input, collected in `seeds`, which the caller sets to zero first. */
 edp_fmu_status edp_fmu_seed(const edp_fmu *f, uint32_t ref, double seed, float seeds[FMU_INPUTS]);

@@ -1,0 +1,194 @@
+"""Text of a bundle's author in generated files: one function a language, names that a target can carry, templates.
+
+Names, descriptions and titles come from whoever made the bundle. Whatever of them goes into C, MATLAB, XML, HTML, YAML,
+Python or Markdown passes the function of that language here, and `fill` refuses text that did not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from html import escape as html_escape
+from string import Template
+
+from edp.errors import ExportError
+
+LONGEST_TEXT = 500
+"""Characters of a description or title: more is cut. C99 promises 4,095 characters of a line; escapes are up to ten."""
+LONGEST_NAME = 120
+"""Characters of a name in XML, YAML and tables. In octal digits that is a C string of at most 1,920 characters."""
+C_SIGNIFICANT = 63
+"""Characters of an identifier that C99 promises to tell apart; also the longest name of MATLAB."""
+UNNAMED = "unnamed"
+"""Stands for an empty name."""
+
+C_WORDS = frozenset(
+    re.findall(
+        r"\w+",
+        """
+    auto break case char const continue default do double else enum extern float for goto if inline int long register
+    restrict return short signed sizeof static struct switch typedef union unsigned void volatile while _Bool _Complex
+    _Imaginary bool true false asm fortran alignas alignof and and_eq bitand bitor catch char8_t char16_t char32_t class
+    compl concept const_cast consteval constexpr constinit co_await co_return co_yield decltype delete dynamic_cast
+    explicit export friend mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected public
+    reinterpret_cast requires static_assert static_cast template this thread_local throw try typeid typename using
+    virtual wchar_t xor xor_eq
+    """,
+    )
+)
+"""Keywords of C99 and C++20."""
+MATLAB_WORDS = frozenset(
+    re.findall(
+        r"\w+",
+        """
+    break case catch classdef continue else elseif end for function global if otherwise parfor persistent return spmd
+    switch try while arguments enumeration events methods properties do until unwind_protect unwind_protect_cleanup
+    end_try_catch end_unwind_protect endclassdef endenumeration endevents endfor endfunction endif endmethods endparfor
+    endproperties endspmd endswitch endwhile __FILE__ __LINE__
+    """,
+    )
+)
+"""Keywords of MATLAB and GNU Octave."""
+
+
+class Code(str):
+    """Text in the language of the file that it goes into: made by an emitter, or escaped by a function of this file."""
+
+    __slots__ = ()
+
+
+def visible(text: object, most: int = LONGEST_TEXT) -> str:
+    r"""Text as one line of printable characters.
+
+    Control and format characters (bidirectional ones too), line separators, lone surrogates, and white space other than
+    a blank become ``\uXXXX``; what is longer than `most` characters ends in ``...``.
+    """
+    whole = str(text)
+    cut = whole if len(whole) <= most else f"{whole[: most - 3]}..."
+    return cut if cut.isprintable() else "".join(c if c.isprintable() else _code_point(c) for c in cut)
+
+
+def _code_point(character: str) -> str:
+    number = ord(character)
+    return f"\\u{number:04x}" if number < 0x10000 else f"\\U{number:08x}"
+
+
+def c_comment(text: object) -> Code:
+    """Text within ``/* */``: no end or beginning of a comment, no trigraph, and no backslash at its end."""
+    plain = visible(text).replace("??", "? ?").replace("??", "? ?").replace("*/", "* /").replace("/*", "/ *")
+    return Code(plain + " " if plain.endswith("\\") else plain)
+
+
+def c_string(text: object) -> Code:
+    """A literal of C; what is not plain ASCII, and quotes, backslashes and question marks, is written in octal digits.
+
+    A lone surrogate, which has no UTF-8, becomes a question mark.
+    """
+    data = str(text).encode("utf-8", "replace")
+    plain = (chr(b) if 32 <= b < 127 and chr(b) not in '"\\?' else f"\\{b:03o}" for b in data)
+    return Code(f'"{"".join(plain)}"')
+
+
+def matlab_comment(text: object) -> Code:
+    """Text behind ``%``: of one line, which cannot begin or end a block of comments behind other text."""
+    return Code(visible(text))
+
+
+def matlab_string(text: object) -> Code:
+    r"""A literal of MATLAB in single quotes; control characters become ``\uXXXX``."""
+    return Code("'" + visible(text, 10 * LONGEST_TEXT).replace("'", "''") + "'")
+
+
+def python_literal(text: object) -> Code:
+    """A literal of Python in ASCII."""
+    return Code(ascii(str(text)))
+
+
+def xml_text(text: object) -> Code:
+    r"""Text between tags of XML or HTML, or within quotes in one; characters that XML cannot hold become ``\uXXXX``."""
+    return Code(html_escape(visible(text)))
+
+
+def yaml_scalar(text: object) -> Code:
+    """A scalar of YAML in double quotes and ASCII, read back as it was; a lone surrogate becomes U+FFFD."""
+    whole = str(text).encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+    return Code('"' + "".join(c if " " <= c <= "~" and c not in '"\\' else _yaml_point(c) for c in whole) + '"')
+
+
+def _yaml_point(character: str) -> str:
+    return f"\\{character}" if character in '"\\' else _code_point(character)
+
+
+def markdown_text(text: object) -> Code:
+    """Text within a line or a cell of a table of Markdown: no markup, no HTML, no link, no end of the cell."""
+    plain = re.sub(r"[\\`*\[\]|~$#!]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", visible(text))
+    plain = plain.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return Code(plain.replace("://", ":\\//").replace("www.", "www\\."))
+
+
+def c_names(names: Iterable[str], most: int) -> list[str]:
+    """Names as the ends of C identifiers, different ones for different names, of at most `most` characters.
+
+    What is no ASCII letter, digit or underscore becomes an underscore; see `distinct`.
+    """
+    return distinct((re.sub(r"\W", "_", name, flags=re.ASCII) for name in names), most)
+
+
+def matlab_names(names: Iterable[str]) -> list[str]:
+    """Names as names of variables, fields and bus elements of MATLAB, different ones for different names.
+
+    As `c_names`; ``x`` comes before what does not begin with a letter, and before keywords of MATLAB, C and C++.
+    """
+    plain = (re.sub(r"\W", "_", name, flags=re.ASCII) for name in names)
+    words = MATLAB_WORDS | C_WORDS
+    return distinct((n if re.match("[A-Za-z]", n) and n not in words else f"x{n}" for n in plain), C_SIGNIFICANT)
+
+
+def shown_names(names: Iterable[str]) -> list[str]:
+    """Names in XML, parameters and tables: `visible`, of at most `LONGEST_NAME` characters, all different.
+
+    Runs of white space become a blank.
+    """
+    return distinct((visible(" ".join(name.split()), LONGEST_NAME) for name in names), 10 * LONGEST_NAME)
+
+
+def distinct(names: Iterable[str], most: int) -> list[str]:
+    """The same names, cut to `most` characters; an empty one is `UNNAMED`, equal ones get ``_1``, ``_2`` and so on."""
+    made: list[str] = []
+    taken: set[str] = set()
+    tried: dict[str, int] = {}
+    for name in (given[:most] or UNNAMED for given in names):
+        number = tried.get(name, 0)
+        while (candidate := _numbered(name, number, most)) in taken:
+            number += 1
+        tried[name] = number + 1
+        taken.add(candidate)
+        made.append(candidate)
+    return made
+
+
+def _numbered(name: str, number: int, most: int) -> str:
+    ending = f"_{number}" if number else ""
+    return name[: most - len(ending)] + ending
+
+
+def fill(template: str, values: Mapping[str, object]) -> Code:
+    """A template with its blanks filled.
+
+    Args:
+        template: with blanks as `string.Template` reads them.
+        values: numbers, `Code`, or text of letters, digits, blanks and ``_.,:+-`` only, which is harmless everywhere.
+
+    Raises:
+        ExportError: other text, which nothing has escaped.
+    """
+    for name, value in values.items():
+        if not isinstance(value, Code | int | float) and not _HARMLESS(str(value)):
+            raise ExportError(
+                f"the value of '{name}' is {visible(ascii(value), LONGEST_NAME)}, which is not escaped for the file it "
+                "goes into; nothing was written. Export another bundle, and report this one"
+            )
+    return Code(Template(template).substitute(values))
+
+
+_HARMLESS: Callable[[str], re.Match[str] | None] = re.compile(r"[A-Za-z0-9_ .,:+\-]*").fullmatch

@@ -1,0 +1,161 @@
+"""The folder of an export: one process writes it, it holds one export, and a list of its files comes last.
+
+`LIST` names every file with its SHA-256 (``sha256sum -c export.sha256`` checks it). It is removed before the first file
+is touched and written after the last one: a folder without it holds no whole export.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePosixPath
+
+from edp.errors import BusyError, StorageError
+from edp.storage import hold, make_folder, storage_error, write_bytes
+
+LIST = "export.sha256"
+UNFINISHED = "export.unfinished"
+"""Lists what may lie there while an export is written: files of the one before and of the new one."""
+LONGEST_LIST = 1_000_000
+"""Bytes of a list that are read; those of the largest export here are 5,000."""
+_LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9_./-]+)")
+_TEMPORARY = re.compile(r"\.[A-Za-z0-9_.-]+\.[a-z0-9_]{8}\.tmp")
+"""Names of files that `edp.storage` has not finished."""
+Listed = dict[str, set[str]]
+
+
+def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
+    """Write an export in place of the one that the folder holds; what no export wrote stays, unless of the same name.
+
+    Args:
+        folder: made when absent.
+        files: content by path in the folder, with ``/`` between its parts.
+
+    Returns:
+        Paths of the files in their order; `LIST` is there besides.
+
+    Raises:
+        BusyError: another process writes there; nothing was changed.
+        StorageError: the folder cannot be written, or a file of the export before was changed since and is not among
+            the new ones; then nothing was changed.
+    """
+    path = make_folder(folder)
+    with _held(path):
+        new = {file: {hashlib.sha256(data).hexdigest()} for file, data in files.items()}
+        old = _listed(path / LIST), _listed(path / UNFINISHED)
+        every: Listed = {}
+        for part in (*old, new):
+            for file, digests in part.items():
+                every[file] = every.get(file, set()) | digests
+        stale = [file for file in every if file not in new and _ours(path, file, every[file])]
+        for place in {(path / file).parent for file in files} - {path}:
+            _check_place(path, place)
+        write_bytes(path / UNFINISHED, _as_list(every))
+        _remove(path / LIST)
+        _clean(path, every)
+        for file in stale:
+            _remove(path / file)
+        _remove_empty(path, stale)
+        for file, data in files.items():
+            write_bytes(path / file, data)
+        write_bytes(path / LIST, _as_list(new))
+        _remove(path / UNFINISHED)
+    return [path / file for file in files]
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[None]:
+    try:
+        lock = hold(path / ".lock")
+    except BusyError as error:
+        holder = str(error).rpartition("process ")[2]
+        raise BusyError(
+            f"folder '{path}' is being written by process {holder}; nothing was changed. Wait for it, or choose "
+            "another folder with --out"
+        ) from None
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            (path / ".lock").unlink(missing_ok=True)
+        lock.close()
+
+
+def _listed(path: Path) -> Listed:
+    """Files of a list with the hashes that they may have; none if it is absent, and none of lines of another form."""
+    made: Listed = {}
+    try:
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > LONGEST_LIST:
+            return made
+        lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError as error:
+        raise storage_error(path, error, "read") from error
+    for found in filter(None, map(_LINE.fullmatch, lines)):
+        parts = PurePosixPath(found[2]).parts
+        if not found[2].startswith("/") and ".." not in parts:
+            made.setdefault("/".join(parts), set()).add(found[1])
+    return made
+
+
+def _as_list(listed: Mapping[str, set[str]]) -> bytes:
+    return "".join(f"{digest}  {file}\n" for file in listed for digest in sorted(listed[file])).encode()
+
+
+def _ours(path: Path, file: str, digests: set[str]) -> bool:
+    """Whether a file of an earlier export is there to be removed.
+
+    Raises:
+        StorageError: it is there with another content.
+    """
+    place = path / file
+    if _linked(path, place) or not place.is_file():
+        return False
+    try:
+        found = hashlib.sha256(place.read_bytes()).hexdigest()
+    except OSError as error:
+        raise storage_error(place, error, "read") from error
+    if found not in digests:
+        raise StorageError(
+            f"'{place}' belongs to the export that this folder holds and was changed since; it is none of the new "
+            "files, so nothing was written. Move it away, or choose another folder with --out"
+        )
+    return True
+
+
+def _linked(path: Path, place: Path) -> bool:
+    """Whether a place below a folder, or one on the way to it, is a symbolic link."""
+    steps = place.relative_to(path).parts
+    return any(path.joinpath(*steps[: at + 1]).is_symlink() for at in range(len(steps)))
+
+
+def _check_place(path: Path, place: Path) -> None:
+    if _linked(path, place):
+        raise StorageError(
+            f"'{place}' is a symbolic link, through which files outside of '{path}' would be written; nothing was "
+            "written. Remove it, or choose another folder with --out"
+        )
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise storage_error(path, error, "remove") from error
+
+
+def _clean(path: Path, every: Mapping[str, object]) -> None:
+    """Remove what a killed export has not finished."""
+    for place in {path, *((path / file).parent for file in every)}:
+        if place.is_dir() and not (place != path and _linked(path, place)):
+            for rest in place.iterdir():
+                if _TEMPORARY.fullmatch(rest.name) and rest.is_file() and not rest.is_symlink():
+                    _remove(rest)
+
+
+def _remove_empty(path: Path, stale: list[str]) -> None:
+    """Remove folders that hold nothing any more."""
+    for place in sorted({(path / file).parent for file in stale} - {path}, reverse=True):
+        with contextlib.suppress(OSError):  # not empty
+            place.rmdir()

@@ -1,0 +1,47 @@
+"""What the generated code counts with: sizes beyond it are refused before anything is written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from edp.errors import ExportError
+from edp.training.bundle import Bundle
+
+LARGEST = 2**31 - 1
+"""Bytes, numbers and ticks: C counts in ``uint32_t``, MATLAB, Simulink and FMI in ``int32_t``."""
+MOST_COLUMNS = 2**16
+"""Numbers of a value from which a table of columns chooses: entries are ``uint16_t``."""
+
+
+def check_numbers(bundle: Bundle) -> None:
+    """Refuse a rate, horizons or coverages that no generated code can state.
+
+    Raises:
+        ExportError: which one, and what must hold.
+    """
+    rate, horizons, coverages = bundle.task.rate_hz, bundle.task.horizons, bundle.predictor.output.coverages
+    if not (isinstance(rate, int | float) and math.isfinite(rate) and 1e-6 <= rate <= 1e6):
+        raise ExportError(f"the rate of the network is {rate!r} Hz; it must be a number from 1e-6 to 1e6: train again")
+    if not all(isinstance(k, int) and 0 <= k <= LARGEST for k in horizons):
+        raise ExportError(f"a horizon of the network is {max(horizons)!r} ticks; at most {LARGEST:,} can be exported")
+    if not all(isinstance(share, float) and 0.0 < share < 1.0 for share in coverages):
+        raise ExportError(f"intervals of the network cover {list(coverages)}; shares between 0 and 1 can be exported")
+
+
+def check_sizes(sizes: Mapping[str, int], limit: int = LARGEST) -> None:
+    """Refuse sizes beyond what an index of the generated code reaches.
+
+    Args:
+        sizes: by what they are sizes of.
+        limit: the largest one.
+
+    Raises:
+        ExportError: one is larger; it is named.
+    """
+    for what, size in sizes.items():
+        if size > limit:
+            raise ExportError(
+                f"{what}: {size:,}; the generated code counts up to {limit:,}. Train a network with fewer units, "
+                "inputs or a shorter window"
+            )
