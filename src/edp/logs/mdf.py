@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import weakref
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.logs.mdf_check import check_blocks
-from edp.logs.names import told_apart
+from edp.logs.mdf_conversion import Conversion, refuse_engines
+from edp.logs.names import shown_name, told_apart
 from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
 from edp.logs.units import normalise_unit
@@ -29,6 +31,8 @@ from edp.signals import SignalMap
 
 _MAGIC = (b"MDF     ", b"UnFinMF ")
 _FACTS = "edp_info.json"
+_FACTS_BYTES = 1 << 24
+"""A thousand channels take 150 kB."""
 _PIECE_BYTES = 1 << 25
 _NUMBERS = range(6)
 """Data types of whole numbers and floats; above are texts, bytes, dates and pictures."""
@@ -103,12 +107,30 @@ class _File:
     def __init__(self, path: Path, log: Any) -> None:
         self.path = path
         self.log = log
+        self.conversions: dict[tuple[int, int], Any] = {}
+        self._take_conversions()
+
+    def _take_conversions(self) -> None:
+        """Take the conversions out of the library's hands before it reads a value: it runs formulas as code."""
+        for number, group in enumerate(self.log.groups):
+            for place, channel in enumerate(group.channels):
+                if channel.conversion is not None:
+                    self.conversions[number, place] = channel.conversion
+                    channel.conversion = None
+
+    def convert(self, number: int, place: int, raw: NDArray[Any]) -> NDArray[Any]:
+        """Physical values of a channel."""
+        block = self.conversions.get((number, place))
+        if block is None:
+            return raw
+        name = self.log.groups[number].channels[place].name
+        return Conversion(block, f"'{self.path}', channel {shown_name(name)}")(raw)
 
     def facts(self) -> OwnFacts:
-        for number, attachment in enumerate(self.log.attachments):
+        for attachment in self.log.attachments:
             if attachment.file_name == _FACTS:
-                data = self.log.extract_attachment(index=number)[0]
-                return own_facts(bytes(data).decode(errors="replace"), f"'{self.path}', attachment '{_FACTS}'")
+                where = f"'{self.path}', attachment '{_FACTS}'"
+                return own_facts(_embedded(attachment, where).decode(errors="replace"), where)
         return OwnFacts()
 
     def group(self, number: int, own: OwnFacts, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
@@ -127,7 +149,8 @@ class _File:
             if place == master or not usable or group.channel_dependencies[place] or not samples:
                 continue
             known = own.channels.get(channel.name)
-            unit = channel.unit or (channel.conversion.unit if channel.conversion else "")
+            conversion = self.conversions.get((number, place))
+            unit = channel.unit or (conversion.unit if conversion else "")
             key = str(place)
             signal = RawSignal(
                 channel.name,
@@ -150,7 +173,8 @@ class _File:
 
     def stamps(self, number: int) -> Column:
         with _damage(self.path):
-            return np.array(self.log.get_master(number), dtype=np.float64)
+            raw = np.asarray(self.log.get_master(number))
+        return np.array(self.convert(number, self.log.masters_db[number], raw), dtype=np.float64)
 
 
 class _Table:
@@ -173,9 +197,9 @@ class _Table:
                     record_offset=first,
                     record_count=count,
                     copy_master=False,
-                    ignore_value2text_conversions=True,
+                    raw=True,
                 )
-                columns = [_valid(signal) for signal in selected]
+                columns = [_plain(signal) for signal in selected]
             for signal, column in zip(selected, columns):
                 if column.dtype.kind not in "fiub" or column.ndim != 1:
                     raise DataError(f"'{self.file.path}': column '{signal.name}' holds no plain numbers; map another")
@@ -184,16 +208,39 @@ class _Table:
                         f"'{self.file.path}': column '{signal.name}' ends after {first + len(column)} rows, {stop} "
                         "were announced (truncated); copy or export it again"
                     )
-            yield columns
+            yield [
+                _valid(signal, self.file.convert(self.number, int(name), column))
+                for signal, column, name in zip(selected, columns, names)
+            ]
 
 
-def _valid(signal: Any) -> NDArray[Any]:
+def _plain(signal: Any) -> NDArray[Any]:
+    return np.asarray(signal.samples)
+
+
+def _valid(signal: Any, values: NDArray[Any]) -> NDArray[Any]:
     """The values, NaN where the file marks them as invalid."""
-    values = np.asarray(signal.samples)
     if signal.invalidation_bits is None:
         return values
     invalid = np.asarray(signal.invalidation_bits, dtype=np.bool_)
     return np.where(invalid, np.nan, values) if invalid.any() else values
+
+
+def _embedded(attachment: Any, where: str) -> bytes:
+    """The bytes of an attachment inside the file, unpacked to `_FACTS_BYTES` and no further; no other file is opened.
+
+    Raises:
+        DataError: the attachment lies outside the file, is packed in another way than deflate, or is too large.
+    """
+    embedded, packed, otherwise = (bool(attachment.flags & flag) for flag in (1, 2, 8))
+    data = bytes(attachment.embedded_data)
+    if not embedded or otherwise or (packed and attachment.zip_type):
+        raise DataError(f"{where}: is not embedded as EDP embeds it; it is damaged: copy or export the file again")
+    if packed:
+        data = zlib.decompressobj().decompress(data, _FACTS_BYTES + 1)
+    if len(data) > _FACTS_BYTES:
+        raise DataError(f"{where}: is larger than {_FACTS_BYTES} bytes; it is damaged: copy or export the file again")
+    return data
 
 
 def _close(log: Any, stream: Any) -> None:
@@ -239,4 +286,5 @@ def _library() -> ModuleType:
             "MDF files need the package asammdf, which is not installed; run pip install "
             "'excavator-dynamics-predictor[mdf]', or export the file as MAT or CSV with your measurement tool"
         ) from error
+    refuse_engines(asammdf)
     return asammdf

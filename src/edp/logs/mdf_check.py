@@ -13,12 +13,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edp.errors import DataError
+from edp.limits import check_memory
+from edp.logs.unpack import unpacked_size
 
 _HEAD = 24
 _FIRST = 64
 _MAX_BLOCK = 1 << 31
 _DEFLATE_RATIO = 1100
+_COPIES = 3
+"""A packed block is in memory as it was unpacked, transposed and as columns."""
+_DEEPEST_CONVERSION = 8
+_MOST_ENTRIES = 2_000_000
+"""Entries of all conversions that the library would load, each table within a table counted as often as it does."""
+_MOST_TEXT = 1 << 26
+_TEXT_RATIO = 8
+"""Bytes of text that blocks may share, beyond `_MOST_TEXT`, for each byte of the file."""
+_PACKINGS = ("zlib", "zlib", "lz4", "lz4", "zstd", "zstd")
+"""By type of a packed block; each second one is transposed."""
 _DATA = {b"##DT", b"##DV", b"##DZ", b"##DL", b"##HL", b"##LD", b"##SD", b"##RD", b"##DI", b"##RV", b"##RI"}
+_NAMED = {b"##CN", b"##CG", b"##CC", b"##SI", b"##AT", b"##EV", b"##CH", b"##FH", b"##DG", b"##HD", b"##CA"}
+_PACKED_HEAD = 24
+"""Type of the block within, way of packing, parameter, sizes unpacked and packed."""
 # The links that make the tree: each of their targets belongs to one block. `None`: all of them.
 _TREE: dict[bytes, tuple[int, ...] | None] = {
     b"##HD": (0, 1, 2, 3, 4),
@@ -101,6 +116,7 @@ class _Walk:
                     owned.add(target)
                 todo.append(found)
             self.numbers(block)
+        self.conversions()
 
     def block(self, at: int) -> _Block:
         if at in self.blocks:
@@ -124,8 +140,63 @@ class _Walk:
             fits = packed <= block.length and original <= min(_MAX_BLOCK, _DEFLATE_RATIO * (packed + 64))
             if not fits:
                 raise self.broken(block.at, f"a packed block of {packed} bytes that claims to hold {original}")
+            check_memory(self.path, _COPIES * original, "a packed block", "it may be damaged; record smaller blocks")
+            self.unpack(block, packed, original)
         elif block.id == b"##DG" and len(block.links) >= 3:
             self.group(block)
+
+    def unpack(self, block: _Block, packed: int, original: int) -> None:
+        """The library unpacks to wherever the content leads; this goes no further than what is announced."""
+        kind = struct.unpack_from("<2sBBIQQ", self.view, block.data_at)[1]
+        if kind >= len(_PACKINGS):
+            raise self.broken(block.at, f"a block packed in a way {kind} that is not known")
+        start = block.data_at + _PACKED_HEAD
+        if start + packed > block.at + block.length:
+            raise self.broken(block.at, f"a packed block of {packed} bytes in {block.length}")
+        try:
+            size = unpacked_size(_PACKINGS[kind], self.view[start : start + packed], original)
+        except Exception as error:
+            # Each packing has exceptions of its own for damaged bytes.
+            raise self.broken(block.at, f"a packed block that cannot be unpacked ({error})") from error
+        if size != original:
+            more = "more than " if size > original else ""
+            raise self.broken(
+                block.at, f"a packed block that announces {original} bytes and holds {more}{min(size, original)}"
+            )
+
+    def conversions(self) -> None:
+        """Tables of conversions: no cycle, not deep, and not more of them (or of text) than the file can mean."""
+        seen: dict[int, tuple[int, int]] = {}
+        entries = 0
+        text = sum(self.text_of(block) for block in self.blocks.values() if block.id not in _DATA)
+        for block in self.blocks.values():
+            if block.id == b"##CN" and len(block.links) >= 8 and block.links[4]:
+                count, more = self.conversion(block.links[4], seen, 0)
+                entries, text = entries + count, text + more
+        if entries > _MOST_ENTRIES or text > _MOST_TEXT + _TEXT_RATIO * len(self.view):
+            raise _broken(
+                self.path,
+                f"states {entries} entries of conversions and {text} bytes of text, by blocks used many times",
+            )
+
+    def conversion(self, at: int, seen: dict[int, tuple[int, int]], depth: int) -> tuple[int, int]:
+        """Entries and bytes of text of one conversion, with those within it."""
+        if depth > _DEEPEST_CONVERSION:
+            raise self.broken(at, "a conversion within itself, or too many within one another")
+        if at not in seen:
+            block = self.block(at)
+            entries, text = 1 + len(block.links), self.text_of(block)
+            for link in block.links[4:]:
+                if link and self.block(link).id == b"##CC":
+                    count, more = self.conversion(link, seen, depth + 1)
+                    entries, text = entries + count, text + more
+            seen[at] = entries, text
+        return seen[at]
+
+    def text_of(self, block: _Block) -> int:
+        """Bytes of text that a block links to."""
+        targets = [self.block(link) for link in block.links if link] if block.id in _NAMED else []
+        return sum(target.length for target in targets if target.id in (b"##TX", b"##MD"))
 
     def group(self, group: _Block) -> None:
         """A sorted data group: its records fill its data, and its channels lie inside a record."""

@@ -26,16 +26,25 @@ def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
     signals: dict[str, RawSignal] = {}
     aliases: dict[str, str] = {}
     repeated: dict[str, list[str]] = {}
+    numbers: Counter[str] = Counter()
     for name, signal in found:
         full = name
         if signal.name not in often:
             signals[signal.name] = signal
             aliases[full] = signal.name
             continue
-        number = 1
         while full in signals:
-            number += 1
-            full = f"{name}#{number}"
+            numbers[name] += 1
+            full = f"{name}#{numbers[name] + 1}"
         signals[full] = replace(signal, name=full)
         repeated.setdefault(signal.name, []).append(full)
     return signals, aliases, repeated
+
+
+SHOWN = 80
+"""Characters of a name in a message."""
+
+
+def shown_name(name: str) -> str:
+    """A name of a file in quotes for a message: shortened, with control characters as escapes."""
+    return repr(name if len(name) <= SHOWN else name[: SHOWN - 3] + "...")

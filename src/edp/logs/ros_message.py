@@ -38,6 +38,8 @@ _DTYPES = {
 }
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 _DEEPEST = 32
+_MOST_STEPS = 100_000
+"""Fields of one message, each element of a list counted; only lists of lists and of messages can have so many."""
 
 
 class Types(Protocol):
@@ -91,6 +93,7 @@ class _Walk:
         self.types = types
         self.cdr = cdr
         self.at = 0
+        self.steps = 0
         self.layout = Layout()
         self.order = "<"
         if cdr:
@@ -125,6 +128,9 @@ class _Walk:
 
     def value(self, kind: Any, path: str, names: list[str], depth: int) -> list[str]:
         """One field; returns the texts of a list of texts."""
+        self.steps += 1
+        if self.steps > _MOST_STEPS:
+            raise DataError(f"a message of more than {_MOST_STEPS} fields")
         what, detail = int(kind[0]), kind[1]
         if what == _BASE:
             self.base(detail[0], path)
@@ -141,7 +147,11 @@ class _Walk:
     def several(self, kind: Any, count: int, path: str, names: list[str], depth: int) -> list[str]:
         """A list: numbers are named by the list of names beside them, else counted from 1."""
         plain = int(kind[0]) == _BASE
+        if not plain and count > _MOST_STEPS:
+            raise DataError(f"a list of {count} messages in a message")
         if plain and kind[1][0] in ("string", "wstring"):
+            if count > len(self.raw):
+                raise DataError(f"a list of {count} texts in a message of {len(self.raw)} bytes")
             return [self.text(kind[1][0]) for _ in range(count)]
         if plain and count > LARGEST_ARRAY:
             size = int(_DTYPES[kind[1][0]][1])
@@ -199,12 +209,14 @@ def columns_of(
     for size in np.unique(sizes):
         rest = np.flatnonzero(sizes == size)
         block = np.frombuffer(b"".join([raws[i] for i in rest.tolist()]), dtype=np.uint8).reshape(len(rest), int(size))
-        while len(rest):
-            layout = layout_of(block[0].tobytes(), message_type, types, cdr)
-            same = np.ones(len(rest), dtype=np.bool_)
+        rows = np.arange(len(rest))
+        while len(rows):
+            layout = layout_of(block[rows[0]].tobytes(), message_type, types, cdr)
+            same = np.ones(len(rows), dtype=np.bool_)
             for at, expected in layout.fixed:
-                same &= (block[:, at : at + len(expected)] == np.frombuffer(expected, dtype=np.uint8)).all(axis=1)
-            chosen = block if same.all() else block[same]
+                part = block[rows, at : at + len(expected)]
+                same &= (part == np.frombuffer(expected, dtype=np.uint8)).all(axis=1)
+            chosen = block if len(rows) == len(block) and same.all() else block[rows[same]]
             for place, name in enumerate(names):
                 if name not in layout.fields:
                     continue
@@ -215,6 +227,7 @@ def columns_of(
                 target = found[place]
                 if target is None:
                     target = found[place] = np.full(len(raws), np.nan, dtype=kept)
-                target[rest[same]] = column
-            rest, block = rest[~same], block[~same]
+                target[rest[rows[same]]] = column
+            # Only the numbers of the rows left are kept: messages may all differ.
+            rows = rows[~same]
     return [np.full(len(raws), np.nan) if column is None else column for column in found]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.logs.mcap_check import check_records
+from edp.logs.bag_guard import check_counts, definitions_of, open_reader
 from edp.logs.names import told_apart
 from edp.logs.own import OwnFacts, own_facts
 from edp.logs.raw import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
@@ -32,8 +32,6 @@ KEPT_BYTES = 1 << 29
 """Wanted columns up to this size are read in one go through the file; beyond, each topic in pieces."""
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _LOG_TIME, _HEADER_TIME = "log_time", "header.stamp"
-_DISTRIBUTION = "ros2_humble"
-"""Whose message types stand in where a bag holds no definitions."""
 
 
 class BagFormat:
@@ -89,7 +87,7 @@ class _Bag:
         self.wanted = wanted
         self.time = signal_map.time
         with damage(path):
-            self.reader = _reader(path)
+            self.reader = open_reader(path)
             self.cdr = not hasattr(self.reader, "chunk_infos")
             self.reader.open()
             weakref.finalize(self, _close, self.reader)
@@ -99,6 +97,7 @@ class _Bag:
                     raise DataError("a topic without a name")
                 by_topic.setdefault(connection.topic, []).append(connection)
             self.about = {name: sum(each.msgcount for each in group) for name, group in by_topic.items()}
+            check_counts(path, self.about, sorted(path.iterdir()) if path.is_dir() else [path])
             filled = {name: group for name, group in by_topic.items() if self.about[name]}
             self.topics = [_Topic(self, name, group) for name, group in filled.items() if name != FACTS_TOPIC]
             self.facts_from = filled.get(FACTS_TOPIC)
@@ -110,7 +109,7 @@ class _Bag:
         with damage(self.path):
             raw = next(iter(self.reader.messages(connections=self.facts_from)))[2]
             start = 8 if self.cdr else 4
-            (count,) = struct.unpack_from("<I", raw, start - 4)
+            (count,) = struct.unpack_from("<I", raw, start - 4)  # a slice ends where the message does
             text = bytes(raw[start : start + count]).rstrip(b"\0").decode()
         return own_facts(text, f"'{self.path}', topic '{FACTS_TOPIC}'")
 
@@ -171,15 +170,17 @@ class _Topic:
         self.connections = connections
         self.samples = bag.about[name]
         self.kind = connections[0].msgtype
-        self.types = _types(connections[0])
+        self.types: Any = definitions_of(connections[0].msgdef, self.kind)
         self.kept: dict[str, NDArray[Any]] = {}
         self._stamps: Column | None = None
         self.paths: dict[str, str] = {}
         self.stamp_paths: list[str] = []
         if self.types is None:
             return
-        first = next(iter(bag.reader.messages(connections=connections)))[2]
-        fields = layout_of(first, self.kind, self.types, bag.cdr).fields
+        first = next(iter(bag.reader.messages(connections=connections)), None)
+        if first is None:
+            raise DataError(f"no message of topic '{name}', of which {self.samples} are announced")
+        fields = layout_of(first[2], self.kind, self.types, bag.cdr).fields
         self.stamp_paths = [path for path in _STAMP if path in fields and bag.time != _LOG_TIME]
         numbers = [path for path in fields if not path.startswith(("header.", "layout."))]
         for path in numbers:
@@ -261,41 +262,12 @@ class _Topic:
                 row += 1
                 if start < row <= stop:
                     raws.append(raw)
-                    if len(raws) >= PIECE_ROWS:
+                    if len(raws) >= PIECE_ROWS // 8:
                         yield self.columns(raws, names)
                         raws = []
             self.check_count(row)
             if raws:
                 yield self.columns(raws, names)
-
-
-def _types(connection: Any) -> Any:
-    """The definitions a connection carries, else those of a known distribution; None for an unknown type."""
-    from rosbags.interfaces import MessageDefinitionFormat
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
-    text = connection.msgdef
-    if text.format == MessageDefinitionFormat.NONE:
-        store = get_typestore(Stores(_DISTRIBUTION))
-        return store if connection.msgtype in store.fielddefs else None
-    store = get_typestore(Stores.EMPTY)
-    if text.format == MessageDefinitionFormat.MSG:
-        store.register(get_types_from_msg(text.data, connection.msgtype))
-    else:
-        for part in text.data.split("=" * 80 + "\n"):
-            if part.strip():
-                store.register(get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part))
-    return store
-
-
-def _reader(path: Path) -> Any:
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
-
-    for file in path.glob("*.mcap") if path.is_dir() else [path]:
-        if file.suffix.lower() == ".mcap":
-            check_records(file)
-    return Reader1(path) if path.suffix.lower() == ".bag" and path.is_file() else Reader2(path)
 
 
 def _close(reader: Any) -> None:

@@ -6,11 +6,14 @@ holds one array (14), whose length stands in its first 8 bytes. v7.3 is HDF5.
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import h5py
+import numpy as np
 
 from edp.errors import DataError
 from edp.limits import check_memory
@@ -23,6 +26,15 @@ _DEFLATE_RATIO = 1100
 """Deflate packs no better than 1,032 to 1."""
 _UNSTORED_BYTES = 1 << 20
 """What an array may claim beyond that: HDF5 need not store what was never written."""
+_MOST_OBJECTS = 1_000_000
+"""Objects of a file; a Simulink log of 1,000 signals has some 30,000."""
+_LINKS = {
+    h5py.h5l.TYPE_SOFT: "a soft link",
+    h5py.h5l.TYPE_EXTERNAL: "a link to another file",
+}
+_FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32))
+"""What MATLAB packs with; others may be code that the library loads from a folder."""
+_SHOWN = 80
 _ADVICE = "it may be damaged, or was made to exhaust memory; else save fewer variables, or Parquet or MDF, in a file"
 
 
@@ -77,20 +89,11 @@ def _unpacked(start: bytes, order: str) -> int:
 
 
 def _announced_v73(path: Path) -> tuple[int, int]:
-    total = objects = 0
-
-    def add(name: str, part: h5py.HLObject) -> None:
-        nonlocal total, objects
-        objects += 1
-        if isinstance(part, h5py.Dataset):
-            held, stored = part.size * part.dtype.itemsize, part.id.get_storage_size()
-            if held > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
-                raise _impossible(path, f"the array '{name}'", held, stored)
-            total += held
-
     try:
         with h5py.File(path, "r") as file:
-            file.visititems(add)
+            walk = _Walk(path)
+            walk.run(file.id)
+            return walk.total, len(walk.seen)
     except DataError:
         raise
     except Exception as error:
@@ -99,7 +102,85 @@ def _announced_v73(path: Path) -> tuple[int, int]:
             f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {error}); it may be truncated or damaged: "
             "copy or export it again"
         ) from error
-    return total, objects
+
+
+class _Walk:
+    """Every object of a v7.3 file, through links and references, before a value of an array is read.
+
+    Only hard links are followed: MATLAB writes no others, and a file could name other files through them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.total = 0
+        self.seen: set[int] = set()
+        self.todo: list[tuple[str, Any]] = []
+
+    def run(self, root: Any) -> None:
+        self.add("/", root)
+        while self.todo:
+            name, part = self.todo.pop()
+            if isinstance(part, h5py.h5g.GroupID):
+                self.links(name, part)
+            elif isinstance(part, h5py.h5d.DatasetID):
+                self.array(name, part)
+
+    def add(self, name: str, part: Any) -> None:
+        address = h5py.h5o.get_info(part).addr
+        if address in self.seen:
+            return
+        self.seen.add(address)
+        if len(self.seen) > _MOST_OBJECTS:
+            raise DataError(f"'{self.path}' holds more than {_MOST_OBJECTS} objects; save fewer variables in a file")
+        self.todo.append((name, part))
+
+    def links(self, name: str, group: Any) -> None:
+        for link in group:
+            inner = f"{name.rstrip('/')}/{link.decode(errors='replace')}"
+            kind = group.links.get_info(link).type
+            if kind != h5py.h5l.TYPE_HARD:
+                raise self.refused(inner, _LINKS.get(kind, "a link of an unknown kind"))
+            self.add(inner, h5py.h5o.open(group, link))
+
+    def array(self, name: str, data: Any) -> None:
+        """Where an array's values lie is looked at before its shape: the shape of a virtual one opens other files."""
+        plan = data.get_create_plist()
+        if plan.get_layout() == h5py.h5d.VIRTUAL:
+            raise self.refused(name, "a virtual data set, whose values lie in other files")
+        if plan.get_external_count():
+            raise self.refused(name, "an array in external storage, whose values lie in another file")
+        for place in range(plan.get_nfilters()):
+            number = plan.get_filter(place)[0]
+            if number not in _FILTERS:
+                raise self.refused(name, f"an array packed by the filter {number}")
+        part = h5py.Dataset(data)
+        size, stored = part.size or 0, data.get_storage_size()
+        chunk = math.prod(part.chunks or (0,))
+        held = max(size, chunk if stored else 0) * part.dtype.itemsize
+        if held > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
+            raise _impossible(self.path, f"the array {_shown(name)}", held, stored)
+        self.total += held
+        if size and h5py.check_ref_dtype(part.dtype) is not None:
+            check_memory(self.path, _COPIES * self.total, "the variables of this MAT file", _ADVICE)
+            self.references(name, part)
+
+    def references(self, name: str, part: h5py.Dataset) -> None:
+        """What a cell or an object refers to need not be linked from anywhere."""
+        for reference in np.asarray(part[()]).ravel():
+            if isinstance(reference, h5py.RegionReference):
+                raise self.refused(name, "a reference to a region of an array")
+            if reference:
+                self.add(f"{name} (reference)", h5py.h5r.dereference(reference, part.id))
+
+    def refused(self, name: str, what: str) -> DataError:
+        return DataError(
+            f"'{self.path}': {_shown(name)} is {what}; a MAT file of MATLAB holds all of its values itself. Load it in "
+            "MATLAB and save it again"
+        )
+
+
+def _shown(name: str) -> str:
+    return repr(name if len(name) <= _SHOWN else name[: _SHOWN - 3] + "...")
 
 
 def _impossible(path: Path, what: str, held: int, stored: int) -> DataError:
