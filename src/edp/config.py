@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from importlib import resources
@@ -15,11 +15,12 @@ import tomli_w
 
 from edp import storage
 from edp.blocks import BLOCKS
+from edp.bounds import shown
 from edp.data.augment import AUGMENTATIONS
 from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS, Derived, FeatureSet
 from edp.data.splits import SPLITS, ByRecording, SplitSpec
-from edp.data.task import TargetMode, Task
+from edp.data.task import TargetMode, Task, check_ends
 from edp.errors import ConfigError, closest
 from edp.evaluation.judge import JudgeSpec
 from edp.losses import LOSSES, TERMS
@@ -61,6 +62,8 @@ USUAL_KIND = {"head": "mlp"}
 
 SHOWN_CHANGE = 200
 """Of a ``--set``, in messages."""
+MOST_LISTED, MOST_KEY = 50, 100
+"""Problems that a message lists, and characters of a key that it repeats."""
 PRESETS = ("quick", "small", "standard", "thesis")
 Table = dict[str, Any]
 
@@ -75,6 +78,9 @@ class FeatureSettings:
     hidden: tuple[str, ...] = ()
     starting: tuple[str, ...] = ()
     starting_ticks: int = 5
+
+    def __post_init__(self) -> None:
+        FeatureSet(**{entry.name: getattr(self, entry.name) for entry in fields(self)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +103,9 @@ class TaskSettings:
     mode: TargetMode = TargetMode.DELTA
     derived_targets: tuple[Derived, ...] = ()
     integrate: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_ends(self)
 
     def resolve(self, rate_hz: float, channels: Sequence[str] = (), physics: PhysicsSpec | None = None) -> Task:
         """The task for recordings of `rate_hz` with these channels, with what a physics base reads beside them."""
@@ -253,7 +262,8 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     problems: list[str] = []
     made = _build(cls, table, "", problems)
     if problems:
-        listed = "\n  - ".join(problems)
+        more = [f"and {len(problems) - MOST_LISTED:,} more"] if len(problems) > MOST_LISTED else []
+        listed = "\n  - ".join(problems[:MOST_LISTED] + more)
         count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
         raise ConfigError(f"settings {where}: {count}\n  - {listed}")
     return typing.cast(T, made)
@@ -261,14 +271,14 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
 def _build(cls: type, table: Any, path: str, problems: list[str]) -> Any:
     if not isinstance(table, Mapping):
-        problems.append(f"{path}: expected a table, got {table!r}")
+        problems.append(f"{path}: expected a table, got {shown(table)}")
         return None
     hints = _hints(cls)
     known = [entry.name for entry in fields(cls)]
     before = len(problems)
     for key in table:
         if key not in known:
-            problems.append(f"unknown key '{_join(path, key)}'{closest(key, known)}")
+            problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), known)}")
     for entry in fields(cls):
         required = entry.default is MISSING and entry.default_factory is MISSING
         if required and entry.name not in table:
@@ -299,17 +309,38 @@ def _value(name: str, hint: Any, value: Any, path: str, problems: list[str]) -> 
     if is_dataclass(item_type) and isinstance(value, list):
         made = [_build(typing.cast(type, item_type), v, f"{path}[{i}]", problems) for i, v in enumerate(value)]
         return tuple(made)
+    if _truth_in(value) and bool not in _leaves(hint):
+        problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
+        return None
     try:
         return _adapter(hint).validate_python(value)
     except pydantic.ValidationError as error:
         first = error.errors()[0]
-        problems.append(f"{path} = {value!r}: {first['msg'][0].lower()}{first['msg'][1:]}")
+        problems.append(f"{path} = {shown(value)}: {first['msg'][0].lower()}{first['msg'][1:]}")
         return None
 
 
 # A search builds thousands of experiments, and making these took nine tenths of the time.
 _hints = cache(typing.get_type_hints)
-_adapter: Callable[[Any], Any] = cache(pydantic.TypeAdapter)
+
+
+@cache
+def _adapter(hint: Any) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(hint, config=pydantic.ConfigDict(allow_inf_nan=False))
+
+
+@cache
+def _leaves(hint: Any) -> frozenset[Any]:
+    """The types that a hint is made of."""
+    inner = typing.get_args(hint)
+    return frozenset().union(*map(_leaves, inner)) if inner else frozenset((hint,))
+
+
+def _truth_in(value: Any) -> bool:
+    """Whether a value is or holds true or false, which Python counts as numbers."""
+    if isinstance(value, Mapping):
+        return any(map(_truth_in, value.values()))
+    return any(map(_truth_in, value)) if isinstance(value, list | tuple) else isinstance(value, bool)
 
 
 def _tagged(name: str, table: Any, path: str, problems: list[str]) -> Any:
@@ -321,12 +352,20 @@ def _tagged(name: str, table: Any, path: str, problems: list[str]) -> Any:
     if not isinstance(table, Mapping) or "kind" not in table:
         problems.append(f'{path}: say which {registry.what} with kind = "..."{closest("", registry)}')
         return None
+    if not isinstance(table["kind"], str):
+        problems.append(f"{path}.kind = {shown(table['kind'])}: the name of one must hold{closest('', registry)}")
+        return None
     try:
-        cls = registry[table["kind"]]
+        cls = registry[_key(table["kind"])]
     except ConfigError as error:
         problems.append(f"{path}.kind: {error}")
         return None
     return _build(cls, {key: value for key, value in table.items() if key != "kind"}, path, problems)
+
+
+def _key(name: str) -> str:
+    """A key or name as messages repeat it."""
+    return name if len(name) <= MOST_KEY else f"{name[:MOST_KEY]}..."
 
 
 def _join(path: str, key: str) -> str:

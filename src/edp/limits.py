@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from edp.errors import DataError
+from edp.errors import ConfigError, DataError
 
 SHARE = 0.8
 """Of the memory that is free now, what a log may take."""
@@ -43,3 +43,25 @@ def check_memory(path: Path, needed: int, what: str, advice: str) -> None:
 
 def _gigabytes(count: int) -> str:
     return f"{count / 1e9:,.3g} GB"
+
+
+def check_setting(needed: float, what: str, advice: str) -> None:
+    """Refuse settings that ask for more memory than this machine can give, before any of it is taken.
+
+    Args:
+        needed: bytes.
+        what: which settings take them.
+        advice: what to do instead.
+
+    Raises:
+        ConfigError: says what it would take and what is free.
+    """
+    free = free_bytes()
+    if needed > SHARE * free:
+        raise ConfigError(f"{what} would take {readable(needed)} of memory, {readable(free)} are free; {advice}")
+
+
+def readable(count: float) -> str:
+    """A number of bytes in MB, GB or TB."""
+    unit, size = ("TB", 1e12) if count >= 1e12 else ("GB", 1e9) if count >= 1e9 else ("MB", 1e6)
+    return f"{count / size:,.3g} {unit}" if count < 1e15 else f"{count / size:,.0f} {unit}"

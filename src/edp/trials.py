@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from edp.bounds import SEED, check_bounds, check_count, whole
 from edp.config import Experiment, FeatureSettings
 from edp.data.features import FEATURE_SETS, Derived
 from edp.data.task import TargetMode
@@ -31,6 +32,8 @@ Sets = Mapping[str, str | FeatureSettings]
 OnTrial = Callable[[str, int, int, Event | None], None]
 FILE = "trials.json"
 COVERAGE = 0.95
+MOST_SETS = 1_000
+"""Random sets, or seeds: each of them is a training."""
 _DRAWS = 20
 """Draws for one random set that is not there already."""
 
@@ -52,11 +55,10 @@ class TrialSpec:
     seeds: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        if self.random < 0 or not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise ConfigError(
-                f"trials: random = {self.random}, seeds = {list(self.seeds)}; random >= 0 and at least one seed, each "
-                "once, must hold"
-            )
+        check_bounds("trials", self, random=whole(0, MOST_SETS), draw=SEED, seeds=SEED)
+        check_count("trials", "seeds", self.seeds, MOST_SETS)
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ConfigError(f"trials: seeds = {list(self.seeds)}; at least one seed, each once, must hold")
 
 
 @dataclass(frozen=True)

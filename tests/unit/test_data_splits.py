@@ -115,11 +115,12 @@ def test_data_that_cannot_be_divided_is_refused(spec, samples, message):
 
 
 @pytest.mark.parametrize(
-    "spec", [ByTime(validation_share=0.6, test_share=0.4), ByBlocks(every=1), ByBlocks(block_s=2.0)]
+    ("rule", "options"),
+    [(ByTime, {"validation_share": 0.6, "test_share": 0.4}), (ByBlocks, {"every": 1}), (ByBlocks, {"block_s": 2.0})],
 )
-def test_options_that_leave_nothing_are_refused(spec):
+def test_options_that_leave_nothing_are_refused(rule, options):
     with pytest.raises(ConfigError, match="split"):
-        spec.split(recordings(1000), 10)
+        rule(**options).split(recordings(1000), 10)
 
 
 def test_prepared_data_keep_window_and_horizon_between_parts_and_know_their_channels():

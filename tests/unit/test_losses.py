@@ -261,7 +261,7 @@ def test_adaptive_weights_are_inverse_running_errors_cut_and_blended():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Huber(delta=0.0), r"delta = 0\.0; delta > 0 must hold"),
+        (lambda: Huber(delta=0.0), r"delta = 0\.0; 0 < delta <= 1,000,000 must hold"),
         (lambda: Focal(gamma=-1.0), r"gamma = -1\.0.*must hold"),
         (lambda: Focal(delta=-2.0), r"delta = -2\.0.*must hold"),
         (lambda: Heteroscedastic(beta=1.5), r"beta = 1\.5; 0 <= beta <= 1 must hold"),

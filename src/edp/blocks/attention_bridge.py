@@ -11,6 +11,7 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, Slot
+from edp.bounds import MOST_CHANNELS, check_bounds, whole
 from edp.errors import ConfigError
 from edp.graph import Builder
 from edp.graph.layers import Activate, Add, Dense, Function, LayerNorm
@@ -43,8 +44,7 @@ class AttentionBridge:
     heads: int = 4
 
     def __post_init__(self) -> None:
-        if self.heads < 1:
-            raise ConfigError(f"attention_bridge: heads = {self.heads}; at least 1 must hold")
+        check_bounds("attention_bridge", self, heads=whole(1, MOST_CHANNELS))
 
     def build(self, width: int, window: int) -> Streaming:
         """The bridge on `width` channels."""

@@ -10,6 +10,7 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, OutputSpace, Slot
+from edp.bounds import MOST_KERNEL, check_bounds, whole
 from edp.errors import ConfigError, closest
 from edp.graph import Builder
 from edp.graph.memory import Convolution
@@ -41,8 +42,7 @@ class LinearBypass:
     trained: bool = True
 
     def __post_init__(self) -> None:
-        if self.taps < 1:
-            raise ConfigError(f"linear_bypass: taps = {self.taps}; at least 1 must hold")
+        check_bounds("linear_bypass", self, taps=whole(1, MOST_KERNEL))
         if self.start not in STARTS:
             raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, STARTS)}")
         if self.start == "zero" and not self.trained:

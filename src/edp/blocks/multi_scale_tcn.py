@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, BranchMaker, Slot
+from edp.bounds import MOST_LEVELS, MOST_TICKS, check_bounds, check_count, whole
 from edp.errors import ConfigError
 from edp.graph import Builder
 from edp.streaming import Cost, State, Streaming
@@ -33,6 +34,8 @@ class MultiScaleTcn:
     first_dilations: tuple[int, ...] = (1, 4)
 
     def __post_init__(self) -> None:
+        check_count("multi_scale_tcn", "first_dilations", self.first_dilations, MOST_LEVELS)
+        check_bounds("multi_scale_tcn", self, first_dilations=whole(1, MOST_TICKS))
         if len(self.first_dilations) < 2 or min(self.first_dilations) < 1:
             raise ConfigError(
                 f"multi_scale_tcn: first_dilations = {list(self.first_dilations)}; "

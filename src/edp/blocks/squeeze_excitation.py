@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, Slot
-from edp.errors import ConfigError
+from edp.bounds import MOST_CHANNELS, check_bounds, whole
 from edp.graph import Builder
 from edp.graph.layers import Activate, Dense, Function, Multiply
 from edp.streaming import Cost, Operation, State, Streaming, parameters_of
@@ -36,8 +36,7 @@ class SqueezeExcitation:
     reduction: int = 4
 
     def __post_init__(self) -> None:
-        if self.reduction < 1:
-            raise ConfigError(f"squeeze_excitation: reduction = {self.reduction}; at least 1 must hold")
+        check_bounds("squeeze_excitation", self, reduction=whole(1, MOST_CHANNELS))
 
     def build(self, width: int, window: int) -> Streaming:
         """The block on `width` channels."""

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from edp.bounds import MOST_UNITS, MOST_WEIGHT, WEIGHT, below, check_bounds, span, whole
 from edp.compress.hints import Components, hint_error
 from edp.data.series import Series
 from edp.data.task import Task
@@ -44,8 +45,7 @@ class SoftmaxDivergence:
     temperature: float = 2.0
 
     def __post_init__(self) -> None:
-        if not self.temperature > 0:
-            raise ConfigError(f"softmax divergence: temperature = {self.temperature}; temperature > 0 must hold")
+        check_bounds("softmax divergence", self, temperature=WEIGHT)
 
     def evaluate(self, answer: Answer, target: Tensor) -> Tensor:
         """Terms of the divergence times the number of outputs, so that their mean is the divergence."""
@@ -75,15 +75,11 @@ class DistillationSpec:
     components: int = 16
 
     def __post_init__(self) -> None:
-        if not 0 <= self.truth < 1:
+        if not below(0.0, 1.0).holds(self.truth):
             raise ConfigError(
                 f"distillation: truth = {self.truth}; 0 <= truth < 1 must hold (with 1 there is no teacher: train)"
             )
-        if self.hint < 0 or self.components < 1:
-            raise ConfigError(
-                f"distillation: hint = {self.hint}, components = {self.components}; hint of at least 0 and components "
-                "of at least 1 must hold"
-            )
+        check_bounds("distillation", self, hint=span(0.0, MOST_WEIGHT), components=whole(1, MOST_UNITS))
 
 
 class Distillation:

@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.bounds import MOST_TICKS, above, check_bounds, whole
 from edp.data.series import Series
-from edp.errors import ConfigError
 from edp.registry import Registry
 
 
@@ -48,8 +48,7 @@ class Jitter:
     std: float = 0.02
 
     def __post_init__(self) -> None:
-        if not 0 < self.std <= 1:
-            raise ConfigError(f"jitter: std = {self.std}; 0 < std <= 1 must hold")
+        check_bounds("jitter", self, std=above(0.0, 1.0))
 
     def apply(self, part: Series, deviation: NDArray[np.float32], rng: np.random.Generator) -> Series:
         """Add the noise."""
@@ -72,8 +71,7 @@ class WindowShift:
     most: int = 2
 
     def __post_init__(self) -> None:
-        if self.most < 1:
-            raise ConfigError(f"window_shift: most = {self.most}; at least 1 must hold")
+        check_bounds("window_shift", self, most=whole(1, MOST_TICKS))
 
     def apply(self, part: Series, deviation: NDArray[np.float32], rng: np.random.Generator) -> Series:
         """Shift all inputs alike; the rows that are missing at one end repeat the last there."""
@@ -100,8 +98,7 @@ class TimeWarp:
     strength: float = 0.1
 
     def __post_init__(self) -> None:
-        if not 0 < self.strength <= 0.5:
-            raise ConfigError(f"time_warp: strength = {self.strength}; 0 < strength <= 0.5 must hold")
+        check_bounds("time_warp", self, strength=above(0.0, 0.5))
 
     def apply(self, part: Series, deviation: NDArray[np.float32], rng: np.random.Generator) -> Series:
         """Read the stretch at warped rows."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.bounds import MOST_BATCH, MOST_TICKS, check_bounds, whole
 from edp.data.augment import AugmentationSpec, input_deviation
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
@@ -43,17 +44,21 @@ class ChunkSpec:
     def __post_init__(self) -> None:
         if self.regime not in ("chunk", "window"):
             raise ConfigError(f"regime = '{self.regime}'; 'chunk' or 'window' must hold")
-        if self.length < 1 or self.batch < 1 or self.burn_in < 0:
-            raise ConfigError(
-                f"chunks: length = {self.length}, batch = {self.batch}, burn_in = {self.burn_in}; "
-                "length and batch of at least 1 and burn_in of at least 0 must hold"
-            )
-        if self.consecutive < 1 or self.batch % self.consecutive:
+        check_bounds(
+            "chunks",
+            self,
+            length=whole(1, MOST_TICKS),
+            batch=whole(1, MOST_BATCH),
+            burn_in=whole(0, MOST_TICKS),
+            consecutive=whole(1, MOST_BATCH),
+            carried=whole(0, MOST_BATCH),
+        )
+        if self.batch % self.consecutive:
             raise ConfigError(
                 f"chunks: consecutive = {self.consecutive}, batch = {self.batch}; consecutive of at least 1 and a "
                 "batch that is a multiple of it must hold"
             )
-        if self.carried < 0 or (self.carried and self.regime == "window"):
+        if self.carried and self.regime == "window":
             raise ConfigError(
                 f"chunks: carried = {self.carried} with regime = '{self.regime}'; at least 0, and 0 for windows, which "
                 "all start anew, must hold"

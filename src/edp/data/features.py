@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from edp.bounds import MOST_NAMES, MOST_TICKS, check_bounds, check_count, whole
 from edp.errors import ConfigError, DataError
 from edp.recording import FloatArray, Recording
 from edp.registry import Registry
@@ -69,16 +71,15 @@ class FeatureSet:
     starting_ticks: int = 5
 
     def __post_init__(self) -> None:
+        check_bounds(f"feature set '{self.name}'", self, starting_ticks=whole(1, MOST_TICKS))
+        for part in ("channels", "derived", "hidden", "starting"):
+            check_count(f"feature set '{self.name}'", part, getattr(self, part), MOST_NAMES)
         names = [*self.channels, *self.starting, *self.hidden, *(d.name for d in self.derived)]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        twice = sorted(name for name, count in Counter(names).items() if count > 1)
         if twice:
             raise ConfigError(f"feature set '{self.name}' names {', '.join(twice)} twice; keep one entry each")
         if not self.channels and not self.derived:
             raise ConfigError(f"feature set '{self.name}' is empty; give it at least one channel")
-        if self.starting_ticks < 1:
-            raise ConfigError(
-                f"feature set '{self.name}': starting_ticks = {self.starting_ticks}; at least 1 must hold"
-            )
         for entry in self.derived:
             if entry.source not in self.channels + self.hidden:
                 raise ConfigError(

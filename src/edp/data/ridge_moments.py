@@ -14,6 +14,7 @@ import numpy as np
 
 from edp.data.lags import DoubleArray, LagTask, anchors, future, origins
 from edp.data.series import Series
+from edp.limits import check_setting
 
 BLOCK_ROWS = 8_192
 
@@ -68,6 +69,11 @@ def standard_of(train: Sequence[Series], means: DoubleArray) -> Standard:
 def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> Moments:
     """Moments over all ticks with a full history and a known future (see `origins`), for ``task.history`` lags."""
     lags, inputs = task.history, len(standard.centre)
+    check_setting(
+        4 * 8 * (lags * inputs) ** 2,  # the matrix, its corrections and two halves, as doubles
+        f"a regression on {lags:,} ticks of {inputs:,} inputs",
+        "take fewer taps of linear_bypass or a shorter judge.history, or fewer channels",
+    )
     first = np.zeros((lags, inputs + task.outputs, inputs))
     edges = np.zeros(((lags - 1) * inputs, (lags - 1) * inputs))
     x, y, yy = np.zeros((lags, inputs)), np.zeros(task.outputs), np.zeros(task.outputs)

@@ -10,11 +10,16 @@ from typing import Protocol
 
 import numpy as np
 
+from edp.bounds import MOST_NAMES, SEED, above, below, check_bounds, shown, span, whole
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
 from edp.registry import Registry
 
 PARTS = ("train", "validation", "test")
+PART = below(0.0, 1.0)
+"""Share of a data set that is set apart; all of it would leave nothing to train on."""
+MOST_BLOCK_S = 31_557_600.0  # a year
+MOST_MASS_T = 10_000.0  # the largest excavator weighs about a tenth of this
 FAMILY = "excitation"
 """Where the meta of a simulated recording says how it was driven."""
 MASS = "mass_t"
@@ -72,6 +77,10 @@ class ByRecording:
     test: tuple[str, ...] = ()
     tail_share: float = 0.2
 
+    def __post_init__(self) -> None:
+        shares = dict.fromkeys(("validation_share", "test_share", "tail_share"), PART)
+        check_bounds("split", self, seed=SEED, **shares)
+
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide by recording."""
         names = [recording.name for recording in recordings]
@@ -114,10 +123,16 @@ class ByTime:
     validation_share: float = 0.15
     test_share: float = 0.2
 
+    def __post_init__(self) -> None:
+        check_bounds("split", self, validation_share=PART, test_share=PART)
+        if self.validation_share + self.test_share >= 1:
+            raise ConfigError(
+                f"split: validation_share = {self.validation_share}, test_share = {self.test_share}; "
+                "validation_share + test_share must be below 1"
+            )
+
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide each recording by time."""
-        if self.validation_share + self.test_share >= 1:
-            raise ConfigError("split: validation_share + test_share must be below 1")
         parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
         for i, recording in enumerate(recordings):
             n = recording.samples
@@ -147,10 +162,17 @@ class ByBlocks:
     every: int = 3
     validation_share: float = 0.2
 
+    def __post_init__(self) -> None:
+        check_bounds(
+            "split",
+            self,
+            block_s=above(0.0, MOST_BLOCK_S),
+            every=whole(2, MOST_NAMES),
+            validation_share=PART,
+        )
+
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide each recording into blocks."""
-        if self.every < 2 or self.block_s <= 0:
-            raise ConfigError("split: every >= 2 and block_s > 0 must hold")
         parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
         turn = itertools.count(1)
         for i, recording in enumerate(recordings):
@@ -204,6 +226,20 @@ class ByMachine:
     test: tuple[str, ...] = ()
     test_masses: tuple[float, ...] = ()
 
+    def __post_init__(self) -> None:
+        check_bounds(
+            "split",
+            self,
+            validation_share=PART,
+            test_share=PART,
+            seed=SEED,
+            test_masses=span(0.0, MOST_MASS_T),
+        )
+        if self.test_masses and (len(self.test_masses) != 2 or self.test_masses[0] > self.test_masses[1]):
+            raise ConfigError(
+                f"split: test_masses = {shown(self.test_masses)}; the lightest and the heaviest in t must be given"
+            )
+
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide by machine.
 
@@ -242,10 +278,6 @@ class ByMachine:
         """Machines whose mass lies in the range that tests."""
         if not self.test_masses:
             return []
-        if len(self.test_masses) != 2 or not self.test_masses[0] <= self.test_masses[1]:
-            raise ConfigError(
-                f"split: test_masses = {list(self.test_masses)}; the lightest and the heaviest in t must be given"
-            )
         low, high = self.test_masses
         masses = {owner: r.meta.get(MASS) for owner, r in zip(owners, recordings, strict=True)}
         found = [owner for owner, mass in masses.items() if mass is not None and low <= float(mass) <= high]

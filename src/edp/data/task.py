@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 
+from edp.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, whole
 from edp.data.features import Derived, FeatureSet, column, kind_of
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
@@ -19,6 +22,42 @@ class TargetMode(StrEnum):
 
     ABSOLUTE = "absolute"
     DELTA = "delta"
+
+
+MOST_RATE_HZ = 1e6
+"""Of any sensor of a machine; faster clocks count something else."""
+
+
+class Ends(Protocol):
+    """What a task and its settings have in common."""
+
+    @property
+    def targets(self) -> tuple[str, ...]: ...
+    @property
+    def horizons(self) -> tuple[int, ...]: ...
+    @property
+    def integrate(self) -> tuple[str, ...]: ...
+    @property
+    def derived_targets(self) -> tuple[Derived, ...]: ...
+
+
+def check_ends(task: Ends) -> None:
+    """Refuse targets and horizons that cannot be, whatever the data.
+
+    Raises:
+        ConfigError: no targets, one twice, too many, or a horizon out of range.
+    """
+    if not task.targets:
+        raise ConfigError("task: no targets; name at least one channel to predict")
+    check_count("task", "horizons", task.horizons, MOST_HORIZONS, least=1)
+    check_bounds("task", task, horizons=whole(0, MOST_TICKS))
+    for part in ("targets", "integrate"):
+        names = getattr(task, part)
+        check_count("task", part, names, MOST_NAMES)
+        twice = sorted(name for name, count in Counter(names).items() if count > 1)
+        if twice:
+            raise ConfigError(f"task: {part} names {', '.join(twice)} twice; keep one entry each")
+    check_count("task", "derived_targets", task.derived_targets, MOST_NAMES)
 
 
 @dataclass(frozen=True)
@@ -51,9 +90,9 @@ class Task:
     physics: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.targets:
-            raise ConfigError("task: no targets; name at least one channel to predict")
-        if not self.horizons or min(self.horizons) < 0 or list(self.horizons) != sorted(set(self.horizons)):
+        check_ends(self)
+        check_bounds("task", self, rate_hz=above(0.0, MOST_RATE_HZ))
+        if list(self.horizons) != sorted(set(self.horizons)):
             raise ConfigError(
                 f"task: horizons = {list(self.horizons)}; samples >= 0, increasing, each once, at least one"
             )

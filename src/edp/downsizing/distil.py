@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from edp.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, whole
 from edp.compress import DistillationSpec, Order, RoundingSpec, unlabelled
 from edp.config import Experiment, load_experiment, plain_tree
 from edp.data.prepared import Prepared
@@ -43,6 +44,9 @@ class DistilSpec:
     teachers: tuple[str, ...] = ()
     further: DataSource | None = None
     changes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_bounds("distil", self, units=whole(1, MOST_UNITS), levels=whole(1, MOST_LEVELS))
 
 
 def distil(

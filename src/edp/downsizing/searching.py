@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from edp.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, whole
 from edp.compress import FORMATS, VARIANTS, Bench, Candidate, Deployed, Order, deploy, width_of
 from edp.config import Experiment, experiment_toml, plain_tree
 from edp.data.prepared import Prepared
@@ -51,6 +52,10 @@ class SearchSpec:
     thesis: bool = False
     again: bool = False
     changes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_count("compress", "units", self.units, MOST_NAMES)
+        check_bounds("compress", self, units=whole(1, MOST_UNITS))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from edp.bounds import check_bounds, whole
 from edp.errors import ConfigError, closest
 from edp.storage import read_toml
 from edp.streaming import Cost
@@ -14,6 +15,10 @@ from edp.streaming import Cost
 STACK_BYTES = 1_024  # an allowance: a tick was seen to take 340 (``benchmarks/controller_memory.py``)
 # Published boards against zero-wait memory (flash wait states): the best, and the slowest, which decides.
 BOARD_TYPICAL, BOARD_SLOW = 1.26, 1.43
+
+
+MOST_GRANTED = 2**53
+"""Cycles or bytes: beyond it not every whole number is a float, in which estimates are computed."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +102,8 @@ class Budget:
     def __post_init__(self) -> None:
         if self.core not in CORES:
             raise ConfigError(f"budget: core = '{self.core}' is not known{closest(self.core, CORES)}")
-        for limit in ("cycles", "parameter_bytes", "ram_bytes", "flash_bytes"):
-            if getattr(self, limit) < 1:
-                raise ConfigError(f"budget: {limit} = {getattr(self, limit)}; at least 1 must hold")
+        limits = ("cycles", "parameter_bytes", "ram_bytes", "flash_bytes")
+        check_bounds("budget", self, **dict.fromkeys(limits, whole(1, MOST_GRANTED)))
 
 
 def load_budget(path: str | Path) -> Budget:

@@ -10,11 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, whole
 from edp.data.prepared import Prepared
 from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
+from edp.limits import check_setting
 from edp.metrics import Scores, interval_scores, mean_scores, score, spread
 from edp.models.predictor import Predictor
 from edp.models.running import stream_intervals, stream_predictions
@@ -23,6 +25,8 @@ from edp.signals import KINDS
 Predictions = list[NDArray[np.float32]]
 B = TypeVar("B", bound=Baseline)
 SPEED_BINS = 6
+SKIP = whole(0, MOST_ROWS)
+"""Ticks that are not scored: a slice that begins with a negative one would score the last ticks alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +46,7 @@ class JudgeSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_bounds("judge", self, history=whole(1, MOST_TICKS), skip=SKIP, seed=SEED)
         for name in self.baselines:
             _ = BASELINES[name]
 
@@ -83,6 +88,7 @@ def judge(
         DataError: no tick of the test series can be scored.
     """
     say = on_step or (lambda name: None)
+    _check_memory(predictor, data, spec)
     say("network")
     predictions = {"network": stream_predictions(predictor, data.test)}
     names, times = {"network": label}, {"network": seconds}
@@ -105,6 +111,18 @@ def judge(
         say("intervals")
         models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
     return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
+
+
+def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None:
+    """Refuse more horizons than the memory holds the truth and all models' predictions of."""
+    task, ticks = data.task, sum(series.samples for series in data.test)
+    ends = len(task.horizons) * len(task.targets)
+    each = 4 * (1 + len(spec.baselines) + 2 * len(predictor.spec.output.coverages)) + 3 * 8  # truth, errors: doubles
+    check_setting(
+        ticks * ends * each,
+        f"judge: {ticks:,} ticks of {len(task.horizons):,} horizon(s) of {len(task.targets):,} target(s)",
+        "judge fewer recordings, or predict fewer horizons",
+    )
 
 
 def baseline_predictions(kind: type[B], data: Prepared, spec: JudgeSpec) -> tuple[Callable[[Prepared], Predictions], B]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from edp.bounds import MOST_NAMES, MOST_ROWS, MOST_TICKS, SEED, check_bounds, whole
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
@@ -56,8 +57,15 @@ class WorthSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.repeats < 1 or self.rows < 100:
-            raise ConfigError(f"worth: repeats = {self.repeats} and rows = {self.rows}; at least 1 and 100")
+        check_bounds(
+            "worth",
+            self,
+            repeats=whole(1, MOST_NAMES),
+            lags=whole(0, MOST_TICKS),
+            rows=whole(100, MOST_ROWS),
+            skip=whole(0, MOST_ROWS),
+            seed=SEED,
+        )
         if 0 not in self.lags or min(self.lags) < 0:
             raise ConfigError(f"worth: lags = {list(self.lags)}; 0 must be among them, and nothing from the future")
 

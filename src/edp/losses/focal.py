@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from edp.errors import ConfigError
+from edp.bounds import WEIGHT, check_bounds, span
 from edp.losses.base import LOSSES, Penalty
 from edp.losses.huber import huber
 
@@ -30,10 +30,7 @@ class Focal(Penalty):
     delta: float = 1.5
 
     def __post_init__(self) -> None:
-        if not 0 <= self.gamma <= 4 or not self.delta > 0:
-            raise ConfigError(
-                f"focal: gamma = {self.gamma}, delta = {self.delta}; 0 <= gamma <= 4, delta > 0 must hold"
-            )
+        check_bounds("focal", self, gamma=span(0.0, 4.0), delta=WEIGHT)
 
     def penalty(self, error: Tensor) -> Tensor:
         """``|e|^gamma`` times the Huber penalty."""

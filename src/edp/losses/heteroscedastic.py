@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from edp.errors import ConfigError
+from edp.bounds import SHARE, check_bounds
 from edp.losses.base import LAPLACE, LOSSES, NORMAL, Answer
 
 
@@ -34,8 +34,7 @@ class Heteroscedastic:
     beta: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0 <= self.beta <= 1:
-            raise ConfigError(f"heteroscedastic: beta = {self.beta}; 0 <= beta <= 1 must hold")
+        check_bounds("heteroscedastic", self, beta=SHARE)
 
     def evaluate(self, answer: Answer, target: Tensor) -> Tensor:
         """The likelihood term of each prediction."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from edp.errors import ConfigError
+from edp.bounds import WEIGHT, check_bounds
 from edp.losses.base import LOSSES, Penalty
 
 
@@ -26,8 +26,7 @@ class Huber(Penalty):
     delta: float = 1.5
 
     def __post_init__(self) -> None:
-        if not self.delta > 0:
-            raise ConfigError(f"huber: delta = {self.delta}; delta > 0 must hold")
+        check_bounds("huber", self, delta=WEIGHT)
 
     def penalty(self, error: Tensor) -> Tensor:
         """``e^2 / 2`` inside, ``delta (|e| - delta / 2)`` outside."""

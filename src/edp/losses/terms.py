@@ -7,6 +7,7 @@ from typing import ClassVar, Protocol
 
 from torch import Tensor
 
+from edp.bounds import WEIGHT, shown
 from edp.errors import ConfigError
 from edp.registry import Registry
 
@@ -58,8 +59,10 @@ def check_weight(name: str, weight: float) -> None:
     Raises:
         ConfigError: the weight is not positive.
     """
-    if not weight > 0:
-        raise ConfigError(f"{name}: weight = {weight}; weight > 0 must hold (leave the term out to do without it)")
+    if not WEIGHT.holds(weight):
+        raise ConfigError(
+            f"{name}: weight = {shown(weight)}; {WEIGHT.rule('weight')} must hold (leave the term out to do without it)"
+        )
 
 
 def masked_mean(each: Tensor, valid: Tensor) -> Tensor:

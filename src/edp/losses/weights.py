@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from edp.errors import ConfigError
+from edp.bounds import MOST_WEIGHT, SHARE, above, below, check_bounds
 
 
 def output_weights(sigma: Tensor, power: float) -> Tensor:
@@ -49,11 +49,7 @@ class AdaptiveWeights:
     memory: float = 0.99
 
     def __post_init__(self) -> None:
-        if not 0 <= self.blend <= 1 or not self.max_ratio > 1 or not 0 <= self.memory < 1:
-            raise ConfigError(
-                f"adaptive: blend = {self.blend}, max_ratio = {self.max_ratio}, memory = {self.memory}; "
-                "0 <= blend <= 1, max_ratio > 1 and 0 <= memory < 1 must hold"
-            )
+        check_bounds("adaptive", self, blend=SHARE, max_ratio=above(1.0, MOST_WEIGHT), memory=below(0.0, 1.0))
 
     def weights(self, running: Tensor) -> Tensor:
         """Weights ``(horizon, output)`` from the running errors, same shape."""

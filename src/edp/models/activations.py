@@ -8,6 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from edp.bounds import above, check_bounds
 from edp.errors import ConfigError
 from edp.graph import Builder
 from edp.graph.layers import Activate, Function, ScaleShift
@@ -28,6 +29,8 @@ class ActivationSpec(Protocol):
 
 
 ACTIVATIONS: Registry[type] = Registry("activation")
+AMPLITUDE = above(0.0, 1000.0)
+"""In standard deviations of the target: beyond a few tens tanh is a straight line over all that occurs."""
 
 
 @ACTIVATIONS.register("identity")
@@ -92,6 +95,7 @@ class ScaledTanh:
     high: float = 5.0
 
     def __post_init__(self) -> None:
+        check_bounds("stanh", self, start=AMPLITUDE, low=AMPLITUDE, high=AMPLITUDE)
         if not 0 < self.low < self.start < self.high:
             raise ConfigError(
                 f"stanh: low = {self.low}, start = {self.start}, high = {self.high}; 0 < low < start < high must hold"

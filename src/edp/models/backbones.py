@@ -10,6 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from edp.blocks.base import BranchMaker, Slot
+from edp.bounds import (
+    MOST_CHANNELS,
+    MOST_KERNEL,
+    MOST_LAYERS,
+    MOST_LEVELS,
+    MOST_UNITS,
+    below,
+    check_bounds,
+    check_count,
+    whole,
+)
 from edp.errors import ConfigError
 from edp.graph import Builder
 from edp.models.cells import CellSpec, GruCell, LstmCell, Stack
@@ -40,6 +51,9 @@ class BackboneSpec(Protocol):
 
 
 BACKBONES: Registry[type] = Registry("backbone")
+UNITS, LAYERS = whole(1, MOST_UNITS), whole(1, MOST_LAYERS)
+CHANNELS, KERNEL = whole(1, MOST_CHANNELS), whole(1, MOST_KERNEL)
+DROPOUT = below(0.0, 1.0)
 
 
 @BACKBONES.register("lstm")
@@ -64,7 +78,7 @@ class LstmSpec:
     initial: InitialSpec = field(default_factory=ZeroState)
 
     def __post_init__(self) -> None:
-        _check(self.dropout, units=self.units, layers=self.layers)
+        check_bounds("backbone", self, units=UNITS, layers=LAYERS, dropout=DROPOUT, zoneout=DROPOUT)
         check_cell("lstm", self.cell, self.zoneout, families=("lstm",))
 
     def slots(self) -> tuple[Slot, ...]:
@@ -102,7 +116,7 @@ class GruSpec:
     initial: InitialSpec = field(default_factory=ZeroState)
 
     def __post_init__(self) -> None:
-        _check(self.dropout, units=self.units, layers=self.layers)
+        check_bounds("backbone", self, units=UNITS, layers=LAYERS, dropout=DROPOUT)
         check_cell("gru", self.cell, 0.0, families=("gru",))
 
     def slots(self) -> tuple[Slot, ...]:
@@ -136,7 +150,8 @@ class TcnSpec:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
-        _check(self.dropout, kernel=self.kernel, levels=len(self.channels), channels=min(self.channels, default=0))
+        check_count("backbone", "channels", self.channels, MOST_LEVELS, least=1)
+        check_bounds("backbone", self, channels=CHANNELS, kernel=KERNEL, dropout=DROPOUT)
 
     def slots(self) -> tuple[Slot, ...]:
         """Parallel stacks, and what works on their channels."""
@@ -185,14 +200,9 @@ class HybridSpec:
     initial: InitialSpec = field(default_factory=ZeroState)
 
     def __post_init__(self) -> None:
-        _check(
-            self.dropout,
-            kernel=self.kernel,
-            units=self.units,
-            layers=self.layers,
-            levels=len(self.channels),
-            channels=min(self.channels, default=0),
-        )
+        check_count("backbone", "channels", self.channels, MOST_LEVELS, least=1)
+        check_bounds("backbone", self, channels=CHANNELS, kernel=KERNEL, units=UNITS, layers=LAYERS)
+        check_bounds("backbone", self, dropout=DROPOUT, zoneout=DROPOUT)
         check_cell("hybrid", self.cell, self.zoneout)
 
     def slots(self) -> tuple[Slot, ...]:
@@ -275,11 +285,3 @@ def _convolutions(
         width *= len(net.branches)
     behind = [spec.build(width, window) for spec in in_slot(blocks, Slot.CHANNELS)]  # type: ignore[attr-defined]
     return (Chain([net, *behind]) if behind else net), width
-
-
-def _check(dropout: float, **at_least_one: int) -> None:
-    for name, value in at_least_one.items():
-        if value < 1:
-            raise ConfigError(f"backbone: {name} = {value}; at least 1 must hold")
-    if not 0 <= dropout < 1:
-        raise ConfigError(f"backbone: dropout = {dropout}; 0 <= dropout < 1 must hold")

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from edp.errors import ConfigError
+from edp.bounds import MOST_LAYERS, MOST_UNITS, check_bounds, whole
 from edp.graph import Builder
 from edp.graph.layers import Activate, Dense, Function, Glu, GroupedDense
 from edp.registry import Registry
@@ -55,7 +55,7 @@ class MlpHead:
     layers: int = 1
 
     def __post_init__(self) -> None:
-        _check(self.hidden, self.layers)
+        check_bounds("head", self, hidden=whole(1, MOST_UNITS), layers=whole(1, MOST_LAYERS))
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
         """Heads with ReLU."""
@@ -83,7 +83,7 @@ class GluHead:
     layers: int = 1
 
     def __post_init__(self) -> None:
-        _check(self.hidden, self.layers)
+        check_bounds("head", self, hidden=whole(1, MOST_UNITS), layers=whole(1, MOST_LAYERS))
 
     def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
         """Heads that begin with a gated linear unit."""
@@ -185,8 +185,3 @@ class Heads(Streaming):
             per_time_step=False,
         )
         return [own] if self.mix is None else [own, *self.mix.costs()]
-
-
-def _check(hidden: int, layers: int) -> None:
-    if hidden < 1 or layers < 1:
-        raise ConfigError(f"head: hidden = {hidden}, layers = {layers}; both must be at least 1")

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from edp.errors import ConfigError
+from edp.bounds import MOST_TICKS, MOST_UNITS, check_bounds, whole
 from edp.graph import Builder
 from edp.graph.memory import PrefixCorrection
 from edp.registry import Registry
@@ -66,8 +66,7 @@ class PrefixState:
     hidden: int = 16
 
     def __post_init__(self) -> None:
-        if self.ticks < 1 or self.hidden < 1:
-            raise ConfigError(f"initial prefix: ticks = {self.ticks}, hidden = {self.hidden}; at least 1 must hold")
+        check_bounds("initial prefix", self, ticks=whole(1, MOST_TICKS), hidden=whole(1, MOST_UNITS))
 
     def build(self, recurrent: Streaming, width_in: int) -> Streaming:
         """The recurrent layers with a network that corrects their state."""

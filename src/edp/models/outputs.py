@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from edp.bounds import between, check_bounds, check_count
 from edp.errors import ConfigError, ExportError
 from edp.graph import Builder
 from edp.graph.layers import Accumulate, Activate, Add, Function, ScaleShift, Subtract
@@ -46,6 +47,8 @@ class OutputSpec(Protocol):
 
 
 OUTPUTS: Registry[type] = Registry("output")
+MOST_PAIRS = 99
+"""Quantiles or intervals: all whole per cent."""
 
 
 class Output(nn.Module):
@@ -185,6 +188,8 @@ class Quantiles:
     calibrated: bool = True
 
     def __post_init__(self) -> None:
+        check_count("quantiles", "levels", self.levels, MOST_PAIRS)
+        check_bounds("quantiles", self, levels=between(0.0, 1.0))
         mirrored = [1.0 - level for level in reversed(self.levels)]
         symmetric = all(math.isclose(a, b, abs_tol=1e-9) for a, b in zip(self.levels, mirrored, strict=True))
         rising = list(self.levels) == sorted(set(self.levels))
@@ -256,6 +261,8 @@ class _Law:
     calibrated: bool = True
 
     def __post_init__(self) -> None:
+        check_count("output", "coverages", self.coverages, MOST_PAIRS, least=1)
+        check_bounds("output", self, coverages=between(0.0, 1.0))
         falling = list(self.coverages) == sorted(set(self.coverages), reverse=True)
         if not self.coverages or not falling or not 0 < min(self.coverages) <= max(self.coverages) < 1:
             raise ConfigError(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
 
 from edp.blocks.base import BLOCKS, OUTPUT_SLOTS, SHARED_SLOTS, OutputSpace, Particular, Slot
+from edp.bounds import MOST_TICKS, check_bounds, check_count, whole
 from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import ConfigError, ExportError
@@ -19,8 +20,10 @@ from edp.models.activations import ACTIVATIONS, ActivationSpec, Identity
 from edp.models.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.models.frontend import FrontEnd, TargetCode
 from edp.models.heads import HEADS, HeadSpec, MlpHead
+from edp.models.initial import state_numbers
 from edp.models.outputs import OUTPUTS, OutputSpec, Point
 from edp.models.physics import PHYSICS, PhysicsBase, PhysicsSpec
+from edp.models.size import MOST_PARAMETERS, MOST_STATE, size_at_most
 from edp.streaming import Cost, State, Streaming, parameters_of
 
 
@@ -47,8 +50,8 @@ class ModelSpec:
     physics: PhysicsSpec | None = None
 
     def __post_init__(self) -> None:
-        if self.window < 1:
-            raise ConfigError(f"model: window = {self.window}; at least 1 must hold")
+        check_bounds("model", self, window=whole(1, MOST_TICKS))
+        check_count("model", "blocks", self.blocks, len(BLOCKS))
         offered = {*self.backbone.slots(), *OUTPUT_SLOTS}
         for block in self.blocks:
             slot = getattr(block, "slot", None)
@@ -92,6 +95,7 @@ class Predictor(Streaming):
     def __init__(self, task: Task, spec: ModelSpec, scaler: Scaler) -> None:
         super().__init__()
         check_combination(task, spec)
+        _check_size(task, spec, scaler)
         self.task, self.spec = task, spec
         features, outputs, horizons = len(task.features.features), len(task.targets), len(task.horizons)
         self.front = FrontEnd(task, scaler)
@@ -248,6 +252,27 @@ class Predictor(Streaming):
                 Cost("output amplitudes", amplitudes, foldable=amplitudes, width_out=amplitudes, per_time_step=False)
             )
         return rows
+
+
+def _check_size(task: Task, spec: ModelSpec, scaler: Scaler) -> None:
+    """Refuse a network that is too large before any of it is there.
+
+    Raises:
+        ConfigError: more parameters or numbers of state than `edp.models.size` allows.
+    """
+    parameters, state = size_at_most(spec, task)
+    if (parameters <= MOST_PARAMETERS and state <= MOST_STATE) or torch.get_default_device().type == "meta":
+        return
+    with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers; takes seconds to load
+        net = Predictor(task, replace(spec, physics=None), scaler)
+        parameters = sum(parameter.numel() for parameter in net.parameters())
+        state = state_numbers(net.initial_state(1, torch.zeros(())))
+    if parameters > MOST_PARAMETERS or state > MOST_STATE:
+        raise ConfigError(
+            f"model: the network would have {parameters:,} parameters and carry {state:,} numbers from tick to tick; "
+            f"at most {MOST_PARAMETERS:,} and {MOST_STATE:,} must hold: make backbone.channels, backbone.units, "
+            "backbone.kernel, the head, the window or the number of horizons smaller"
+        )
 
 
 def build_model(task: Task, spec: ModelSpec, scaler: Scaler, seed: int) -> Predictor:

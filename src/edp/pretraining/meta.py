@@ -38,6 +38,11 @@ class Meta(ABC):
     def __init__(self, spec: MetaSpec, start: Predictor | None = None) -> None:
         self.spec, self.start = spec, start
 
+    @property
+    def passes(self) -> int:
+        """Through the network that an update goes back through."""
+        return 1 + self.spec.inner_steps
+
     def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
         """The training series as they are."""
         return list(known)

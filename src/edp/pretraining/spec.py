@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edp.errors import ConfigError
+from edp.bounds import MOST_BATCH, RATE, check_bounds, whole
+
+MOST_STEPS = 1_000
+"""Of adaptation: the gradient goes through all of them, and each keeps its copy of the weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +30,13 @@ class MetaSpec:
     head_only: bool = False
 
     def __post_init__(self) -> None:
-        if not self.inner_rate > 0 or self.inner_steps < 1 or self.shots < 1:
-            raise ConfigError(
-                f"pretraining: inner_rate = {self.inner_rate}, inner_steps = {self.inner_steps}, shots = {self.shots}; "
-                "inner_rate > 0 and inner_steps and shots of at least 1 must hold"
-            )
+        check_bounds(
+            "pretraining",
+            self,
+            inner_rate=RATE,
+            inner_steps=whole(1, MOST_STEPS),
+            shots=whole(1, MOST_BATCH),
+        )
 
     @property
     def steps(self) -> tuple[float, ...]:

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from edp.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, whole
 from edp.errors import ConfigError
+
+# Rows that estimates rest on: errors of information and rank estimates fall with their root, and time grows at least
+# in proportion (of nearest neighbours, ranks and trees); a million is far beyond what any of them gains from.
+MOST_SAMPLES = 1_000_000
+MOST_TREES = 10_000
+MOST_REPEATS = 1_000
+MOST_PIECES = 10_000
+MOST_NEIGHBOURS = 100
+# A minute and a half at 100 Hz, to both sides, for each pair of channels and target.
+MOST_LAG = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +41,17 @@ class ForestSpec:
     held_out: float = 0.34
 
     def __post_init__(self) -> None:
-        for name in ("trees", "samples", "tests", "repeats", "leaf"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"screening.forest.{name} = {getattr(self, name)}; it must be at least 1")
-        for name in ("share", "held_out"):
-            if not 0.0 < getattr(self, name) <= (1.0 if name == "share" else 0.8):
-                raise ConfigError(f"screening.forest.{name} = {getattr(self, name)}; a share above 0, held_out <= 0.8")
+        check_bounds(
+            "screening.forest",
+            self,
+            trees=whole(1, MOST_TREES),
+            samples=whole(1, MOST_SAMPLES),
+            tests=whole(1, MOST_SAMPLES),
+            repeats=whole(1, MOST_REPEATS),
+            leaf=whole(1, MOST_SAMPLES),
+            share=above(0.0, 1.0),
+            held_out=above(0.0, 0.8),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,14 +94,21 @@ class ScreeningSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        least = {"horizon": 0, "max_lag": 20, "pieces": 4, "neighbours": 1, "seed": 0}
-        least |= dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), 100)
-        for name, low in least.items():
-            if getattr(self, name) < low:
-                raise ConfigError(f"screening.{name} = {getattr(self, name)}; it must be at least {low}")
-        for name in ("collinear", "copy", "level"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ConfigError(f"screening.{name} = {getattr(self, name)}; it must lie between 0 and 1")
+        shares = dict.fromkeys(("collinear", "copy", "level"), between(0.0, 1.0))
+        rows = dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), whole(100, MOST_SAMPLES))
+        check_bounds(
+            "screening",
+            self,
+            horizon=whole(0, MOST_LAG),
+            max_lag=whole(20, MOST_LAG),
+            pieces=whole(4, MOST_PIECES),
+            neighbours=whole(1, MOST_NEIGHBOURS),
+            seed=SEED,
+            **rows,
+            **shares,
+        )
+        for name in ("targets", "candidates", "trusted"):
+            check_count("screening", name, getattr(self, name), MOST_NAMES)
         if self.horizon > self.max_lag:
             raise ConfigError(
                 f"screening.horizon = {self.horizon} is beyond max_lag = {self.max_lag}; raise max_lag to see it"

@@ -14,6 +14,7 @@ from typing import Any
 
 import tomli_w
 
+from edp.bounds import MOST_THREADS, above, check_bounds, whole
 from edp.config import Experiment, Table, build
 from edp.errors import ConfigError, DataError, LostError
 from edp.ledger import Ledger, Record, Status
@@ -33,6 +34,7 @@ from edp.storage import make_folder, write_bytes
 
 BOX = "test sessions"
 TEACHER = "teacher.toml"
+MOST_SECONDS, MOST_MB = 31_557_600.0, 1e9  # a year, a petabyte: caps beyond cap nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +60,14 @@ class Crew:
     cluster: str = ""
 
     def __post_init__(self) -> None:
-        caps = [cap for cap in (self.seconds, self.memory_mb) if cap is not None]
-        if self.workers < 0 or self.threads < 1 or any(cap <= 0 for cap in caps):
-            raise ConfigError(
-                f"workers = {self.workers}, threads = {self.threads}, caps {self.seconds} s and {self.memory_mb} MB; "
-                "workers >= 0, threads >= 1 and caps above 0 must hold"
-            )
+        check_bounds(
+            "search",
+            self,
+            workers=whole(0, MOST_THREADS),
+            threads=whole(1, MOST_THREADS),
+            seconds=above(0.0, MOST_SECONDS),
+            memory_mb=above(0.0, MOST_MB),
+        )
         if self.cluster and self.workers:
             raise ConfigError(
                 f"workers = {self.workers} and the cluster '{self.cluster}' came; a cluster has its own number of "

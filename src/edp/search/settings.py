@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
+from edp.bounds import MOST_TICKS, MOST_UPDATES, SEED, above, between, check_bounds, shown, span, whole
 from edp.config import FeatureSettings, plain_tree
 from edp.errors import ConfigError
 from edp.search.space import ELASTIC, THESIS, Space
@@ -13,6 +14,9 @@ from edp.search.study import PRUNERS, SamplerSpec
 
 MODES = ("sound", "thesis")
 COSTS = ("parameters", "macs_tick")
+MOST_TRAININGS = 1_000_000
+"""Of a phase, in runs, seeds, repeats or questions; of a second each they would take eleven days."""
+LIMIT = above(0.0, 1e18)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,18 +101,29 @@ class SearchSpec:
 
     def __post_init__(self) -> None:
         counts = (
-            *("updates", "final_updates", "variance_seeds", "trials", "trial_runs", "screening_repeats"),
+            *("variance_seeds", "trials", "trial_runs", "screening_repeats"),
             *("module_trials", "run_seeds", "joint_trials", "free_trials", "batch"),
         )
-        wrong = [f"{name} = {getattr(self, name)} (at least 1)" for name in counts if getattr(self, name) < 1]
-        wrong += [f"{name} = {value} (between 0 and 1)" for name, value in self._shares() if not 0 < value < 1]
+        bounds = dict.fromkeys(counts, whole(1, MOST_TRAININGS)) | {"seed": SEED, "horizon": whole(0, MOST_TICKS)}
+        bounds |= dict.fromkeys(("updates", "final_updates"), whole(1, MOST_UPDATES))
+        bounds |= dict.fromkeys(("folds", "variance_runs", "most_runs", "screening_runs"), whole(2, MOST_TRAININGS))
+        bounds |= {"warm_rounds": whole(0, MOST_TRAININGS), "least_gain": span(0.0, 1.0)}
+        bounds |= dict.fromkeys(("test_share", "least_effect", "power", "alpha"), between(0.0, 1.0))
+        bounds |= {"rungs": between(0.0, 1.0)}
+        check_bounds("search", self, **bounds)
+        wrong = []
         if self.mode not in MODES:
             wrong.append(f"mode = '{self.mode}' ({' or '.join(MODES)})")
         if self.cost not in ("none", *COSTS):
             wrong.append(f"cost = '{self.cost}' (none, {' or '.join(COSTS)})")
         wrong += self._wrong_rungs()
         wrong += [f"limits.{name} ({' or '.join(COSTS)})" for name in self.limits if name not in COSTS]
-        wrong += [f"limits.{name} = {most} (above 0)" for name, most in self.limits.items() if not most > 0]
+        wrong += [f"limits.{name} = {most} (above 0)" for name, most in self.limits.items() if not LIMIT.holds(most)]
+        wrong += [
+            f"elastic.{name} = {shown(reach)} (above 0)"
+            for name, reach in self.elastic.items()
+            if not LIMIT.holds(reach)
+        ]
         if self.folds < 2 or self.variance_runs < 2 * self.folds or self.variance_runs % self.folds:
             wrong.append(
                 f"folds = {self.folds} (at least 2), variance_runs = {self.variance_runs} (two repeats of them or more)"
@@ -117,8 +132,6 @@ class SearchSpec:
             wrong.append(f"most_runs = {self.most_runs} (at least the {self.folds} folds)")
         if not self.backbones or not self.features:
             wrong.append("backbones and features (at least one of each)")
-        if self.warm_rounds < 0 or self.least_gain < 0:
-            wrong.append(f"warm_rounds = {self.warm_rounds}, least_gain = {self.least_gain} (at least 0)")
         if len(self.feature_sets) < len(self.features):
             wrong.append("features (sets of different names)")
         if wrong:
@@ -152,7 +165,3 @@ class SearchSpec:
                 "would end the cheap ones of a front; a cost can be held by limits instead)"
             )
         return wrong
-
-    def _shares(self) -> list[tuple[str, float]]:
-        names = ("test_share", "least_effect", "power", "alpha")
-        return [(name, getattr(self, name)) for name in names]

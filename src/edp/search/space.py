@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from edp.bounds import MOST_NAMES, check_bounds, check_count, span
 from edp.config import Table
 from edp.errors import ConfigError
 from edp.registry import Registry
 
 Value = float | int | str
+REAL = span(-1e30, 1e30)
+"""Ends of a range, whose difference must be a finite number too."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class Real:
     log: bool = False
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+        check_bounds("a range", self, low=REAL, high=REAL)
+        if not self.low < self.high:
             raise ConfigError(f"a range from {self.low} to {self.high}; low < high, both finite, must hold")
         if self.log and self.low <= 0:
             raise ConfigError(f"a logarithmic range from {self.low}; low > 0 must hold")
@@ -57,6 +60,7 @@ class Choice:
     options: tuple[Value, ...]
 
     def __post_init__(self) -> None:
+        check_count("a choice", "options", self.options, MOST_NAMES)
         if len(self.options) < 2 or len(set(self.options)) < len(self.options):
             raise ConfigError(f"a choice of {list(self.options)}; two values or more, each once, must hold")
 

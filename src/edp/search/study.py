@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from edp.bounds import MOST_NAMES, check_bounds, whole
 from edp.errors import ConfigError
 from edp.search.space import Candidate, Choice, Range, Real, Space, Value, check, names
 from edp.storage import replacing
@@ -62,8 +63,7 @@ class SamplerSpec:
     def __post_init__(self) -> None:
         if self.kind not in SAMPLERS:
             raise ConfigError(f"sampler '{self.kind}'; {', '.join(SAMPLERS)} must hold")
-        if self.startup < 1:
-            raise ConfigError(f"sampler: startup = {self.startup}; at least 1 must hold")
+        check_bounds("sampler", self, startup=whole(1, MOST_NAMES))
 
 
 @dataclass

@@ -10,6 +10,7 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
+from edp.bounds import MOST_UPDATES, SEED, check_bounds, whole
 from edp.config import Experiment, Table, build, plain_tree
 from edp.data.prepared import Prepared, prepare
 from edp.data.splits import ByRecording
@@ -59,8 +60,7 @@ class Order:
             raise ConfigError(
                 f"order: {len(self.train)} sessions train, {len(self.judged)} judge; at least one of each must hold"
             )
-        if self.updates < 1:
-            raise ConfigError(f"order: updates = {self.updates}; at least 1 must hold")
+        check_bounds("order", self, seed=SEED, updates=whole(1, MOST_UPDATES))
         steps = [*self.stops, self.updates if self.until is None else self.until]
         if steps[0] < 1 or any(a >= b for a, b in pairwise(steps)) or (self.until or 0) >= self.updates:
             raise ConfigError(

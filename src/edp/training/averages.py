@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from edp.bounds import SHARE, above, between, check_bounds
 from edp.errors import ConfigError
 from edp.registry import Registry
 
@@ -61,7 +62,7 @@ class Exponential:
     decay: float = 0.995
 
     def __post_init__(self) -> None:
-        if not 0 < self.decay < 1:
+        if not between(0.0, 1.0).holds(self.decay):
             raise ConfigError(f"ema: decay = {self.decay}; 0 < decay < 1 must hold (kind = 'none' averages nothing)")
 
     def step(self, update: int, updates: int) -> float:
@@ -96,10 +97,7 @@ class Stochastic:
     rate: float = 0.3
 
     def __post_init__(self) -> None:
-        if not 0 < self.share <= 1 or not 0 <= self.rate <= 1:
-            raise ConfigError(
-                f"swa: share = {self.share}, rate = {self.rate}; 0 < share <= 1 and 0 <= rate <= 1 must hold"
-            )
+        check_bounds("swa", self, share=above(0.0, 1.0), rate=SHARE)
 
     def _begin(self, updates: int) -> int:
         return updates - max(1, round(self.share * updates))

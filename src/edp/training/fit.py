@@ -21,6 +21,7 @@ from edp.runs import RunFolder
 from edp.streaming import State, detach_state, reset_where
 from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, load_checkpoint, save_checkpoint
 from edp.training.lesson import Episodic, Lesson, Moment
+from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Event, Fitted, TrainingError
 from edp.training.ridge_start import start_bypass
@@ -98,6 +99,8 @@ class Loop:
         self.file = run[0].path / (FILE if refitted is None else REFIT) if run else None
         self.device = _device(spec.device)
         check_training(data.task, model, spec)
+        self.net = build_model(data.task, model, data.scaler(), spec.seed)
+        check_training_memory(self.net, data, spec, getattr(lesson, "passes", 1))
         known = data.train if refitted is None else [*data.train, *data.validation]
         lessons = known if lesson is None else lesson.series(data.task, known)
         self.sampler = self._sampler(lessons)
@@ -107,7 +110,6 @@ class Loop:
                     f"validation recording '{part.name}' has {part.samples} samples, no more than the burn-in of "
                     f"{spec.chunks.burn_in} plus the horizon of {data.task.reach}; give a longer one"
                 )
-        self.net = build_model(data.task, model, data.scaler(), spec.seed)
         if self.net.physics is not None:
             self.net.physics.settle([torch.from_numpy(part.inputs) for part in data.train])
         started = start_bypass(self.net, data.train, data.validation)

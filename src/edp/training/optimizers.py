@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import nn
 
+from edp.bounds import DECAY, MOST_NAMES, MOST_UPDATES, RATE, below, check_bounds, check_count, shown, whole
 from edp.errors import ConfigError
 from edp.registry import Registry
 
@@ -20,8 +22,14 @@ class OptimizerSpec(Protocol):
         """The optimiser on these parameters."""
         ...
 
+    def remembers(self, shape: Sequence[int]) -> int:
+        """Numbers that it keeps for a parameter of this shape."""
+        ...
+
 
 OPTIMIZERS: Registry[type] = Registry("optimizer")
+BETA = below(0.0, 1.0)
+"""Decays of running means; at 1 a mean never moves from zero."""
 
 
 @OPTIMIZERS.register("adamw")
@@ -42,17 +50,17 @@ class AdamW:
     beta2: float = 0.99
 
     def __post_init__(self) -> None:
-        if not self.learning_rate > 0 or self.weight_decay < 0:
-            raise ConfigError(
-                f"adamw: learning_rate = {self.learning_rate}, weight_decay = {self.weight_decay}; "
-                "learning_rate > 0 and weight_decay >= 0 must hold"
-            )
+        check_bounds("adamw", self, learning_rate=RATE, weight_decay=DECAY, beta1=BETA, beta2=BETA)
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
         """The optimiser, with biases and gains free of decay."""
         matrices, vectors = _decaying(named)
         groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
         return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
+
+    def remembers(self, shape: Sequence[int]) -> int:
+        """Two means."""
+        return 2 * math.prod(shape)
 
 
 @OPTIMIZERS.register("sgd")
@@ -67,12 +75,15 @@ class Sgd:
     learning_rate: float = 0.05
 
     def __post_init__(self) -> None:
-        if not self.learning_rate > 0:
-            raise ConfigError(f"sgd: learning_rate = {self.learning_rate}; learning_rate > 0 must hold")
+        check_bounds("sgd", self, learning_rate=RATE)
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
         """The optimiser on all parameters."""
         return torch.optim.SGD([parameter for _, parameter in named], lr=self.learning_rate)
+
+    def remembers(self, shape: Sequence[int]) -> int:
+        """Nothing."""
+        return 0
 
 
 @OPTIMIZERS.register("discriminative")
@@ -95,12 +106,10 @@ class Discriminative:
     beta2: float = 0.999
 
     def __post_init__(self) -> None:
-        rates = [self.learning_rate, *(rate for _, rate in self.rates)]
-        if not min(rates) > 0 or self.weight_decay < 0:
-            raise ConfigError(
-                f"discriminative: learning_rate = {self.learning_rate}, rates = {list(map(list, self.rates))}, "
-                f"weight_decay = {self.weight_decay}; rates > 0 and weight_decay >= 0 must hold"
-            )
+        check_bounds("discriminative", self, learning_rate=RATE, weight_decay=DECAY, beta1=BETA, beta2=BETA)
+        check_count("discriminative", "rates", self.rates, MOST_NAMES)
+        if not all(RATE.holds(rate) for _, rate in self.rates):
+            raise ConfigError(f"discriminative: rates = {shown(self.rates)}; {RATE.rule('rate')} must hold")
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
         """The optimiser; the first group has `learning_rate`, where any parameter has it."""
@@ -114,6 +123,10 @@ class Discriminative:
             if some
         ]
         return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)
+
+    def remembers(self, shape: Sequence[int]) -> int:
+        """Two means."""
+        return 2 * math.prod(shape)
 
     def _rate(self, name: str) -> float:
         return next((rate for part, rate in self.rates if f"{name}.".startswith(f"{part}.")), self.learning_rate)
@@ -142,11 +155,15 @@ class Soap:
     refresh: int = 10
 
     def __post_init__(self) -> None:
-        if not self.learning_rate > 0 or self.weight_decay < 0 or self.refresh < 1:
-            raise ConfigError(
-                f"soap: learning_rate = {self.learning_rate}, weight_decay = {self.weight_decay}, refresh = "
-                f"{self.refresh}; learning_rate > 0, weight_decay >= 0 and refresh >= 1 must hold"
-            )
+        check_bounds(
+            "soap",
+            self,
+            learning_rate=RATE,
+            weight_decay=DECAY,
+            beta1=BETA,
+            beta2=BETA,
+            refresh=whole(1, MOST_UPDATES),
+        )
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:
         """The optimiser on all parameters."""
@@ -159,6 +176,10 @@ class Soap:
             weight_decay=self.weight_decay,
             precondition_frequency=self.refresh,
         )
+
+    def remembers(self, shape: Sequence[int]) -> int:
+        """Two means, and two square matrices for each axis of a matrix or kernel."""
+        return 2 * math.prod(shape) + (2 * sum(size**2 for size in shape) if len(shape) > 1 else 0)
 
 
 def _decaying(named: Iterable[tuple[str, nn.Parameter]]) -> tuple[list[nn.Parameter], list[nn.Parameter]]:

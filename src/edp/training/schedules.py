@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from edp.errors import ConfigError
+from edp.bounds import MOST_EPOCHS, SHARE, below, check_bounds, whole
 from edp.registry import Registry
 
 
@@ -49,6 +49,9 @@ class Constant:
 
     warmup: float = 0.0
 
+    def __post_init__(self) -> None:
+        check_bounds("schedule", self, warmup=SHARE)
+
     def factor(self, progress: float, state: ScheduleState) -> float:
         return _ramp(progress, self.warmup)
 
@@ -70,7 +73,7 @@ class Cosine:
     floor: float = 0.01
 
     def __post_init__(self) -> None:
-        _shares(warmup=self.warmup, floor=self.floor)
+        check_bounds("schedule", self, warmup=SHARE, floor=SHARE)
 
     def factor(self, progress: float, state: ScheduleState) -> float:
         if progress < self.warmup:
@@ -98,7 +101,7 @@ class OneCycle:
     floor: float = 1e-3
 
     def __post_init__(self) -> None:
-        _shares(rise=self.rise, start=self.start, floor=self.floor)
+        check_bounds("schedule", self, rise=SHARE, start=SHARE, floor=SHARE)
 
     def factor(self, progress: float, state: ScheduleState) -> float:
         if progress < self.rise:
@@ -127,7 +130,9 @@ class Plateau:
     floor: float = 1e-3
 
     def __post_init__(self) -> None:
-        _shares(shrink=self.shrink, floor=self.floor)
+        check_bounds(
+            "schedule", self, shrink=SHARE, patience=whole(0, MOST_EPOCHS), threshold=below(0.0, 1.0), floor=SHARE
+        )
 
     def factor(self, progress: float, state: ScheduleState) -> float:
         return state.factor
@@ -144,9 +149,3 @@ class Plateau:
 
 def _between(start: float, end: float, share: float) -> float:
     return end + (start - end) * 0.5 * (1.0 + math.cos(math.pi * share))
-
-
-def _shares(**values: float) -> None:
-    for name, value in values.items():
-        if not 0 <= value <= 1:
-            raise ConfigError(f"schedule: {name} = {value}; 0 <= {name} <= 1 must hold")

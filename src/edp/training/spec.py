@@ -4,6 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from edp.bounds import (
+    MOST_EPOCHS,
+    MOST_THREADS,
+    MOST_UPDATES,
+    MOST_WEIGHT,
+    SEED,
+    above,
+    check_bounds,
+    check_count,
+    span,
+    whole,
+)
 from edp.data.augment import AugmentationSpec
 from edp.data.chunks import ChunkSpec
 from edp.data.task import Task
@@ -16,6 +28,9 @@ from edp.training.optimizers import AdamW, OptimizerSpec
 from edp.training.schedules import Cosine, ScheduleSpec
 
 REFITS = ("none", "best", "whole")
+MOST_POWER = 4.0
+"""Of the weights of outputs: spreads of targets a thousand times apart then give weights 1e12 times apart."""
+MOST_AUGMENTATIONS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,16 +84,19 @@ class TrainingSpec:
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        if self.epochs < 1 or self.updates < 0 or self.patience < 0 or self.threads < 0:
-            raise ConfigError(
-                f"training: epochs = {self.epochs} (at least 1), updates = {self.updates}, patience = "
-                f"{self.patience}, threads = {self.threads} (all at least 0) must hold"
-            )
-        if not self.clip_norm > 0 or not 0 < self.horizon_decay <= 1:
-            raise ConfigError(
-                f"training: clip_norm = {self.clip_norm}, horizon_decay = {self.horizon_decay}; clip_norm > 0 and "
-                "0 < horizon_decay <= 1 must hold"
-            )
+        check_bounds(
+            "training",
+            self,
+            weight_power=span(-MOST_POWER, MOST_POWER),
+            horizon_decay=above(0.0, 1.0),
+            epochs=whole(1, MOST_EPOCHS),
+            updates=whole(0, MOST_UPDATES),
+            patience=whole(0, MOST_EPOCHS),
+            clip_norm=above(0.0, MOST_WEIGHT),
+            seed=SEED,
+            threads=whole(0, MOST_THREADS),
+        )
+        check_count("training", "augmentations", self.augmentations, MOST_AUGMENTATIONS)
         if self.refit not in REFITS:
             raise ConfigError(f"training: refit = '{self.refit}'; {_either(REFITS)} must hold")
         if self.device not in ("auto", "cpu", "cuda"):

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from edp.bounds import MOST_WEIGHT, SHARE, WEIGHT, check_bounds, span
 from edp.data.series import Series
 from edp.data.task import Task
-from edp.errors import ConfigError
 from edp.losses import Huber, masked_loss
 from edp.models.predictor import Predictor
 from edp.models.running import stream_predictions
@@ -45,11 +45,7 @@ class BothSpec:
     reversal: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.weight > 0 or not 0 <= self.soft <= 1 or self.reversal < 0:
-            raise ConfigError(
-                f"both worlds: weight = {self.weight}, soft = {self.soft}, reversal = {self.reversal}; weight > 0, "
-                "0 <= soft <= 1 and reversal >= 0 must hold"
-            )
+        check_bounds("both worlds", self, weight=WEIGHT, soft=SHARE, reversal=span(0.0, MOST_WEIGHT))
 
 
 class BothWorlds:

@@ -4,7 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edp.errors import ConfigError
+from edp.bounds import (
+    DECAY,
+    MOST_BATCH,
+    MOST_EPOCHS,
+    MOST_UNITS,
+    RATE,
+    WEIGHT,
+    above,
+    check_bounds,
+    span,
+    whole,
+)
+
+MOST_STEPS = 10_000
+"""Of the method of few steps, each over all the logs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,28 +71,18 @@ class FinetuneSpec:
     check_signs: bool = True
 
     def __post_init__(self) -> None:
-        if min(self.head_epochs, self.epochs, self.rounds, self.batch, self.rank) < 1 or self.patience < 0:
-            raise ConfigError(
-                f"finetune: head_epochs = {self.head_epochs}, epochs = {self.epochs}, rounds = {self.rounds}, batch = "
-                f"{self.batch}, rank = {self.rank}, patience = {self.patience}; at least 1, and a patience of at "
-                "least 0, must hold"
-            )
-        if not min(self.head_rate, self.backbone_rate, self.rate) > 0 or not 0 < self.depth_decay <= 1:
-            raise ConfigError(
-                f"finetune: head_rate = {self.head_rate}, backbone_rate = {self.backbone_rate}, rate = {self.rate}, "
-                f"depth_decay = {self.depth_decay}; rates > 0 and 0 < depth_decay <= 1 must hold"
-            )
-        if self.inner_rate < 0 or self.inner_steps < 1:
-            raise ConfigError(
-                f"finetune: inner_rate = {self.inner_rate}, inner_steps = {self.inner_steps}; a rate of at least 0 and "
-                "at least one step must hold"
-            )
-        if not self.source_weight > 0 or not 0 < self.soft <= 1 or not self.reversal > 0:
-            raise ConfigError(
-                f"finetune: source_weight = {self.source_weight}, soft = {self.soft}, reversal = {self.reversal}; "
-                "source_weight > 0, 0 < soft <= 1 and reversal > 0 must hold"
-            )
-        if min(self.smoothness, self.weight_decay) < 0:
-            raise ConfigError(
-                f"finetune: smoothness = {self.smoothness}, weight_decay = {self.weight_decay}; at least 0 must hold"
-            )
+        check_bounds(
+            "finetune",
+            self,
+            **dict.fromkeys(("head_epochs", "epochs", "rounds"), whole(1, MOST_EPOCHS)),
+            **dict.fromkeys(("head_rate", "backbone_rate", "rate"), RATE),
+            **dict.fromkeys(("smoothness", "weight_decay"), DECAY),
+            **dict.fromkeys(("source_weight", "reversal"), WEIGHT),
+            depth_decay=above(0.0, 1.0),
+            soft=above(0.0, 1.0),
+            batch=whole(1, MOST_BATCH),
+            patience=whole(0, MOST_EPOCHS),
+            rank=whole(1, MOST_UNITS),
+            inner_rate=span(0.0, RATE.high),
+            inner_steps=whole(1, MOST_STEPS),
+        )

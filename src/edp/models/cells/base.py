@@ -7,6 +7,7 @@ from typing import ClassVar, Protocol
 
 from torch import Tensor, nn
 
+from edp.bounds import below, shown
 from edp.errors import ConfigError
 from edp.graph import Builder
 from edp.registry import Registry
@@ -45,8 +46,8 @@ def check_cell(backbone: str, cell: CellSpec, zoneout: float, families: Sequence
             f"'{kind}' is of the family {cell.family}; take a cell of its family, or the backbone 'hybrid', which "
             "has any of them"
         )
-    if not 0 <= zoneout < 1:
-        raise ConfigError(f"backbone '{backbone}': zoneout = {zoneout}; 0 <= zoneout < 1 must hold")
+    if not below(0.0, 1.0).holds(zoneout):
+        raise ConfigError(f"backbone '{backbone}': zoneout = {shown(zoneout)}; 0 <= zoneout < 1 must hold")
     if zoneout and not cell.zoneout:
         able = ", ".join(name for name in CELLS if CELLS[name].zoneout)
         raise ConfigError(

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor, nn
 
-from edp.errors import ConfigError
+from edp.bounds import MOST_UNITS, check_bounds, whole
 from edp.graph import Builder
 from edp.graph.layers import Dense, Glu
 from edp.graph.memory import Rotation
@@ -42,8 +42,7 @@ class DiagonalSsmCell:
     states: int = 64
 
     def __post_init__(self) -> None:
-        if self.states < 1:
-            raise ConfigError(f"diagonal_ssm: states = {self.states}; at least 1 must hold")
+        check_bounds("diagonal_ssm", self, states=whole(1, MOST_UNITS))
 
     def build(self, width_in: int, units: int, zoneout: float) -> Streaming:
         """One layer."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from edp.bounds import check_bounds, span
 from edp.data.task import Task
 from edp.errors import ConfigError, closest
 from edp.models.physics.base import HEADS, RODS, PhysicsBase, PhysicsSpec
@@ -17,6 +18,8 @@ from edp.models.physics.geometry import Pose
 from edp.streaming import Operation
 
 LOADS = ("none", "gravity", "all")
+MOST_FADE_S = 3600.0
+"""Of a fading that no horizon sees the end of; oil's stiffness takes up the force within hundredths of a second."""
 NEAR = 3e-3
 """Distance in m from the end of a stroke within which a piston stands at its stop: what sensors can tell."""
 
@@ -47,8 +50,7 @@ class DynamicSpec(PhysicsSpec):
             raise ConfigError(
                 f"physics: load = '{self.load}' must hold one of {', '.join(LOADS)}{closest(self.load, LOADS)}"
             )
-        if not 0.0 <= self.fade_s < math.inf:
-            raise ConfigError(f"physics: fade_s = {self.fade_s}; a time in s of at least 0 must hold")
+        check_bounds("physics", self, fade_s=span(0.0, MOST_FADE_S))
 
     def channels(self) -> tuple[str, ...]:
         return (*super().channels(), *HEADS, *RODS)

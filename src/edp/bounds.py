@@ -1,0 +1,152 @@
+"""Ranges of settings: every number of a spec has both ends stated, and what lies outside is one error with its name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Any
+
+from edp.errors import ConfigError
+
+# Sizes of a network: eight times the widest of the thesis (256 units, 4 levels) and more; it must run on a controller.
+MOST_UNITS = 4096
+MOST_CHANNELS = 4096
+MOST_LAYERS = 16
+# The dilation doubles from level to level: 16 levels of kernel 2 see 65,536 ticks, as long as the longest window.
+MOST_LEVELS = 16
+MOST_KERNEL = 1024
+# Ten minutes at 100 Hz; what a stream remembers beyond that is a slow drift, which recurrent states carry.
+MOST_TICKS = 65_536
+# A batch holds at most a month at 100 Hz; the memory that it needs is computed before it is taken.
+MOST_BATCH = 1_000_000
+# Of targets, horizons, channels, features, terms or names in a list: machines log hundreds, and each is an output.
+MOST_NAMES = 10_000
+MOST_HORIZONS = 1_000
+# Rows or ticks: 115 days at 100 Hz, more than any recording has.
+MOST_ROWS = 1_000_000_000
+MOST_EPOCHS = 1_000_000
+MOST_UPDATES = 1_000_000_000
+MOST_THREADS = 4_096
+# Of NumPy's RandomState, which Optuna and scikit-learn draw from: 32 bits.
+MOST_SEED = 2**32 - 1
+# Standardised errors, gradients and weights of loss terms are of the order of one; float32 squares overflow at 1.8e19.
+MOST_WEIGHT = 1e6
+MOST_SHOWN = 60
+"""Characters of a value that a message repeats."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """From where to where a number may lie.
+
+    Attributes:
+        low: least value.
+        high: largest value, finite.
+        whole: only whole numbers.
+        above: `low` itself is out.
+        below: `high` itself is out.
+    """
+
+    low: float
+    high: float
+    whole: bool = False
+    above: bool = False
+    below: bool = False
+
+    def holds(self, value: Any) -> bool:
+        """Whether a value is a number within; NaN, infinity, text and truth values are not."""
+        if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
+            return False
+        over = value > self.low if self.above else value >= self.low
+        under = value < self.high if self.below else value <= self.high
+        return bool(over and under)
+
+    def rule(self, name: str) -> str:
+        """The rule as a message says it."""
+        first, second = "<" if self.above else "<=", "<" if self.below else "<="
+        kind = "whole numbers, " if self.whole else ""
+        return f"{kind}{self.low:,.12g} {first} {name} {second} {self.high:,.12g}"
+
+
+def whole(low: int, high: int) -> Bound:
+    """Whole numbers from `low` to `high`, both included."""
+    return Bound(low, high, whole=True)
+
+
+def span(low: float, high: float) -> Bound:
+    """Numbers from `low` to `high`, both included."""
+    return Bound(low, high)
+
+
+def above(low: float, high: float) -> Bound:
+    """Numbers above `low`, up to `high`."""
+    return Bound(low, high, above=True)
+
+
+def below(low: float, high: float) -> Bound:
+    """Numbers from `low` on, below `high`."""
+    return Bound(low, high, below=True)
+
+
+def between(low: float, high: float) -> Bound:
+    """Numbers between `low` and `high`, neither included."""
+    return Bound(low, high, above=True, below=True)
+
+
+SEED = whole(0, MOST_SEED)
+SHARE = span(0.0, 1.0)
+RATE = above(0.0, 1e38)
+"""Of learning: what float32 holds. A rate that is too large for a network is told as a training that diverged."""
+DECAY = span(0.0, 100.0)
+"""Of weights, per unit of the learning rate."""
+WEIGHT = above(0.0, MOST_WEIGHT)
+"""Of a term of a loss."""
+
+
+def check_bounds(what: str, spec: object, **bounds: Bound) -> None:
+    """Refuse numbers of a spec that lie outside their bounds; None is no number and passes.
+
+    Args:
+        what: how messages call the spec.
+        spec: object whose attributes are checked; of tuples and lists every entry.
+        bounds: by the attribute's name.
+
+    Raises:
+        ConfigError: every one that is out, with its bound.
+    """
+    wrong = []
+    for name, bound in bounds.items():
+        value = getattr(spec, name)
+        entries = value if isinstance(value, tuple | list) else () if value is None else (value,)
+        if not all(bound.holds(entry) for entry in entries):
+            wrong.append(f"{name} = {shown(value)}; {bound.rule(name)} must hold")
+    if wrong:
+        raise ConfigError(f"{what}: {'; '.join(wrong)}")
+
+
+def check_count(what: str, name: str, entries: Sequence[object], most: int, least: int = 0) -> None:
+    """Refuse a list that is too long or too short.
+
+    Raises:
+        ConfigError: says how long it is and how long it may be.
+    """
+    if not least <= len(entries) <= most:
+        raise ConfigError(f"{what}: {name} has {len(entries):,} entries; {least:,} to {most:,} must hold")
+
+
+def shown(value: Any) -> str:
+    """A value as a message repeats it: long ones cut, numbers of thousands of digits by their length."""
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * MOST_SHOWN:
+        return f"a number of about {round(value.bit_length() * 0.30103):,} digits"
+    if isinstance(value, tuple | list):
+        return f"[{_cut(', '.join(shown(entry) for entry in value[:MOST_SHOWN]))}]"
+    if isinstance(value, dict):
+        return _cut(
+            "{" + ", ".join(f"{key!r}: {shown(entry)}" for key, entry in list(value.items())[:MOST_SHOWN]) + "}"
+        )
+    return _cut(repr(value))
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= 2 * MOST_SHOWN else f"{text[: 2 * MOST_SHOWN]} ... ({len(text):,} characters)"

@@ -1,0 +1,58 @@
+"""How large a network will be, bounded from its options before it is built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from edp.data.task import Task
+
+# Forty times the largest network of the thesis (1.2 million); controllers hold a hundred thousand. 0.2 GB as float32.
+MOST_PARAMETERS = 50_000_000
+# Numbers that a stream carries from tick to tick: 0.4 GB as float32, and a training has a stream for each lane.
+MOST_STATE = 100_000_000
+NO_WIDTHS = ("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations")
+"""Options in whole numbers that are not the width of anything."""
+
+
+def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
+    """Parameters and numbers of state that a network of these options cannot exceed; quick, and up to ten times more.
+
+    Args:
+        spec: a `ModelSpec`.
+        task: what it reads and predicts.
+    """
+    options = list(_whole_numbers((spec.backbone, spec.head, *spec.blocks)))
+    features, targets = len(task.features.features), len(task.targets)
+
+    def most(name: str) -> int:
+        return max((value for key, value in options if key == name), default=1)
+
+    width = max([features, *(value for key, value in options if key not in NO_WIDTHS)])
+    levels = sum(key == "channels" for key, _ in options)
+    stacks = max(1, sum(key == "first_dilations" for key, _ in options))
+    layers = sum(value for key, value in options if key == "layers")
+    squares = (
+        2 * most("kernel") * levels * stacks  # two convolutions a level
+        + 6 * (stacks + 1) * layers  # gates on the input and on the state
+        + 8 * stacks**2  # attention and feed-forward network behind the convolutions
+        + 4  # pooling and further features
+        + targets * (13 + layers)  # full gates and heads
+    )
+    values = len(task.horizons) * spec.output.values
+    ends = targets * values * (2 * width + features * most("taps"))
+    small = 64 * stacks * (targets + levels + layers + 1) * width  # biases, norms, gates by feature
+    reach = spec.window + 2 * most("kernel") * most("first_dilations") * 2**levels + most("taps") + most("ticks")
+    return squares * width**2 + ends + small, 4 * reach * stacks * (levels + layers + 2) * width
+
+
+def _whole_numbers(parts: tuple[Any, ...] | list[Any], name: str = "") -> Iterator[tuple[str, int]]:
+    for part in parts:
+        if is_dataclass(part):
+            for entry in fields(part):
+                yield from _whole_numbers([getattr(part, entry.name)], entry.name)
+        elif isinstance(part, tuple):
+            yield from _whole_numbers(part, name)
+        elif isinstance(part, int) and not isinstance(part, bool):
+            yield name, part
