@@ -29,6 +29,7 @@ from edp.screening.spec import ForestSpec, ScreeningSpec
 from edp.search.runner import Crew
 from edp.search.settings import SearchSpec
 from edp.search.study import SamplerSpec
+from edp.signals import Kind
 from edp.training.bundle import blank_scaler
 from edp.training.fit import Loop
 from edp.training.spec import TrainingSpec
@@ -232,7 +233,12 @@ def prepared(task, ticks=400):
         return Series(name, inputs, rng.standard_normal((ticks, len(task.targets)), dtype=np.float32))
 
     return SimpleNamespace(
-        task=task, train=[series("a")], validation=[series("b")], test=[series("c")], scaler=lambda: blank_scaler(task)
+        task=task,
+        train=[series("a")],
+        validation=[series("b")],
+        test=[series("c")],
+        target_kinds=(Kind.VELOCITY,) * len(task.targets),
+        scaler=lambda: blank_scaler(task),
     )
 
 

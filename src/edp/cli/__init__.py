@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from io import TextIOWrapper
 from typing import Annotated
 
 import typer
@@ -76,4 +77,6 @@ def _root(
 
 def main() -> None:
     """Entry point of ``edp``."""
+    if isinstance(sys.stdout, TextIOWrapper):  # a terminal that lacks a character gets its escape
+        sys.stdout.reconfigure(errors="backslashreplace")
     sys.exit(run_app(app))

@@ -3,21 +3,59 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgressColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from edp.errors import EdpError
 
-out = Console(highlight=False, soft_wrap=True)
-err = Console(stderr=True, highlight=False, soft_wrap=True)
+KEPT_BREAK = re.compile(r"\n(?=  - )")
+"""The line break that messages list several things with; any other may come from a name."""
+
+
+def visible(text: str) -> str:
+    r"""Text as a terminal may have it: what moves its cursor, turns its direction or is no character is escaped.
+
+    Control characters and escape sequences, bidirectional and other invisible controls, line breaks, and the bytes of
+    file names that are not UTF-8 become ``\x1b``, ``\u202e``, ``\n`` and ``\xff``.
+    """
+    return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else _escape(c) for c in text)
+
+
+def _escape(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name, as Python holds it
+        return f"\\x{code - 0xDC00:02x}"
+    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
+class Terminal(Console):
+    """Where all text of the command line becomes output: nothing in it is markup, and all of it is visible."""
+
+    def __init__(self, stderr: bool = False) -> None:
+        super().__init__(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True)
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print text, or a renderable of this module."""
+        super().print(*(_shown(part) if isinstance(part, str) else part for part in objects), **options)
+
+
+def _shown(text: str) -> Text:
+    return Text("\n".join(map(visible, KEPT_BREAK.split(text))))
+
+
+out = Terminal()
+err = Terminal(stderr=True)
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON document to standard output and nothing else.")]
 INTERRUPTED = 130
@@ -33,22 +71,55 @@ def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None
 
 def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Print a table; the first column is text, the others are aligned right."""
-    made = Table(title=title, title_justify="left", title_style="bold", header_style="bold", box=None, pad_edge=False)
+    made = _table(title)
     for i, heading in enumerate(headings):
-        made.add_column(heading, justify="left" if i == 0 else "right")
+        made.add_column(_shown(heading), justify="left" if i == 0 else "right")
     for row in rows:
-        made.add_row(*(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in row))
+        made.add_row(*(_shown(f"{cell:,}" if isinstance(cell, int) else str(cell)) for cell in row))
     out.print(made)
+
+
+def listing(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print rows of text, everything to the left and folded where it is wide."""
+    made = _table(title)
+    for heading in headings:
+        made.add_column(_shown(heading), overflow="fold")
+    for row in rows:
+        made.add_row(*map(_shown, row))
+    out.print(made)
+
+
+def _table(title: str) -> Table:
+    return Table(
+        title=_shown(title) if title else None,
+        title_justify="left",
+        title_style="bold",
+        header_style="bold",
+        box=None,
+        pad_edge=False,
+    )
+
+
+class Words(ProgressColumn):
+    """The description or the note of a task, as text."""
+
+    def __init__(self, of_task: Callable[[Task], str]) -> None:
+        super().__init__()
+        self.of_task = of_task
+
+    def render(self, task: Task) -> Text:
+        """The words now."""
+        return _shown(self.of_task(task))
 
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Progress]:
     """A progress display on standard error with a bar, a note (rate and figures) and the time left."""
     columns = (
-        TextColumn("{task.description}"),
+        Words(lambda task: task.description),
         BarColumn(bar_width=24),
         TaskProgressColumn(),
-        TextColumn("{task.fields[note]}"),
+        Words(lambda task: task.fields["note"]),
         TimeRemainingColumn(elapsed_when_finished=True),
     )
     with Progress(*columns, console=err, disable=quiet or not err.is_terminal, refresh_per_second=4) as shown:
@@ -106,7 +177,7 @@ def run_app(app: typer.Typer) -> int:
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:
-        err.print(f"[bold red]error:[/] {_escaped(str(error))}")
+        _say_error(str(error))
         return error.exit_code
     except typer.Exit as done:
         return done.exit_code
@@ -114,13 +185,25 @@ def run_app(app: typer.Typer) -> int:
         err.print("stopped; what was finished is on disk: give the same command again to go on")
         return INTERRUPTED
     except Exception as error:
-        show = getattr(error, "show", None)  # a usage error of the command line itself
-        if show is None:
+        if not hasattr(error, "format_message"):
             raise
-        show()
+        _say_usage(error)
         return int(getattr(error, "exit_code", 2))
     return code if isinstance(code, int) else 0
 
 
-def _escaped(text: str) -> str:
-    return text.replace("[", r"\[")
+def _say_error(text: str) -> None:
+    err.print("error: ", style="bold red", end="")
+    err.print(text)
+
+
+def _say_usage(error: Any) -> None:
+    """A mistake in the words of the command line itself, such as an unknown option; or help, where none were given."""
+    context = getattr(error, "ctx", None)
+    if type(error).__name__ == "NoArgsIsHelpError":
+        error.show()
+        return
+    if context is not None:
+        err.print(" ".join(context.get_usage().split()))
+        err.print(f"Try '{context.command_path} --help' for help.", style="dim")
+    _say_error(error.format_message())

@@ -57,4 +57,4 @@ def demo(
 
 def _say(quiet: bool, text: str) -> None:
     if not quiet:
-        out.print(f"[bold]{text}[/]")
+        out.print(text, style="bold")

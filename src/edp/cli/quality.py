@@ -35,15 +35,13 @@ class LogDisplay:
 
 def show_report(report: QualityReport, channels: bool) -> None:
     """Print one recording's facts and findings."""
+    out.print(report.name, style="bold", end="")
     out.print(
-        f"[bold]{_plain(report.name)}[/]: {report.duration_s:.1f} s, {report.rate_hz:g} Hz, {report.samples:,} samples"
-        f", verdict: {report.verdict}"
+        f": {report.duration_s:.1f} s, {report.rate_hz:g} Hz, {report.samples:,} samples, verdict: {report.verdict}"
     )
     for clock in report.clocks:
         gaps = f"{clock.gaps} gap(s), longest {clock.longest_gap_s:g} s" if clock.gaps else "no gaps"
-        out.print(
-            f"  time of '{_plain(clock.name)}': {clock.rate_hz:g} Hz, jitter {clock.jitter:.2g} of a step, {gaps}"
-        )
+        out.print(f"  time of '{clock.name}': {clock.rate_hz:g} Hz, jitter {clock.jitter:.2g} of a step, {gaps}")
     if channels and report.channels:
         rows = [(c.name, c.unit, *map(_short, (c.min, c.max, c.mean, c.std)), c.missing) for c in report.channels]
         table("", ["channel", "unit", "min", "max", "mean", "std", "missing"], rows)
@@ -66,7 +64,7 @@ def show_finding(finding: Finding) -> None:
     where = f" {finding.channel}:" if finding.channel else ""
     place = f" ({finding.where})" if finding.where else ""
     advice = f". {finding.advice}" if finding.advice else ""
-    out.print(_plain(f"  {finding.severity}:{where} {finding.what}{place}{advice}"))
+    out.print(f"  {finding.severity}:{where} {finding.what}{place}{advice}")
 
 
 def show_between(quality: DataQuality) -> None:
@@ -88,7 +86,3 @@ def verdict_text(quality: DataQuality) -> str:
 
 def _short(value: float | None, digits: int = 4) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
-
-
-def _plain(text: str) -> str:
-    return text.replace("[", r"\[")

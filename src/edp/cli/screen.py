@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.console import JsonFlag, Steps, duration, emit, listing, out, progress, table
 from edp.cli.quality import LogDisplay, show_between, verdict_text
 from edp.cli.train import MapOption, RepairOption, source_of
 
@@ -129,13 +129,13 @@ def show_selection(made: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
     found = made.found
     rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in found.proposal.choices if c.keep]
-    _listing(f"keep: {len(rows)} of {len(found.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
+    listing(f"keep: {len(rows)} of {len(found.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
     if len(rows) > SHOWN:
         out.print(f"  ... and {len(rows) - SHOWN} more in {made.files['page']}")
     out.print()
     if found.flags:
         flags = [(flag.channel, str(flag.kind), flag.evidence) for flag in found.flags]
-        _listing(f"flags: {len(flags)}", ["channel", "what", "evidence"], flags[:SHOWN_FLAGS])
+        listing(f"flags: {len(flags)}", ["channel", "what", "evidence"], flags[:SHOWN_FLAGS])
         if len(flags) > SHOWN_FLAGS:
             out.print(f"  ... and {len(flags) - SHOWN_FLAGS} more in {made.files['page']}")
         out.print()
@@ -148,18 +148,6 @@ def show_selection(made: Selection) -> None:
         _show_trials(made)
     out.print(f"page: {made.files['page']}")
     out.print(f"feature sets: {made.files['sets']}")
-
-
-def _listing(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Rows of text, everything to the left; names come from files and may hold brackets."""
-    from rich.table import Table
-
-    made = Table(title=title, title_justify="left", title_style="bold", header_style="bold", box=None, pad_edge=False)
-    for heading in headings:
-        made.add_column(heading, overflow="fold")
-    for row in rows:
-        made.add_row(*(cell.replace("[", r"\[") for cell in row))
-    out.print(made)
 
 
 def _show_lags(made: Selection) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -137,7 +138,12 @@ def export(
 
     file, names = export_study(study, output)
     facts = {"journal": str(file), "studies": names}
-    emit(as_json, facts, lambda: out.print(f"{len(names)} studies in {file}\nnext: optuna-dashboard {file}"))
+    emit(as_json, facts, lambda: _show_journal(file, names))
+
+
+def _show_journal(file: Path, names: Sequence[str]) -> None:
+    out.print(f"{len(names)} studies in {file}")
+    out.print(f"next: optuna-dashboard {file}")
 
 
 class SearchDisplay:
@@ -173,9 +179,9 @@ class SearchDisplay:
         from edp.search.phases import PHASES
 
         if not self.quiet:
-            out.print(f"[bold]{PHASES[decision.phase].title}[/]")
+            out.print(PHASES[decision.phase].title, style="bold")
             for sentence in decision.sentences:
-                out.print("  " + sentence.replace("[", r"\["))
+                out.print(f"  {sentence}")
 
 
 def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
@@ -225,4 +231,4 @@ def _show_status(held: dict[str, Any]) -> None:
     out.print(f"{counts['done']} trainings done, {held['running']} running, {counts['total'] - counts['done']} left")
     for decision in held["decisions"]:
         for sentence in decision["sentences"]:
-            out.print("  " + sentence.replace("[", r"\["))
+            out.print(f"  {sentence}")

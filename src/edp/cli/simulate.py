@@ -146,7 +146,7 @@ def limit_table(found: dict[str, Any]) -> None:
 
 
 def _note(text: str) -> None:
-    err.print(f"note: {text}", markup=False)
+    err.print(f"note: {text}")
 
 
 def _range(text: str) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.bounds import check_bounds, span, whole
 from edp.errors import ConfigError
 
 Array = NDArray[np.float32]
@@ -55,13 +56,8 @@ class AdaptationSpec:
     margin: float = 0.05
 
     def __post_init__(self) -> None:
-        if not 0 <= self.rank <= 64:
-            raise ConfigError(f"adaptation: rank = {self.rank}; 0 to 64 must hold")
-        for entry in fields(self)[1:]:
-            value = getattr(self, entry.name)
-            low = 0.0 if entry.name == "rest" else 1e-3
-            if not (low <= value <= 1e6):
-                raise ConfigError(f"adaptation: {entry.name} = {value}; {low:g} to 1e6 must hold")
+        reals = {entry.name: span(1e-3, 1e6) for entry in fields(self)[1:]}
+        check_bounds("adaptation", self, rank=whole(0, 64), **(reals | {"rest": span(0.0, 1e6)}))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -58,8 +58,8 @@ def check_channels(recordings: Sequence[Recording], task: Task) -> None:
             problems.append(f"'{recording.name}' ({recording.source}) lacks {', '.join(missing)}{hint}")
     if problems:
         raise DataError(
-            "the network reads channels that the logs do not have:\n  - " + "\n  - ".join(problems) + "\n"
-            "Map the columns that hold them (--map); give a channel that this machine does not have a value there "
+            "the network reads channels that the logs do not have:\n  - " + "\n  - ".join(problems) + "\n  - "
+            "map the columns that hold them (--map); give a channel that this machine does not have a value there "
             "(constant = 0.0); or train the source without it (task.features)"
         )
     other = [f"'{r.name}' {r.rate_hz:g} Hz" for r in recordings if abs(r.rate_hz - task.rate_hz) > 1e-3 * task.rate_hz]
