@@ -58,8 +58,9 @@ class Bound:
         """Whether a value is a number within; NaN, infinity, text and truth values are not."""
         if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
             return False
-        over = value > self.low if self.above else value >= self.low
-        under = value < self.high if self.below else value <= self.high
+        given: Any = value  # whole numbers beyond what a float holds compare as they are
+        over = given > self.low if self.above else given >= self.low
+        under = given < self.high if self.below else given <= self.high
         return bool(over and under)
 
     def rule(self, name: str) -> str:

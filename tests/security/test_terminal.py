@@ -120,9 +120,11 @@ def test_inspect_of_a_file_of_a_hostile_name(name, tmp_path, monkeypatch, capsys
     path.parent.mkdir(exist_ok=True)
     path.write_text(LOG)
     code, out, err = run(monkeypatch, capsys, "inspect", path, "--no-coverage")
-    assert code in (0, 3), err
-    shows(out, "a[/bold]b")
+    shows(out)
     shows(err)
+    if name.isprintable():
+        assert code in (0, 3), err
+        shows(out, "a[/bold]b")
     assert "Traceback" not in err
 
 
