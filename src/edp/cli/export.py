@@ -14,7 +14,7 @@ from edp.errors import ConfigError
 def export(
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train.")],
     to: Annotated[str, typer.Option(help="Form: c (C99 for controllers), casadi, fmu, onnx, ros2 or simulink.")],
-    folder: Annotated[Path, typer.Option("--out", help="Folder for the files; those of the same names are replaced.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an export that is there is replaced.")],
     name: Annotated[str, typer.Option(help="What the network is called there.")] = "predictor",
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from edp.cli.console import JsonFlag, emit, err, out, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.errors import ConfigError
 
 if TYPE_CHECKING:
     from edp.parity import Row
@@ -28,17 +30,25 @@ def parity(
     strict: Annotated[bool, typer.Option(help="Forms that cannot be run here fail too.")] = False,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before code of a bundle outside of a run folder is run.")
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Run one recording through PyTorch and every exported form; compare the numbers and the time of a tick.
+
+    Each form is exported, compiled and run on this computer: C with cc, Python and MATLAB code with this Python and GNU
+    Octave, where they are there. Of a bundle that is not in a run folder it asks first.
 
     Ends with 1 where a form differs from PyTorch by more than its tolerance.
 
     Example: `edp parity runs/first`
     """
-    from edp.parity import compare, golden_case, recorded_case
+    from edp.parity import compare, from_own_run, golden_case, recorded_case
     from edp.training import load_bundle
 
+    if not (yes or from_own_run(bundle)):
+        _ask(bundle)
     loaded = load_bundle(bundle)
     source = None if data is None else source_of(data, signal_map, repair)
     case = golden_case(loaded, ticks) if source is None else recorded_case(loaded, source, ticks)
@@ -55,6 +65,22 @@ def parity(
     if failed:
         err.print(f"not the same: {', '.join(failed)}")
         raise typer.Exit(1)
+
+
+def _ask(bundle: Path) -> None:
+    """Ask on a terminal whether a bundle from elsewhere is to be compiled and run.
+
+    Raises:
+        ConfigError: there is no terminal, or the answer is no.
+    """
+    from edp.parity import WHAT
+
+    why = f"'{bundle}' is not the folder of a run of yours. {WHAT}"
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigError(f"{why}. Give --yes if you trust its source; nothing was run")
+    err.print(f"{why}.", markup=False)
+    if not typer.confirm("Go on?", err=True):
+        raise ConfigError("nothing was run")
 
 
 def _show(rows: list[Row], ticks: int) -> None:

@@ -1,0 +1,21 @@
+"""Whose bundle is compiled and run: one of a run folder of this computer's owner, or one from elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+RUN = "run.json"
+"""Training, distillation, quantisation and adaptation write it beside a bundle; a bundle that is passed on has none."""
+WHAT = (
+    "edp parity writes C, Python and MATLAB code of this network, compiles it and runs it on this computer with your "
+    "rights. The code holds numbers and sizes of the bundle, and its text in comments and strings only"
+)
+
+
+def from_own_run(path: str | Path) -> bool:
+    """Whether a path is a run folder, or the bundle in one.
+
+    A convenience and no proof: a folder that somebody sent whole looks like one of your own.
+    """
+    folder = Path(path)
+    return any((place / RUN).is_file() for place in (folder, *([folder.parent] if folder.name == "bundle" else [])))
