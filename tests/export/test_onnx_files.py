@@ -14,6 +14,7 @@ import scipy.io
 
 from edp.errors import ConfigError, ExportError
 from edp.export import make_target
+from edp.export.folder import LIST
 from edp.export.golden import random_inputs, stream, tolerance
 from edp.export.onnx import nodes as nodes_file
 from edp.export.onnx.nodes import ALLOWED, OPSETS, Nodes
@@ -32,7 +33,7 @@ def test_files_are_clean(opset, bundle_of, tmp_path):
     bundle = bundle_of("hybrid+all")
     files = OnnxTarget(opset).write(bundle, "arm", tmp_path)
     read = {file.name: file.read_bytes() for file in files}
-    assert sorted(read) == sorted(file.name for file in tmp_path.iterdir())
+    assert sorted([*read, LIST]) == sorted(file.name for file in tmp_path.iterdir())
     OnnxTarget(opset).write(bundle, "arm", tmp_path)
     assert {file.name: file.read_bytes() for file in files} == read  # the same network gives the same bytes
     described = json.loads(read["arm.json"])
