@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import StorageError
-from edp.storage import replacing
+from edp.storage import object_with, parse_json, read_bytes, replacing
 
 SCHEMA = 2
+MOST_BYTES = 1 << 30
+"""Largest file of a snapshot: days of a simulation's log."""
 _FACTS = "facts"
 
 
@@ -59,18 +62,45 @@ class Snapshot:
         Raises:
             StorageError: the file is missing, damaged, or of another schema.
         """
+        where = f"snapshot '{path}'"
         try:
-            with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-                facts = json.loads(bytes(stored[_FACTS]))
-                arrays = tuple(stored[f"a{i}"] for i in range(len(stored.files) - 2))
-                log = stored["log"]
+            with zipfile.ZipFile(io.BytesIO(read_bytes(path, MOST_BYTES, where))) as packed:
+                _check_members(packed, where)
+                stored = {name.removesuffix(".npy"): _array(packed, name) for name in packed.namelist()}
+            facts = object_with(
+                parse_json(stored[_FACTS].tobytes().decode(), where), ("schema", "scenario", "samples", "state"), where
+            )
             if facts["schema"] != SCHEMA:
-                raise StorageError(f"snapshot '{path}' has schema {facts['schema']}; this version reads {SCHEMA}")
+                raise StorageError(f"{where} has schema {facts['schema']}; this version reads {SCHEMA}")
+            arrays, log = tuple(stored[f"a{i}"] for i in range(len(stored) - 2)), stored["log"]
             return Snapshot(
                 facts["scenario"], int(facts["samples"]), facts["state"], arrays, (log,) if len(log) else ()
             )
-        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, zipfile.BadZipFile) as error:
             raise StorageError(f"'{path}' is not a snapshot of a simulation, or is damaged: {error}") from error
+
+
+def _check_members(packed: zipfile.ZipFile, where: str) -> None:
+    """Hold the members to what `save` writes: nothing packed, so that no small file unpacks to a large one."""
+    names = packed.namelist()
+    if len(set(names)) < len(names):
+        raise StorageError(f"{where} holds an array twice; it is damaged")
+    if any(member.compress_type != zipfile.ZIP_STORED for member in packed.infolist()):
+        raise StorageError(f"{where} holds packed arrays, which EDP never writes; save the simulation again")
+
+
+def _array(packed: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    """One array; its header must announce the bytes that are there, before NumPy takes memory for it."""
+    data = io.BytesIO(packed.read(name))
+    version = np.lib.format.read_magic(data)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(data)
+    left = len(data.getvalue()) - data.tell()
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != left:
+        raise ValueError(f"array '{name}' announces {shape} of {dtype} and holds {left} bytes")
+    data.seek(0)
+    array: NDArray[Any] = np.lib.format.read_array(data, allow_pickle=False)
+    return array
 
 
 def capture(value: Any, arrays: list[NDArray[Any]]) -> Any:
