@@ -48,5 +48,7 @@ def footprint(
         ]
         out.print()
         table(f"Budget: {facts['budget']['name']}", ["", "value", "limit", "unit", "verdict", "meaning"], limits)
+        for number_format, why in counts.refused.items():
+            out.print(f"not in {number_format}: {why}")
 
     emit(as_json, facts, show)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from edp.errors import ExportError
+from edp.export.c.sizes import constant_bytes
 from edp.models.integer import integer_predictor
 from edp.models.running import mean_error
 from edp.runs import RunFolder
@@ -25,7 +26,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         ticks: about how many ticks of the training part run through the whole network.
 
     Returns:
-        ``float`` and ``integer``: MAE over horizons and targets in SI units; ``bytes``: of the constants.
+        ``float`` and ``integer``: MAE over horizons and targets in SI units; ``bytes``: of the constants of its C code.
 
     Raises:
         EdpError: not a run folder, a network without a form in whole numbers or in them already, or a folder that
@@ -45,4 +46,4 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
                 write_bytes(target.file(name), (folder / name).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"number_format": made.number_format})
         save_bundle(replace(bundle, predictor=made, scores={}), target.file("bundle"))
-    return found | {"bytes": float(sum(values.nbytes for _, _, values in made.integers.tensors()))}
+    return found | {"bytes": float(constant_bytes(made.integers, bundle.adaptation))}

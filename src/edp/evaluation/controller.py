@@ -9,6 +9,7 @@ from typing import Any
 
 from edp.bounds import check_bounds, whole
 from edp.errors import ConfigError, closest
+from edp.export.c.sizes import Sizes
 from edp.storage import read_toml
 from edp.streaming import Cost
 
@@ -30,25 +31,19 @@ class NumberFormat:
     10 % less.
 
     Attributes:
-        weight_bytes: of a weight.
-        output_bytes: of scale and bias of an output of weights.
-        program_bytes: of the program and its tables.
         state_bytes: of a number that is carried from tick to tick, working memory included; the most that was seen.
         per_mac: cycles of a multiply-accumulate.
         per_output: cycles of a feature that a part writes.
     """
 
-    weight_bytes: int
-    output_bytes: int
-    program_bytes: int
     state_bytes: float
     per_mac: float
     per_output: float
 
 
 FORMATS = {
-    "float32": NumberFormat(4, 0, 4_500, 4.6, 4.05, 40.0),
-    "w8a16": NumberFormat(1, 9, 7_900, 3.1, 2.14, 98.0),
+    "float32": NumberFormat(4.6, 4.05, 40.0),
+    "w8a16": NumberFormat(3.1, 2.14, 98.0),
 }
 
 
@@ -127,34 +122,43 @@ def load_budget(path: str | Path) -> Budget:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a network takes as a stream, in one number format; estimates, not measurements.
+    """What a network takes as a stream, in one number format, as its exported C code.
+
+    Bytes of constants are counted and are those of the compiled code; the others are estimates, not measurements.
 
     Attributes:
         number_format: a name of `FORMATS`.
         cycles: low, typical and high estimate of a tick by core; the high one decides.
-        parameter_bytes: folded weights, with scale and bias of each output.
-        flash_bytes: the same with the program.
+        parameter_bytes: constants of the model on a 32-bit controller: weights, multipliers, shifts, biases, and all
+            else that the C code of the model holds in read-only memory.
+        program_bytes: code, and tables of functions; within 2 %.
         ram_bytes: state, working memory and an allowance of `STACK_BYTES` for the stack.
     """
 
     number_format: str
     cycles: dict[str, tuple[int, int, int]]
     parameter_bytes: int
-    flash_bytes: int
+    program_bytes: int
     ram_bytes: int
+
+    @property
+    def flash_bytes(self) -> int:
+        """Constants and program."""
+        return self.parameter_bytes + self.program_bytes
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
-        return asdict(self)
+        return asdict(self) | {"flash_bytes": self.flash_bytes}
 
 
-def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str) -> Estimate:
+def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str, sizes: Sizes) -> Estimate:
     """Estimate a network in one number format.
 
     Args:
         costs: of all its parts.
         state_numbers: how many numbers it carries from tick to tick.
         number_format: a name of `FORMATS`.
+        sizes: of its C code in this format.
     """
     form = FORMATS[number_format]
     macs = sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)
@@ -164,6 +168,5 @@ def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str) -> E
         name: (round(step * core.low), round(step * core.typical * BOARD_TYPICAL), round(step * BOARD_SLOW))
         for name, core in CORES.items()
     }
-    weights = form.weight_bytes * sum(cost.parameters - cost.foldable for cost in costs) + form.output_bytes * outputs
     working = round(form.state_bytes * state_numbers)
-    return Estimate(number_format, cycles, weights, form.program_bytes + weights, working + STACK_BYTES)
+    return Estimate(number_format, cycles, sizes.constants, sizes.program, working + STACK_BYTES)

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 
-from edp.errors import ConfigError
-from edp.evaluation.controller import CORES, FORMATS, Budget, Estimate, estimate
+from edp.errors import ConfigError, ExportError
+from edp.evaluation.controller import CORES, Budget, Estimate, estimate
+from edp.export.c.sizes import Sizes, sizes_of
+from edp.graph import Graph
+from edp.integer.quantise import outline
 from edp.models.predictor import Predictor
 from edp.onboard import Adaptation
 from edp.streaming import Cost, state_numbers
+
+GRAPHS: dict[str, Callable[[Predictor], Graph]] = {
+    "float32": lambda predictor: predictor.graph(),
+    "w8a16": lambda predictor: outline(predictor.graph()),
+}
+"""Layers of a network by number format of `FORMATS`."""
 
 
 @dataclass(frozen=True)
@@ -24,28 +34,37 @@ class Footprint:
         macs_window: multiply-accumulates of one prediction from a window of `window` samples (pooling left out, as
             in the thesis's tables).
         macs_tick: multiply-accumulates of one tick of the stream, pooling included.
-        weight_bytes_fp32: folded weights at 4 bytes.
-        weight_bytes_int8: folded weights at 1 byte.
         peak_activation_bytes: largest input plus output of one layer in a stream, float32.
         peak_activation_bytes_window: the same when a whole window is held.
         state_bytes: state carried from tick to tick, float32.
         window: W in samples.
         rows: costs by part.
-        estimates: cycles, flash and memory of a stream in each number format.
+        estimates: bytes, cycles and memory of a stream in each number format that the network has a form in.
+        refused: why it has none in the others, by number format.
     """
 
     parameters: int
     parameters_folded: int
     macs_window: int
     macs_tick: int
-    weight_bytes_fp32: int
-    weight_bytes_int8: int
     peak_activation_bytes: int
     peak_activation_bytes_window: int
     state_bytes: int
     window: int
     rows: tuple[dict[str, Any], ...]
     estimates: tuple[Estimate, ...]
+    refused: dict[str, str]
+
+    def estimate(self, number_format: str) -> Estimate:
+        """The one of a number format.
+
+        Raises:
+            ExportError: the network has no form in it.
+        """
+        for entry in self.estimates:
+            if entry.number_format == number_format:
+                return entry
+        raise ExportError(self.refused[number_format])
 
     def to_json(self, budget: Budget) -> dict[str, Any]:
         """Plain values with the verdict against `budget`."""
@@ -61,17 +80,11 @@ class Footprint:
             label = entry.number_format
             low, typical, high = entry.cycles[budget.core]
             range_text = f"high estimate for a {CORES[budget.core].label}; low {low:,}, typical {typical:,}"
-            weights = FORMATS[label].weight_bytes * self.parameters_folded
+            constants, memory = entry.parameter_bytes, entry.parameter_bytes + entry.ram_bytes
             rows += [
                 (f"cycles per tick, {label}", high, budget.cycles, "cycles", range_text),
-                (f"parameters, {label}", weights, budget.parameter_bytes, "bytes", "folded weights"),
-                (
-                    f"RAM, {label}",
-                    weights + entry.ram_bytes,
-                    budget.ram_bytes,
-                    "bytes",
-                    "weights too, as in the thesis",
-                ),
+                (f"parameters, {label}", constants, budget.parameter_bytes, "bytes", "all constants of the C code"),
+                (f"RAM, {label}", memory, budget.ram_bytes, "bytes", "constants too, as in the thesis"),
                 (f"flash, {label}", entry.flash_bytes, budget.flash_bytes, "bytes", "estimate, with the program"),
             ]
         return [
@@ -89,20 +102,32 @@ def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Foo
     column = sum(cost.per_column for cost in costs)
     once = sum(cost.per_prediction for cost in costs)
     folded = sum(cost.parameters - cost.foldable for cost in costs)
+    sizes, refused = _sizes(predictor, adaptation)
     return Footprint(
         parameters=sum(cost.parameters for cost in costs),
         parameters_folded=folded,
         macs_window=column * window + once,
         macs_tick=column + once + sum(cost.pooling for cost in costs),
-        weight_bytes_fp32=4 * folded,
-        weight_bytes_int8=folded,
         peak_activation_bytes=4 * max(cost.width_in + cost.width_out for cost in costs),
         peak_activation_bytes_window=4 * max(_window_width(cost, window) for cost in costs),
         state_bytes=4 * state,
         window=window,
         rows=tuple(_row(cost, window) for cost in costs),
-        estimates=tuple(estimate(costs, state, name) for name in FORMATS),
+        estimates=tuple(estimate(costs, state, name, size) for name, size in sizes.items()),
+        refused=refused,
     )
+
+
+def _sizes(predictor: Predictor, adaptation: Adaptation | None) -> tuple[dict[str, Sizes], dict[str, str]]:
+    """Sizes by number format, and why there are none."""
+    sizes: dict[str, Sizes] = {}
+    refused: dict[str, str] = {}
+    for name, in_format in GRAPHS.items():
+        try:
+            sizes[name] = sizes_of(in_format(predictor), adaptation)
+        except ExportError as error:
+            refused[name] = str(error)
+    return sizes, refused
 
 
 def adaptation_cost(adaptation: Adaptation) -> Cost:
@@ -128,10 +153,12 @@ def check_possible(budget: Budget, least: Footprint) -> None:
     Raises:
         ConfigError: each limit that is too small, and what the smallest network needs.
     """
+    if not least.estimates:
+        return  # nothing is known of what it takes
     needs = {
         "cycles": min(entry.cycles[budget.core][2] for entry in least.estimates),
-        "parameter_bytes": least.weight_bytes_int8,
-        "ram_bytes": least.weight_bytes_int8 + min(entry.ram_bytes for entry in least.estimates),
+        "parameter_bytes": min(entry.parameter_bytes for entry in least.estimates),
+        "ram_bytes": min(entry.parameter_bytes + entry.ram_bytes for entry in least.estimates),
         "flash_bytes": min(entry.flash_bytes for entry in least.estimates),
     }
     short = [f"{what} = {getattr(budget, what):,}" for what, need in needs.items() if getattr(budget, what) < need]

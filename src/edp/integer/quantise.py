@@ -138,6 +138,23 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
     return replace(finished, initial=_initial(graph, finished, work))
 
 
+def outline(graph: Graph) -> Graph:
+    """The network in W8A16 with nothing in it: every constant has its shape and kind, but noughts for numbers.
+
+    What a network takes of a controller depends on no number, so neither training nor recordings are needed.
+
+    Raises:
+        ExportError: a kind of layer that has no whole-number form.
+    """
+    hollow = tuple(
+        replace(layer, **{name: np.zeros_like(values) for name, values in layer.tensors().items()})
+        for layer in graph.layers
+    )
+    names = [INPUT, *(layer.name for layer in graph.layers)]
+    names += [f"{layer}/{slot.name}" for layer, slot in graph.slots()]
+    return quantise(replace(graph, layers=hollow), Formats(dict.fromkeys(names, 0)))
+
+
 def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str], Any]:
     """What slots start from, in their formats."""
     numbers = {(name, slot.name): slot.number for name, slot in finished.slots()}

@@ -168,14 +168,15 @@ def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
         "parameters_folded": ("Parameters after folding", ""),
         "macs_tick": ("Work per tick, streaming", "MAC"),
         "macs_window": ("Work per window, from scratch", "MAC"),
-        "weight_bytes_fp32": ("Weights in FP32", "B"),
-        "weight_bytes_int8": ("Weights in INT8", "B"),
+        "float32": ("Constants on a controller, FP32", "B"),
+        "w8a16": ("Constants on a controller, W8A16", "B"),
         "peak_activation_bytes": ("Peak activations, streaming", "B"),
         "peak_activation_bytes_window": ("Peak activations, window", "B"),
         "state_bytes": ("State carried between ticks", "B"),
         "window": ("Window", "samples"),
     }
-    values = facts.footprint or {}
+    values = dict(facts.footprint or {})
+    values |= {row["number_format"]: row["parameter_bytes"] for row in values.get("estimates", [])}
     found = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
     return [(label, f"{whole(value)} {unit}".rstrip()) for label, value, unit in found if value is not None]
 

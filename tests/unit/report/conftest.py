@@ -136,7 +136,11 @@ def write_footprint(folder: Path) -> None:
     ]  # fmt: skip
     footprint = {
         "parameters": 41283, "parameters_folded": 40960, "macs_tick": 40752, "macs_window": 1822000, "window": 50,
-        "weight_bytes_fp32": 165132, "weight_bytes_int8": 41283, "peak_activation_bytes": 6144, "state_bytes": 25056,
+        "peak_activation_bytes": 6144, "state_bytes": 25056,
+        "estimates": [
+            {"number_format": "float32", "parameter_bytes": 165132},
+            {"number_format": "w8a16", "parameter_bytes": 45283},
+        ],
         "peak_activation_bytes_window": 51200,
         "rows": [dict(zip(("part", "parameters", "macs_tick", "macs_window"), row, strict=True)) for row in rows],
         "budget": {"name": "180 MHz, 4 ms per tick", "cycles": 720000, "parameter_bytes": 100000, "ram_bytes": 500000},

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.data.series import Series
-from edp.evaluation import controller
-from edp.evaluation.controller import Budget
-from edp.evaluation.footprint import Footprint, footprint
+from edp.evaluation.controller import Budget, Estimate
+from edp.evaluation.footprint import footprint
 from edp.models.predictor import Predictor
 from edp.registry import Registry
 
@@ -25,7 +24,7 @@ class Format(Protocol):
 
     Attributes:
         label: how tables call it.
-        estimated: name in `edp.evaluation.controller.FORMATS` of the estimate of its cycles and state.
+        estimated: name in `edp.evaluation.controller.FORMATS` of the estimate of its cycles, program and state.
         rounded: whether training with rounded numbers is of use for it.
     """
 
@@ -33,8 +32,8 @@ class Format(Protocol):
     estimated: ClassVar[str]
     rounded: ClassVar[bool]
 
-    def parameter_bytes(self, predictor: Predictor, counts: Footprint) -> int:
-        """Memory for the parameters of a network."""
+    def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
+        """Memory for the parameters of a network, whose C code takes `estimate`."""
         ...
 
     def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
@@ -86,11 +85,13 @@ def taken(predictor: Predictor, name: str, budget: Budget, parameter_bytes: int 
         name: a name of `FORMATS`.
         budget: says which core.
         parameter_bytes: where they are known better than the format knows them.
+
+    Raises:
+        ExportError: the network has no form in this format.
     """
     form, counts = FORMATS[name](), footprint(predictor)
-    estimate = next(entry for entry in counts.estimates if entry.number_format == form.estimated)
-    weights = form.parameter_bytes(predictor, counts) if parameter_bytes is None else parameter_bytes
-    program = estimate.flash_bytes - controller.FORMATS[form.estimated].weight_bytes * counts.parameters_folded
+    estimate = counts.estimate(form.estimated)
+    weights = form.parameter_bytes(predictor, estimate) if parameter_bytes is None else parameter_bytes
     return Taken(
         parameters=counts.parameters_folded,
         macs_tick=counts.macs_tick,
@@ -98,7 +99,7 @@ def taken(predictor: Predictor, name: str, budget: Budget, parameter_bytes: int 
         cycles=estimate.cycles[budget.core],
         parameter_bytes=weights,
         ram_bytes=weights + estimate.ram_bytes,
-        flash_bytes=weights + program,
+        flash_bytes=weights + estimate.program_bytes,
     )
 
 

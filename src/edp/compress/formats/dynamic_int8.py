@@ -9,7 +9,7 @@ from typing import ClassVar
 from edp.compress.formats.base import FORMATS, Predict
 from edp.compress.int8 import dynamic_int8
 from edp.data.series import Series
-from edp.evaluation.footprint import Footprint
+from edp.evaluation.controller import Estimate
 from edp.models.predictor import Predictor
 from edp.models.running import stream_predictions
 
@@ -25,8 +25,8 @@ class DynamicInt8:
     estimated: ClassVar[str] = "float32"
     rounded: ClassVar[bool] = False
 
-    def parameter_bytes(self, predictor: Predictor, counts: Footprint) -> int:
-        """One byte for each weight of a linear layer, four for the others, as in Table 4.9."""
+    def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
+        """One byte for each weight of a linear layer, four for the others, as in Table 4.9; no code is exported."""
         return dynamic_int8(predictor).weight_bytes
 
     def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:

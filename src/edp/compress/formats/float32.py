@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from edp.compress.formats.base import FORMATS, Predict
 from edp.data.series import Series
-from edp.evaluation.footprint import Footprint
+from edp.evaluation.controller import Estimate
 from edp.models.predictor import Predictor
 from edp.models.running import stream_predictions
 
@@ -21,9 +21,9 @@ class Float32:
     estimated: ClassVar[str] = "float32"
     rounded: ClassVar[bool] = False
 
-    def parameter_bytes(self, predictor: Predictor, counts: Footprint) -> int:
-        """Four bytes each."""
-        return counts.weight_bytes_fp32
+    def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
+        """All constants of the exported C code."""
+        return estimate.parameter_bytes
 
     def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
         """The network as it is."""

@@ -7,9 +7,8 @@ from functools import partial
 from typing import ClassVar
 
 from edp.compress.formats.base import FORMATS, Predict
-from edp.compress.rounding import matrices_of
 from edp.data.series import Series
-from edp.evaluation.footprint import Footprint
+from edp.evaluation.controller import Estimate
 from edp.models.integer import integer_predictor
 from edp.models.predictor import Predictor
 from edp.models.running import stream_predictions
@@ -26,10 +25,9 @@ class W8A16:
     estimated: ClassVar[str] = "w8a16"
     rounded: ClassVar[bool] = True
 
-    def parameter_bytes(self, predictor: Predictor, counts: Footprint) -> int:
-        """One byte for each weight of a multiply-accumulate, four for the others, after folding."""
-        weights = sum(matrix.values.numel() for matrix in matrices_of(predictor))
-        return 4 * counts.parameters_folded - 3 * weights
+    def parameter_bytes(self, predictor: Predictor, estimate: Estimate) -> int:
+        """All constants of the exported C code."""
+        return estimate.parameter_bytes
 
     def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
         """Ranges and weights are chosen on `known`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from edp.export.c.constants import Constant, total_bytes
 from edp.export.c.text import array, filled, number
 from edp.export.escape import Code
 from edp.onboard import Adaptation
@@ -11,6 +12,18 @@ from edp.onboard import Adaptation
 FILES = ("edp_adaptation.h", "edp_adaptation.c")
 POINTERS = ("offset", "scale", "directions", "middle", "spread", "rest", "change", "unit")
 NUMBERS = ("keep", "keep_squared", "refresh", "prior", "noise", "limit", "bound", "rate", "worse", "better")
+
+FUNCTIONS = ("edp_adapt_forget", "edp_adapt_directions", "edp_adapt_error", "edp_adapt_due", "edp_adapt_correct")
+"""Of the runtime, that every adaptation calls."""
+# Bytes of code of ``NAME_adaptation.c`` on a Cortex-M4F, as compiled for 1 to 6 horizons: with one of them the compiler
+# leaves the loops out.
+OWN_OF_ONE, OWN, OWN_OF_EACH = 720, 930, 28
+
+
+def own_bytes(law: Adaptation) -> int:
+    """Code of ``NAME_adaptation.c``."""
+    ahead = len(law.horizons)
+    return OWN_OF_ONE if ahead == 1 else OWN + OWN_OF_EACH * ahead
 
 
 def values(law: Adaptation, upper: str, intervals: int) -> dict[str, object]:
@@ -26,7 +39,7 @@ def values(law: Adaptation, upper: str, intervals: int) -> dict[str, object]:
     work = targets + law.spec.rank + max(inputs, row)
     most = law.unit * law.numbers["limit"]
     sizes = {"inputs": inputs, "targets": targets, "rank": law.spec.rank, "features": n}
-    entries = [*POINTERS, "columns", *(f"{size}u" for size in sizes.values())]
+    entries = [*POINTERS, "columns", "ahead", *(f"{size}u" for size in sizes.values())]
     entries += [number(law.numbers[name]) for name in NUMBERS]
     rows = [f"    float rows_{k}[{k * row}];" for k in law.horizons]
     return {
@@ -41,32 +54,30 @@ def values(law: Adaptation, upper: str, intervals: int) -> dict[str, object]:
         "judged": f"{law.spec.judged_s:g}",
         "margin": f"{100 * law.spec.margin:g}",
         "adapt_macs": law.macs,
-        "adapt_flash": constant_bytes(law),
+        "adapt_flash": total_bytes(constants(law)),
         "adapt_ram": 4 * (5 + len(law.horizons) + law.state_numbers + work),
         "adapt_rows": Code("\n".join(rows)),
         "adapt_pointers": Code(", ".join(f"a->rows_{k}" for k in law.horizons)),
         "adapt_work": work,
-        "adapt_constants": _constants(law),
+        "adapt_constants": Code("\n".join(one.text for one in constants(law) if one.text)),
         "adapt_law": filled(entries),
         "adapt_most": Code(",\n".join(f"    {{{', '.join(map(number, of))}}}" for of in most)),
         "adapt_intervals": _intervals(upper) if intervals else "",
     }
 
 
-def constant_bytes(law: Adaptation) -> int:
-    """Of the constants."""
-    held = sum(values.nbytes for values in law.arrays().values()) + law.rest.nbytes
-    return held + 2 * len(law.columns) + 4 * (len(law.horizons) + len(NUMBERS) + 4)
-
-
-def _constants(law: Adaptation) -> Code:
+def constants(law: Adaptation) -> list[Constant]:
+    """All constants, those with a text in the order of the C code."""
     made = []
     for name in POINTERS:
         held = np.atleast_1d(getattr(law, name)).ravel()
         # C has no array of nothing: without directions one number stands there that is never read.
-        made.append(array("float", name, map(number, held if held.size else np.zeros(1))))
-    made.append(array("uint16_t", "columns", (f"{column}u" for column in law.columns)))
-    return Code("\n".join(made))
+        numbers = held if held.size else np.zeros(1)
+        made.append(Constant("float", name, len(numbers), array("float", name, map(number, numbers))))
+    columns = array("uint16_t", "columns", (f"{column}u" for column in law.columns))
+    made.append(Constant("uint16_t", "columns", len(law.columns), columns))
+    shared = [Constant("edp_adapt_law", "law", 1), Constant("float", "adapt_most", law.unit.size)]
+    return [*made, *shared, Constant("uint32_t", "ahead", len(law.horizons))]
 
 
 def _intervals(upper: str) -> Code:

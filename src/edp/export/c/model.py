@@ -6,17 +6,14 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any
-
-from numpy.typing import NDArray
 
 from edp import __version__
 from edp.errors import ExportError
 from edp.export.c import adaptation, integer_calls, tangents
-from edp.export.c.calls import WORK, Calls, constant, describe, needs_columns, slot, structs
-from edp.export.c.layout import laid
+from edp.export.c.calls import WORK, Calls, describe, needs_columns, slot
+from edp.export.c.constants import constants_of, stored, total_bytes
 from edp.export.c.plan import Plan, plan
-from edp.export.c.text import array, filled, indented, number
+from edp.export.c.text import filled, indented, number
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
@@ -40,8 +37,6 @@ COUNTED = (
     *integer_calls.COUNTED,
 )
 """Layers with a ring or a counter."""
-TYPES = {"float32": "float", "int8": "int8_t", "int16": "int16_t", "int32": "int32_t", "uint8": "uint8_t"}
-"""C types of constants."""
 STATES = {Number.FLOAT: "float", Number.INT16: "int16_t", Number.INT32: "int32_t"}
 FILLS = {Number.FLOAT: "edp_fill(0.0f, ", Number.INT16: "edp_q_zero16(", Number.INT32: "edp_q_fill32(0, "}
 COPIES = {Number.FLOAT: "edp_copy", Number.INT16: "edp_q_copy16", Number.INT32: "edp_q_copy32"}
@@ -90,23 +85,7 @@ class Model:
     def weights(self) -> str:
         """The file of constants."""
         parts = [f"/* Constants of {self.name}. Written by EDP {__version__}; do not edit. */"]
-        calls = Calls(self.graph, self.plan)
-        for layer in self.graph.layers:
-            for name, values in layer.tensors().items():
-                note = " x ".join(map(str, values.shape))
-                parts.append(_constants(constant(layer, name), _laid(layer, name, values), note))
-            if needs_columns(calls, layer):
-                parts.append(array("uint16_t", constant(layer, "columns"), (f"{c}u" for c in layer.columns)))  # type: ignore[attr-defined]
-            parts += structs(layer) + integer_calls.structs(layer)
-        for (name, part), values in self.graph.initial.items():
-            start = slot(name, part).removeprefix("s->") + "_start"
-            parts.append(_constants(start, values))
-        tables = [
-            f"{{{constant(layer, n)}, {v.size}u, {v.itemsize}u}}"
-            for layer in self.graph.layers
-            for n, v in layer.tensors().items()
-        ]
-        parts.append(array("edp_table", "tables", tables))
+        parts += [one.text for one in constants_of(self.graph, self.plan, written=True) if one.text]
         return "\n".join(parts) + "\n"
 
     def fill(self, template: str) -> Code:
@@ -137,7 +116,7 @@ class Model:
             "limit": f"{LIMIT:.0f}",
             "macs": self.graph.macs,
             "format": self.bundle.predictor.number_format,
-            "flash": sum(values.nbytes for _, _, values in self.graph.tensors()),
+            "flash": total_bytes(constants_of(self.graph, self.plan)),
             "ram": self.state_bytes(),
             "runtime": "edp_integer.h" if self.whole else "edp_runtime.h",
             "counters": CLIPPED if self.whole else "",
@@ -184,23 +163,7 @@ class Model:
         return {"input_enum": _listed(inputs), "target_enum": _listed(targets), "horizon_enum": _listed(ahead)}
 
     def _state(self) -> dict[str, str]:
-        declared, cleared = [], []
-        for layer in self.graph.layers:
-            for part in layer.slots:
-                if part.name == "age":
-                    continue
-                where, size = slot(layer, part.name), max(1, part.size)
-                field = where.removeprefix("s->")
-                declared.append(f"{STATES[part.number]} {field}[{size}];")
-                learned = (layer.name, part.name) in self.graph.initial
-                start = f"{COPIES[part.number]}({field}_start, {size}u, {where});"
-                zero = f"{FILLS[part.number]}{size}u, {where});"
-                fill = f"edp_fill({number(part.fill)}, {size}u, {where});" if part.fill else zero
-                cleared.append(start if learned else fill)
-            if has_ring(layer):
-                field = slot(layer, "ring_at").removeprefix("s->")
-                declared.append(f"edp_ring {field};")
-                cleared += [f"s->{field}.at = 0u;", f"s->{field}.seen = 0u;"]
+        declared, cleared = remembered(self.graph)
         return {"state_fields": indented(declared), "forget": indented(cleared)}
 
     def _work(self) -> dict[str, str]:
@@ -208,7 +171,7 @@ class Model:
         return {
             "work_fields": indented(f"{STATES[kind]} {WORK[kind]}[{size}];" for kind, size in sizes.items()),
             "work_pointers": indented(f"{STATES[kind]} *const {WORK[kind]} = s->{WORK[kind]};" for kind in sizes),
-            "clear_work": indented(f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in sizes.items()),
+            "clear_work": indented(cleared_work(self.plan)),
         }
 
     def _tangent(self, changes: Plan) -> dict[str, object]:
@@ -244,21 +207,55 @@ class Model:
         return 4 * (7 + self.whole + self.graph.inputs + 2 * rings) + slots + work
 
     def _code(self) -> dict[str, str]:
-        calls = Calls(self.graph, self.plan)
-        lines = [line for layer in self.graph.layers for line in ("", describe(layer), *calls.of(layer))]
-        checks: list[str] = []
-        copies, members = [], []
+        members = []
         shape = "[{0}_HORIZONS][{0}_TARGETS]".format(self.name.upper())
-        for meaning, value in self.graph.results.items():
-            size, at = self.graph.width_of(value), calls.value(value)
-            first = f"edp_all_finite({at}, {size}u)"
-            checks.append(f"finite = {first} && finite;" if checks else f"bool finite = {first};")
+        for meaning in self.graph.results:
             more = "" if meaning == "prediction" else f"[{self.name.upper()}_INTERVALS]"
             members.append(f"float {meaning}{more}{shape};")
-            zero = "[0][0][0]" if more else "[0][0]"
-            copies.append(f"    edp_copy({at}, {size}u, &out->{meaning}{zero});")
-        end = [*checks, "if (finite) {", *copies, "}", "return finite;"]
-        return {"compute": indented(lines[1:]), "finish": indented(end), "output_fields": indented(members)}
+        compute, finish = computed(self.graph, self.plan)
+        return {"compute": indented(compute), "finish": indented(finish), "output_fields": indented(members)}
+
+
+def remembered(graph: Graph) -> tuple[list[str], list[str]]:
+    """Fields of the state for what the layers remember, and the statements that set them as after a reset."""
+    declared, cleared = [], []
+    for layer in graph.layers:
+        for part in layer.slots:
+            if part.name == "age":
+                continue
+            where, size = slot(layer, part.name), max(1, part.size)
+            field = where.removeprefix("s->")
+            declared.append(f"{STATES[part.number]} {field}[{size}];")
+            learned = (layer.name, part.name) in graph.initial
+            start = f"{COPIES[part.number]}({field}_start, {size}u, {where});"
+            zero = f"{FILLS[part.number]}{size}u, {where});"
+            value = f"edp_fill({number(part.fill)}, {size}u, {where});" if part.fill else zero
+            cleared.append(start if learned else value)
+        if has_ring(layer):
+            field = slot(layer, "ring_at").removeprefix("s->")
+            declared.append(f"edp_ring {field};")
+            cleared += [f"s->{field}.at = 0u;", f"s->{field}.seen = 0u;"]
+    return declared, cleared
+
+
+def cleared_work(plan: Plan) -> list[str]:
+    """Statements that clear the work memories."""
+    return [f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in plan.sizes.items()]
+
+
+def computed(graph: Graph, plan: Plan) -> tuple[list[str], list[str]]:
+    """Statements of a tick: the layers one after the other, and what becomes of the results."""
+    calls = Calls(graph, plan)
+    lines = [line for layer in graph.layers for line in ("", describe(layer), *calls.of(layer))]
+    checks: list[str] = []
+    copies = []
+    for meaning, value in graph.results.items():
+        size, at = graph.width_of(value), calls.value(value)
+        first = f"edp_all_finite({at}, {size}u)"
+        checks.append(f"finite = {first} && finite;" if checks else f"bool finite = {first};")
+        zero = "[0][0]" if meaning == "prediction" else "[0][0][0]"
+        copies.append(f"    edp_copy({at}, {size}u, &out->{meaning}{zero});")
+    return lines[1:], [*checks, "if (finite) {", *copies, "}", "return finite;"]
 
 
 def _listed(entries: Sequence[tuple[str, str]]) -> Code:
@@ -317,27 +314,10 @@ def has_ring(layer: Layer) -> bool:
     return isinstance(layer, COUNTED) and bool(layer.slots)
 
 
-def _laid(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """A constant in the order of the C code."""
-    return laid(layer, name, integer_calls.laid_out(layer, values))
-
-
 def crc(graph: Graph) -> int:
     """CRC-32 of all constants, little-endian, in the order of the C code."""
     value = 0
     for layer in graph.layers:
         for name, values in layer.tensors().items():
-            value = zlib.crc32(little_endian(_laid(layer, name, values)), value)
+            value = zlib.crc32(little_endian(stored(layer, name, values)), value)
     return value
-
-
-def _constants(name: str, values: NDArray[Any], note: str = "") -> str:
-    """A constant array of a tensor."""
-    kind = TYPES[values.dtype.name]
-    items = map(number, values.ravel()) if kind == "float" else (_integer(v) for v in values.ravel().tolist())
-    return array(kind, name, items, note)
-
-
-def _integer(value: int) -> str:
-    # The literal of the least 32-bit number would not fit before its sign.
-    return "(-2147483647 - 1)" if value == -(2**31) else str(value)

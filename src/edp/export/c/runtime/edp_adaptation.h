@@ -32,6 +32,7 @@ typedef struct {
     const float *change;      /* (horizons, targets) */
     const float *unit;        /* (horizons, targets) */
     const uint16_t *columns;  /* (targets): input that measures each of them */
+    const uint32_t *ahead;    /* (horizons): ticks */
     uint32_t inputs;
     uint32_t targets;
     uint32_t rank;

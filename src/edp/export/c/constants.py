@@ -1,0 +1,147 @@
+"""The constants of a model as its C code declares them: one list, from which they are written and counted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.export.c import integer_calls
+from edp.export.c.calls import Calls, constant, needs_columns, slot, structs
+from edp.export.c.layout import laid
+from edp.export.c.plan import Plan
+from edp.export.c.text import array, number
+from edp.graph import Graph, Layer
+
+TYPES = {"float32": "float", "int8": "int8_t", "int16": "int16_t", "int32": "int32_t", "uint8": "uint8_t"}
+"""C types of constants."""
+NUMBER_BYTES = {"float": 4, "int8_t": 1, "uint8_t": 1, "int16_t": 2, "uint16_t": 2, "int32_t": 4, "uint32_t": 4}
+STRUCTS = {
+    "edp_table": (1, 2),
+    "edp_lstm_weights": (3, 1),
+    "edp_lstm_norms": (4, 1),
+    "edp_gru_weights": (4, 0),
+    "edp_prefix_weights": (4, 3),
+    "edp_q_matrix": (3, 0),
+    "edp_q_recurrent": (8, 1),
+    "edp_adapt_law": (10, 14),
+}
+"""Pointers, and numbers of 4 bytes behind them, of the runtime's structs."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """How a compiler lays constants out.
+
+    Attributes:
+        pointer: bytes of a pointer.
+        boundary: a multiple of so many bytes is where each constant begins.
+    """
+
+    pointer: int
+    boundary: int
+
+
+CORTEX_M = Machine(pointer=4, boundary=4)
+"""32-bit Arm cores: GCC lets every constant begin on a word (``DATA_ALIGNMENT`` of its Arm back end; not with -Os)."""
+DESKTOP = Machine(pointer=8, boundary=1)
+"""64-bit computers, without the gaps between constants, which are the compiler's affair there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Constant:
+    """A constant of a model.
+
+    Attributes:
+        kind: C type of its entries.
+        name: in C.
+        count: entries.
+        text: its definition; empty where a template holds it.
+    """
+
+    kind: str
+    name: str
+    count: int
+    text: str = ""
+
+    def bytes_on(self, machine: Machine) -> int:
+        """What it takes on a machine, up to the next constant."""
+        if self.kind in STRUCTS:
+            pointers, numbers = STRUCTS[self.kind]
+            each = _up_to(pointers * machine.pointer + 4 * numbers, machine.pointer)
+        else:
+            each = NUMBER_BYTES[self.kind]
+        return _up_to(self.count * each, machine.boundary)
+
+
+def total_bytes(constants: Iterator[Constant] | list[Constant], machine: Machine = CORTEX_M) -> int:
+    """What constants take in read-only memory."""
+    return sum(one.bytes_on(machine) for one in constants)
+
+
+def constants_of(graph: Graph, plan: Plan, written: bool = False) -> Iterator[Constant]:
+    """All constants of a model, in the order of the C code; those of ``NAME_weights.h`` first.
+
+    Args:
+        graph: its layers.
+        plan: places in the work memory.
+        written: with their texts, which take time; without them they are counted only.
+    """
+    calls = Calls(graph, plan)
+    for layer in graph.layers:
+        for name, values in layer.tensors().items():
+            yield _tensor(layer, name, values, written)
+        if needs_columns(calls, layer):
+            columns, name = layer.columns, constant(layer, "columns")  # type: ignore[attr-defined]
+            text = array("uint16_t", name, (f"{column}u" for column in columns)) if written else ""
+            yield Constant("uint16_t", name, len(columns), text)
+        for line in structs(layer) + integer_calls.structs(layer):
+            _, _, kind, name, *_ = line.split()  # static const KIND NAME = ...
+            yield Constant(kind, name, 1, line)
+    for (layer_name, part), values in graph.initial.items():
+        start = slot(layer_name, part).removeprefix("s->") + "_start"
+        yield Constant(TYPES[values.dtype.name], start, values.size, _array(start, values) if written else "")
+    yield _tables(graph)
+    for name in ("input_low", "input_high"):
+        yield Constant("float", name, graph.inputs)
+
+
+def stored(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A constant's numbers in the order of the C code."""
+    return laid(layer, name, integer_calls.laid_out(layer, values))
+
+
+def _tensor(layer: Layer, name: str, values: NDArray[Any], written: bool) -> Constant:
+    full, note = constant(layer, name), " x ".join(map(str, values.shape))
+    text = _array(full, stored(layer, name, values), note) if written else ""
+    return Constant(TYPES[values.dtype.name], full, values.size, text)
+
+
+def _tables(graph: Graph) -> Constant:
+    """Where the tensors are, for their checksum."""
+    entries = [
+        f"{{{constant(layer, name)}, {values.size}u, {values.itemsize}u}}"
+        for layer in graph.layers
+        for name, values in layer.tensors().items()
+    ]
+    return Constant("edp_table", "tables", len(entries), array("edp_table", "tables", entries))
+
+
+def _array(name: str, values: NDArray[Any], note: str = "") -> str:
+    kind = TYPES[values.dtype.name]
+    flat: NDArray[Any] = np.ravel(values)
+    items = map(number, flat) if kind == "float" else (_integer(value) for value in flat.tolist())
+    return array(kind, name, items, note)
+
+
+def _integer(value: int) -> str:
+    # The literal of the least 32-bit number would not fit before its sign.
+    return "(-2147483647 - 1)" if value == -(2**31) else str(value)
+
+
+def _up_to(size: int, multiple: int) -> int:
+    """The next multiple of a number of bytes."""
+    return -(-size // multiple) * multiple

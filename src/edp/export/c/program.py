@@ -1,0 +1,66 @@
+"""Bytes of the program of a model on a Cortex-M4F, from the statements of its C code and the functions that it calls.
+
+What each function of the runtime takes, with all that it needs, is measured (``kernels.toml``); the model's own code is
+counted from its calls and their arguments, with bytes for each that were fitted to compiled networks. Both come from
+``python benchmarks/program_bytes.py --fit``.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable
+from functools import cache
+from importlib import resources
+
+FIXED = ("edp_valid", "edp_all_finite", "edp_copy", "edp_fill", "edp_crc")
+"""Functions that every model calls."""
+IN_REGISTERS = 4
+"""Arguments of a call that are handed over in registers; those behind them go over the stack."""
+CALL = re.compile(r"\b(edp_\w+)\(([^()]*)\)")
+FLOAT = re.compile(r"-?[0-9.][0-9.e+-]*f")
+OWN, EACH_CALL, ON_STACK, WIDE = 593.0, 14.6, 5.4, 9.7
+"""Bytes of Thumb-2 code (GCC 12, -O2): of every model, a call, an argument on the stack, a number above 255."""
+MOST_COPIED = 64
+"""Bytes of a struct that the compiler copies itself; larger ones are copied by ``memcpy``."""
+
+
+def features(statements: Iterable[str]) -> tuple[int, int, int]:
+    """What the size of a model's own code depends on.
+
+    Returns:
+        Calls, arguments on the stack, whole numbers that are wider than a byte.
+    """
+    calls = on_stack = wide = 0
+    for _, inside in CALL.findall(" ".join(statements)):
+        given = [argument.strip() for argument in inside.split(",")]
+        others = [argument for argument in given if not FLOAT.fullmatch(argument)]  # floats have registers of their own
+        calls += 1
+        on_stack += max(0, len(others) - IN_REGISTERS)
+        wide += sum(argument.rstrip("u").isdigit() and int(argument.rstrip("u")) > 255 for argument in others)
+    return calls, on_stack, wide
+
+
+def own_bytes(statements: Iterable[str]) -> int:
+    """Code of ``NAME.c``: `statements` are those that compute a tick and those that clear the memory."""
+    calls, on_stack, wide = features(statements)
+    return round(OWN + EACH_CALL * calls + ON_STACK * on_stack + WIDE * wide)
+
+
+def called(statements: Iterable[str]) -> set[str]:
+    """Functions of the runtime that statements call."""
+    return {name for name, _ in CALL.findall(" ".join(statements))}
+
+
+def runtime_bytes(functions: Iterable[str]) -> int:
+    """Functions of the runtime, with the functions, tables and parts of the C library that they need."""
+    sizes, needs = _measured()
+    every = {symbol for function in functions for symbol in needs[function]}
+    return sum(sizes[symbol] for symbol in every)
+
+
+@cache
+def _measured() -> tuple[dict[str, int], dict[str, list[str]]]:
+    text = resources.files("edp.export.c").joinpath("kernels.toml").read_text(encoding="utf-8")
+    held = tomllib.loads(text)
+    return held["bytes"], held["needs"]
