@@ -22,8 +22,8 @@ from edp.export.c.model import make_model
 from edp.export.c.program import runtime_bytes
 from edp.export.c.sizes import constant_bytes, program_bytes, sizes_of
 from edp.export.c.target import core_files
-from edp.export.golden import ends
 from edp.integer.quantise import outline
+from edp.models.input_range import usual_range
 from edp.onboard import Adaptation, AdaptationSpec
 
 ARM = ("-std=c99", "-O2", "-ffp-contract=off", "-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16",
@@ -125,7 +125,7 @@ def compiled(c, tmp_path_factory):
 def adapted(bundle, rank):
     """The bundle with an adaptation."""
     task = bundle.task
-    centre, spread = ends(bundle.predictor)
+    centre, spread = usual_range(bundle.predictor)
     columns = tuple(task.inputs.index(name) for name in task.targets)
     shape = (len(task.horizons), len(task.targets))
     arrays = {
