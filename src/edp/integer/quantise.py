@@ -146,13 +146,13 @@ def outline(graph: Graph) -> Graph:
     Raises:
         ExportError: a kind of layer that has no whole-number form.
     """
-    hollow = tuple(
-        replace(layer, **{name: np.zeros_like(values) for name, values in layer.tensors().items()})
-        for layer in graph.layers
-    )
+    hollow = []
+    for layer in graph.layers:
+        empty: dict[str, Any] = {name: np.zeros_like(values) for name, values in layer.tensors().items()}
+        hollow.append(replace(layer, **empty))
     names = [INPUT, *(layer.name for layer in graph.layers)]
     names += [f"{layer}/{slot.name}" for layer, slot in graph.slots()]
-    return quantise(replace(graph, layers=hollow), Formats(dict.fromkeys(names, 0)))
+    return quantise(replace(graph, layers=tuple(hollow)), Formats(dict.fromkeys(names, 0)))
 
 
 def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str], Any]:

@@ -62,10 +62,12 @@ def program_bytes(graph: Graph, adaptation: Adaptation | None = None) -> int:
     compute, finish = computed(graph, places)
     statements = [*compute, *finish, *remembered(graph)[1]]
     functions = {*FIXED, *called(statements), *called(cleared_work(places))}
-    if 4 * sum(map(graph.width_of, graph.results.values())) > MOST_COPIED:
-        functions.add("memcpy")
+    copied = 4 * sum(map(graph.width_of, graph.results.values()))
     own = own_bytes(statements)
     if adaptation is not None:
         own += adapting.own_bytes(adaptation)
-        functions |= {*adapting.FUNCTIONS, "memcpy"}
+        functions |= set(adapting.FUNCTIONS)
+        copied = max(copied, 4 * (1 + adaptation.unit.size * adaptation.features))
+    if copied > MOST_COPIED:
+        functions.add("memcpy")
     return own + runtime_bytes(functions)
