@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -217,6 +219,12 @@ GROUND_CHANNELS: Mapping[str, Channel] = {
 VOCABULARY: Mapping[str, Channel] = {**TABLE_A1, **EXTRA_CHANNELS, **GROUND_CHANNELS}
 
 
+_SLOWEST, _FASTEST = 1e-9, 1e9
+"""Bounds of a rate in Hz and of a step in s: clocks of logs count nanoseconds."""
+_LONGEST = 1024
+"""Characters of a name, a column or a description in a signal map."""
+
+
 @dataclass(frozen=True)
 class ChannelMap:
     """How one channel is found in a file: its column, unit and kind; a constant where the machine lacks it."""
@@ -228,6 +236,24 @@ class ChannelMap:
     constant: float | None = None
     scale: float = 1.0
     description: str = ""
+
+    def check(self) -> None:
+        """Refuse what no channel can be.
+
+        Raises:
+            ConfigError: a name that is empty, too long or holds control characters, or a number that is not finite.
+        """
+        for key in ("name", "column", "description"):
+            text = getattr(self, key)
+            if len(text) > _LONGEST or not all(letter.isprintable() for letter in text):
+                raise ConfigError(
+                    f"signal map, channel {self.name[:80]!r}: its {key} has {len(text)} characters; at most {_LONGEST} "
+                    "are taken, and no control characters: change it"
+                )
+        if self.constant is not None and not math.isfinite(self.constant):
+            raise ConfigError(f"signal map, channel '{self.name}': constant = {self.constant:g}; give a finite number")
+        if not math.isfinite(self.scale):
+            raise ConfigError(f"signal map, channel '{self.name}': scale = {self.scale:g}; give a finite number")
 
     def channel(self) -> Channel:
         """The channel this entry yields; a name outside the vocabulary needs a kind (default generic)."""
@@ -267,12 +293,24 @@ class SignalMap:
     others: bool = False
 
     def __post_init__(self) -> None:
-        names = [entry.name for entry in self.channels]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        counts = Counter(entry.name for entry in self.channels)
+        twice = sorted(name for name, count in counts.items() if count > 1)
         if twice:
             raise ConfigError(f"signal map names channel(s) twice: {', '.join(twice)}; keep one entry each")
         if self.time_unit not in TIME_UNITS:
             raise ConfigError(f"signal map: time_unit '{self.time_unit}' is not one of {', '.join(TIME_UNITS)}")
+        for key in ("sample_time_s", "rate_hz"):
+            value = getattr(self, key)
+            if value is not None and not (math.isfinite(value) and _SLOWEST <= value <= _FASTEST):
+                raise ConfigError(
+                    f"signal map: {key} = {value:g}; give a number from {_SLOWEST:g} to {_FASTEST:g}, or leave it out"
+                )
+        if self.delimiter is not None and (len(self.delimiter) != 1 or self.delimiter in '"\r\n\0'):
+            raise ConfigError(f"signal map: delimiter = {self.delimiter!r}; give one character, such as ',' or ';'")
+        if self.decimal not in (".", ","):
+            raise ConfigError(f"signal map: decimal = {self.decimal!r}; give '.' or ','")
+        for entry in self.channels:
+            entry.check()
 
 
 TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -80,14 +80,14 @@ def by_reference_in_refs(file: h5py.File, other: Path) -> None:
 
 
 ATTACKS: dict[str, tuple[Callable[[h5py.File, Path], None], str]] = {
-    "external link": (external_link, "'/stolen' is a link to another file"),
-    "external link within": (external_link_within, "'/log/a/b/c/stolen' is a link to another file"),
-    "external storage": (external_storage, "'/stolen' is an array in external storage"),
-    "virtual": (virtual, "'/stolen' is a virtual data set"),
-    "virtual without end": (virtual_without_end, "'/stolen' is a virtual data set"),
-    "soft link to itself": (soft_link_to_itself, "'/stolen' is a soft link"),
-    "soft link": (soft_link, "'/g/out' is a soft link"),
-    "by reference": (by_reference_in_refs, "'/stolen .reference.' is an array in external storage"),
+    "external link": (external_link, "'stolen' is a link to another file"),
+    "external link within": (external_link_within, "'log/a/b/c/stolen' is a link to another file"),
+    "external storage": (external_storage, "'stolen' is an array in external storage"),
+    "virtual": (virtual, "'stolen' is a virtual data set"),
+    "virtual without end": (virtual_without_end, "'stolen' is a virtual data set"),
+    "soft link to itself": (soft_link_to_itself, "'stolen' is a soft link"),
+    "soft link": (soft_link, "'g/out' is a soft link"),
+    "by reference": (by_reference_in_refs, "'stolen .reference.' is an array in external storage"),
 }
 
 
@@ -146,7 +146,7 @@ def test_an_array_that_only_a_reference_leads_to_is_looked_at(tmp_path):
         with h5py.File(path) as file:
             if isinstance(file.get("gone/hidden"), h5py.Group) and file[file["cell"][0, 0]].name != "/":
                 break
-    with pytest.raises(DataError, match=r"'/cell \(reference\)' is a virtual data set"):
+    with pytest.raises(DataError, match=r"'cell \(reference\)' is a virtual data set"):
         check_size(path)
 
 
@@ -156,7 +156,7 @@ def test_bombs_are_refused_by_what_they_claim(tmp_path, rows):
     with h5py.File(path, "r+") as file:
         file.create_dataset("bomb", shape=(rows, 1), chunks=(1 << 20, 1), dtype="f8", compression="gzip")
         file["bomb"][:8] = 1.0
-    with pytest.raises(DataError, match="'/bomb' claims"):
+    with pytest.raises(DataError, match="'bomb' claims"):
         read_recording(path)
 
 
@@ -164,7 +164,7 @@ def test_a_filter_that_is_loaded_as_code_is_refused(tmp_path):
     path = log_in(tmp_path)
     with h5py.File(path, "r+") as file:
         file.create_dataset("odd", data=np.zeros(100), chunks=(100,), compression="lzf")
-    with pytest.raises(DataError, match="'/odd' is an array packed by the filter 32000"):
+    with pytest.raises(DataError, match="'odd' is an array packed by the filter 32000"):
         read_recording(path)
 
 

@@ -14,14 +14,30 @@ import pyarrow.csv as arrow_csv
 
 from edp.errors import DataError
 from edp.logs.csv_table import CsvTable, Layout, is_number
-from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, WriteOptions, find_time, load_column, time_factor
+from edp.logs.raw import (
+    FORMATS,
+    MOST_COLUMNS,
+    Column,
+    RawLog,
+    RawSignal,
+    WriteOptions,
+    check_names,
+    find_time,
+    load_column,
+    time_factor,
+)
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
 from edp.signals import TIME_UNITS, UNITS, SignalMap
 
-_HEAD_BYTES = 1 << 18
+_HEAD_BYTES = (1 << 18, 1 << 22, 1 << 26)
+"""How much of a file is looked at for its header: more where comments or the header itself are longer."""
+_MOST_CELLS_LOOKED = 200_000
+"""Cells in which the layout is looked for; wide tables need fewer rows."""
 _DELIMITERS = (",", ";", "\t", "|")
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")
+_STATED = re.compile(r'sep=([^\w\s"]|\t)', re.IGNORECASE)
+_ROWS_LOOKED = 200
 _BLOCK_ROWS = 65536
 
 
@@ -79,32 +95,77 @@ FORMATS.register("csv")(CsvFormat())
 
 
 def _layout(path: Path, signal_map: SignalMap) -> Layout:
-    with path.open("rb") as stream:
-        head = stream.read(_HEAD_BYTES)
-    encoding = _encoding(head)
-    lines = head.decode(encoding, errors="replace").splitlines()
-    if len(head) == _HEAD_BYTES and len(lines) > 1:
-        lines = lines[:-1]
-    skip = 0
-    while skip < len(lines) and (not lines[skip].strip() or lines[skip].lstrip()[0] in "#%"):
-        skip += 1
-    lines = lines[skip:]
-    if not lines:
+    lines, skip, encoding, stated = _first_lines(path)
+    delimiter = signal_map.delimiter or stated or _delimiter(path, lines)
+    rows, ends = _rows(path, lines, delimiter)
+    if not rows:
         raise DataError(f"'{path}' holds no rows; expected a header row and numbers")
-    delimiter = signal_map.delimiter or _delimiter(lines)
-    rows = [row for row in text_csv.reader(lines[:200], delimiter=delimiter) if row]
+    check_names(path, () if len(rows[0]) <= MOST_COLUMNS else map(str, range(len(rows[0]))))
     body = rows[1:] if signal_map.header else rows
     decimal = signal_map.decimal
     if decimal == "." and delimiter != "," and _has_decimal_commas(body):
         decimal = ","
     if signal_map.header:
         names, units, more = _header(path, rows, decimal)
-        skip += more
+        skip += ends[more - 1]
         body = rows[more:]
     else:
         names, units = _stated_columns(path, rows, signal_map)
     numeric = tuple(all(is_number(row[i], decimal) for row in body if i < len(row)) for i in range(len(names)))
     return Layout(names, units, numeric, delimiter, decimal, skip, encoding)
+
+
+def _first_lines(path: Path) -> tuple[list[str], int, str, str | None]:
+    """The lines behind leading comments, how many are before them, the encoding, and a delimiter that they state."""
+    for size in _HEAD_BYTES:
+        with path.open("rb") as stream:
+            head = stream.read(size)
+        encoding = _encoding(head)
+        text = head.decode(encoding, errors="replace")
+        # As the parser behind counts lines; other signs of Unicode end none.
+        lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        whole = len(head) < size
+        if not whole or not lines[-1]:
+            lines.pop()
+        skip, stated = 0, None
+        while skip < len(lines) and (not lines[skip].strip() or lines[skip].lstrip()[0] in "#%"):
+            skip += 1
+        if skip < len(lines) and (match := _STATED.fullmatch(lines[skip])):
+            # Excel writes the delimiter into the first line.
+            stated, skip = match[1], skip + 1
+        if whole or len(lines) > skip + 1:
+            break
+    if len(lines) <= skip:
+        if not whole:
+            raise DataError(f"'{path}': no row ends within the first {len(head)} bytes; it is no table")
+        raise DataError(f"'{path}' holds no rows; expected a header row and numbers")
+    return lines[skip:], skip, encoding, stated
+
+
+def _rows(path: Path, lines: list[str], delimiter: str) -> tuple[list[list[str]], list[int]]:
+    """The first rows that are not empty, and how many lines end with each.
+
+    Raises:
+        DataError: a cell too long.
+    """
+    reader = text_csv.reader((line + "\n" for line in lines), delimiter=delimiter)
+    rows: list[list[str]] = []
+    ends: list[int] = []
+    cells = 0
+    try:
+        for row in reader:
+            if row:
+                rows.append(row)
+                ends.append(reader.line_num)
+                cells += len(row)
+            if len(rows) >= _ROWS_LOOKED or (cells > _MOST_CELLS_LOOKED and len(rows) > 2):
+                break
+    except text_csv.Error as error:
+        raise DataError(
+            f"'{path}': line {reader.line_num} cannot be read ({error}); a cell has at most "
+            f"{text_csv.field_size_limit()} characters: check the delimiter and the quotes"
+        ) from error
+    return rows, ends
 
 
 def _encoding(head: bytes) -> str:
@@ -117,12 +178,16 @@ def _encoding(head: bytes) -> str:
     return "utf-8-sig" if head[:3] == b"\xef\xbb\xbf" else "utf-8"
 
 
-def _delimiter(lines: list[str]) -> str:
+def _delimiter(path: Path, lines: list[str]) -> str:
     """The delimiter that splits the first lines into the same, largest number of cells."""
     sample = [line for line in lines[:20] if line.strip()]
     best, most = ",", 0
     for delimiter in _DELIMITERS:
-        counts = [len(row) for row in text_csv.reader(sample, delimiter=delimiter)]
+        try:
+            counts = [len(row) for row in _rows(path, sample, delimiter)[0]] or [0]
+        except DataError:
+            # A line without this delimiter may be longer than a cell.
+            continue
         if counts[0] > 1 and counts.count(counts[0]) >= 0.8 * len(counts) and counts[0] > most:
             best, most = delimiter, counts[0]
     return best
@@ -137,7 +202,8 @@ def _has_decimal_commas(rows: list[list[str]]) -> bool:
 
 def _header(path: Path, rows: list[list[str]], decimal: str) -> tuple[tuple[str, ...], tuple[str | None, ...], int]:
     """Names, units and the number of header rows (2 with a row of units)."""
-    cells = [cell.strip() for cell in rows[0]]
+    # A name may be broken into lines where it is quoted.
+    cells = [" ".join(cell.split()) for cell in rows[0]]
     filled = [cell for cell in cells if cell]
     if not filled or all(is_number(cell, decimal) for cell in filled):
         raise DataError(

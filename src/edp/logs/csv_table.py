@@ -10,14 +10,22 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv as arrow_csv
 from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.limits import free_bytes
 from edp.logs.raw import PIECE_ROWS
 
-WHOLE_BYTES = 1 << 28
+WHOLE_BYTES = 1 << 30
 """Files up to this size are parsed once and kept; longer ones are parsed once to check them, then once a reading."""
+_WHOLE_SHARE = 0.25
+"""Of free memory, what a kept file may take."""
+_WIDEST = 4
+"""Bytes of memory a byte of text: a digit and a delimiter become a number of eight."""
+_TRIES = 8
+"""Parses that end at text in a column of numbers; after the second, the columns are looked at all at once."""
 NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "-nan", "-nan(ind)", "1.#QNAN"]
 _BLOCK_BYTES = 1 << 24
 
@@ -47,6 +55,18 @@ def is_number(cell: str, decimal: str = ".") -> bool:
     return True
 
 
+def _all_numbers(cells: pa.Array, nulls: pa.Array, decimal: str) -> bool:
+    cells = pc.utf8_trim_whitespace(cells)
+    cells = pc.if_else(pc.is_in(cells, nulls), pa.scalar(None, pa.string()), cells)
+    if decimal != ".":
+        cells = pc.replace_substring(cells, decimal, ".")
+    try:
+        pc.cast(cells, pa.float64())
+    except pa.ArrowInvalid:
+        return False
+    return True
+
+
 class CsvTable:
     """The columns of a text file; a column goes by its place.
 
@@ -62,8 +82,9 @@ class CsvTable:
         self.kept: pa.Table | None = None
         self.rows = 0
         self.ragged: list[Any] = []
-        small = path.stat().st_size <= WHOLE_BYTES
-        for _ in range(len(self.keys) + 1):
+        size = path.stat().st_size
+        small = size <= WHOLE_BYTES and _WIDEST * size <= _WHOLE_SHARE * free_bytes()
+        for tried in range(_TRIES):
             self.ragged.clear()
             try:
                 if small:
@@ -77,10 +98,24 @@ class CsvTable:
                     raise DataError(f"'{path}' cannot be read as CSV: {error}") from error
                 # Text further down a column of numbers: keep it as text, so that only a map that needs it is refused.
                 self.types[self.keys[int(column[1])]] = pa.string()
+                if tried:
+                    self.find_texts()
                 continue
             self.refuse_ragged()
             return
-        raise DataError(f"'{path}' cannot be read as CSV")
+        raise DataError(f"'{path}' cannot be read as CSV: its columns hold numbers and text in turn")
+
+    def find_texts(self) -> None:
+        """Find all columns that hold text further down in one go: a parse a column would take columns times rows."""
+        numeric = [key for key in self.keys if self.types[key] != pa.string()]
+        self.types |= dict.fromkeys(numeric, pa.string())
+        texts: set[str] = set()
+        nulls = pa.array(NULLS)
+        for batch in self.stream(numeric):
+            for key in numeric:
+                if key not in texts and not _all_numbers(batch.column(key), nulls, self.layout.decimal):
+                    texts.add(key)
+        self.types |= {key: pa.float64() for key in numeric if key not in texts}
 
     def options(self, keys: Sequence[str]) -> tuple[Any, Any, Any]:
         """How pyarrow reads the wanted columns."""

@@ -37,6 +37,12 @@ class OwnFacts:
         }
 
 
+LONGEST_FACTS = 1 << 24
+"""Characters; a thousand channels take 150,000."""
+LONGEST_TEXT = 4096
+"""Characters of a name, a source or a description."""
+DEEPEST = 32
+"""Lists and tables within one another; EDP's own facts have four."""
 KNOWN = frozenset({"name", "rate_hz", "source", "meta", "channels", "digest", "truth", "truth_digest"})
 
 
@@ -66,7 +72,11 @@ def own_facts(text: str, where: str) -> OwnFacts:
         DataError: the text is damaged.
     """
     try:
+        if len(text) > LONGEST_FACTS:
+            raise ValueError(f"they have {len(text)} characters, at most {LONGEST_FACTS} are read")
         facts = json.loads(text)
+        if not isinstance(facts, dict):
+            raise ValueError(f"they are a {type(facts).__name__}")
         strange = sorted(set(facts) - KNOWN)
         if strange:
             # A damaged key must not pass for a file that states no digest.
@@ -80,9 +90,39 @@ def own_facts(text: str, where: str) -> OwnFacts:
         )
         # Files of earlier versions state no digest.
         digests = (facts.get("digest"), facts.get("truth_digest"))
-        return OwnFacts(rate, str(facts["name"]), str(facts["source"]), dict(facts["meta"]), channels, truth, *digests)
-    except (ValueError, KeyError, TypeError) as error:
+        if any(digest is not None and not isinstance(digest, str) for digest in digests):
+            raise ValueError("its digest is no text")
+        name, source = (str(facts[key]) for key in ("name", "source"))
+        _check_texts([name, source, *(text for c in [*channels.values(), *truth.values()] for text in _texts(c))])
+        _check_depth(facts["meta"])
+        return OwnFacts(rate, name, source, dict(facts["meta"]), channels, truth, *digests)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(
-            f"{where}: the facts that EDP wrote into it are damaged ({type(error).__name__}: {error}); "
+            f"{where}: the facts that EDP wrote into it are damaged ({type(error).__name__}: {str(error)[:200]}); "
             "copy or export it again"
         ) from error
+
+
+def _texts(channel: Channel) -> tuple[str, str]:
+    return channel.name, channel.description
+
+
+def _check_texts(texts: Sequence[str]) -> None:
+    longest = max(map(len, texts), default=0)
+    if longest > LONGEST_TEXT:
+        raise ValueError(f"a text in them has {longest} characters, at most {LONGEST_TEXT} are read")
+
+
+def _check_depth(value: Any) -> None:
+    """Refuse what is nested so deep that writing it again would end in an error of the stack."""
+    level = [value]
+    for _ in range(DEEPEST):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+        if not level:
+            return
+    raise ValueError(f"they are nested more than {DEEPEST} deep")

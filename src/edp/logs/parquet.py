@@ -6,6 +6,7 @@ Tables of Simulink and its targets are among these: one time column for all or o
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +20,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from edp.errors import DataError
+from edp.limits import check_memory
 from edp.logs.names import told_apart
 from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import (
@@ -28,6 +30,7 @@ from edp.logs.raw import (
     RawLog,
     RawSignal,
     WriteOptions,
+    check_names,
     find_time,
     load_column,
     time_factor,
@@ -40,6 +43,12 @@ _MAGIC = b"PAR1"
 _KEY = b"edp_recording"
 _GROUP_ROWS = 1 << 17
 _LARGEST_LIST = 256
+RATIO = 1100
+"""Bytes of values that a byte of the file may mean, as in the other formats."""
+SPARE = 1 << 28
+"""And so many beyond that: columns of one value throughout are usual, an hour at 1 kHz takes 29 MB."""
+_COPIES = 2
+"""A column is in memory in pieces and in one."""
 
 
 class ParquetFormat:
@@ -135,14 +144,46 @@ class _Table:
         self.file = pq.ParquetFile(path, page_checksum_verification=True)
         self.schema = self.file.schema_arrow
         self.rows = int(self.file.metadata.num_rows)
+        self.which = [0] * len(self.schema.names)
+        for places in _by_name(self.schema.names).values():
+            for which, place in enumerate(places):
+                self.which[place] = which
+        self.weigh()
+
+    def weigh(self) -> None:
+        """Refuse what a small file claims to hold: runs of equal values pack without end.
+
+        Raises:
+            DataError: more rows, or more values of lists, than the bytes of the file can mean or memory can take.
+        """
+        about = self.file.metadata
+        check_names(self.path, self.schema.names)
+        held = [0] * about.num_columns
+        for number in range(about.num_row_groups):
+            group = about.row_group(number)
+            for column in range(about.num_columns):
+                held[column] += max(int(group.column(column).num_values), int(group.num_rows))
+        largest, size = 8 * max([self.rows, *held]), self.path.stat().st_size
+        if self.rows < 0 or largest > RATIO * size + SPARE:
+            raise DataError(
+                f"'{self.path}': a column claims {largest // 8} values in a file of {size} bytes; it may be damaged, "
+                "or was made to exhaust memory: copy or export it again"
+            )
+        check_memory(self.path, _COPIES * largest, "a column", "split the file")
 
     def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
         """See `edp.logs.raw.Table`; a name is ``PLACE`` or ``PLACE.ELEMENT``."""
         keys = [tuple(int(part) for part in name.split(".")) for name in names]
+        seen = start
         for first, columns in self.batches([key[0] for key in keys], start, stop):
+            seen = max(seen, first + len(columns[0]))
             low, high = max(start - first, 0), min(stop - first, len(columns[0]))
             if high > low:
                 yield [_numbers(column.slice(low, high - low), *key[1:]) for column, key in zip(columns, keys)]
+        if seen < stop:
+            raise DataError(
+                f"'{self.path}' announces {self.rows} rows and ends after {seen} (truncated); copy or export it again"
+            )
 
     def batches(self, places: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, list[pa.Array]]]:
         """The row that a batch begins with, and the columns at some places; groups of rows outside are not read."""
@@ -158,8 +199,8 @@ class _Table:
         wanted = list(dict.fromkeys(names[place] for place in places))
         try:
             for batch in self.file.iter_batches(PIECE_ROWS, row_groups=groups, columns=wanted):
-                found = batch.schema.names
-                yield skipped, [batch.column(_nth(found, names, place)) for place in places]
+                found = _by_name(batch.schema.names)
+                yield skipped, [batch.column(found[names[place]][self.which[place]]) for place in places]
                 skipped += batch.num_rows
         except (pa.ArrowException, OSError, ValueError, IndexError) as error:
             shown = ", ".join(wanted[:4])
@@ -171,11 +212,12 @@ class _Table:
         return pa.concat_arrays(parts) if parts else pa.array([], self.schema.field(place).type)
 
 
-def _nth(found: Sequence[str], names: Sequence[str], place: int) -> int:
-    """Where the column at `place` of the file lies in a batch: names that occur twice keep their order."""
-    name = names[place]
-    which = names[:place].count(name)
-    return [i for i, other in enumerate(found) if other == name][which]
+def _by_name(names: Sequence[str]) -> dict[str, list[int]]:
+    """Where the columns of each name lie: names that occur twice keep their order."""
+    places: dict[str, list[int]] = {}
+    for place, name in enumerate(names):
+        places.setdefault(name, []).append(place)
+    return places
 
 
 def _numbers(column: pa.Array, element: int | None = None) -> NDArray[Any]:
@@ -225,18 +267,22 @@ def _clocks(table: _Table, signal_map: SignalMap) -> dict[int, _Clock]:
 def _own_times(schema: pa.Schema) -> dict[int, int]:
     """Columns that have a time column of their own: ``X_time`` beside ``X``, or the nearest ``time`` to the left."""
     names = [name.lower() for name in schema.names]
+    first: dict[str, int] = {}
+    for i, name in enumerate(names):
+        first.setdefault(name, i)
     usable = [_is_time(field.type) or pa.types.is_floating(field.type) for field in schema]
     plain = [i for i, name in enumerate(names) if usable[i] and re.fullmatch(r"time[_ ]?\d*", name)]
     pairs = {}
     for i, name in enumerate(names):
         for spelling in (f"{name}_time", f"{name}.time", f"{name}:time", f"time_{name}"):
-            if spelling in names and usable[names.index(spelling)]:
-                pairs[i] = names.index(spelling)
+            if spelling in first and usable[first[spelling]]:
+                pairs[i] = first[spelling]
     if pairs:
         return pairs
     if len(plain) < 2:
         return {}
-    return {i: max(t for t in plain if t < i) for i in range(len(names)) if i not in plain and i > plain[0]}
+    times = set(plain)
+    return {i: plain[bisect_left(plain, i) - 1] for i in range(plain[0] + 1, len(names)) if i not in times}
 
 
 def _signals(table: _Table, place: int, field: pa.Field, clock: _Clock | None) -> list[tuple[str, RawSignal]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -106,6 +106,9 @@ class RawLog:
     repeated: Mapping[str, Sequence[str]] = field(default_factory=dict)
     digest: str | None = None
 
+    def __post_init__(self) -> None:
+        check_names(self.path, self.signals)
+
     def __contains__(self, name: str) -> bool:
         """Whether the file has a column of this name or alias."""
         return name in self.signals or name in self.aliases
@@ -132,6 +135,31 @@ class RawLog:
     def _told_apart(self, name: str) -> str:
         found = [self.signals[full] for full in self.repeated[name]]
         return ", ".join(signal.name + (f" [{signal.unit}]" if signal.unit else "") for signal in found[:8])
+
+
+LONGEST_NAME = 256
+"""Characters of a column's name; a full path of a Simulink signal has some hundred."""
+MOST_COLUMNS = 65_536
+
+
+def check_names(path: Path, names: Iterable[str]) -> None:
+    """Refuse names that pictures, tables and generated programs cannot carry.
+
+    Raises:
+        DataError: a name that is too long or holds control characters, or more columns than a log has.
+    """
+    count = 0
+    for name in names:
+        count += 1
+        if len(name) > LONGEST_NAME:
+            raise DataError(
+                f"'{path}': column {name[:40]!r}... has a name of {len(name)} characters, at most {LONGEST_NAME} are "
+                "read; rename it"
+            )
+        if not name.isprintable() and any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in name):
+            raise DataError(f"'{path}': the name of column {name[:80]!r} holds control characters; rename it")
+    if count > MOST_COLUMNS:
+        raise DataError(f"'{path}' has {count} columns, at most {MOST_COLUMNS} are read; split it")
 
 
 TRUTH_PLACES = ("with", "apart", "without")

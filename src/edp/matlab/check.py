@@ -180,6 +180,7 @@ class _Walk:
 
 
 def _shown(name: str) -> str:
+    name = name.lstrip("/")
     return repr(name if len(name) <= _SHOWN else name[: _SHOWN - 3] + "...")
 
 
