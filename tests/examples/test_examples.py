@@ -17,8 +17,9 @@ from edp.cli.console import run_app
 from edp.cli.finetune import finetune
 from edp.cli.pretrain import pretrain
 from edp.compress import DistillationSpec
-from edp.config import TAGGED, TaskSettings, load_experiment
+from edp.config import TAGGED, FeatureSettings, TaskSettings, load_experiment
 from edp.data.chunks import ChunkSpec
+from edp.data.features import Derived
 from edp.data_sets import SimulationOrder, simulate_data_set
 from edp.evaluation.controller import Budget
 from edp.evaluation.judge import JudgeSpec
@@ -112,11 +113,24 @@ def test_settings_page_names_every_part_and_key():
         "`[training.chunks]`": ChunkSpec,
         "`[training.adaptive]`": AdaptiveWeights,
         "`[[recordings]]`": RecordingEntry,
+        "`[task.features]`: a feature set of your own": FeatureSettings,
+        "`derived` and `derived_targets` entries": Derived,
     }
     assert {title for title in sections if "kind =" in title} == {title for title in classes if "kind =" in title}
     for title, cls in classes.items():
         keys = re.findall(r"^\| `(\w+)` \|", sections[title], re.MULTILINE)
         assert keys == [entry.name for entry in dataclasses.fields(cls)], title
+
+
+def test_rows_of_tables_stand_in_tables():
+    """A row behind a paragraph is shown as text with bars."""
+    for page in [ROOT / "README.md", *ROOT.glob("docs/**/*.md")]:
+        text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for block in re.split(r"\n[ \t]*\n", text):
+            lines = block.strip("\n").splitlines()
+            if any(line.startswith("| ") for line in lines):
+                assert lines[0].startswith("|"), f"{page.name}: {lines[0]}"
+                assert re.fullmatch(r"\|[-:| ]+\|", lines[1]), f"{page.name}: {lines[1]}"
 
 
 def test_screening_page_names_every_option_and_its_default():

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgres
 from rich.table import Table
 from rich.text import Text
 
-from edp.errors import EdpError
+from edp.errors import ConfigError, EdpError
 
 KEPT_BREAK = re.compile(r"\n(?=  - )")
 """The line break that messages list several things with; any other may come from a name."""
@@ -59,6 +59,14 @@ err = Terminal(stderr=True)
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON document to standard output and nothing else.")]
 INTERRUPTED = 130
+PATH_OPTIONS = frozenset(
+    f"--{name}"
+    for name in (
+        *("budget", "config", "data", "features", "further", "limit", "map", "out", "page", "scenario", "start"),
+        *("study", "teacher"),
+    )
+)
+"""Options of all commands that name a file or folder."""
 
 
 def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None:
@@ -173,6 +181,7 @@ def duration(seconds: float) -> str:
 def run_app(app: typer.Typer) -> int:
     """Run the command line; a user's mistake ends in one message and that error's exit code, Ctrl-C in 130."""
     try:
+        refuse_empty(sys.argv[1:])
         code = app(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
         if code == INTERRUPTED:
             raise KeyboardInterrupt
@@ -190,6 +199,21 @@ def run_app(app: typer.Typer) -> int:
         _say_usage(error)
         return int(getattr(error, "exit_code", 2))
     return code if isinstance(code, int) else 0
+
+
+def refuse_empty(words: Sequence[str]) -> None:
+    """Refuse an empty path, which Python takes for the folder that one stands in.
+
+    Raises:
+        ConfigError: an empty word, or an option of `PATH_OPTIONS` with nothing behind it.
+    """
+    for place, word in enumerate(words):
+        before = words[place - 1] if place else ""
+        behind_option = before.startswith("--") and before not in PATH_OPTIONS
+        option, sign, value = word.partition("=")
+        if (not word and not behind_option) or (sign and not value and option in PATH_OPTIONS):
+            what = option or (before if before in PATH_OPTIONS else "an argument")
+            raise ConfigError(f"{what} is empty; give a path (. is the folder that you are in)")
 
 
 def _say_error(text: str) -> None:

@@ -13,7 +13,9 @@ from edp.cli.console import JsonFlag, emit, out
 def quantise(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train, distil or compress.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the new run.")],
-    ticks: Annotated[int, typer.Option(min=1000, help="Ticks on which formats and weights are chosen.")] = 20_000,
+    ticks: Annotated[
+        int, typer.Option(min=1000, max=100_000_000, help="Ticks on which formats and weights are chosen.")
+    ] = 20_000,
     as_json: JsonFlag = False,
 ) -> None:
     """Write a run with 8-bit weights and 16-bit values: evaluate, report and export then use whole numbers.

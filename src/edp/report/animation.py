@@ -192,7 +192,7 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
         data=Markup(_script_json(_plain(scene))),
     )
     target = Path(output)
-    write_bytes(target, page.encode())
+    write_bytes(target, page.encode("utf-8", "replace"))
     return target
 
 

@@ -28,7 +28,7 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
     facts = read_compression(folder)
     tables = sheets(facts)
     page = facts.folder / "report.html"
-    write_bytes(page, render(facts, tables).encode())
+    write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
     write_sheets(facts.folder / "tables", tables)
     if pictures:
         write_drawings(facts.folder / "pictures", drawings(facts))

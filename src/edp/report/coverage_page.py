@@ -31,7 +31,7 @@ def build_coverage_page(found: Coverage, output: str | Path, title: str, quality
         StorageError: the page cannot be written.
     """
     target = Path(output)
-    write_bytes(target, render_coverage(found, title, quality).encode())
+    write_bytes(target, render_coverage(found, title, quality).encode("utf-8", "replace"))
     return target
 
 

@@ -44,7 +44,7 @@ def build_report(
     """
     facts = run.read_facts(run_folder, limit)
     target = Path(output) if output is not None else facts.folder / "report.html"
-    write_bytes(target, render(facts, title).encode())
+    write_bytes(target, render(facts, title).encode("utf-8", "replace"))
     return target
 
 

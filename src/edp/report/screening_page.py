@@ -40,7 +40,7 @@ def build_screening_page(
         StorageError: the page cannot be written.
     """
     target = Path(output)
-    write_bytes(target, render_screening(found, title, quality, trials, notes).encode())
+    write_bytes(target, render_screening(found, title, quality, trials, notes).encode("utf-8", "replace"))
     return target
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edp.report.tables import Table
-from edp.report.wording import MISSING, decimals_for, number
+from edp.report.wording import MISSING, decimals_for, in_cell, in_markdown, number
 from edp.storage import make_folder, write_bytes
 
 Value = float | int | str | None
@@ -90,11 +90,11 @@ class Sheet:
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
-        """For other programs: full precision, empty where there is no value."""
+        """For other programs: full precision, empty where there is no value; text is text to a spreadsheet, too."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(self.heads())
-        writer.writerows(["" if value is None else value for value in row] for row in self.rows)
+        writer.writerow(map(in_cell, self.heads()))
+        writer.writerows([_cell(value) for value in row] for row in self.rows)
         return stream.getvalue()
 
 
@@ -106,8 +106,12 @@ def write_sheets(folder: Path, sheets: Iterable[Sheet]) -> None:
     """
     for sheet in sheets:
         place = make_folder(folder) / sheet.name
-        write_bytes(place.with_suffix(".csv"), sheet.csv().encode())
-        write_bytes(place.with_suffix(".md"), sheet.markdown().encode())
+        write_bytes(place.with_suffix(".csv"), sheet.csv().encode("utf-8", "replace"))
+        write_bytes(place.with_suffix(".md"), sheet.markdown().encode("utf-8", "replace"))
+
+
+def _cell(value: Value) -> Value:
+    return "" if value is None else in_cell(value) if isinstance(value, str) else value
 
 
 def _row(cells: list[str]) -> str:
@@ -116,5 +120,5 @@ def _row(cells: list[str]) -> str:
 
 def _piped(text: str) -> str:
     """Text that ends no cell, starts no element and stays on its line."""
-    flat = " ".join(text.split())
-    return flat.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_")
+    flat = text.replace("\\", "\\\\").replace("|", "\\|").replace("*", "\\*").replace("_", "\\_")
+    return in_markdown(flat)

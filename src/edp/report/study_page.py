@@ -15,7 +15,7 @@ from edp.report.study_pictures import write_study_pictures
 from edp.report.study_plots import study_plots
 from edp.report.study_tables import sheets
 from edp.report.templates import template
-from edp.report.wording import number, unbroken
+from edp.report.wording import in_markdown, number, unbroken
 from edp.storage import make_folder, write_bytes
 
 SCORE = "The composite score is 0.40 MAE + 0.15 RMSE + 0.25 P95 + 0.20 P99, mean over sessions and outputs."
@@ -55,12 +55,12 @@ def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool =
     page, text, tables = reading("study.json", lambda: _contents(facts))
     folder = make_folder(out)
     target, document = folder / "report.html", folder / "report.md"
-    write_bytes(target, page.encode())
-    write_bytes(document, text.encode())
+    write_bytes(target, page.encode("utf-8", "replace"))
+    write_bytes(document, text.encode("utf-8", "replace"))
     made = []
     for name, sheet in tables.items():
         made.append(make_folder(folder / "tables") / f"{name}.csv")
-        write_bytes(made[-1], sheet.csv().encode())
+        write_bytes(made[-1], sheet.csv().encode("utf-8", "replace"))
     drawn = reading("study.json", lambda: write_study_pictures(facts, folder / "pictures")) if pictures else []
     return StudyReport(target, document, tuple(made), tuple(drawn))
 
@@ -98,11 +98,13 @@ def _about(study: StudyFacts) -> str:
 
 def study_text(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
     """The report as Markdown: what came out, what was decided and why, what it can show, and the tables."""
-    lines = [f"# Model search on {study.title}", "", f"{_about(study)}.", "", words.headline(study), ""]
-    lines += [" ".join(words.verdict(study)), "", "## What was decided, and why", ""]
+    lines = [f"# Model search on {in_markdown(study.title)}", "", f"{in_markdown(_about(study))}.", ""]
+    lines += [in_markdown(words.headline(study)), "", in_markdown(" ".join(words.verdict(study))), ""]
+    lines += ["## What was decided, and why", ""]
     for heading, sentences in words.decided(study):
-        lines += [f"**{heading}.** {' '.join(sentences)}", ""]
-    lines += ["## What it can and cannot show", "", *(f"- {line}" for line in words.caveats(study)), ""]
+        lines += [f"**{heading}.** {in_markdown(' '.join(sentences))}", ""]
+    caveats = [f"- {in_markdown(line)}" for line in words.caveats(study)]
+    lines += ["## What it can and cannot show", "", *caveats, ""]
     lines += ["## Tables", "", SCORE, ""]
     for sheet in tables.values():
         lines += [sheet.markdown(), ""]

@@ -28,7 +28,7 @@ def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
     facts = read_transfer(folder)
     tables = [sheet for horizon in reversed(facts.horizons) for sheet in words.sheets_of(facts, horizon)]
     page = facts.folder / "transfer.html"
-    write_bytes(page, render(facts, tables).encode())
+    write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
     write_sheets(facts.folder / "tables", tables)
     if pictures:
         write_drawings(facts.folder / "pictures", drawings(facts))

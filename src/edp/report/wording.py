@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterable
 from datetime import datetime
 
 MISSING = "–"
+FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
+"""With what a spreadsheet takes a cell for a formula."""
 
 
 def decimals_for(values: Iterable[float | None], significant: int = 3) -> int:
@@ -34,6 +37,26 @@ def percent(share: float | None, signed: bool = False) -> str:
     if share is None or not math.isfinite(share):
         return MISSING
     return number(100 * share, 1 if abs(share) < 0.0995 else 0, signed) + " %"
+
+
+def printable(text: str) -> str:
+    """Text without control characters, turns of direction and halves of characters, each of them as one mark."""
+    return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else "\ufffd" for c in text)
+
+
+def in_cell(text: str) -> str:
+    """Text as a cell of a CSV file: what a spreadsheet would take for a formula has an apostrophe in front."""
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}" if text.startswith(FORMULA) else text
+    return text
+
+
+def in_markdown(text: str) -> str:
+    """A sentence in a Markdown document: names in it start no element, link or line."""
+    flat = printable(re.sub(r"[ \t\r\n\f\v]+", " ", text).strip())
+    return flat.replace("<", "&lt;").replace("](", "]\\(").replace("][", "]\\[")
 
 
 def whole(value: float | None) -> str:
