@@ -12,7 +12,7 @@ from typer.models import OptionInfo, ParameterInfo
 from edp.cli import app
 from edp.cli.console import PATH_OPTIONS, run_app
 
-EXTREMES = ("-1", "-1e9", "0", "1e9", "1000000000000", "9" * 30, "9" * 6000, "nan", "inf", "-inf", "1e400", "0x10", "")
+EXTREMES = ("-1", "0", "1e9", "1000000000000", "9" * 6000, "nan", "1e400", "")
 APART = {"simulate", "demo"}
 """Their numbers are tested with the simulator's."""
 ALWAYS_WRONG = {
