@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from edp import __version__
-from edp.errors import ConfigError, EdpError, StorageError, closest
+from edp.errors import BusyError, ConfigError, EdpError, StorageError, closest
 from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
@@ -20,10 +21,20 @@ from edp.sim.limit import LimitJob, LimitSpec, find_limit, plan_limit
 from edp.sim.plan import DataSetSpec, simulate_many
 from edp.sim.scenario import Scenario, plain
 from edp.sim.scenario_file import read_scenario_file
-from edp.storage import make_folder, read_json, write_json
+from edp.storage import (
+    check_held,
+    check_writable,
+    hold,
+    make_folder,
+    read_json,
+    release,
+    remove_unfinished,
+    write_json,
+)
 
 MANIFEST = "data_set.json"
 LIMIT = "limit.json"
+LOCK = ".lock"
 BYTES_PER_VALUE = {".parquet": 3.0, ".csv": 10.0, ".mat": 3.0}
 """Room a logged value takes, rounded up; measured on M22: 1.7, 8.0 and 2.1."""
 
@@ -127,6 +138,7 @@ def simulate_data_set(
         on_done: called with each recording and whether it was there already.
 
     Raises:
+        BusyError: another process simulates into the folder.
         StorageError: the folder holds another data set, cannot be written, or its disk has not room enough.
         ConfigError: an ending without a format, or a number out of range.
     """
@@ -134,23 +146,55 @@ def simulate_data_set(
     suffix, files = order.suffix, order.files()
     plan = order.scenarios()
     folder = make_folder(out)
-    identity = identity_of(plan, files)
-    manifest = folder / MANIFEST
-    if manifest.exists() and read_json(manifest) != identity:
-        raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
+    identity = identity_of(plan, files, suffix)
     paths = [folder / f"{scenario.name}{suffix}" for scenario in plan]
-    missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
-    check_room(folder, missing, suffix)
-    write_json(manifest, identity)
-    for scenario, path in zip(plan, paths, strict=True):
-        if on_done is not None and scenario not in missing:
-            on_done(read_recording(path), True)
-    count = workers or os.cpu_count() or 1
-    for recording in simulate_many(missing, min(count, max(1, len(missing)))):
-        write_recording(recording, folder / f"{recording.name}{suffix}", files)
-        if on_done is not None:
-            on_done(recording, False)
+    with _alone(folder) as check:
+        bound = _bound(folder, identity)
+        missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
+        check_room(folder, missing, suffix)
+        if not bound:
+            write_json(folder / MANIFEST, identity)
+        absent = {scenario.name for scenario in missing}
+        for scenario, path in zip(plan, paths, strict=True):
+            if on_done is not None and scenario.name not in absent:
+                on_done(read_recording(path), True)
+        count = workers or os.cpu_count() or 1
+        for recording in simulate_many(missing, min(count, max(1, len(missing)))):
+            check()
+            write_recording(recording, folder / f"{recording.name}{suffix}", files)
+            if on_done is not None:
+                on_done(recording, False)
     return paths
+
+
+def _bound(folder: Path, identity: dict[str, Any]) -> bool:
+    """Whether a folder is bound to an order; False where it is bound to none."""
+    manifest = folder / MANIFEST
+    if not os.path.lexists(manifest):
+        return False
+    if read_json(manifest) != identity:
+        raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
+    return True
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[Callable[[], None]]:
+    """Hold a folder of logs; yields what sees that it is still held. Nothing of it stays.
+
+    Raises:
+        BusyError: another process simulates into it.
+    """
+    file = folder / LOCK
+    try:
+        lock = hold(file)
+    except BusyError as error:
+        holder = str(error).rpartition("process ")[2]
+        raise BusyError(f"process {holder} simulates into '{folder}'; wait for it, or choose another folder") from None
+    try:
+        remove_unfinished(folder)
+        yield lambda: check_held(file, lock)
+    finally:
+        release(file, lock)
 
 
 def find_data_set_limit(
@@ -179,10 +223,11 @@ def find_data_set_limit(
     plan = order.scenarios()
     key = _digest([identity_of(plan, WriteOptions()), asdict(spec)])
     target = make_folder(folder) / LIMIT
-    if target.exists():
+    if os.path.lexists(target):
         kept = read_json(target)
         if isinstance(kept, dict) and kept.get("key") == key:
             return kept
+    check_writable(target.parent)
     jobs, done = len(plan_limit(plan, spec)), 0
 
     def count(job: LimitJob) -> None:
@@ -200,11 +245,13 @@ def _digest(value: Any) -> str:
     return hashlib.blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
-def identity_of(plan: Sequence[Scenario], files: WriteOptions) -> dict[str, Any]:
+def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, Any]:
     """What makes two simulated data sets the same, as JSON gives it back."""
     identity: dict[str, Any] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
     if files != WriteOptions():
         identity["files"] = asdict(files)
+    if suffix != ".parquet":
+        identity["suffix"] = suffix
     kept: dict[str, Any] = json.loads(json.dumps(identity))
     return kept
 

@@ -15,7 +15,16 @@ from typing import Any
 
 from edp import __version__
 from edp.errors import BusyError, StorageError
-from edp.storage import hold, make_folder, object_with, read_object, remove_unfinished, write_bytes, write_json
+from edp.storage import (
+    check_held,
+    hold,
+    make_folder,
+    object_with,
+    read_object,
+    remove_unfinished,
+    write_bytes,
+    write_json,
+)
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
 
@@ -95,6 +104,7 @@ class RunFolder:
 
     def write_status(self, status: str, **facts: Any) -> None:
         """Say where the run stands: ``running``, ``finished`` or ``diverged``, with facts that fit into JSON."""
+        check_held(self.file(".lock"), self._lock)
         write_json(self.file("status.json"), {"status": status, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
 
     def status(self) -> dict[str, Any]:
@@ -104,6 +114,7 @@ class RunFolder:
 
     def write_history(self, rows: list[dict[str, Any]]) -> None:
         """Write all epochs so far, a JSON line each."""
+        check_held(self.file(".lock"), self._lock)
         write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 

@@ -19,7 +19,7 @@ from edp.models import AdaptedStream
 from edp.onboard import AdaptationSpec, Status
 from edp.storage import read_json, write_json
 from edp.training import load_bundle, save_bundle
-from edp.training.bundle import ADAPTED_SCHEMA, SCHEMA
+from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
 from edp.workflow import evaluate, footprint_of, train, trained_run
 
 SETTINGS = (
@@ -82,7 +82,7 @@ def test_a_bundle_keeps_it_and_a_damaged_one_is_refused(run, adapted, tmp_path):
     save_bundle(bundle, copy)
     held = read_json(copy / "bundle.json")
     held["adaptation"]["horizons"] = [3]
-    write_json(copy / "bundle.json", held)
+    write_json(copy / "bundle.json", held | {HASH: header_digest(held)})
     with pytest.raises(BundleError, match="another task"):
         load_bundle(copy)
     save_bundle(dataclasses.replace(bundle, adaptation=None), copy)

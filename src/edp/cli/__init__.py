@@ -30,6 +30,7 @@ from edp.cli import (
     train,
 )
 from edp.cli.console import run_app
+from edp.cli.ending import stop_on_request
 
 app = typer.Typer(
     name="edp",
@@ -77,6 +78,7 @@ def _root(
 
 def main() -> None:
     """Entry point of ``edp``."""
+    stop_on_request()
     if isinstance(sys.stdout, TextIOWrapper):  # a terminal that lacks a character gets its escape
         sys.stdout.reconfigure(errors="backslashreplace")
     sys.exit(run_app(app))

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskProgres
 from rich.table import Table
 from rich.text import Text
 
+from edp.cli.ending import memory_message, out_of_memory, stopped_code
 from edp.errors import ConfigError, EdpError
 
 KEPT_BREAK = re.compile(r"\n(?=  - )")
@@ -192,8 +193,11 @@ def run_app(app: typer.Typer) -> int:
         return done.exit_code
     except (KeyboardInterrupt, typer.Abort):
         err.print("stopped; what was finished is on disk: give the same command again to go on")
-        return INTERRUPTED
+        return stopped_code(INTERRUPTED)
     except Exception as error:
+        if out_of_memory(error):
+            _say_error(memory_message(error))
+            return 1
         if not hasattr(error, "format_message"):
             raise
         _say_usage(error)

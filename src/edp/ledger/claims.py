@@ -10,7 +10,7 @@ from typing import IO
 
 from edp.errors import BusyError, StorageError
 from edp.ledger.record import FINAL, RECORD_BYTES, Record
-from edp.storage import hold, make_folder, read_bytes, write_bytes
+from edp.storage import hold, make_folder, read_bytes, release, write_bytes
 
 
 def claim(folder: str | Path, key: str) -> Claim:
@@ -42,8 +42,7 @@ class Claim:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Free the claim."""
-        self.file.unlink(missing_ok=True)  # first, so that nobody can lock what is about to go
-        self.stream.close()
+        release(self.file, self.stream)
 
 
 def free_dead_claims(folder: str | Path) -> None:

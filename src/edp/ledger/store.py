@@ -16,6 +16,7 @@ from edp.ledger.claims import free_dead_claims, whole
 from edp.ledger.record import FINAL, RECORD_BYTES, SCHEMA, Record, Status, body_of, canonical, digest_of
 from edp.ledger.states import SUFFIX, left_state, read_state
 from edp.storage import (
+    check_held,
     hold,
     make_folder,
     read_bytes,
@@ -176,6 +177,7 @@ class Ledger:
             StorageError: the disk is full (earlier records stay, nothing half written is left), or the ledger holds
                 another end of the same training.
         """
+        check_held(self.path / ".lock", self._lock)
         held = self.finished(record.key)
         if held is not None and held.told() != record.told():
             raise StorageError(

@@ -6,12 +6,10 @@ It lives as long as its parent and not longer, and answers each job with one rec
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib
 import os
 import queue
 import resource
-import signal
 import sys
 import threading
 import time
@@ -22,8 +20,8 @@ from typing import Any
 
 from edp.errors import BusyError, ConfigError, EdpError, NotFiniteError, StorageError
 from edp.ledger import Identity, Record, Status, WithState, canonical, claim, known, leave_arrival, leave_state
+from edp.processes import die_with_parent
 
-PR_SET_PDEATHSIG = 1
 CLAIM_WAIT_S = 10.0
 """For how long a worker waits for the claim of another one, such as that of a pool that was killed a moment ago."""
 SHOWN_TRACE = 4000
@@ -120,14 +118,6 @@ def _out_of_memory(error: BaseException) -> bool:
     """Python's, NumPy's and PyTorch's ways to say so."""
     named = any("OutOfMemoryError" in kind.__name__ for kind in type(error).__mro__)
     return named or isinstance(error, MemoryError) or "can't allocate memory" in str(error)
-
-
-def die_with_parent(parent: int) -> None:
-    """Have the system kill this process when its parent ends; Linux only, elsewhere the closed socket tells."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before that
-        os._exit(1)
 
 
 def serve(connection: Connection) -> None:

@@ -31,6 +31,8 @@ PAST = 40
 """Samples of the past that sensors see before a branch: longer than any latency of the bus."""
 RESAMPLES = 2000
 CONFIDENCE = 0.95
+MOST_BRANCHES, MOST_MOMENTS = 4096, 100_000
+"""Bounds; the usual 32 branches of 240 moments take minutes."""
 KINDS = ("commands_unknown", "commands_known", "persistence")
 
 
@@ -59,11 +61,12 @@ class LimitSpec:
         rising = all(a < b for a, b in zip(self.horizons, self.horizons[1:], strict=False))
         if not self.horizons or self.horizons[0] < 1 or not rising or self.horizons[-1] > 2000:
             raise ConfigError(f"limit: horizons = {list(self.horizons)} must rise from at least 1 to at most 2000")
-        if self.branches < 4 or self.branches % 2:
-            raise ConfigError(f"limit: branches = {self.branches} must be even and at least 4")
-        if self.moments < 2 or self.recordings < 1:
+        if not 4 <= self.branches <= MOST_BRANCHES or self.branches % 2:
+            raise ConfigError(f"limit: branches = {self.branches} must be even, from 4 to {MOST_BRANCHES}")
+        if not 2 <= self.moments <= MOST_MOMENTS or self.recordings < 1:
             raise ConfigError(
-                f"limit: moments = {self.moments} must be at least 2, recordings = {self.recordings} at least 1"
+                f"limit: moments = {self.moments} must be from 2 to {MOST_MOMENTS}, "
+                f"recordings = {self.recordings} at least 1"
             )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -15,6 +16,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from edp.errors import ConfigError
+from edp.processes import begin_helper
 from edp.recording import Recording
 from edp.sim import soil
 from edp.sim.excitation import EXCITATIONS
@@ -34,6 +36,8 @@ DEFAULT_MIX: Mapping[str, float] = {
 }
 """Share of the recordings by excitation."""
 
+MOST_RECORDINGS, MOST_MINUTES, MOST_MACHINES, MOST_SEED = 100_000, 1e6, 1000, 2**63
+"""Bounds of one data set; the plan of the most recordings takes some seconds."""
 AIR = "air"
 """Free air in a mix of materials."""
 
@@ -83,8 +87,15 @@ class DataSetSpec:
             raise ConfigError(
                 f"data set of recordings = {self.recordings} and minutes = {self.minutes}; both must be positive"
             )
-        if self.family < 0:
-            raise ConfigError(f"family = {self.family} machines; must be at least 0")
+        if self.recordings > MOST_RECORDINGS or self.minutes > MOST_MINUTES:
+            raise ConfigError(
+                f"data set of recordings = {self.recordings} and minutes = {self.minutes:g}; at most "
+                f"{MOST_RECORDINGS} and {MOST_MINUTES:g} are simulated in one go"
+            )
+        if not 0 <= self.seed < MOST_SEED:
+            raise ConfigError(f"seed = {self.seed}; a whole number from 0 to 2^63 - 1 must hold")
+        if not 0 <= self.family <= MOST_MACHINES:
+            raise ConfigError(f"family = {self.family} machines; must be at least 0 and at most {MOST_MACHINES}")
         if not self.family and tuple(self.masses) != MASSES_T:
             raise ConfigError(f"masses = {list(self.masses)} are those of a family; say how many machines with family")
         if not self.family and self.scatter != 1.0:
@@ -257,7 +268,8 @@ def _parallel(function: Callable[[Job], Result], jobs: Sequence[Job], workers: i
     # Spawned rather than forked: a forked child may inherit locks of threads that do not exist in it.
     context = multiprocessing.get_context("spawn")
     running: deque[tuple[Job, Future[Result]]] = deque()
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context) as pool:
+    others, finished = set(multiprocessing.active_children()), False
+    with ProcessPoolExecutor(min(workers, len(jobs)), context, begin_helper, (os.getpid(),)) as pool:
         try:
             for job in jobs:
                 running.append((job, pool.submit(function, job)))
@@ -265,7 +277,11 @@ def _parallel(function: Callable[[Job], Result], jobs: Sequence[Job], workers: i
                     yield _result(*running.popleft())
             while running:
                 yield _result(*running.popleft())
+            finished = True
         finally:
+            if not finished:  # stopped or failed: nobody waits for what they are at
+                for child in set(multiprocessing.active_children()) - others:
+                    child.terminate()
             pool.shutdown(wait=False, cancel_futures=True)
 
 

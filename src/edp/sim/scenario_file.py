@@ -10,12 +10,12 @@ from typing import Any
 
 from edp.errors import ConfigError, closest
 from edp.sim.family import WIDEST
-from edp.sim.plan import DataSetSpec
+from edp.sim.plan import MOST_MACHINES, MOST_MINUTES, MOST_RECORDINGS, MOST_SEED, DataSetSpec
 from edp.storage import read_toml
 
 FILE_KEYS = ("format", "layout", "truth")
-WHOLE = {"recordings": (1, 100_000), "seed": (0, 2**63), "family": (0, 1000)}
-NUMBERS = {"minutes": (0.0, 1e6), "rate_hz": (1.0, 1000.0), "step_s": (0.0, 2.5e-3), "scatter": (0.0, WIDEST)}
+WHOLE = {"recordings": (1, MOST_RECORDINGS), "seed": (0, MOST_SEED - 1), "family": (0, MOST_MACHINES)}
+NUMBERS = {"minutes": (0.0, MOST_MINUTES), "rate_hz": (1.0, 1000.0), "step_s": (0.0, 2.5e-3), "scatter": (0.0, WIDEST)}
 """Bounds; the lower one of numbers itself is not allowed where it is 0."""
 TABLES = ("mix", "materials", "sensors")
 

@@ -1,6 +1,6 @@
 """Files of EDP's own kinds: read within bounds, written whole, and locked."""
 
-from edp.storage.locks import held_by, hold
+from edp.storage.locks import check_held, held_by, hold, release
 from edp.storage.reading import (
     JSON_BYTES,
     SETTINGS_BYTES,
@@ -26,6 +26,7 @@ from edp.storage.writing import (
 __all__ = [
     "JSON_BYTES",
     "SETTINGS_BYTES",
+    "check_held",
     "check_writable",
     "held_by",
     "hold",
@@ -38,6 +39,7 @@ __all__ = [
     "read_object",
     "read_text",
     "read_toml",
+    "release",
     "remove_unfinished",
     "replacing",
     "storage_error",

@@ -69,6 +69,26 @@ def still_ours(path: str | Path, stream: IO[str]) -> bool:
     return (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
 
 
+def release(path: str | Path, stream: IO[str]) -> None:
+    """Free a lock and remove its file, where it is still ours; who waits for it locks a new one."""
+    if still_ours(path, stream):
+        Path(path).unlink(missing_ok=True)  # first, so that nobody can lock what is about to go
+    stream.close()
+
+
+def check_held(path: str | Path, stream: IO[str]) -> None:
+    """Refuse to go on where the lock file was removed or replaced, so that another process may have locked a new one.
+
+    Raises:
+        StorageError: the file at `path` is not the one that is locked.
+    """
+    if not still_ours(path, stream):
+        raise StorageError(
+            f"'{path}' was removed or replaced while this process held it, so another one may write here, too; this "
+            "one stops. See that only one runs, and give the same command again to go on"
+        )
+
+
 def held_by(path: str | Path) -> str | None:
     """Who holds a file that `hold` locks, None for nobody; nothing is changed."""
     try:

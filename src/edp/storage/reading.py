@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
-from edp.errors import EdpError, StorageError
+from edp.errors import StorageError
 
 JSON_BYTES = 64 * 2**20
 """Of a JSON file; larger ones are not EDP's own."""
@@ -32,7 +32,7 @@ DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*+{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{
 """A dotted key deeper than `DEPTH`, on which the standard library's reader spends the third power of its parts."""
 
 
-def read_bytes(path: str | Path, limit: int, where: str = "", error: type[EdpError] = StorageError) -> bytes:
+def read_bytes(path: str | Path, limit: int, where: str = "", error: type[Exception] = StorageError) -> bytes:
     """The whole content of a regular file, or of a link to one; a pipe or a device is refused, not waited for.
 
     Args:
@@ -42,7 +42,7 @@ def read_bytes(path: str | Path, limit: int, where: str = "", error: type[EdpErr
         error: kind of error to raise.
 
     Raises:
-        EdpError: `error`; missing, unreadable, not a regular file, or too large.
+        Exception: `error`; missing, unreadable, not a regular file, or too large.
     """
     where = where or f"'{path}'"
     try:
@@ -63,7 +63,7 @@ def read_bytes(path: str | Path, limit: int, where: str = "", error: type[EdpErr
     return b"".join(parts)
 
 
-def _check_regular(status: os.stat_result, limit: int, where: str, error: type[EdpError]) -> None:
+def _check_regular(status: os.stat_result, limit: int, where: str, error: type[Exception]) -> None:
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
         raise error(f"{where} cannot be read: it is {kind}; a regular file must be there")
@@ -75,11 +75,11 @@ def _too_large(where: str, size: int, limit: int) -> str:
     return f"{where} cannot be read: it has {size:,} bytes or more, and a file of this kind at most {limit:,}"
 
 
-def read_text(path: str | Path, limit: int, where: str = "", error: type[EdpError] = StorageError) -> str:
+def read_text(path: str | Path, limit: int, where: str = "", error: type[Exception] = StorageError) -> str:
     """The text of a regular file in UTF-8; see `read_bytes`.
 
     Raises:
-        EdpError: `error`; not readable, too large, not UTF-8, or with a byte-order mark in front.
+        Exception: `error`; not readable, too large, not UTF-8, or with a byte-order mark in front.
     """
     where = where or f"'{path}'"
     try:
@@ -88,18 +88,18 @@ def read_text(path: str | Path, limit: int, where: str = "", error: type[EdpErro
         raise error(f"{where} cannot be read: not UTF-8 ({failure.reason} at byte {failure.start})") from failure
 
 
-def read_json(path: str | Path, where: str = "", error: type[EdpError] = StorageError) -> Any:
+def read_json(path: str | Path, where: str = "", error: type[Exception] = StorageError) -> Any:
     """A JSON file; see `parse_json`.
 
     Raises:
-        EdpError: `error`; the file is missing, unreadable, beyond its bounds, or not JSON.
+        Exception: `error`; the file is missing, unreadable, beyond its bounds, or not JSON.
     """
     where = where or f"'{path}'"
     return parse_json(read_text(path, JSON_BYTES, where, error), where, error)
 
 
 def read_object(
-    path: str | Path, keys: Iterable[str] = (), where: str = "", error: type[EdpError] = StorageError
+    path: str | Path, keys: Iterable[str] = (), where: str = "", error: type[Exception] = StorageError
 ) -> dict[str, Any]:
     """A JSON file that holds one object.
 
@@ -110,17 +110,17 @@ def read_object(
         error: kind of error to raise.
 
     Raises:
-        EdpError: `error`; as `read_json`, or it holds something else.
+        Exception: `error`; as `read_json`, or it holds something else.
     """
     where = where or f"'{path}'"
     return object_with(read_json(path, where, error), keys, where, error)
 
 
-def object_with(value: Any, keys: Iterable[str], where: str, error: type[EdpError] = StorageError) -> dict[str, Any]:
+def object_with(value: Any, keys: Iterable[str], where: str, error: type[Exception] = StorageError) -> dict[str, Any]:
     """`value`, which is checked to be an object with these keys.
 
     Raises:
-        EdpError: `error`; the message says what it is, or which keys it lacks.
+        Exception: `error`; the message says what it is, or which keys it lacks.
     """
     if not isinstance(value, dict):
         kind = {type(None): "null", list: "a list", str: "a text"}.get(type(value), "a value")
@@ -131,7 +131,7 @@ def object_with(value: Any, keys: Iterable[str], where: str, error: type[EdpErro
     return value
 
 
-def parse_json(text: str, where: str, error: type[EdpError] = StorageError, finite: bool = True) -> Any:
+def parse_json(text: str, where: str, error: type[Exception] = StorageError, finite: bool = True) -> Any:
     """The value that JSON stands for.
 
     Args:
@@ -141,7 +141,7 @@ def parse_json(text: str, where: str, error: type[EdpError] = StorageError, fini
         finite: refuse NaN and infinity, which are not JSON; Python writes them all the same.
 
     Raises:
-        EdpError: `error`; not JSON, nested too deep, a key twice in an object, or a number beyond all use.
+        Exception: `error`; not JSON, nested too deep, a key twice in an object, or a number beyond all use.
     """
     try:
         _refuse_mark(text)
@@ -156,7 +156,7 @@ def parse_json(text: str, where: str, error: type[EdpError] = StorageError, fini
 
 
 def read_toml(
-    path: str | Path, where: str = "", error: type[EdpError] = StorageError, advice: str = ""
+    path: str | Path, where: str = "", error: type[Exception] = StorageError, advice: str = ""
 ) -> dict[str, Any]:
     """The table of a TOML file; see `parse_toml`.
 
@@ -167,21 +167,21 @@ def read_toml(
         advice: added to the message of a file that cannot be read.
 
     Raises:
-        EdpError: `error`; the file is missing, unreadable, beyond its bounds, or not TOML.
+        Exception: `error`; the file is missing, unreadable, beyond its bounds, or not TOML.
     """
     where = where or f"'{path}'"
     try:
         text = read_text(path, SETTINGS_BYTES, where, error)
-    except EdpError as failure:
+    except error as failure:
         raise error(f"{failure}{advice}") from failure
     return parse_toml(text, where, error)
 
 
-def parse_toml(text: str, where: str, error: type[EdpError] = StorageError) -> dict[str, Any]:
+def parse_toml(text: str, where: str, error: type[Exception] = StorageError) -> dict[str, Any]:
     """The table that TOML stands for.
 
     Raises:
-        EdpError: `error`; not TOML, nested too deep, or a number beyond all use.
+        Exception: `error`; not TOML, nested too deep, or a number beyond all use.
     """
     try:
         _refuse_mark(text)

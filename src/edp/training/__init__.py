@@ -1,7 +1,18 @@
 """Training: the loop, its parts, checkpoints and bundles."""
 
-from edp.training.bundle import Bundle, load_bundle, make_bundle, save_bundle
+from edp.training.bundle import Bundle, load_bundle, make_bundle, save_bundle, upgrade_bundle
 from edp.training.fit import TrainingSpec, fit
 from edp.training.outcome import Diverged, Event, Fitted
 
-__all__ = ["Bundle", "Diverged", "Event", "Fitted", "TrainingSpec", "fit", "load_bundle", "make_bundle", "save_bundle"]
+__all__ = [
+    "Bundle",
+    "Diverged",
+    "Event",
+    "Fitted",
+    "TrainingSpec",
+    "fit",
+    "load_bundle",
+    "make_bundle",
+    "save_bundle",
+    "upgrade_bundle",
+]

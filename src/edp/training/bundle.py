@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Mapping
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +23,7 @@ from edp import __version__
 from edp.data.prepared import Prepared
 from edp.data.scaling import Scaler
 from edp.data.task import Task
-from edp.errors import BundleError, ConfigError, StorageError
+from edp.errors import BundleError, EdpError
 from edp.integer import Formats
 from edp.integer.quantise import weights_of
 from edp.models.integer import IntegerPredictor
@@ -27,16 +31,26 @@ from edp.models.plain import model_from_plain, model_to_plain, task_from_plain, 
 from edp.models.predictor import Predictor
 from edp.onboard import Adaptation
 from edp.signals import Channel, Kind
-from edp.storage import make_folder, read_json, write_bytes, write_json
+from edp.storage import make_folder, object_with, read_bytes, read_json, write_bytes, write_json
 
-SCHEMA = 2
-INTEGER_SCHEMA = 3
+SCHEMA = 5
+INTEGER_SCHEMA = 6
 """Of a bundle in whole numbers, which older versions would read as one in float32."""
-ADAPTED_SCHEMA = 4
+ADAPTED_SCHEMA = 7
 """Of a bundle with an adaptation, which older versions would leave out; its network may be in whole numbers."""
+UNHASHED = {2: SCHEMA, 3: INTEGER_SCHEMA, 4: ADAPTED_SCHEMA}
+"""Schemas from before the header had a hash, and what they became."""
+WEIGHTS_BYTES = 2**30
+"""Most that a file of arrays has; the weights of 250 million parameters."""
+HASH = "blake2b"
+"""Key of the hash over the rest of the header."""
 HEADER = "bundle.json"
 ARRAYS = ("weights", "integers", "adaptation")
 """Beginnings of the names of a bundle's files of arrays."""
+MOST_RATE_HZ, MOST_BITS = 1e6, 64
+"""Bounds of the ticks in a second, and of the fraction of a number."""
+SHOWN_REASON = 300
+"""Of what is wrong, in a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +145,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         entry = _write_arrays(path, "adaptation", save_arrays(bundle.adaptation.arrays()))
         kept.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
-    write_json(path / HEADER, header)
+    write_json(path / HEADER, header | {HASH: header_digest(header)})
     for old in (
         found for what in ("weights", "integers", "adaptation") for found in path.glob(f"{what}-*.safetensors")
     ):
@@ -153,63 +167,175 @@ def _write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
     return {"file": file, "blake2b": digest}
 
 
+def header_digest(header: Mapping[str, Any]) -> str:
+    """Hash over all of a header but its hash: what is fed and predicted, and in which order, is under it."""
+    plain = json.loads(json.dumps({key: value for key, value in header.items() if key != HASH}, allow_nan=False))
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
 def load_bundle(folder: str | Path) -> Bundle:
-    """Read a bundle, check its schema and the digest of its weights.
+    """Read a bundle; schema, the hashes of header and weights, sizes and ranges are checked before it is built.
 
     Raises:
-        BundleError: not a bundle, a newer schema, damaged weights, or parts that this version does not know.
+        BundleError: not a bundle, another schema, damaged weights or header, values that cannot be, or parts that this
+            version does not know.
     """
-    path = Path(folder)
-    path = path / "bundle" if (path / "bundle" / HEADER).is_file() else path
-    if not (path / HEADER).is_file():
-        raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
-    try:
-        header = read_json(path / HEADER)
+    path = _bundle_folder(folder)
+    with _as_damage(path):
+        header = _read_header(path)
         _check_schema(header, path)
-        spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
-        data = _weights(path, header["weights"])
-        inputs = tuple(Channel(c["name"], Kind(c["kind"]), c["description"]) for c in header["inputs"])
-        kinds = tuple(Kind(c["kind"]) for c in header["outputs"])
-        texts = tuple(c["description"] for c in header["outputs"])
-        predictor = Predictor(task, spec, blank_scaler(task))
-        predictor.load_state_dict(load(data))
-        if header["schema"] == INTEGER_SCHEMA or "number_format" in header:
-            integers = {name: x.numpy() for name, x in load(_weights(path, header["integers"])).items()}
-            predictor = IntegerPredictor(predictor, Formats(header["formats"], integers))
-        adaptation = _adaptation(header["adaptation"], task, path) if header["schema"] == ADAPTED_SCHEMA else None
-        return Bundle(predictor.eval(), inputs, kinds, texts, header["provenance"], header["scores"], adaptation)
-    except (KeyError, TypeError, ValueError, RuntimeError, SafetensorError, StorageError) as error:
-        raise BundleError(f"bundle '{path}' is damaged: {error}; restore it or train again") from error
+        if header.get(HASH) != header_digest(header):
+            raise BundleError(
+                f"'{path / HEADER}' does not match its hash: it was cut off or changed by hand; restore the bundle"
+            )
+        return _assembled(header, path)
+
+
+def upgrade_bundle(folder: str | Path) -> Path:
+    """Hash the header of a bundle of an earlier version, whose content the caller vouches for.
+
+    Raises:
+        BundleError: not a bundle of a version before headers were hashed, or a damaged one; it is left as it is.
+    """
+    path = _bundle_folder(folder)
+    with _as_damage(path):
+        header = _read_header(path)
+        if header.get("schema") not in UNHASHED:
+            raise BundleError(f"bundle '{path}' has schema {header.get('schema')}; there is nothing to upgrade")
+        upgraded = header | {"schema": UNHASHED[header["schema"]]}
+        _assembled(upgraded, path)
+    write_json(path / HEADER, upgraded | {HASH: header_digest(upgraded)})
+    return path
+
+
+def _bundle_folder(folder: str | Path) -> Path:
+    path = Path(folder)
+    path = path / "bundle" if os.path.lexists(path / "bundle" / HEADER) else path
+    if not os.path.lexists(path / HEADER):
+        raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
+    return path
+
+
+@contextlib.contextmanager
+def _as_damage(path: Path) -> Iterator[None]:
+    """What goes wrong in a file of a bundle, as one message that names the bundle."""
+    kinds = (EdpError, LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError)
+    try:
+        yield
+    except BundleError:
+        raise
+    except (*kinds, SafetensorError) as error:
+        told = " ".join(str(error).split())
+        told = f"it lacks {told}" if isinstance(error, KeyError) else told
+        raise BundleError(f"bundle '{path}' is damaged: {told[:SHOWN_REASON]}; restore it or train again") from error
+
+
+def _read_header(path: Path) -> dict[str, Any]:
+    header = read_json(path / HEADER)
+    if not isinstance(header, dict) or "schema" not in header:
+        header = {"schema": None}
+    return header
+
+
+def _assembled(header: dict[str, Any], path: Path) -> Bundle:
+    """The bundle that a header and the files that it names stand for."""
+    spec, task = model_from_plain(header["model"]), task_from_plain(header["task"])
+    inputs = tuple(Channel(_text(c["name"]), Kind(c["kind"]), _text(c["description"])) for c in header["inputs"])
+    kinds = tuple(Kind(c["kind"]) for c in header["outputs"])
+    texts = tuple(_text(c["description"]) for c in header["outputs"])
+    _check_channels(header, task, inputs)
+    predictor = Predictor(task, spec, blank_scaler(task))
+    _fill(predictor, load(_weights(path, header["weights"])))
+    if header["schema"] == INTEGER_SCHEMA or "number_format" in header:
+        integers = {name: x.numpy() for name, x in load(_weights(path, header["integers"])).items()}
+        predictor = IntegerPredictor(predictor, Formats(_formats(header["formats"]), integers))
+    adaptation = _adaptation(header["adaptation"], task, path) if header["schema"] == ADAPTED_SCHEMA else None
+    provenance = object_with(header["provenance"], (), "its provenance")
+    scores = object_with(header["scores"], (), "its scores")
+    return Bundle(predictor.eval(), inputs, kinds, texts, provenance, scores, adaptation)
+
+
+def _check_channels(header: Mapping[str, Any], task: Task, inputs: Sequence[Channel]) -> None:
+    """The channels that are listed are those of the task, in its order."""
+    if [channel.name for channel in inputs] != list(task.inputs):
+        raise ValueError("its inputs are not those of its task")
+    if [entry["name"] for entry in header["outputs"]] != list(task.targets):
+        raise ValueError("its outputs are not the targets of its task")
+    for channel, entry in zip(inputs, header["inputs"], strict=True):
+        if entry["unit"] != channel.unit:
+            raise ValueError(f"input '{channel.name}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
+    if not (math.isfinite(task.rate_hz) and 0.0 < task.rate_hz <= MOST_RATE_HZ):
+        raise ValueError(f"its rate_hz is {task.rate_hz}; above 0 and at most {MOST_RATE_HZ:g} must hold")
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{str(value)[:40]!r} stands where a text must be")
+    return value
+
+
+def _formats(plain: Any) -> dict[str, int]:
+    held = object_with(plain, (), "its formats")
+    wrong = [name for name, frac in held.items() if isinstance(frac, bool) or not isinstance(frac, int)]
+    wrong += [name for name, frac in held.items() if name not in wrong and abs(frac) > MOST_BITS]
+    if wrong:
+        raise ValueError(f"the format of '{wrong[0][:40]}' is no whole number of at most {MOST_BITS} bits")
+    return held
+
+
+def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
+    """Put weights into a network: all of them, of its shapes and types, finite, and widths above 0."""
+    wanted = predictor.state_dict()
+    other = sorted({*wanted} ^ {*tensors})
+    if other:
+        raise ValueError(f"its weights are not those of its header: '{other[0][:80]}' is in one of them only")
+    for name, tensor in tensors.items():
+        if (tensor.shape, tensor.dtype) != (wanted[name].shape, wanted[name].dtype):
+            kinds = f"{tuple(tensor.shape)} {tensor.dtype}, not {tuple(wanted[name].shape)} {wanted[name].dtype}"
+            raise ValueError(f"its weights are not those of its header: '{name}' is {kinds}")
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise ValueError(f"its weights are damaged: '{name}' holds a number that is not finite")
+    predictor.load_state_dict(dict(tensors))
+    for what, width in (("inputs", predictor.front.width), ("targets", predictor.code.width)):
+        if not (width > 0).all():
+            raise ValueError(f"its weights are damaged: the scale of the {what} holds a width that is not positive")
 
 
 def _adaptation(entry: Mapping[str, Any], task: Task, path: Path) -> Adaptation:
-    try:
-        found = Adaptation.from_plain(entry, load_arrays(_weights(path, entry["arrays"])))
-    except ConfigError as error:
-        raise ValueError(str(error)) from error
+    found = Adaptation.from_plain(entry, load_arrays(_weights(path, entry["arrays"])))
     if (len(found.offset), len(found.columns), found.horizons) != (len(task.inputs), len(task.targets), task.horizons):
         raise ValueError("its adaptation belongs to another task")
+    if found.rate_hz != task.rate_hz:
+        raise ValueError("its adaptation belongs to a task of another rate")
     return found
 
 
-def _check_schema(header: Any, path: Path) -> None:
-    schema = header.get("schema") if isinstance(header, dict) else None
-    if schema not in (SCHEMA, INTEGER_SCHEMA, ADAPTED_SCHEMA):
-        newer = isinstance(schema, int) and schema > ADAPTED_SCHEMA
-        older = isinstance(schema, int) and 0 < schema < SCHEMA
-        raise BundleError(
-            f"bundle '{path}' has schema {schema}, this version of EDP ({__version__}) reads {SCHEMA} to "
-            f"{ADAPTED_SCHEMA}; "
-            + ("install a newer EDP" if newer else "train again" if older else "the header is not that of a bundle")
+def _check_schema(header: Mapping[str, Any], path: Path) -> None:
+    schema = header["schema"]
+    if schema in (SCHEMA, INTEGER_SCHEMA, ADAPTED_SCHEMA) and not isinstance(schema, bool | float):
+        return
+    whole = isinstance(schema, int) and not isinstance(schema, bool)
+    if whole and schema > ADAPTED_SCHEMA:
+        advice = "install a newer EDP"
+    elif whole and schema in UNHASHED:
+        advice = (
+            "its header has no hash yet: train again, or, where you know that nobody changed it, call "
+            "edp.training.upgrade_bundle with the folder"
         )
+    else:
+        advice = "train again" if whole and 0 < schema < SCHEMA else "the header is not that of a bundle"
+    raise BundleError(
+        f"bundle '{path}' has schema {str(schema)[:40]}, this version of EDP ({__version__}) reads {SCHEMA} to "
+        f"{ADAPTED_SCHEMA}; {advice}"
+    )
 
 
 def _weights(path: Path, entry: Mapping[str, str]) -> bytes:
-    file = path / Path(entry["file"]).name  # never a path out of the bundle
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise BundleError(f"bundle '{path}' lacks its weights '{file.name}': {error.strerror}") from error
+    file = path / Path(_text(entry["file"])).name  # never a path out of the bundle
+    if not os.path.lexists(file):
+        raise BundleError(f"bundle '{path}' lacks its weights '{file.name}'; restore the bundle")
+    data = read_bytes(file, WEIGHTS_BYTES, f"weights '{file}'", BundleError)
     if hashlib.blake2b(data, digest_size=16).hexdigest() != entry["blake2b"]:
         raise BundleError(f"weights '{file}' do not match their digest: cut off or changed; restore the bundle")
     return data

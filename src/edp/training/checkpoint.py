@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
 from edp.errors import StorageError
-from edp.storage import write_bytes
+from edp.storage import parse_json, read_bytes, write_bytes
 from edp.streaming import State
 from edp.training.schedules import ScheduleState
 
+CHECKPOINT_BYTES = 16 * 2**30
+"""Most that a checkpoint has: three times the weights, and the optimiser's two, of a network of 800 million numbers."""
+BLANK = "0" * 32
+"""In the place of the checksum while it is computed, so that it covers the whole file."""
+CHECKSUM = re.compile(rb'"blake2b":"([0-9a-f]{32})"')
 FILE = "checkpoint.safetensors"
 REFIT = "refit.safetensors"
 
@@ -74,26 +82,34 @@ def save_checkpoint(
     state = optimizer.state_dict()
     structure = _strip(state, "optimizer", tensors)
     header = {"key": key, "progress": asdict(progress), "optimizer": structure}
-    data = save(tensors, metadata={"edp": json.dumps(header)})
-    write_bytes(path, data)
+    write_bytes(path, _signed(save(tensors, metadata={"edp": json.dumps(header), "blake2b": BLANK})))
 
 
 def load_checkpoint(path: Path, key: str) -> tuple[Progress, Weights, dict[str, Any]] | None:
     """Progress, weights and optimiser state of the run `key`, or None where there is no checkpoint yet.
 
     Raises:
-        StorageError: the file is damaged or belongs to another run.
+        StorageError: the file is damaged, in a single bit, too, or belongs to another run.
     """
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
+    data = read_bytes(path, CHECKPOINT_BYTES, f"checkpoint '{path}'")
     try:
-        with safe_open(path, framework="pt") as held:
-            header = json.loads(held.metadata()["edp"])
-            tensors = {name: held.get_tensor(name) for name in held.keys()}  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
-        raise StorageError(f"checkpoint '{path}' is damaged ({error}); remove it to train from the start") from error
-    if header["key"] != key:
-        raise StorageError(f"checkpoint '{path}' belongs to another run; choose another folder with --out")
+        _check_digest(data)
+        header, tensors = _header(data), load(data)
+        if header["key"] != key:
+            raise StorageError(f"checkpoint '{path}' belongs to another run; choose another folder with --out")
+        return _taken_apart(header, tensors)
+    except (SafetensorError, LookupError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+        raise damaged(path, error) from error
+
+
+def damaged(path: Path, error: Exception) -> StorageError:
+    """What is said of a checkpoint that cannot be gone on from; it is left where it is."""
+    return StorageError(f"checkpoint '{path}' is damaged ({error}); remove it to train from the start")
+
+
+def _taken_apart(header: dict[str, Any], tensors: dict[str, Tensor]) -> tuple[Progress, Weights, dict[str, Any]]:
     plain = header["progress"]
     progress = Progress(**{**plain, "schedule": ScheduleState(**plain["schedule"])})
     groups: dict[str, dict[str, Tensor]] = {"current": {}, "average": {}, "best": {}}
@@ -121,9 +137,39 @@ def pack(tree: Any) -> bytes:
 
 def unpack(data: bytes) -> Any:
     """The tree that `pack` was given, to the bit."""
+    return _restore(_header(data), load(data))
+
+
+def _header(data: bytes) -> Any:
     size = int.from_bytes(data[:8], "little")
-    plain = json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["edp"])
-    return _restore(plain, load(data))
+    outer = parse_json(data[8 : 8 + size].decode(), "its header", ValueError)
+    return parse_json(outer["__metadata__"]["edp"], "its header", ValueError, finite=False)
+
+
+def _place_of_digest(data: bytes) -> int:
+    end = 8 + int.from_bytes(data[:8], "little")
+    spot = CHECKSUM.search(data, 8, min(end, len(data)))
+    if spot is None:
+        raise ValueError("it has no checksum: cut off, or written by an earlier version of EDP")
+    return spot.start(1)
+
+
+def _digest(data: bytes, place: int) -> bytes:
+    state = hashlib.blake2b(data[:place], digest_size=16)
+    state.update(BLANK.encode())
+    state.update(memoryview(data)[place + len(BLANK) :])
+    return state.hexdigest().encode()
+
+
+def _signed(data: bytes) -> bytes:
+    place = _place_of_digest(data)
+    return data[:place] + _digest(data, place) + data[place + len(BLANK) :]
+
+
+def _check_digest(data: bytes) -> None:
+    place = _place_of_digest(data)
+    if data[place : place + len(BLANK)] != _digest(data, place):
+        raise ValueError("its checksum does not fit: cut off or changed")
 
 
 def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
@@ -144,6 +190,8 @@ def _restore(value: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(value, dict):
         if set(value) == {"tensor", "stride"}:
             held = tensors[value["tensor"]]
+            if sum((n - 1) * step for n, step in zip(held.shape, value["stride"], strict=True)) + 1 > held.numel() > 0:
+                raise ValueError(f"'{value['tensor']}' asks for more memory than it has numbers")
             return torch.empty_strided(held.shape, value["stride"], dtype=held.dtype).copy_(held)
         if set(value) == {"tuple"}:
             return tuple(_restore(item, tensors) for item in value["tuple"])

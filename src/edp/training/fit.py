@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,7 +20,7 @@ from edp.errors import ConfigError, DataError
 from edp.models.predictor import ModelSpec, build_model, trainable
 from edp.runs import RunFolder
 from edp.streaming import State, detach_state, reset_where
-from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, load_checkpoint, save_checkpoint
+from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, damaged, load_checkpoint, save_checkpoint
 from edp.training.lesson import Episodic, Lesson, Moment
 from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
@@ -193,13 +194,16 @@ class Loop:
         if held is None:
             return
         self.progress, weights, optimizer = held
-        self.objective.running.copy_(weights.running)
-        with torch.no_grad():
-            for name, parameter in self.net.named_parameters():
-                parameter.copy_(weights.current[name])
-                self.average[name].copy_(weights.average[name])
-                self.best[name].copy_(weights.best[name])
-        self.optimizer.load_state_dict(optimizer)
+        try:
+            self.objective.running.copy_(weights.running)
+            with torch.no_grad():
+                for name, parameter in self.net.named_parameters():
+                    parameter.copy_(weights.current[name])
+                    self.average[name].copy_(weights.average[name])
+                    self.best[name].copy_(weights.best[name])
+            self.optimizer.load_state_dict(optimizer)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise damaged(self.file or Path(FILE), error) from error
 
     def _stalled(self) -> bool:
         waited = self.progress.epoch - self.progress.best_epoch

@@ -1,0 +1,46 @@
+"""Processes that help another one: none of them outlives it, however it ends."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+
+PR_SET_PDEATHSIG = 1
+LOOK_S = 0.5
+"""Between looks at the parent, where the system does not tell of its end."""
+
+
+def die_with_parent(parent: int) -> None:
+    """End this process when its parent ends: by the system on Linux, elsewhere by looking now and then.
+
+    On Linux the thread that started this process counts as its parent.
+
+    Args:
+        parent: id of the parent process.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+    if os.getppid() != parent:  # it ended before that
+        os._exit(1)
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK_S)
+    os._exit(1)
+
+
+def begin_helper(parent: int) -> None:
+    """What a process of a pool does first: it ends with its parent, and leaves Ctrl-C to it.
+
+    Args:
+        parent: id of the parent process, which ends its helpers itself when it is interrupted.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with_parent(parent)
