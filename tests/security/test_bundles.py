@@ -250,7 +250,7 @@ def test_a_safetensors_header_that_lies_is_refused(folder):
 
 
 def test_a_network_that_its_weights_cannot_fill_is_refused(tmp_path):
-    folder = save_bundle(bundle_of(TcnSpec(channels=(4, 4), kernel=2)), tmp_path)
+    folder = save_bundle(bundle_of(TcnSpec(channels=(4, 4), kernel=3)), tmp_path)
     changed(folder, put("model", "backbone", "channels", [400, 400]), hashed=True)
     refused(folder, "its weights are not those of its header")
 

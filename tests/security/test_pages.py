@@ -1,0 +1,34 @@
+"""Pages run nothing but their own script and fetch nothing, whatever the names in them."""
+
+from importlib import resources
+
+import pytest
+
+from edp.report import animation, page
+
+PAGES = sorted(entry.name for entry in resources.files("edp.report").iterdir() if entry.name.endswith(".html.jinja"))
+HOSTILE = ["</script><script>alert(1)</script>", "<!--<script>", "--></script>", "]]>", "&lt;/script&gt;"]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_page_has_a_policy_before_anything_that_runs(name):
+    text = resources.files("edp.report").joinpath(name).read_text(encoding="utf-8")
+    head = text[: text.index("<style")]
+    assert 'http-equiv="Content-Security-Policy"' in head
+    for rule in ("default-src 'none'", "form-action 'none'", "base-uri 'none'", "img-src data:"):
+        assert rule in head
+    assert "http:" not in head
+    assert "https:" not in head
+
+
+def test_all_pages_are_looked_at():
+    assert {"animation.html.jinja", "page.html.jinja", "study.html.jinja"} <= set(PAGES)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize("embed", [page.script_json, animation._script_json])
+def test_data_in_a_page_ends_no_script(embed, name):
+    text = str(embed({"name": name, name: [name]}))
+    assert "<" not in text
+    assert ">" not in text
+    assert "&" not in text
