@@ -1,12 +1,14 @@
 """What accuracy does a network give up to fit the controller, and what do the thesis's ways of making it smaller?
 
 A full-size teacher (preset ``standard``, Huber 0.1) learns 1 or 10 ticks ahead on simulated recordings of machine
-M22. ``edp.downsizing`` then makes networks of 72 units, the widest that fits in whole numbers (W8A16), and of 60,
-each by all of its ways, and the rival in the same run: the variants of the thesis's Table 4.9 of the same teacher
-(with seed 0, judged on the validation part). Students have as many updates as their teacher, and a third of that with
-rounded numbers. All choices rest on the validation part. The test part is a second lock-box: nothing was chosen or
-judged on it before, and it is opened once, for the teacher and the chosen network. Seeds are those of weights and of
-the split; the recordings stay.
+M22. ``edp.downsizing`` then makes a network of 68 units, the widest multiple of four whose constants fit in whole
+numbers (W8A16), and the rival in the same run: the variants of the thesis's Table 4.9 of the same teacher (with seed 0,
+judged on the validation part). The chosen network is put into whole numbers, exported, compiled for a Cortex-M4F and
+run on an emulated one: bytes of constants, program, state and stack are those of that where compiler and emulator are
+there, else the estimates. Students have as many updates as their teacher, and a third of that with rounded numbers.
+All choices rest on the validation part. The test part is a second lock-box: nothing was chosen or judged on it before,
+and it is opened once, for the teacher and the chosen network. Seeds are those of weights and of the split; the
+recordings stay.
 
 Every training is a run below ``--work``: a benchmark that was stopped goes on.
 """
@@ -14,17 +16,23 @@ Every training is a run below ``--work``: a benchmark that was stopped goes on.
 from __future__ import annotations
 
 import argparse
+import shutil
 import statistics
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import controller_memory
+import program_bytes
 from common import Verdict, finish, parser, table, verdict
 from edp.compress import FORMATS
 from edp.config import Experiment, load_experiment
 from edp.downsizing import Found, Judged, SearchSpec, search
+from edp.downsizing.plan import WAYS
+from edp.downsizing.quantise import quantise
 from edp.evaluation.controller import Budget
+from edp.training import load_bundle
 from edp.workflow import DataSource, SimulationOrder, simulate_data_set, train
 
 BUDGET = Budget()  # thesis 3.5.2: 720,000 cycles, 100 KB of parameters
@@ -49,6 +57,7 @@ def one(source: DataSource, horizon: int, seed: int, folder: Path, arguments: ar
         budget=BUDGET,
         units=tuple(arguments.units),
         formats=(FORMAT,),
+        ways=tuple(arguments.ways),
         thesis=seed == 0 and not arguments.quick,
     )
     return search(run / "teacher", spec, run / "small")
@@ -66,7 +75,7 @@ def rows_of(found: Found, horizon: int) -> list[list[object]]:
     return lines
 
 
-def facts_of(found: Found, horizon: int) -> dict[str, Any]:
+def facts_of(found: Found, horizon: int, made: dict[str, int]) -> dict[str, Any]:
     """What is kept of a search."""
 
     def plain(row: Judged) -> dict[str, Any]:
@@ -77,7 +86,20 @@ def facts_of(found: Found, horizon: int) -> dict[str, Any]:
 
     box = {"error": found.box["error"], "scores": found.box["scores"]} if found.best else {}
     return {"teacher": plain(found.teacher), "rows": [plain(row) for row in found.rows], "box": box,
-            "chosen": found.best.name if found.best else None, "notes": list(found.notes)}  # fmt: skip
+            "chosen": found.best.name if found.best else None, "compiled": made,
+            "notes": list(found.notes)}  # fmt: skip
+
+
+def compiled(best: Judged, folder: Path) -> dict[str, int]:
+    """Bytes of the chosen network as exported, compiled for a Cortex-M4F and run; empty without the programs for it."""
+    if any(shutil.which(program) is None for program in ("arm-none-eabi-gcc", "qemu-system-arm")):
+        print("needs the Debian packages gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm: estimates are kept")
+        return {}
+    quantise(best.run, folder)
+    bundle = load_bundle(folder)
+    constants, program, _ = program_bytes.measured(bundle)
+    state, stack = controller_memory.measured(bundle)
+    return {"constants": constants, "program": program, "state": state, "stack": stack}
 
 
 def memory(row: Judged) -> int:
@@ -85,8 +107,15 @@ def memory(row: Judged) -> int:
     return row.taken.ram_bytes - row.taken.parameter_bytes
 
 
-def verdicts_of(found: Sequence[Found], horizon: int, quick: bool) -> list[Verdict]:
-    """The goals at one horizon: the largest of what is taken, the median of errors over the seeds."""
+def verdicts_of(found: Sequence[Found], objects: Sequence[dict[str, int]], horizon: int, quick: bool) -> list[Verdict]:
+    """The goals at one horizon: the largest of what is taken, the median of errors over the seeds.
+
+    Args:
+        found: the searches.
+        objects: of each search what was compiled; empty where nothing was.
+        horizon: in ticks.
+        quick: whether this is the short form.
+    """
     best = [one.best for one in found if one.best is not None]
     if len(best) < len(found):
         raise SystemExit(f"k = {horizon}: no network fits in {len(found) - len(best)} of {len(found)} searches")
@@ -95,11 +124,15 @@ def verdicts_of(found: Sequence[Found], horizon: int, quick: bool) -> list[Verdi
     def boxed(name: str) -> float:
         return statistics.median(one.box["scores"][name][key]["mae"] for one in found)
 
-    bytes_, cycles = max(row.taken.parameter_bytes for row in best), max(row.taken.cycles[2] for row in best)
+    taken = [(row.taken.parameter_bytes, memory(row)) for row in best]
+    if all(objects):
+        taken = [(one["constants"], one["state"] + one["stack"]) for one in objects]
+    bytes_, used = (max(column) for column in zip(*taken, strict=True))
+    cycles = max(row.taken.cycles[2] for row in best)
     told = [
-        verdict(f"k={horizon}: parameters", bytes_, 100_000, "<= 1.0", "bytes", quick),
+        verdict(f"k={horizon}: constants", bytes_, 100_000, "<= 1.0", "bytes", quick),
         verdict(f"k={horizon}: cycles, high estimate, M4F", cycles, BUDGET.cycles, "<= 1.0", "cycles", quick),
-        verdict(f"k={horizon}: state and stack", max(map(memory, best)), MEMORY, "<= 1.0", "bytes", quick),
+        verdict(f"k={horizon}: state and stack", used, MEMORY, "<= 1.0", "bytes", quick),
         verdict(f"k={horizon}: lock-box MAE against the teacher", boxed("chosen"), boxed("teacher"), "<= 1.05",
                 "mm/s", quick),
     ]  # fmt: skip
@@ -120,15 +153,14 @@ def verdicts_of(found: Sequence[Found], horizon: int, quick: bool) -> list[Verdi
 def main() -> None:
     made = parser(__doc__ or "")
     made.add_argument("--work", type=Path, default=None, help="folder that keeps data and runs")
-    made.add_argument(
-        "--units", type=int, nargs="*", default=[], help="widths of the smaller networks; default 72 and 60"
-    )
+    made.add_argument("--units", type=int, nargs="*", default=[], help="widths of the smaller networks; default 68")
+    made.add_argument("--ways", nargs="+", default=list(WAYS), choices=WAYS, help="how they are made; default all")
     made.add_argument("--updates", type=int, default=4000, help="of the teacher and of each student")
     made.add_argument("--minutes", type=float, default=300.0, help="minutes of simulated recordings")
     made.add_argument("--horizons", type=int, nargs="+", default=[10, 1])
     made.add_argument("--seeds", type=int, default=2)
     arguments = made.parse_args()
-    arguments.units = arguments.units or ([24] if arguments.quick else [72, 60])
+    arguments.units = arguments.units or ([24] if arguments.quick else [68])
     quick = arguments.quick
     horizons, seeds = ([10], 1) if quick else (arguments.horizons, arguments.seeds)
     with tempfile.TemporaryDirectory() as temporary:
@@ -137,17 +169,24 @@ def main() -> None:
         minutes, recordings = (4.0, 6) if quick else (arguments.minutes, int(arguments.minutes / 3))
         simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=recordings))
         searches: dict[int, list[Found]] = {horizon: [] for horizon in horizons}
+        objects: dict[int, list[dict[str, int]]] = {horizon: [] for horizon in horizons}
         for seed in range(arguments.seed, arguments.seed + seeds):
             for horizon in horizons:
                 found = one(DataSource.of(data), horizon, seed, folder, arguments)
                 searches[horizon].append(found)
+                chosen = folder / f"k{horizon}_seed{seed}" / "chosen_w8a16"
+                objects[horizon].append(compiled(found.best, chosen) if found.best else {})
                 print(f"\nk = {horizon}, seed {seed}: validation part; * is chosen", flush=True)
                 table(["network", "MAE mm/s", "over teacher %", "parameters", "bytes", "format", "cycles", "budget"],
                       rows_of(found, horizon))  # fmt: skip
                 box = found.box["scores"] if found.best else {}
+                print("compiled:", objects[horizon][-1])
                 print("lock-box:", {name: round(score[str(horizon)]["mae"], 4) for name, score in box.items()})
-    verdicts = [v for horizon, found in searches.items() for v in verdicts_of(found, horizon, quick)]
-    kept = {f"k={k}": [facts_of(one, k) for one in found] for k, found in searches.items()}
+    verdicts = [v for k, found in searches.items() for v in verdicts_of(found, objects[k], k, quick)]
+    kept = {
+        f"k={k}": [facts_of(one, k, made_of) for one, made_of in zip(found, objects[k], strict=True)]
+        for k, found in searches.items()
+    }
     finish("compression", verdicts, arguments.seed, kept)
 
 

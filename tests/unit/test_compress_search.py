@@ -18,6 +18,8 @@ from edp.downsizing import SearchSpec, Watchers, search, searching
 from edp.downsizing.plan import make_plan
 from edp.errors import ConfigError, StorageError
 from edp.evaluation.controller import Budget
+from edp.export.c.sizes import constant_bytes
+from edp.integer.quantise import outline
 from edp.models.backbones import GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.models.cells import LayerNormLstmCell
 from edp.models.predictor import build_model
@@ -159,6 +161,26 @@ def test_widths_reach_from_the_widest_that_fits_to_a_quarter_of_it(run):
     need = taken(teacher, "float32", Budget())
     narrow = make_plan(teacher, Budget(cycles=need.cycles[2] - 1), formats=("float32",))
     assert tuple(narrow.orders) == (12, 4, 2)
+
+
+def test_ways_can_be_left_out(run):
+    teacher = load_bundle(run).predictor
+    plan = make_plan(teacher, Budget(), units=(4,), ways=("pruned",))
+    assert [order.name for ways in plan.orders.values() for order in ways] == ["p4"]
+    for ways, message in ((("cut",), "ways = cut; some of distilled, pruned"), ((), "ways = none; some of")):
+        with pytest.raises(ConfigError, match=message):
+            make_plan(teacher, Budget(), ways=ways)
+
+
+def test_the_widest_network_fits_with_all_of_its_constants(run):
+    """A budget of one byte less than a width's constants takes the next narrower one."""
+    teacher = load_bundle(run).predictor
+    need = taken(teacher, "w8a16", Budget())
+    graph = outline(teacher.graph())
+    assert need.parameter_bytes == constant_bytes(graph) > sum(values.nbytes for _, _, values in graph.tensors())
+    fits = make_plan(teacher, Budget(parameter_bytes=need.parameter_bytes), formats=("w8a16",))
+    short = make_plan(teacher, Budget(parameter_bytes=need.parameter_bytes - 1), formats=("w8a16",))
+    assert max(short.orders) > max(fits.orders)  # the teacher itself is no order
 
 
 def test_report_tables_and_pictures(done):

@@ -18,6 +18,7 @@ from edp.models.predictor import ModelSpec, Predictor, build_model
 from edp.training.bundle import blank_scaler
 
 STEP = 4  # widths are multiples of it: what kernels compute at a time
+WAYS = ("distilled", "pruned")  # and the better one is trained on with rounded numbers
 SHARES = (1.0, 0.5, 0.25)  # of the widest that fits: the front below it
 
 
@@ -50,7 +51,13 @@ class Plan:
         return [rounded_order(best)] if self.rounds else []
 
 
-def make_plan(teacher: Predictor, budget: Budget, units: Sequence[int] = (), formats: Sequence[str] = ()) -> Plan:
+def make_plan(
+    teacher: Predictor,
+    budget: Budget,
+    units: Sequence[int] = (),
+    formats: Sequence[str] = (),
+    ways: Sequence[str] = WAYS,
+) -> Plan:
     """Plan a search: the widest network that fits in each format, and its halves and quarters.
 
     Args:
@@ -58,11 +65,15 @@ def make_plan(teacher: Predictor, budget: Budget, units: Sequence[int] = (), for
         budget: what the controller grants.
         units: widths to make; none given, they are planned.
         formats: names of number formats; none given, all.
+        ways: some of `WAYS`.
 
     Raises:
-        ConfigError: an unknown format, a width that is none, or a budget that no network of this kind meets.
+        ConfigError: an unknown format or way, a width that is none, or a budget that no network of this kind meets.
     """
     full = width_of(teacher.spec)
+    unknown = [way for way in ways if way not in WAYS]
+    if unknown or not ways:
+        raise ConfigError(f"ways = {', '.join(unknown) or 'none'}; some of {', '.join(WAYS)} must hold")
     wrong = [width for width in units if not 1 <= width <= full]
     if wrong:
         raise ConfigError(
@@ -80,19 +91,23 @@ def make_plan(teacher: Predictor, budget: Budget, units: Sequence[int] = (), for
     tops = set(fitting.values()) - {0}
     shares = {max(tops) * share for share in SHARES}
     widths = set(units) or tops | {max([width for width in possible if width <= share] or tops) for share in shares}
-    ways = {width: _orders(teacher, width, notes) for width in sorted(widths - {full}, reverse=True)}
-    return Plan(ways, tuple(able), tuple(dict.fromkeys(notes)))
+    orders = {width: _orders(teacher, width, ways, notes) for width in sorted(widths - {full}, reverse=True)}
+    return Plan(orders, tuple(able), tuple(dict.fromkeys(notes)))
 
 
-def _orders(teacher: Predictor, width: int, notes: list[str]) -> tuple[Order, ...]:
+def _orders(teacher: Predictor, width: int, ways: Sequence[str], notes: list[str]) -> tuple[Order, ...]:
     """The ways to a network of this width; why there are no others is noted."""
-    ways = [Order(name=f"u{width}", units=width), Order(name=f"p{width}", units=width, pruned=True)]
+    both = {
+        "distilled": Order(name=f"u{width}", units=width),
+        "pruned": Order(name=f"p{width}", units=width, pruned=True),
+    }
+    orders = [order for way, order in both.items() if way in ways]
     try:
         check_pruning(teacher.spec, _narrow(teacher.spec, width))
     except ConfigError as error:
         notes.append(str(error))
-        ways = ways[:1]
-    why = {way: _why_not(teacher, way.model(teacher.spec)) for way in ways}
+        orders = [both["distilled"]]
+    why = {order: _why_not(teacher, order.model(teacher.spec)) for order in orders}
     notes += [f"{way.name} is left out: {reason}" for way, reason in why.items() if reason]
     able = tuple(way for way, reason in why.items() if not reason)
     if not able:

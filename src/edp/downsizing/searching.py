@@ -13,7 +13,7 @@ from edp.config import Experiment, experiment_toml, plain_tree
 from edp.data.prepared import Prepared
 from edp.downsizing.distil import order_facts, read_run
 from edp.downsizing.judged import Found, Judged, choose, deployed_row, measure, on_validation, relative
-from edp.downsizing.plan import Plan, make_plan
+from edp.downsizing.plan import WAYS, Plan, make_plan
 from edp.errors import ExportError
 from edp.evaluation.controller import Budget
 from edp.ledger import Ledger
@@ -41,6 +41,7 @@ class SearchSpec:
         budget: what the controller grants.
         units: widths; none given, they are planned from the budget.
         formats: number formats; none given, all.
+        ways: how each width is made, some of `edp.downsizing.plan.WAYS`.
         thesis: also make the variants of Table 4.9 that are narrower than the teacher.
         again: open the lock-box again for another choice, which weakens what it can show; it is recorded.
         changes: settings of the trainings that differ from the run's, as ``key.path=value``.
@@ -49,6 +50,7 @@ class SearchSpec:
     budget: Budget
     units: tuple[int, ...] = ()
     formats: tuple[str, ...] = ()
+    ways: tuple[str, ...] = WAYS
     thesis: bool = False
     again: bool = False
     changes: tuple[str, ...] = ()
@@ -144,7 +146,7 @@ def search(
             opened for another choice.
     """
     teacher, experiment, own = read_run(run, spec.changes)
-    plan = make_plan(teacher, spec.budget, spec.units, spec.formats)
+    plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.ways)
     told = watchers or Watchers()
     for note in plan.notes:
         told.on_note(note)

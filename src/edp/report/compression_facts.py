@@ -177,7 +177,8 @@ def caveats(facts: Compression) -> list[str]:
     """What the figures can and cannot show."""
     box, parts = facts.held["box"], facts.held["recordings"]
     lines = [
-        "Cycles, flash and memory beside weights are estimates; MACs and bytes of weights are counted. The high "
+        "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
+        "constants, as the exported C code holds them (INT8, which has no such code: as in Table 4.9). The high "
         "estimate decides.",
         f"Networks are compared and chosen on {parts['validation']} validation recordings, which chose their best "
         "epochs too: the least of many errors is a little too good there.",
