@@ -2,28 +2,113 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from edp.errors import ConfigError, DataError
 
 SHARE = 0.8
 """Of the memory that is free now, what a log may take."""
+UNKNOWN_BYTES = 1 << 62
+"""Stands for memory without a bound that the system tells."""
+Listener = Callable[[int, int, int], None]
+_listener: Listener | None = None
+
+
+def listen(listener: Listener | None) -> None:
+    """Have `announce` call a function: a process that reads one log grows its limits by what the log announces."""
+    global _listener
+    _listener = listener
+
+
+def announce(*, memory: int = 0, work: int = 0, parts: int = 0) -> None:
+    """Say what the checked headers of a log promise, so that a sandbox allows it and no more.
+
+    Args:
+        memory: bytes that reading takes at one time.
+        work: bytes that are unpacked, one after the other.
+        parts: objects, variables or messages that are gone through.
+    """
+    if _listener is not None:
+        _listener(memory, work, parts)
 
 
 def free_bytes() -> int:
-    """Memory that can be had now; a large number where the system does not tell."""
-    try:
+    """Memory that this process can have now: the least of what the machine, its control group and its limits leave.
+
+    A large number where the system does not tell.
+    """
+    return max(min([_machine(), *_groups(), *_own_limits()]), 0)
+
+
+def _machine() -> int:
+    with contextlib.suppress(OSError, ValueError, IndexError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
+    with contextlib.suppress(OSError, ValueError, AttributeError):
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, AttributeError, IndexError):
-        return 1 << 62
+    return UNKNOWN_BYTES
+
+
+def _groups(processes: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
+    """What each control group of memory leaves, from this process's own to the outermost (versions 2 and 1)."""
+    try:
+        lines = processes.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError):
+        return
+    for line in lines:
+        _, names, place = (*line.split(":", 2), "", "")[:3]
+        if names and "memory" not in names.split(","):
+            continue
+        top = root if not names else root / "memory"
+        group = top / place.lstrip("/")
+        # In a container the path may be that of the host; its own group then lies at the top.
+        for folder in (group, *group.parents):
+            if folder == top or top in folder.parents:
+                left = _group_left(folder, version_2=not names)
+                if left is not None:
+                    yield left
+
+
+def _group_left(folder: Path, version_2: bool) -> int | None:
+    limit, usage, cache = (
+        ("memory.max", "memory.current", "inactive_file")
+        if version_2
+        else ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+    )
+    try:
+        most, used = int((folder / limit).read_text("ascii")), int((folder / usage).read_text("ascii"))
+    except (OSError, ValueError):  # no such group, or "max"
+        return None
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in (folder / "memory.stat").read_text("ascii").splitlines():
+            if line.startswith(f"{cache} "):
+                used -= int(line.split()[1])  # files kept in memory give way
+    return most - used
+
+
+def _own_limits() -> Iterator[int]:
+    """What this process's limits on address space and data leave; inside a sandbox, its hard limits."""
+    try:
+        import resource
+
+        pages = [int(part) for part in Path("/proc/self/statm").read_text("ascii").split()]
+    except (ImportError, OSError, ValueError):
+        return
+    page = os.sysconf("SC_PAGE_SIZE")
+    used = {resource.RLIMIT_AS: pages[0] * page, resource.RLIMIT_DATA: pages[5] * page}
+    for limit, taken in used.items():
+        soft, hard = resource.getrlimit(limit)
+        most = soft if _listener is None else hard
+        if most != resource.RLIM_INFINITY:
+            yield most - taken
 
 
 def check_memory(path: Path, needed: int, what: str, advice: str) -> None:
-    """Refuse what does not fit.
+    """Refuse what does not fit; what does is allowed to a reader in a sandbox.
 
     Args:
         path: the file.
@@ -37,11 +122,13 @@ def check_memory(path: Path, needed: int, what: str, advice: str) -> None:
     free = free_bytes()
     if needed > SHARE * free:
         raise DataError(
-            f"'{path}': {what} would take {_gigabytes(needed)} of memory, {_gigabytes(free)} are free; {advice}"
+            f"'{path}': {what} would take {gigabytes(needed)} of memory, {gigabytes(free)} are free; {advice}"
         )
+    announce(memory=needed)
 
 
-def _gigabytes(count: int) -> str:
+def gigabytes(count: float) -> str:
+    """A number of bytes for messages."""
     return f"{count / 1e9:,.3g} GB"
 
 

@@ -20,11 +20,11 @@ import numpy as np
 
 from edp.errors import EdpError
 from edp.logs import read_recording
-from edp.matlab import end
 from edp.recording import Recording
+from edp.sandbox import end
 
 MEMORY_BYTES = 6 << 30
-# By the clock, so that a busy machine has time; how long a damaged MAT file may take the processor is bounded by EDP.
+# By the clock, so that a busy machine has time; how long a damaged file may take the processor is bounded by EDP.
 SECONDS = 60
 
 
@@ -123,7 +123,7 @@ def main() -> None:
         results[case] = read_damaged(folder, case, first, count)
         print(case, file=sys.stderr)
     end()
-    # MAT files are unpacked in processes of their own.
+    # Logs are read in processes of their own.
     users = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     results["peak_mb"] = max(resource.getrusage(user).ru_maxrss for user in users) / 1024
     print(json.dumps(results))

@@ -201,10 +201,10 @@ def test_read_only_folder(tmp_path, monkeypatch):
 def test_unreadable_file(tmp_path, monkeypatch):
     path = write_recording(make(), tmp_path / "a.csv")
 
-    def refuse(self, *args, **kwargs):
-        raise PermissionError(errno.EACCES, "Permission denied")
+    def refuse(place, *_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied", str(place))
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr("edp.logs.detect.os.open", refuse)
     with pytest.raises(DataError, match="Permission denied"):
         read_recording(path)
 

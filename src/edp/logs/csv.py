@@ -48,6 +48,7 @@ class CsvFormat:
     suffixes: tuple[str, ...] = (".csv", ".tsv")
     content = "CSV text"
     parts = False
+    libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
     def claims(self, head: bytes) -> bool:
         """Text without NUL bytes, or UTF-16 with its mark."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path
 
 from edp.errors import DataError, closest
 from edp.logs.raw import FORMATS, LogFormat, RawLog
+from edp.logs.sandboxed import read_apart
 from edp.signals import SignalMap
 
 _HEAD = 4096
@@ -77,11 +80,10 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
     """
     source = Path(path)
     named = format_for(source)
-    if source.is_dir():
-        return named.read(source, signal_map)
     try:
-        with source.open("rb") as stream:
-            head = stream.read(_HEAD)
+        if source.is_dir():
+            return read_apart(named, source, _size_of_folder(source), signal_map)
+        head, size = _begin(source)
     except OSError as error:
         reason = error.strerror or error
         raise DataError(f"cannot read '{source}': {reason}; check the path and its permissions") from error
@@ -91,7 +93,33 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
         raise DataError(f"'{source}' begins with zeros only; it is half downloaded or damaged: copy it again")
     if not named.claims(head) or any(head.startswith(magic) for magic in _OTHERS):
         raise DataError(f"'{source}' is named {source.suffix} but holds {_content(head)}; rename it or export it again")
-    return named.read(source, signal_map)
+    return read_apart(named, source, size, signal_map)
+
+
+def _begin(path: Path) -> tuple[bytes, int]:
+    """The first bytes of a regular file, and its size; nothing else is opened, as that may wait or do something."""
+    _check_regular(path, os.stat(path))
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with open(handle, "rb", buffering=0) as stream:
+        status = os.fstat(handle)
+        _check_regular(path, status)
+        return stream.read(_HEAD), status.st_size
+
+
+def _size_of_folder(folder: Path) -> int:
+    """Bytes of the files of a bag."""
+    total = 0
+    for entry in folder.iterdir():
+        status = entry.stat()
+        if not stat.S_ISDIR(status.st_mode):
+            _check_regular(entry, status)
+            total += status.st_size
+    return total
+
+
+def _check_regular(path: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise DataError(f"'{path}' is a pipe, a socket or a device; a log is a regular file: save it as one")
 
 
 def _content(head: bytes) -> str:

@@ -17,7 +17,7 @@ from edp.logs.mat_layouts import LAYOUTS
 from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import FORMATS, TRUTH, Column, RawLog, RawSignal, WriteOptions, find_time, parted, time_factor
 from edp.logs.units import normalise_unit
-from edp.matlab import INFO, MAGIC, Found, is_v4, unpack
+from edp.matlab import INFO, MAGIC, Found, is_v4
 from edp.recording import Recording
 from edp.signals import SignalMap
 
@@ -31,6 +31,7 @@ class MatFormat:
     suffixes: tuple[str, ...] = (".mat",)
     content = "a MAT file"
     parts = True
+    libraries = ("edp.matlab.unpacking",)
 
     def claims(self, head: bytes) -> bool:
         """The text header of v5 and v7.3 (also when cut off), or the numbers of a v4 header."""
@@ -40,6 +41,8 @@ class MatFormat:
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read all variables, or the one that the map names."""
+        from edp.matlab.unpacking import unpack  # pandas takes seconds to import
+
         found = unpack(path, signal_map.variable)
         own = OwnFacts() if found.info is None else own_facts(found.info, f"'{path}', variable '{INFO}'")
         if signal_map.variable is not None:

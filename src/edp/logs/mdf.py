@@ -48,6 +48,7 @@ class MdfFormat:
     suffixes: tuple[str, ...] = (".mf4", ".mdf")
     content = "MDF"
     parts = False
+    libraries = ("asammdf",)
 
     def claims(self, head: bytes) -> bool:
         """Begins with MDF's file identification."""

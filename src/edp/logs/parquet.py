@@ -58,6 +58,7 @@ class ParquetFormat:
     suffixes: tuple[str, ...] = (".parquet", ".pq")
     content = "Parquet"
     parts = False
+    libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
     def claims(self, head: bytes) -> bool:
         """Begins with Parquet's magic number."""

@@ -208,7 +208,11 @@ def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
 
 
 class LogFormat(Protocol):
-    """One file format; instances are entered in `FORMATS`. `parts`: whether one file can hold truth apart."""
+    """One file format; instances are entered in `FORMATS`.
+
+    `parts`: whether one file can hold truth apart. A format may also have `libraries`: names of modules that reading
+    imports, which the sandbox then imports once instead of once a log.
+    """
 
     name: str
     suffixes: tuple[str, ...]

@@ -38,6 +38,7 @@ class BagFormat:
     """One container of messages."""
 
     parts = False
+    libraries = ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")
 
     def __init__(self, name: str, suffix: str, content: str, magic: bytes) -> None:
         self.name = name

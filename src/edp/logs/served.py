@@ -1,0 +1,233 @@
+"""In the sandbox: one log is read by its format, and its columns are handed over as they are asked for.
+
+The messages are those of `edp.sandbox.protocol`. After the order come the log's facts, then answers to requests:
+``time`` and ``load`` (a header with the number of bytes, then the array), ``open`` and ``next`` for the pieces of a
+table, and with any of them the pieces that nobody wants any more (``drop``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, EdpError
+from edp.limits import announce
+from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, Table
+from edp.sandbox import lock_down
+from edp.sandbox.allowance import Allowance, is_exhausted
+from edp.sandbox.protocol import Header, is_plain, reader, receive, send, writer
+from edp.signals import ChannelMap, Kind, SignalMap
+
+MESSAGE_BYTES = 1 << 24
+"""Of the numbers of one message; larger pieces are sent in parts."""
+_TEXT = 20_000
+"""Longest message about what is wrong."""
+_STAMP_BYTES = 128
+"""What a time stamp takes while it is collected, message by message."""
+_KEPT_BYTES = 24
+"""What a wanted value takes where a format must keep whole columns, which it does up to `_KEPT_MOST`."""
+_KEPT_MOST = 3 << 29
+
+
+def map_of(plain: Header) -> SignalMap:
+    """The signal map in an order; see `edp.logs.sandboxed.plain_map`."""
+    entries = [entry | {"kind": Kind(entry["kind"]) if entry["kind"] else None} for entry in plain["channels"]]
+    channels = tuple(ChannelMap(**entry) for entry in entries)
+    return SignalMap(**plain | {"channels": channels, "columns": tuple(plain["columns"])})
+
+
+def serve(requests: int, answers: int) -> None:
+    """Take an order, read its log, and answer requests until the other side is gone."""
+    read_into, write = reader(requests), writer(answers)
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        order, _ = receive(read_into)
+        os.chdir(order["folder"])
+        path = Path(order["path"])
+        allowance = Allowance(path, order["size"])
+        _keep_temporary_files_in_memory()
+        lock_down([Path(os.path.realpath(path))])
+        served = _answer(write, allowance, 0, lambda: _read(order, path))
+        while served is not None:
+            request, _ = receive(read_into)
+            served.obey(request, write, allowance)
+
+
+def _read(order: Header, path: Path) -> tuple[Header, _Served]:
+    served = _Served(FORMATS[order["format"]].read(path, map_of(order["map"])))
+    return served.facts(), served
+
+
+def _answer(
+    write: Callable[[Any], None], allowance: Allowance, values: int, work: Callable[[], tuple[Header, Any]]
+) -> Any:
+    """Do some work within the limits and send what it says first; returns what it made, None where it failed."""
+    try:
+        with allowance.running(allowance.seconds(values)):
+            header, made = work()
+        send(write, header)
+    except (EOFError, BrokenPipeError):
+        raise
+    except Exception as error:
+        send(write, refusal(error, allowance))
+        return None
+    return made
+
+
+def refusal(error: Exception, allowance: Allowance) -> Header:
+    """What is wrong with the file, for the other side.
+
+    Libraries meet damaged bytes with any exception there is; every one means the same to the user.
+    """
+    if is_exhausted(error):
+        error = allowance.exhausted()
+    if isinstance(error, EdpError):
+        return {"refused": str(error)[:_TEXT], "kind": type(error).__name__}
+    told = f"{type(error).__name__}: {error}"[:_TEXT]
+    advice = "it may be truncated or damaged: copy or export it again"
+    return {"refused": f"'{allowance.path}' cannot be read ({told}); {advice}", "kind": DataError.__name__}
+
+
+@dataclass
+class _Stream:
+    """Pieces of a table that are being read, in parts that a message takes, and the processor time left for it."""
+
+    parts: Iterator[list[NDArray[Any]]]
+    seconds: float
+
+
+@dataclass
+class _Served:
+    """The log that was read."""
+
+    raw: RawLog
+    times: list[Column | Callable[[], Column]] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    streams: dict[int, _Stream] = field(default_factory=dict)
+
+    def facts(self) -> Header:
+        """Everything about the log but its numbers."""
+        raw = self.raw
+        times: dict[Any, int] = {}
+        tables: dict[int, int] = {}
+        signals = []
+        for signal in raw.signals.values():
+            time = table = None
+            if signal.time is not None:
+                key = signal.time if callable(signal.time) else id(signal.time)
+                time = times.setdefault(key, len(times))
+                if time == len(self.times):
+                    self.times.append(signal.time)
+            if signal.table is not None:
+                table = tables.setdefault(id(signal.table), len(tables))
+                if table == len(self.tables):
+                    self.tables.append(signal.table)
+            kind = None if signal.kind is None else str(signal.kind)
+            signals.append(
+                [signal.name, signal.samples, signal.unit, kind, signal.description, time, table, signal.key]
+            )
+        plain = {item.name: getattr(raw, item.name) for item in dataclasses.fields(raw)}
+        del plain["path"]
+        named = {name: list(full) for name, full in raw.repeated.items()}
+        return plain | {"signals": list(zip(raw.signals, signals)), "repeated": named}
+
+    def obey(self, request: Header, write: Callable[[Any], None], allowance: Allowance) -> None:
+        """Answer one request."""
+        doing = request["do"]
+        for number in request.get("drop", ()):
+            self.streams.pop(number, None)
+        if doing == "time":
+            signal = next(s for s in self.raw.signals.values() if s.time is not None and self._time(s) == request["of"])
+            announce(memory=_STAMP_BYTES * signal.samples)
+            self._array(write, allowance, signal.samples, lambda: signal.time_s)
+        elif doing == "load":
+            signal = list(self.raw.signals.values())[request["of"]]
+            self._array(write, allowance, signal.samples, signal.load)
+        elif doing == "open":
+            keys, start, stop = request["keys"], request["start"], request["stop"]
+            values = (stop - start) * len(keys)
+            announce(memory=min(_KEPT_BYTES * values, _KEPT_MOST) + _STAMP_BYTES * (stop - start))
+            parts = _parts(self.tables[request["table"]], keys, start, stop)
+            self.streams[request["stream"]] = _Stream(parts, allowance.seconds(values))
+        else:
+            self._next(request["stream"], write, allowance)
+
+    def _time(self, signal: RawSignal) -> int:
+        same = (place for place, time in enumerate(self.times) if time is signal.time or _equal(time, signal.time))
+        return next(same)
+
+    def _array(
+        self,
+        write: Callable[[Any], None],
+        allowance: Allowance,
+        values: int,
+        load: Callable[[], Column | None],
+    ) -> None:
+        def work() -> tuple[Header, list[NDArray[Any]]]:
+            array = np.asarray(load())
+            check_plain(self.raw.path, [array])
+            return {"bytes": array.nbytes}, [array]
+
+        made = _answer(write, allowance, values, work)
+        if made is not None:
+            send(write, {}, made)
+
+    def _next(self, number: int, write: Callable[[Any], None], allowance: Allowance) -> None:
+        stream = self.streams.get(number)
+        if stream is None:
+            send(write, {"end": True})
+            return
+        try:
+            with allowance.running(stream.seconds) as left:
+                columns = next(stream.parts, None)
+                if columns is not None:
+                    check_plain(self.raw.path, columns)
+            stream.seconds = left[0]
+        except Exception as error:
+            del self.streams[number]
+            send(write, refusal(error, allowance))
+            return
+        if columns is None:
+            del self.streams[number]
+            send(write, {"end": True})
+        else:
+            send(write, {}, columns)
+
+
+def _equal(time: Any, other: Any) -> bool:
+    return callable(time) and callable(other) and bool(time == other)
+
+
+def check_plain(path: Path, arrays: Sequence[NDArray[Any]]) -> None:
+    """Refuse columns of anything but numbers, or of unequal lengths.
+
+    Raises:
+        DataError: naming the file.
+    """
+    if not all(map(is_plain, arrays)) or len({len(array) for array in arrays}) > 1:
+        raise DataError(f"'{path}' holds a column of no plain numbers; map another")
+
+
+def _parts(table: Table, keys: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+    """Pieces, cut where a message would be too long."""
+    for columns in table.pieces(keys, start, stop):
+        row = sum(column.itemsize for column in columns)
+        rows = max(MESSAGE_BYTES // max(row, 1), 1)
+        for start in range(0, len(columns[0]) if columns else 0, rows):
+            yield [column[start : start + rows] for column in columns]
+
+
+def _keep_temporary_files_in_memory() -> None:
+    """The library of MDF opens a temporary file for what may be appended to a log, also where nothing is."""
+    for name in ("asammdf.blocks.mdf_v4", "asammdf.blocks.mdf_v3"):
+        if name in sys.modules:
+            vars(sys.modules[name])["NamedTemporaryFile"] = lambda *_, **__: io.BytesIO()

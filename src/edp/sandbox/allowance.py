@@ -1,0 +1,149 @@
+"""How much memory and processor time the reader of one log may take, as functions of the file and its headers.
+
+Memory beyond what the process has when it begins: `START_BYTES` + `COPIES` x the file's size + the largest need that
+its checked headers announced (`edp.limits.announce`), and never more than the machine has free. Processor time of one
+request: `START_S` + what the size, the announced work and the wanted values take at speeds well below those of a slow
+computer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+from edp import limits
+from edp.errors import DataError
+from edp.limits import gigabytes
+
+try:
+    import resource
+except ImportError:  # not POSIX
+    resource = None  # type: ignore[assignment]
+
+START_BYTES = 512 << 20
+COPIES = 16
+"""A cell of text may take two bytes and becomes eight, which libraries hold twice while they build a column."""
+RESERVED_BYTES = 4 << 30
+"""Address space beyond memory: arenas of threads and pools of allocators are reserved, and mostly never used."""
+START_S = 5.0
+BYTES_PER_S = 1e6
+WORK_PER_S = 2e6
+VALUES_PER_S = 1e6
+PART_S = 0.01
+WALL = 12
+"""Longest time by the clock, in allowed processor times: a process may also wait for ever."""
+MOST_S = 1e6
+_EXHAUSTED = re.compile(
+    r"(?:out of|not enough|insufficient) memory|memory allocation|bad_alloc|malloc|alloc\w* failed|"
+    r"(?:cannot|unable to) alloc",
+    re.IGNORECASE,
+)
+
+
+class Allowance:
+    """The limits of this process while it reads one log."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        self.path = path
+        self.size = size
+        self.memory = 0
+        self.work_s = 0.0
+        self.bound = START_BYTES + COPIES * size
+        self.free = max(int(limits.SHARE * limits.free_bytes()), 0)
+        self.start = _used()
+        self._limit_files()
+        self._limit_memory()
+        limits.listen(self.announce)
+
+    def announce(self, memory: int, work: int, parts: int) -> None:
+        """What checked headers promise; see `edp.limits.announce`."""
+        self.work_s += work / WORK_PER_S + parts * PART_S
+        if memory > self.memory:
+            self.memory = memory
+            self._limit_memory()
+        if work or parts:
+            self._rearm(work / WORK_PER_S + parts * PART_S)
+
+    def seconds(self, values: int = 0) -> float:
+        """Processor time of a request that wants some values."""
+        return min(START_S + self.size / BYTES_PER_S + self.work_s + values / VALUES_PER_S, MOST_S)
+
+    @contextlib.contextmanager
+    def running(self, seconds: float) -> Iterator[list[float]]:
+        """Limit the time of what runs inside; what is left of it is found in the list afterwards."""
+        left = [seconds]
+        if not hasattr(signal, "setitimer"):
+            yield left
+            return
+        signal.setitimer(signal.ITIMER_REAL, WALL * seconds)
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+        try:
+            yield left
+        finally:
+            left[0] = max(signal.setitimer(signal.ITIMER_PROF, 0)[0], 1e-3)
+            signal.setitimer(signal.ITIMER_REAL, 0)
+
+    def _rearm(self, more: float) -> None:
+        if hasattr(signal, "setitimer"):
+            for timer, times in ((signal.ITIMER_PROF, 1), (signal.ITIMER_REAL, WALL)):
+                left = signal.getitimer(timer)[0]
+                if left:
+                    signal.setitimer(timer, min(left + times * more, WALL * MOST_S))
+
+    def _limit_memory(self) -> None:
+        """Set the soft limits; the hard ones stay at what the machine has, so that headers may still raise these."""
+        if resource is None:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            more = min(self.bound + self.memory, self.free)
+            for kind, used, extra in (
+                (resource.RLIMIT_DATA, self.start[1], 0),
+                (resource.RLIMIT_AS, self.start[0], RESERVED_BYTES),
+            ):
+                hard = resource.getrlimit(kind)[1]
+                most = [used + self.free + extra] + ([hard] if hard != resource.RLIM_INFINITY else [])
+                resource.setrlimit(kind, (min([used + more + extra, *most]), min(most)))
+
+    @staticmethod
+    def _limit_files() -> None:
+        if resource is None:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+
+    def exhausted(self) -> DataError:
+        """What to say where memory ran out: of the machine, or of what a file of this size may take."""
+        if self.bound + self.memory >= self.free:
+            return DataError(
+                f"'{self.path}': reading it takes more memory than this machine has free ({gigabytes(self.free)} may "
+                "be taken); free some memory, raise the limit, or read fewer channels or a part of it"
+            )
+        return DataError(
+            f"'{self.path}': reading it takes more than {gigabytes(self.bound + self.memory)} of memory, the limit for "
+            f"a file of {self.size} bytes with its headers; it may be damaged or made to exhaust memory: copy or "
+            "export it again, or save fewer channels in a file"
+        )
+
+
+def is_exhausted(error: BaseException | None) -> bool:
+    """Whether an exception comes from a lack of memory, however a library calls it."""
+    depth = 0
+    while error is not None and depth < 20:
+        if isinstance(error, MemoryError) or (not isinstance(error, DataError) and _EXHAUSTED.search(str(error))):
+            return True
+        error, depth = error.__cause__ or error.__context__, depth + 1
+    return False
+
+
+def _used() -> tuple[int, int]:
+    """Address space and data of this process, in bytes."""
+    try:
+        pages = [int(part) for part in Path("/proc/self/statm").read_text(encoding="ascii").split()]
+        return pages[0] * os.sysconf("SC_PAGE_SIZE"), pages[5] * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0, 0

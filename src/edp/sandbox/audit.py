@@ -1,0 +1,55 @@
+"""The layer that every system has: Python itself refuses what a reader of logs never needs.
+
+It sees what Python code does, not what a compiled library does by itself; for that there are `edp.sandbox.landlock`
+and `edp.sandbox.syscalls`.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+_REFUSED = (
+    "socket.", "subprocess.", "os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "os.startfile",
+    "pty.spawn", "os.kill", "signal.pthread_kill", "os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link",
+    "os.symlink", "os.chmod", "os.chown", "os.chflags", "os.truncate", "os.utime", "os.setxattr", "os.removexattr",
+    "shutil.", "tempfile.", "pickle.", "sqlite3.enable_load_extension", "sqlite3.load_extension", "ftplib.", "http.",
+    "imaplib.", "poplib.", "smtplib.", "telnetlib.", "urllib.", "webbrowser.", "winreg.", "resource.prlimit",
+)  # fmt: skip
+"""Events whose name begins so. Compiling and executing code is how libraries are imported, so it is not among them."""
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+_OPENERS = {"open", "sqlite3.connect"}
+
+
+def restrict(readable: Iterable[Path]) -> None:
+    """Refuse for good to open, from Python, anything for writing, and for reading all but `readable`; and more."""
+    sys.addaudithook(hook(readable))
+
+
+def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
+    """What is called with every event; raises PermissionError for those refused."""
+    places = tuple(os.path.realpath(path) for path in readable)
+    below = tuple(os.path.join(place, "") for place in places)
+
+    def judge(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in _OPENERS:
+            path = arguments[0]
+            if event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING:
+                raise PermissionError(errno.EPERM, f"a reader of logs may not write files ({path!r})")
+            if isinstance(path, str | bytes | os.PathLike):
+                real = os.path.realpath(_plain(os.fsdecode(path)))
+                if real not in places and not real.startswith(below):
+                    raise PermissionError(errno.EPERM, f"a reader of logs may not read other files ({path!r})")
+        elif event.startswith(_REFUSED):
+            raise PermissionError(errno.EPERM, f"a reader of logs may not do this ({event})")
+
+    return judge
+
+
+def _plain(path: str) -> str:
+    """The path in a URI of SQLite, which is written without escapes by the library that reads bags."""
+    return path.removeprefix("file:").partition("?")[0] if path.startswith("file:") else path

@@ -1,0 +1,83 @@
+"""Landlock (Linux 5.13 and later): the process may read below some paths, and write nowhere.
+
+Source: the kernel's documentation "Landlock: unprivileged access control" and linux/landlock.h; system calls 444 to
+446 have the same numbers on every architecture.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import struct
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+_CREATE, _ADD, _RESTRICT = 444, 445, 446
+_VERSION = 1
+"""Flag that asks which version (ABI) of Landlock the kernel has."""
+_PATH_BENEATH = 1
+_NO_NEW_PRIVILEGES = 38
+_READ_FILE, _READ_DIR = 1 << 2, 1 << 3
+_FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
+"""From which version on, how many rights on files there are; a kernel refuses bits that it does not know."""
+_NET_FROM, _NET_RIGHTS = 4, 2
+"""To bind and to connect TCP sockets."""
+_SCOPE_FROM, _SCOPES = 6, 3
+"""Abstract sockets and signals of processes outside."""
+
+
+def restrict(readable: Iterable[Path]) -> bool:
+    """Forbid this process for good to open anything for writing, and for reading all but `readable`.
+
+    Args:
+        readable: files, or folders with all below them; missing ones are passed over.
+
+    Returns:
+        whether the kernel does so.
+
+    Raises:
+        OSError: the kernel has Landlock but refuses.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    version = libc.syscall(_CREATE, None, ctypes.c_size_t(0), ctypes.c_uint(_VERSION))
+    if version < 1:
+        return False
+    rights = (1 << max(count for since, count in _FILE_RIGHTS.items() if since <= version)) - 1
+    net = (1 << _NET_RIGHTS) - 1 if version >= _NET_FROM else 0
+    scopes = _SCOPES if version >= _SCOPE_FROM else 0
+    fields = [rights, net, scopes][: 1 + (version >= _NET_FROM) + (version >= _SCOPE_FROM)]
+    attributes = struct.pack(f"={len(fields)}Q", *fields)
+    rules = libc.syscall(_CREATE, attributes, ctypes.c_size_t(len(attributes)), ctypes.c_uint(0))
+    if rules < 0:
+        raise _failure("make rules")
+    try:
+        for path in readable:
+            _allow(libc, rules, path)
+        if libc.prctl(_NO_NEW_PRIVILEGES, *map(ctypes.c_ulong, (1, 0, 0, 0))) or libc.syscall(
+            _RESTRICT, ctypes.c_int(rules), ctypes.c_uint(0)
+        ):
+            raise _failure("take effect")
+    finally:
+        os.close(rules)
+    return True
+
+
+def _allow(libc: ctypes.CDLL, rules: int, path: Path) -> None:
+    with contextlib.suppress(OSError):
+        handle = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        try:
+            rights = _READ_FILE | _READ_DIR if path.is_dir() else _READ_FILE
+            rule = struct.pack("=Qi", rights, handle)
+            if libc.syscall(_ADD, ctypes.c_int(rules), ctypes.c_int(_PATH_BENEATH), rule, ctypes.c_uint(0)):
+                raise _failure(f"allow '{path}'")
+        finally:
+            os.close(handle)
+
+
+def _failure(doing: str) -> OSError:
+    number = ctypes.get_errno()
+    return OSError(number, f"Landlock cannot {doing}: {os.strerror(number)}")

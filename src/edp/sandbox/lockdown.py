@@ -1,0 +1,77 @@
+"""What a process may no longer do once it reads a log, and which layer sees to it.
+
+* **Landlock** (`edp.sandbox.landlock`, Linux 5.13): opens nothing for writing and, for reading, only the log and the
+  folders of Python and its libraries; from 6.7 no TCP, from 6.12 no signals to other processes.
+* **System calls** (`edp.sandbox.syscalls`, Linux on x86_64 and aarch64): no sockets, no programs, no new processes, no
+  change of files, no tracing, mounting or loading into the kernel.
+* **Limits** (`edp.sandbox.allowance`, POSIX): memory, processor time, no file grows, no core file. The number of
+  processes is not limited: that limit counts all processes and threads of the user.
+* **Audit hook** (`edp.sandbox.audit`, everywhere): the same from Python code.
+
+Each layer holds where the system has it; none needs rights.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import sysconfig
+from collections.abc import Iterable
+from pathlib import Path
+
+from edp.sandbox import audit, landlock, syscalls
+
+_SYSTEM = (
+    "/lib", "/lib64", "/usr/lib", "/usr/lib64", "/usr/local/lib", "/usr/share/zoneinfo", "/etc/localtime",
+    "/etc/timezone", "/etc/ld.so.cache", "/dev/null", "/dev/zero", "/dev/random", "/dev/urandom", "/proc/self",
+    "/proc/meminfo", "/proc/cpuinfo", "/proc/stat", "/proc/sys/vm/overcommit_memory", "/proc/sys/kernel/pid_max",
+    "/sys/devices/system/cpu", "/sys/devices/system/node", "/sys/fs/cgroup",
+    "/sys/kernel/mm/transparent_hugepage",
+)  # fmt: skip
+"""What Python and its libraries read of the system: themselves, time zones, and how many processors there are."""
+_LIBRARIES = {"site-packages", "dist-packages"}
+
+
+_folders: list[Path] = []
+
+
+def note_libraries() -> None:
+    """Look for the folders of the standard library, of installed libraries, and of the packages imported so far.
+
+    A worker does so before it forks, whenever it has imported something.
+    """
+    places = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    places |= {os.path.join(prefix, "lib") for prefix in (sys.prefix, sys.base_prefix)}
+    places |= {place for place in sys.path if Path(place).name in _LIBRARIES or place.endswith(".zip")}
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if "." not in name and isinstance(file, str):
+            places.add(os.path.dirname(file) if os.path.basename(file).startswith("__init__.") else file)
+    _folders.clear()
+    for place in sorted(os.path.realpath(place) for place in places if place):
+        if os.path.exists(place) and not any(Path(place).is_relative_to(folder) for folder in _folders):
+            _folders.append(Path(place))
+
+
+def lock_down(readable: Iterable[Path]) -> list[str]:
+    """Give up for good all that reading a log does not need.
+
+    Args:
+        readable: the log, a file or a folder.
+
+    Returns:
+        the layers that hold.
+    """
+    if not _folders:
+        note_libraries()
+    allowed = [*readable, *_folders, *map(Path, _SYSTEM)]
+    layers = []
+    with contextlib.suppress(OSError):
+        if landlock.restrict(allowed):
+            layers.append("landlock")
+    with contextlib.suppress(OSError):
+        if syscalls.restrict():
+            layers.append("system calls")
+    audit.restrict(allowed)
+    return [*layers, "audit hook"]
