@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 _REFUSED = (
     "socket.", "subprocess.", "os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "os.startfile",
@@ -41,8 +42,8 @@ def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
             if event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING:
                 raise PermissionError(errno.EPERM, f"a reader of logs may not write files ({path!r})")
             if isinstance(path, str | bytes | os.PathLike):
-                real = os.path.realpath(_plain(os.fsdecode(path)))
-                if real not in places and not real.startswith(below):
+                real = [os.path.realpath(name) for name in _plain(os.fsdecode(path))]
+                if not any(name in places or name.startswith(below) for name in real):
                     raise PermissionError(errno.EPERM, f"a reader of logs may not read other files ({path!r})")
         elif event.startswith(_REFUSED):
             raise PermissionError(errno.EPERM, f"a reader of logs may not do this ({event})")
@@ -50,6 +51,9 @@ def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
     return judge
 
 
-def _plain(path: str) -> str:
-    """The path in a URI of SQLite, which is written without escapes by the library that reads bags."""
-    return path.removeprefix("file:").partition("?")[0] if path.startswith("file:") else path
+def _plain(path: str) -> list[str]:
+    """The paths that a name may stand for: a URI of SQLite is written with escapes by some and without by others."""
+    if not path.startswith("file:"):
+        return [path]
+    name = path.removeprefix("file:").partition("?")[0]
+    return [name, unquote(name)]
