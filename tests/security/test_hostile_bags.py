@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import contextlib
+import json
 import os
 import resource
 import sqlite3
@@ -14,6 +15,7 @@ import lz4.frame
 import numpy as np
 import pytest
 from backports import zstd
+from rosbags.rosbag2 import Reader
 
 from edp.errors import DataError
 from edp.logs import read_recording, write_recording
@@ -270,11 +272,46 @@ def test_a_packed_bag_is_unpacked_within_bounds(tmp_path, little_memory, zstd_bo
         read_recording(folder)
     (folder / "a.mcap.zstd").unlink()
     os.mkfifo(folder / "a.mcap.zstd")
-    with pytest.raises(DataError, match="is no regular file"):
+    with pytest.raises(DataError, match="a log is a regular file"):
         read_recording(folder)
     (folder / "metadata.yaml").write_text("a: " + "[" * (5 << 20))
     with pytest.raises(DataError, match="is no regular file"):
         read_recording(folder)
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
+def test_a_bag_packed_file_by_file_is_read_in_memory(tmp_path, suffix):
+    written = log_in(tmp_path, suffix)
+    with Reader(written) as reader:
+        facts = {
+            "version": 5,
+            "storage_identifier": {".mcap": "mcap", ".db3": "sqlite3"}[suffix],
+            "relative_file_paths": [f"a{suffix}.zstd"],
+            "compression_format": "zstd",
+            "compression_mode": "file",
+            "duration": {"nanoseconds": reader.duration - 1},
+            "starting_time": {"nanoseconds_since_epoch": reader.start_time},
+            "message_count": reader.message_count,
+            "topics_with_message_count": [
+                {
+                    "message_count": connection.msgcount,
+                    "topic_metadata": {
+                        "name": connection.topic,
+                        "type": connection.msgtype,
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": "",
+                    },
+                }
+                for connection in reader.connections
+            ],
+        }
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    (folder / f"a{suffix}.zstd").write_bytes(zstd.compress(written.read_bytes()))
+    (folder / "metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": facts}))
+    read, plain = read_recording(folder), read_recording(written)
+    assert read.channel_names == plain.channel_names
+    np.testing.assert_array_equal(read.values, plain.values)
 
 
 @pytest.mark.parametrize("deep", [10, 100_000])

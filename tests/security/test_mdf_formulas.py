@@ -14,7 +14,7 @@ from asammdf.blocks import v4_blocks
 from asammdf.blocks.conversion_utils import from_dict
 
 from edp.errors import DataError
-from edp.logs import inspect_log, read_recording
+from edp.logs import FORMATS, inspect_log, read_recording
 from edp.logs.mdf_formula import DEEPEST, FUNCTIONS, LONGEST, Formula, FormulaError
 from edp.signals import ChannelMap, SignalMap
 
@@ -112,7 +112,7 @@ def test_no_command_runs_it(tmp_path, monkeypatch, edp, command):
 
 def test_the_librarys_engines_are_switched_off(tmp_path):
     path = log_with(tmp_path / "a.mf4", from_dict({"formula": "2*X"}))
-    read_recording(path, BM_UP)
+    FORMATS["mdf"].read(path, BM_UP)
     for engine in ("evaluate", "lambdify"):
         with pytest.raises(DataError, match="would have been run"):
             getattr(v4_blocks, engine)("1+1")

@@ -227,7 +227,7 @@ def test_all_layers_hold_here_and_threads_still_run(hostile):
         ("fail", "name", r"cannot be read .KeyError: 'name'"),
         ("recursion", "", r"cannot be read .RecursionError"),
         ("allocate", 3000, r"reading it takes more than 0.537 GB of memory, the limit for a file of \d+ bytes"),
-        ("announce", 3000, r"KeyError|3000 MB were had|machine has free"),
+        ("announce", 1500, r"1500 MB were had|machine has free"),
     ],
 )
 @pytest.mark.parametrize("when", ["open", "load"])
@@ -442,7 +442,7 @@ def test_a_watcher_hears_of_slow_logs_only(hostile, impatient, monkeypatch):
 
 def test_maps_pass_unchanged():
     plain = SignalMap(
-        (ChannelMap("a", "b", "bar", Kind.PRESSURE, None, 2.0, "x"), ChannelMap("c", "", constant=float("inf"))),
+        (ChannelMap("a", "b", "bar", Kind.PRESSURE, None, 2.0, "x"), ChannelMap("c", "", constant=1e300)),
         "t", "ms", None, 50.0, False, ("t", "b"), "v", ";", ",", True,
     )  # fmt: skip
     assert map_of(plain_map(plain)) == plain

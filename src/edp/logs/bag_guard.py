@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 from edp.errors import DataError
 from edp.limits import check_memory
+from edp.logs.bag_memory import MemoryFile, NoFolder, place
 from edp.logs.mcap_check import RATIO, SPARE, check_records
 from edp.logs.unpack import unpack_to
 
@@ -87,15 +88,17 @@ def _readers() -> tuple[Any, Any]:
     for kind in ("lz4", "zstd"):
         storage_mcap.DECOMPRESSORS[kind] = partial(_to_size, kind)
     rosbag2.zstd = _Zstd  # type: ignore[assignment]
+    rosbag2.TemporaryDirectory = NoFolder  # type: ignore[assignment, misc]
+    rosbag2.Path = place  # type: ignore[assignment, misc]
 
     class Mcap(storage_mcap.McapReader):
         def open(self) -> None:
-            check_records(Path(str(self.path)))
+            check_records(_source(self.path))
             super().open()
 
     class Sqlite(rosbag2.Sqlite3Reader):  # type: ignore[name-defined, misc]
         def open(self) -> None:
-            _check_database(Path(str(self.path)))
+            _check_database(_source(self.path))
             super().open()
 
     class Folder(rosbag2.DirectoryReader):
@@ -105,6 +108,10 @@ def _readers() -> tuple[Any, Any]:
         STORAGE_PLUGINS: ClassVar[Any] = {"dir": Folder, ".mcap": Mcap, ".db3": Sqlite}  # type: ignore[misc]
 
     return Reader1, Bag2
+
+
+def _source(path: Any) -> Path | MemoryFile:
+    return path if isinstance(path, MemoryFile) else Path(str(path))
 
 
 def _to_size(kind: str, data: bytes, size: int) -> bytes:
@@ -156,7 +163,7 @@ def _check_folder(folder: Path) -> None:
             raise DataError(f"'{part}' has {about.st_size} bytes, at most {_LONGEST_METADATA} are read")
 
 
-def _check_database(path: Path) -> None:
+def _check_database(path: Path | MemoryFile) -> None:
     """Plain tables only: views, virtual tables and computed columns would run what their author wrote.
 
     Raises:
@@ -165,9 +172,14 @@ def _check_database(path: Path) -> None:
     if any(sign in str(path) for sign in "?#%"):
         raise DataError(f"'{path}': a bag's path must not hold '?', '#' or '%'; rename it")
     size = path.stat().st_size
-    with_uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-    base = sqlite3.connect(with_uri, uri=True)
+    if isinstance(path, MemoryFile):
+        base = sqlite3.connect(":memory:")
+    else:
+        base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
     try:
+        if isinstance(path, MemoryFile):
+            # Bytes 18 and 19 tell how it is written to; a base in memory knows only one way.
+            base.deserialize(path.data[:18] + b"\1\1" + path.data[20:])
         # A value cannot be longer than the file, whatever its header says.
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(size, 4096), (1 << 31) - 1))
         base.execute("PRAGMA trusted_schema = OFF")

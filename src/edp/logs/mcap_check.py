@@ -11,6 +11,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.limits import check_memory
+from edp.logs.bag_memory import MemoryFile
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _CHUNK, _CHUNK_INDEX, _STATISTICS = 0x02, 0x03, 0x04, 0x06, 0x08, 0x0B
@@ -24,40 +25,47 @@ _SMALLEST_MESSAGE = 31
 _PREFIX = 9
 
 
-def check_records(path: Path) -> None:
-    """Walk the records of an MCAP file.
+def check_records(path: Path | MemoryFile) -> None:
+    """Walk the records of an MCAP file, on disk or in memory.
 
     Raises:
         DataError: the file is cut off, a record does not fit, or a chunk is larger than memory.
     """
     size = path.stat().st_size
     if size < 2 * len(_MAGIC) + _PREFIX:
-        raise _broken(path, "ends inside its header (truncated)")
+        raise _broken(Path(str(path)), "ends inside its header (truncated)")
+    if isinstance(path, MemoryFile):
+        _walk(Path(path.name), memoryview(path.data), size)
+        return
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as view:
-        if view[-len(_MAGIC) :] != _MAGIC:
-            raise _broken(path, "has no end (truncated, half downloaded, or its recorder was killed)")
-        walk = _Walk(path, view)
-        at, last = len(_MAGIC), 0
-        while at < size - len(_MAGIC):
-            if at + _PREFIX > size - len(_MAGIC):
-                raise _broken(path, f"has at byte {at} a record that is cut off")
-            last, length = struct.unpack_from("<BQ", view, at)
-            if not last or at + _PREFIX + length > size - len(_MAGIC):
-                raise _broken(path, f"has at byte {at} a record of {length} bytes, more than the file holds")
-            try:
-                walk.record(last, at + _PREFIX, length)
-            except struct.error as error:
-                raise _broken(path, f"has at byte {at} a record that is cut off ({error})") from error
-            at += _PREFIX + length
-        if last != _FOOTER:
-            raise _broken(path, "has no footer (truncated)")
-        walk.end()
+        _walk(path, view, size)
+
+
+def _walk(path: Path, view: mmap.mmap | memoryview, size: int) -> None:
+    if view[-len(_MAGIC) :] != _MAGIC:
+        raise _broken(path, "has no end (truncated, half downloaded, or its recorder was killed)")
+    walk = _Walk(path, view)
+    at, last = len(_MAGIC), 0
+    while at < size - len(_MAGIC):
+        if at + _PREFIX > size - len(_MAGIC):
+            raise _broken(path, f"has at byte {at} a record that is cut off")
+        last, length = struct.unpack_from("<BQ", view, at)
+        if not last or at + _PREFIX + length > size - len(_MAGIC):
+            raise _broken(path, f"has at byte {at} a record of {length} bytes, more than the file holds")
+        try:
+            walk.record(last, at + _PREFIX, length)
+        except struct.error as error:
+            raise _broken(path, f"has at byte {at} a record that is cut off ({error})") from error
+        at += _PREFIX + length
+    if last != _FOOTER:
+        raise _broken(path, "has no footer (truncated)")
+    walk.end()
 
 
 class _Walk:
     """The records one after the other, and what they announce together."""
 
-    def __init__(self, path: Path, view: mmap.mmap) -> None:
+    def __init__(self, path: Path, view: mmap.mmap | memoryview) -> None:
         self.path = path
         self.view = view
         self.unpacked = len(view)

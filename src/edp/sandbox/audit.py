@@ -24,6 +24,7 @@ _REFUSED = (
 """Events whose name begins so. Compiling and executing code is how libraries are imported, so it is not among them."""
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _OPENERS = {"open", "sqlite3.connect"}
+_IN_MEMORY = ":memory:"
 
 
 def restrict(readable: Iterable[Path]) -> None:
@@ -41,7 +42,7 @@ def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
             path = arguments[0]
             if event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING:
                 raise PermissionError(errno.EPERM, f"a reader of logs may not write files ({path!r})")
-            if isinstance(path, str | bytes | os.PathLike):
+            if isinstance(path, str | bytes | os.PathLike) and path != _IN_MEMORY:
                 real = [os.path.realpath(name) for name in _plain(os.fsdecode(path))]
                 if not any(name in places or name.startswith(below) for name in real):
                     raise PermissionError(errno.EPERM, f"a reader of logs may not read other files ({path!r})")
