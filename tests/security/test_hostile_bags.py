@@ -275,7 +275,7 @@ def test_a_packed_bag_is_unpacked_within_bounds(tmp_path, little_memory, zstd_bo
     with pytest.raises(DataError, match="a log is a regular file"):
         read_recording(folder)
     (folder / "metadata.yaml").write_text("a: " + "[" * (5 << 20))
-    with pytest.raises(DataError, match="is no regular file"):
+    with pytest.raises(DataError, match="a log is a regular file"):
         read_recording(folder)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from edp import limits
+from edp.cli import slow
 from edp.errors import DataError
 from edp.logs import FORMATS, WriteOptions, open_log, read_recording, write_recording
 from edp.logs.sandboxed import plain_map
@@ -438,6 +439,27 @@ def test_a_watcher_hears_of_slow_logs_only(hostile, impatient, monkeypatch):
     assert heard[0][0] == path
     assert heard[0][1] > 0.5
     assert heard[0][2] == path.stat().st_size
+
+
+def test_the_command_line_says_what_takes_long(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["edp", "inspect", "a.csv"])
+    try:
+        slow.tell_of_slow_logs()
+        heard = sandbox._watcher
+        for seconds in (5.1, 6.0, 9.0, 10.5, 15.0, 21.2):
+            heard(Path("day/a[/b]\x1b.mf4"), seconds, 1_200_000_000)
+        heard(Path("b.mf4"), 5.0, 3_000_000)
+        watch(None)
+        monkeypatch.setattr(sys, "argv", ["edp", "inspect", "a.csv", "--json"])
+        slow.tell_of_slow_logs()
+        assert sandbox._watcher is None
+    finally:
+        watch(None)
+    said = capsys.readouterr().err
+    assert "\x1b" not in said
+    assert [line.partition("(")[2] for line in said.splitlines()] == [
+        "5 s, 1.2 GB)", "10 s, 1.2 GB)", "21 s, 1.2 GB)", "5 s, 3 MB)"
+    ]  # fmt: skip
 
 
 def test_maps_pass_unchanged():

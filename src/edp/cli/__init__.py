@@ -31,6 +31,7 @@ from edp.cli import (
 )
 from edp.cli.console import run_app
 from edp.cli.ending import stop_on_request
+from edp.cli.slow import tell_of_slow_logs
 
 app = typer.Typer(
     name="edp",
@@ -81,4 +82,5 @@ def main() -> None:
     stop_on_request()
     if isinstance(sys.stdout, TextIOWrapper):  # a terminal that lacks a character gets its escape
         sys.stdout.reconfigure(errors="backslashreplace")
+    tell_of_slow_logs()
     sys.exit(run_app(app))

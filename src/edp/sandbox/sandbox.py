@@ -30,6 +30,8 @@ SMALL_BYTES = 4096
 """A request that any pipe takes at once."""
 SLOW_S = 5.0
 """After so long the watcher is told what is being read."""
+TOLD_S = 1
+"""At least so long between two words to the watcher."""
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _ONE_ALLOCATOR = {"ARROW_DEFAULT_MEMORY_POOL": "system"}
 """Arrow's own pool takes a gigabyte at once, which would have to be allowed to every file."""
@@ -45,7 +47,7 @@ _watcher: Watcher | None = None
 
 
 def watch(watcher: Watcher | None) -> None:
-    """Have a function called about once a second while a log takes longer than `SLOW_S`.
+    """Have a function called about once a second while a log is read that was opened more than `SLOW_S` ago.
 
     Args:
         watcher: takes the log, the seconds since it was opened, and its size in bytes; None for nobody.
@@ -238,6 +240,7 @@ class Channel:
         self.path = path
         self.size = 0
         self.started = time.monotonic()
+        self.told = 0.0
         self.answers = answers
         self.requests = requests
         self._ended = ended
@@ -306,10 +309,13 @@ class Channel:
             return
         poll = select.poll()
         poll.register(self.answers, select.POLLIN)
-        while not poll.poll(1000):
-            passed = time.monotonic() - self.started
-            if passed > SLOW_S:
-                watcher(self.path, passed, self.size)
+        came: list[tuple[int, int]] = []
+        while not came:
+            came = poll.poll(1000 * TOLD_S)
+            now = time.monotonic()
+            if now - self.started > SLOW_S and now - self.told >= TOLD_S:
+                self.told = now
+                watcher(self.path, now - self.started, self.size)
 
     def lost(self) -> DataError:
         """What to say about a process that ended."""

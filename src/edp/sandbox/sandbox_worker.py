@@ -8,7 +8,6 @@ fork and the process that asks. A fork is killed as soon as the other end of its
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import importlib
 import json
@@ -22,6 +21,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from edp.processes import die_with_parent
 from edp.sandbox.lockdown import note_libraries
 
 IDLE_S = 60.0
@@ -30,7 +30,6 @@ END_S = 5.0
 """Time for a process whose pipes are closed to end, before it is killed."""
 KEPT_CODES = 1024
 ORDER_BYTES = 1 << 16
-_PARENT_DEATH_SIGNAL = 1
 Serve = Callable[[int, int], None]
 """Serves one log by what it reads from one pipe and writes to another."""
 
@@ -175,18 +174,16 @@ def _serve(serve: Serve, pipes: tuple[int, int], inherited: list[int], worker: i
     """In the fork: serve one log and end, whatever happens."""
     code = 1
     try:
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, ctypes.c_ulong(signal.SIGKILL))
-        if os.getppid() == worker:
-            signal.set_wakeup_fd(-1)
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            for handle in inherited:
-                os.close(handle)
-            nothing = os.open(os.devnull, os.O_RDWR)
-            for handle in (0, 1, 2):
-                os.dup2(nothing, handle)
-            serve(*pipes)
-            code = 0
+        die_with_parent(worker)
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        for handle in inherited:
+            os.close(handle)
+        nothing = os.open(os.devnull, os.O_RDWR)
+        for handle in (0, 1, 2):
+            os.dup2(nothing, handle)
+        serve(*pipes)
+        code = 0
     except BaseException:
         traceback.print_exc()
     finally:

@@ -1,0 +1,35 @@
+"""What the command line says while a log takes long to read."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from edp.cli.console import err
+from edp.limits import readable
+from edp.sandbox import sandbox
+
+_AGAIN = 2.0
+"""Times as long until the next line: after 5, 10, 20, 40 s and so on."""
+
+
+class SlowLogs:
+    """Says on standard error which log is being read, how long it has taken, and how large it is."""
+
+    def __init__(self) -> None:
+        self.path: Path | None = None
+        self.next_s = 0.0
+
+    def __call__(self, path: Path, seconds: float, size: int) -> None:
+        """Say so, ever more seldom for one log."""
+        if path != self.path or seconds < self.next_s / _AGAIN:
+            self.path, self.next_s = path, 0.0
+        if seconds >= self.next_s:
+            err.print(f"reading '{path.name}' ({seconds:.0f} s, {readable(size)})")
+            self.next_s = _AGAIN * seconds
+
+
+def tell_of_slow_logs() -> None:
+    """Say what takes long, on a terminal, and wherever no program reads the output."""
+    if err.is_terminal or "--json" not in sys.argv:
+        sandbox.watch(SlowLogs())
