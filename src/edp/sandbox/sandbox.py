@@ -33,8 +33,8 @@ SLOW_S = 5.0
 TOLD_S = 1
 """At least so long between two words to the watcher."""
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-_ONE_ALLOCATOR = {"ARROW_DEFAULT_MEMORY_POOL": "system"}
-"""Arrow's own pool takes a gigabyte at once, which would have to be allowed to every file."""
+_SMALL_POOL = {"MIMALLOC_ARENA_RESERVE": "65536"}
+"""Arrow's pool takes a gigabyte at once unless told to take less (KiB), which would have to be allowed to every file."""
 _FORKS = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _END_S = 5.0
 _TRIES = 2
@@ -120,7 +120,7 @@ def _forget() -> None:
 
 def _environment() -> dict[str, str]:
     places = os.pathsep.join(place for place in sys.path if place)
-    return os.environ | dict.fromkeys(_THREADS, "1") | _ONE_ALLOCATOR | {"PYTHONPATH": places}
+    return os.environ | dict.fromkeys(_THREADS, "1") | _SMALL_POOL | {"PYTHONPATH": places}
 
 
 def _start(worker: str, arguments: Sequence[str], **pipes: Any) -> subprocess.Popen[bytes]:
