@@ -267,29 +267,6 @@ def test_low_memory_is_not_told_as_damage(hostile):
     assert done.stderr == ""
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX")
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_what_is_no_regular_file_is_refused_unopened(tmp_path, suffix):
-    pipe, link = tmp_path / f"pipe{suffix}", tmp_path / f"link{suffix}"
-    os.mkfifo(pipe)
-    link.symlink_to(pipe)
-    endless = tmp_path / f"zero{suffix}"
-    endless.symlink_to("/dev/zero")
-    for path in (pipe, link, endless):
-        with pytest.raises(DataError, match="a regular file"):
-            read_recording(path)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX")
-def test_a_bag_with_a_pipe_in_it_is_refused(tmp_path):
-    bag = tmp_path / "bag"
-    bag.mkdir()
-    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
-    os.mkfifo(bag / "a.db3")
-    with pytest.raises(DataError, match="a regular file"):
-        read_recording(bag)
-
-
 @linux
 def test_readers_end_with_whoever_asked(tmp_path):
     path = write_recording(recording(300_000), tmp_path / "a.parquet")

@@ -11,7 +11,8 @@ import pytest
 
 from edp import limits
 from edp.cli import slow
-from edp.logs import WriteOptions, write_recording
+from edp.errors import DataError
+from edp.logs import FORMATS, WriteOptions, read_recording, write_recording
 from edp.logs.sandboxed import plain_map
 from edp.logs.served import map_of
 from edp.recording import Recording
@@ -19,6 +20,8 @@ from edp.sandbox import sandbox, syscalls, watch
 from edp.sandbox.audit import hook
 from edp.sandbox.protocol import HEADER_BYTES, packed, receive
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
+
+SUFFIXES = [part.suffixes[0] for part in FORMATS.values()]
 
 
 def recording(samples):
@@ -161,3 +164,26 @@ def test_limits_grow_with_what_a_mat_file_holds(tmp_path, version):
     announced = [limit for limit in told if limit[1]]
     assert len(announced) == 2
     assert announced[1][0] - announced[0][0] > 8 * 9_000 * 12
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_no_regular_file_is_refused_unopened(tmp_path, suffix):
+    pipe, link = tmp_path / f"pipe{suffix}", tmp_path / f"link{suffix}"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    endless = tmp_path / f"zero{suffix}"
+    endless.symlink_to("/dev/zero")
+    for path in (pipe, link, endless):
+        with pytest.raises(DataError, match="a regular file"):
+            read_recording(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX")
+def test_a_bag_with_a_pipe_in_it_is_refused(tmp_path):
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    os.mkfifo(bag / "a.db3")
+    with pytest.raises(DataError, match="a regular file"):
+        read_recording(bag)
