@@ -34,7 +34,7 @@ TOLD_S = 1
 """At least so long between two words to the watcher."""
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _SMALL_POOL = {"MIMALLOC_ARENA_RESERVE": "65536"}
-"""Arrow's pool takes a gigabyte at once unless told to take less (KiB), which would have to be allowed to every file."""
+"""Arrow's pool takes a gigabyte at once unless told to take less (KiB); every file would have to be allowed that."""
 _FORKS = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _END_S = 5.0
 _TRIES = 2
