@@ -262,7 +262,7 @@ def test_students_of_other_backbones():
         (lambda m: student(ModelSpec(backbone=LstmSpec(units=8)), 4, levels=1), "has no convolutions"),
         (lambda m: DistillationSpec(truth=1.0), "truth = 1.0; 0 <= truth < 1"),
         (lambda m: DistillationSpec(hint=-1.0), "hint = -1.0"),
-        (lambda m: SoftmaxDivergence(temperature=0.0), "temperature = 0.0; temperature > 0"),
+        (lambda m: SoftmaxDivergence(temperature=0.0), "temperature = 0.0; 0 < temperature"),
         (lambda m: Distillation([]), "no teacher"),
     ],
 )

@@ -163,7 +163,7 @@ def test_later_rungs_that_are_the_same_step_count_once():
     ("change", "match"),
     [
         ({"rungs": (0.5, 0.25)}, r"rungs = \[0\.5, 0\.25\] \(shares between 0 and 1, each above"),
-        ({"rungs": (0.5, 1.0)}, "shares between 0 and 1"),
+        ({"rungs": (0.5, 1.0)}, r"rungs = \[0\.5, 1\.0\]; 0 < rungs < 1 must hold"),
         ({"rungs": ()}, r"pruner = 'median' with rungs = \[\] \(at least one rung"),
         ({"pruner": "mean"}, r"pruner = 'mean' \(none or median\)"),
         ({"cost": "parameters"}, "the rule knows one score"),

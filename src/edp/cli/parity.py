@@ -78,7 +78,7 @@ def _ask(bundle: Path) -> None:
     why = f"'{bundle}' is not the folder of a run of yours. {WHAT}"
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigError(f"{why}. Give --yes if you trust its source; nothing was run")
-    err.print(f"{why}.", markup=False)
+    err.print(f"{why}.")
     if not typer.confirm("Go on?", err=True):
         raise ConfigError("nothing was run")
 

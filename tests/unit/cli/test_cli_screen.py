@@ -187,7 +187,7 @@ def test_time_left_is_told_once_there_is_something_to_judge_it_by(monkeypatch):
         (["--targets", "sped"], "did you mean 'speed'"),
         (["--exclude", "levr"], "cannot exclude 'levr'"),
         (["--set", "max_lags=3"], "unknown key 'max_lags'; did you mean 'max_lag'"),
-        (["--set", "forest.trees=0"], "must be at least 1"),
+        (["--set", "forest.trees=0"], "1 <= trees <= 10,000 must hold"),
         (["--horizon", "200"], "beyond max_lag"),
         (["--set", "max_lag"], "write key.path=value"),
     ],

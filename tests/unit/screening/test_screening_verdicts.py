@@ -152,15 +152,15 @@ def test_bad_requests_are_named(sessions: list[Recording]) -> None:
     [
         ({"horizon": -1}, "horizon = -1"),
         ({"horizon": 70}, "beyond max_lag"),
-        ({"copy": 1.0}, "between 0 and 1"),
-        ({"pieces": 2}, "at least 4"),
-        ({"information_samples": 10}, "at least 100"),
+        ({"copy": 1.0}, "0 < copy < 1 must hold"),
+        ({"pieces": 2}, "4 <= pieces"),
+        ({"information_samples": 10}, "100 <= information_samples"),
     ],
 )
 def test_wrong_options_are_refused(wrong: dict, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         replace(SPEC, **wrong)
-    with pytest.raises(ConfigError, match=r"forest\.trees"):
+    with pytest.raises(ConfigError, match=r"screening\.forest: trees = 0"):
         ForestSpec(trees=0)
-    with pytest.raises(ConfigError, match=r"held_out <= 0\.8"):
+    with pytest.raises(ConfigError, match=r"0 < held_out <= 0\.8"):
         ForestSpec(held_out=0.9)
