@@ -26,7 +26,7 @@ def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, t
     assert mae[0] != mae[1]
     np.testing.assert_allclose(mae[0], mae[1], rtol=0.2)
     header = json.loads((whole / "bundle" / "bundle.json").read_text())
-    assert (header["schema"], header["number_format"]) == (3, "w8a16")
+    assert (header["schema"], header["number_format"]) == (6, "w8a16")
     assert load_bundle(whole).scores
     counts = [edp("footprint", run, "--json").json for run in (whole, trained)]
     assert counts[0] == counts[1]
