@@ -152,4 +152,4 @@ def test_the_elastic_window_is_a_decade_and_stays_in_the_space():
 
 def test_a_space_has_the_order_of_the_registry():
     shuffled = dict(reversed(list(THESIS.items())))
-    assert names(shuffled) == list(DIMENSIONS) == list(THESIS)
+    assert names(shuffled) == list(THESIS) == list(DIMENSIONS)[: len(THESIS)]

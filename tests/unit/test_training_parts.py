@@ -89,6 +89,12 @@ def test_parts_that_cannot_be_are_refused(tiny, tiny_model, one_epoch):
             fit_part(tiny, tiny_model, one_epoch, until)
     with pytest.raises(ConfigError, match="from update 10 to 10 of 40"):
         fit_part(tiny, tiny_model, one_epoch, 10, state)
-    for change in ({"epochs": 2}, {"refit": "best"}):
-        with pytest.raises(ConfigError, match="cannot be done in parts"):
-            fit_part(tiny, tiny_model, dataclasses.replace(one_epoch, **change), 10)
+    with pytest.raises(ConfigError, match="cannot be done in parts"):
+        fit_part(tiny, tiny_model, dataclasses.replace(one_epoch, refit="best"), 10)
+    several = dataclasses.replace(one_epoch, epochs=3)
+    _, state = fit_part(tiny, tiny_model, several, 1)
+    for until in (0, 3, 4):
+        with pytest.raises(ConfigError, match=f"from epoch 0 to {until} of 3"):
+            fit_part(tiny, tiny_model, several, until)
+    with pytest.raises(ConfigError, match="from epoch 1 to 1 of 3"):
+        fit_part(tiny, tiny_model, several, 1, state)

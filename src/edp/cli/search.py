@@ -52,7 +52,7 @@ def run(
     data: Annotated[Path, typer.Argument(help="A folder of logs, or a data-set file (.toml); each log is a session.")],
     study: Annotated[Path, typer.Option("--study", help="Folder of the study; goes on where it stopped.")],
     preset: Annotated[str, typer.Option(help="quick, standard or thesis: how much is trained.")] = "quick",
-    mode: Annotated[str | None, typer.Option(help="sound, or thesis: its tests and rules to the letter.")] = None,
+    mode: Annotated[str | None, typer.Option(help="sound, or thesis: its tests and rules.")] = None,
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset, with [search].")] = None,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting, for example search.trials=30 or model.window=40.")

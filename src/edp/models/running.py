@@ -1,4 +1,4 @@
-"""Run a predictor over whole recordings as a stream, several side by side."""
+"""Run a predictor over whole recordings, as a stream, several side by side, or window by window."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from edp.models.predictor import Predictor
 from edp.streaming import State
 
 Run = Callable[[Tensor, State], tuple[Tensor, State]]
-PIECE = 512  # ticks per call: long enough for speed, short enough for memory
+PIECE = 512  # ticks per call, or windows: long enough for speed, short enough for memory
 
 
 def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:
@@ -26,6 +26,14 @@ def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: in
         For each series float32 ``(time, horizon, target)`` in SI units: row t is the prediction made at t.
     """
     return _stream(predictor, predictor.predict, series, batch)
+
+
+def window_predictions(predictor: Predictor, series: Sequence[Series]) -> list[NDArray[np.float32]]:
+    """As `stream_predictions`, each prediction from reset over the window that ends at its tick (thesis 3.1.4).
+
+    W times the work of a stream. The first ticks, which have no whole window, have what there is of it.
+    """
+    return _windows(predictor, predictor.predict, series)
 
 
 def mean_error(predictor: Predictor, series: Sequence[Series]) -> float:
@@ -59,8 +67,17 @@ def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int 
     return _stream(predictor, predictor.intervals, series, batch)
 
 
-def stream_answers(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[Answer]:
-    """All that the network says at every tick, standardised, with a batch of one; double precision, on the CPU."""
+def stream_answers(
+    predictor: Predictor, series: Sequence[Series], batch: int = 16, windowed: bool = False
+) -> list[Answer]:
+    """All that the network says at every tick, standardised, with a batch of one; double precision, on the CPU.
+
+    Args:
+        predictor: the network.
+        series: each from reset.
+        batch: streams side by side.
+        windowed: each answer from reset over the window that ends at its tick, and not as a stream.
+    """
     form: list[Answer] = []
 
     def run(x: Tensor, state: State) -> tuple[Tensor, State]:
@@ -68,7 +85,8 @@ def stream_answers(predictor: Predictor, series: Sequence[Series], batch: int = 
         form[:] = [answer]
         return torch.cat([answer.center.unsqueeze(-2), answer.spread], dim=-2), new
 
-    values = [torch.from_numpy(found).double().unsqueeze(0) for found in _stream(predictor, run, series, batch)]
+    answers = _windows(predictor, run, series) if windowed else _stream(predictor, run, series, batch)
+    values = [torch.from_numpy(found).double().unsqueeze(0) for found in answers]
     levels, law = (form[0].levels, form[0].law) if form else ((), "")
     return [Answer(every[..., 0, :], every[..., 1:, :], levels, law) for every in values]
 
@@ -97,6 +115,31 @@ def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int
     finally:
         predictor.train(was_training)
     return [results[i] for i in range(len(series))]
+
+
+def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[NDArray[np.float32]]:
+    like, window = next(predictor.parameters()), predictor.spec.window
+    was_training = predictor.training
+    predictor.eval()
+
+    def answers(x: NDArray[np.float32]) -> NDArray[np.float32]:
+        tensor = torch.from_numpy(np.ascontiguousarray(x)).to(device=like.device, dtype=like.dtype)
+        found: NDArray[np.float32] = run(tensor, predictor.initial_state(len(x), like))[0].float().cpu().numpy()
+        return found
+
+    made = []
+    try:
+        with torch.inference_mode():
+            for part in series:
+                pieces = [answers(part.inputs[None, : window - 1])[0]] if window > 1 else []
+                ends = np.arange(window, part.samples + 1)
+                for at in range(0, len(ends), PIECE):
+                    rows = ends[at : at + PIECE, None] - window + np.arange(window)
+                    pieces.append(answers(part.inputs[rows])[:, -1])
+                made.append(np.concatenate(pieces)[: part.samples])
+    finally:
+        predictor.train(was_training)
+    return made
 
 
 def _run_group(predictor: Predictor, run: Run, group: list[Series]) -> list[NDArray[np.float32]]:

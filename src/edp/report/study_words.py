@@ -128,13 +128,13 @@ def caveats(study: StudyFacts) -> list[str]:
     updates, final = int(spec["updates"]), int(spec["final_updates"])
     horizon = _count(int(spec["horizon"]), "sample")
     made = [
-        f"Every comparison is between trainings of {whole(updates)} updates, judged {horizon} ahead. It shows which "
+        f"Every comparison is between trainings of {_length(spec, updates)}, judged {horizon} ahead. It shows which "
         "part learns more from so little: a part that pays only after long training is missed, and one that only "
         "speeds up the start is favoured.",
-        f"Only the last trainings are longer ({whole(final)} updates); they judge the whole network, not its single "
+        f"Only the last trainings are longer ({_length(spec, final)}); they judge the whole network, not its single "
         "modules."
         if final > updates
-        else f"The last trainings are no longer ({whole(final)} updates), so nothing is known of long ones.",
+        else f"The last trainings are no longer ({_length(spec, final)}), so nothing is known of long ones.",
         f"Sessions: {len(study.development)} that train and judge in turn, {len(study.test)} set apart. Intervals and "
         "p-values speak of sessions like these, not of another machine.",
         *_power(study),
@@ -146,11 +146,20 @@ def caveats(study: StudyFacts) -> list[str]:
     ]
     if study.mode == "thesis":
         made.append(
-            "This study follows the thesis's tests to the letter, to be compared with it. They take splits that share "
+            "This study follows the thesis's tests, to be compared with it. They take splits that share "
             "most of their training data as independent, and accept a module on any of four metrics, so they confirm "
             "useless modules more often than their level says; conclusions want the sound mode."
         )
     return made
+
+
+def _length(spec: Mapping[str, Any], updates: int) -> str:
+    """How long a training is, in words."""
+    epochs = int(spec.get("epochs", 1))
+    if epochs == 1:
+        return f"{whole(updates)} updates"
+    each = f"{whole(updates // epochs)} updates" if updates else "one pass over the data"
+    return f"at most {epochs} epochs of {each}"
 
 
 def _power(study: StudyFacts) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from edp.errors import StorageError
 from edp.ledger import Opening, Record, digest_of
 from edp.report import read_study
 from edp.search.ground import Decision, Ground, Outcome
-from edp.search.modules import MODULES
+from edp.search.modules import MODULES, title_of
 from edp.search.phases import PHASES
 from edp.search.trainings import Order
 from edp.storage import held_by, read_json, write_json
@@ -196,7 +196,7 @@ class Diary:
             "schema": SCHEMA,
             "state": self.state,
             **self.facts,
-            "modules": {name: module.title for name, module in MODULES.items()},
+            "modules": {name: title_of(name) for name in (*MODULES, *self.facts["spec"]["toggles"])},
             "decisions": [decision.to_json() for decision in self.decisions],
             "phases": list(self.phases.values()),
             "history": list(self.rows.values()),

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from edp.config import Table
 from edp.errors import ConfigError, DataError, closest
+from edp.search.modules import with_modules
 from edp.search.settings import SearchSpec
+from edp.search.space import WIDTHS, Candidate
 from edp.search.trainings import Order
 from edp.stats.folds import repeated_folds, repeated_splits
 
@@ -108,8 +110,18 @@ class Ground:
             return repeated_splits(sessions, max(1, round(sessions / folds)), runs, self.spec.seed)
         return repeated_folds(sessions, folds, -(-runs // folds), self.spec.seed)[:runs]
 
+    def shaped(self, settings: Table) -> Table:
+        """Settings with the widths that this search gives its networks."""
+        return WIDTHS[self.spec.widths](settings)
+
+    def network(self, settings: Table, names: Sequence[str] = (), options: Candidate | None = None) -> Table:
+        """Settings with modules and toggles added, and the widths of this search."""
+        return with_modules(settings, names, self.channels, options, self.shaped)
+
     def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[Order]:
         """An order for each run: the same folds and, for common random numbers, the same seeds for every arm.
+
+        Trainings of several epochs are validated by the sessions that judge them, as in the thesis.
 
         Args:
             settings: of the arm.
@@ -126,9 +138,16 @@ class Ground:
                 tuple(names[mask[run]].tolist()),
                 self.seed("run", run, seed),
                 self.spec.updates,
+                **self.several(tuple(names[mask[run]].tolist())),
             )
             for run in runs
         ]
+
+    def several(self, validation: tuple[str, ...]) -> dict[str, Any]:
+        """What an order of several epochs says beside; nothing of one epoch."""
+        if self.spec.epochs == 1:
+            return {}
+        return {"epochs": self.spec.epochs, "patience": self.spec.patience, "validation": validation}
 
     def seed(self, *parts: object) -> int:
         """A seed of its own for each purpose, from the root."""

@@ -29,6 +29,10 @@ def job_of(
     """
     settings = {**order.settings, "training": {**order.settings.get("training", {}), "threads": threads}}
     config: dict[str, Any] = {"settings": settings, "updates": order.updates}
+    sessions = {"train": list(order.train), "judged": list(order.judged)}
+    if order.epochs > 1:
+        config |= {"epochs": order.epochs, "patience": order.patience}
+        sessions["validation"] = list(order.validation)
     if order.until is not None:
         config["until"] = order.until
     if settings.get("model", {}).get("physics"):
@@ -37,9 +41,9 @@ def job_of(
     identity = Identity(
         f"{__name__}:train",
         config,
-        {"train": list(order.train), "judged": list(order.judged)},
+        sessions,
         order.seed,
-        1,
+        order.epochs,
         code_version(),
         data,
         _environment(threads),

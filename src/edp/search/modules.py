@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 from edp.blocks import BLOCKS, BlockSpec
 from edp.config import Experiment, Table, build, merged, plain_tree
 from edp.errors import ConfigError
+from edp.losses import Correlation
 from edp.models.heads import GluHead
 from edp.models.predictor import check_combination
 from edp.registry import Registry
@@ -27,15 +28,22 @@ class Module:
         block: a block that is appended to the baseline's; None for none.
         options: values worth searching where the module is on, by the place of the setting: keys joined by points, or
             the name of an option of the block.
+        alter: changes settings in place, where what changes depends on them; None for nothing.
     """
 
     title: str
     change: Mapping[str, Any] = field(default_factory=dict)
     block: Mapping[str, Any] | None = None
     options: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    alter: Callable[[Table], None] | None = None
 
 
 MODULES: Registry[Module] = Registry("module")
+TOGGLES: Registry[Module] = Registry("toggle")
+"""Parts of the training that thesis Table 4.6 lists among what phases 4 and 5 may switch on; no module of Table 4.5."""
+
+Shape: TypeAlias = Callable[[Table], Table]
+"""Gives settings the widths that follow from others (`edp.search.space.WIDTHS`)."""
 
 
 def _block(name: str, title: str, **fixed: Any) -> None:
@@ -66,16 +74,57 @@ _change("glu_head", "GLU Head", "head", {"kind": "glu"}, {"hidden": GluHead.spac
 _change("stanh", "STanh Activation", "activation", {"kind": "stanh"})
 
 
+def _correlation(settings: Table) -> None:
+    """The term with its own weight, unless the training has one."""
+    terms = settings["training"].get("terms", [])
+    if all(term["kind"] != "correlation" for term in terms):
+        settings["training"]["terms"] = [*terms, *plain_tree((Correlation(),), "terms")]
+
+
+def _focal(settings: Table) -> None:
+    """The loss, weighted by the size of the error; below the quadratic one no threshold of the Huber loss comes."""
+    loss = settings["training"]["loss"]
+    if loss["kind"] != "focal":
+        settings["training"]["loss"] = {"kind": "focal", "gamma": 2.0, "delta": loss.get("delta", NO_THRESHOLD)}
+
+
+NO_THRESHOLD = 1e6
+"""Standard deviations of the target: errors that do not occur, so that the focal form of the squared error results."""
+
+TOGGLES.register("swa")(Module("SWA", {"training": {"average": {"kind": "swa"}}}))
+TOGGLES.register("correlation_loss")(Module("Correlation Loss", alter=_correlation))
+TOGGLES.register("focal_loss")(Module("Focal Loss", alter=_focal))
+
+
+def part_of(name: str) -> Module:
+    """A module, or a toggle.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    return TOGGLES[name] if name in TOGGLES else MODULES[name]
+
+
+def title_of(name: str) -> str:
+    """What the thesis calls a module or a toggle."""
+    return part_of(name).title
+
+
 def with_modules(
-    settings: Table, names: Iterable[str], channels: Sequence[str] = (), options: Mapping[str, Value] | None = None
+    settings: Table,
+    names: Iterable[str],
+    channels: Sequence[str] = (),
+    options: Mapping[str, Value] | None = None,
+    shape: Shape | None = None,
 ) -> Table:
     """Settings with these modules added, in the order of the registry, so that equal sets give equal settings.
 
     Args:
         settings: a whole experiment as plain tables (`edp.config.plain_tree`).
-        names: registered modules.
+        names: registered modules and toggles.
         channels: of the recordings, for the feature set ``all``.
         options: values of `options_of` for some of the modules; those that a module has anyway change nothing.
+        shape: gives the result its widths, before the options.
 
     Raises:
         ConfigError: an unknown module or option, or modules that contradict one another or the network; every reason.
@@ -85,8 +134,10 @@ def with_modules(
     if reasons:
         raise ConfigError("modules: " + "; ".join(reasons))
     made = _added(settings, wanted)
+    if shape is not None:
+        made = shape(made)
     for name in (name for name in MODULES if name in wanted):
-        for key, option in _options(settings, name).items():
+        for key, option in _options(settings, name, shape).items():
             label = (options or {}).get(key, option.present)
             if label not in option.values:
                 raise ConfigError(f"modules: {key} = {label!r}; one of {list(option.values)} must hold")
@@ -95,20 +146,21 @@ def with_modules(
     return made
 
 
-def options_of(settings: Table, name: str) -> dict[str, Choice]:
+def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[str, Choice]:
     """What may be varied of a module where it is on, as dimensions ``module.option``.
 
     Args:
         settings: to which the module would be added; what it would have there is one of the values.
-        name: of the module.
+        name: of the module, or of a toggle, which has none.
+        shape: as in `with_modules`.
     """
-    found = {key: tuple(option.values) for key, option in _options(settings, name).items()}
+    found = {key: tuple(option.values) for key, option in _options(settings, name, shape).items()}
     return {key: Choice(values) for key, values in found.items() if len(values) > 1}
 
 
-def present_options(settings: Table, names: Iterable[str]) -> dict[str, Value]:
+def present_options(settings: Table, names: Iterable[str], shape: Shape | None = None) -> dict[str, Value]:
     """What these modules have of their options where nothing is chosen."""
-    return {key: option.present for name in names for key, option in _options(settings, name).items()}
+    return {key: option.present for name in names for key, option in _options(settings, name, shape).items()}
 
 
 @dataclass(frozen=True)
@@ -130,9 +182,11 @@ class _Option:
         held[self.keys[-1]] = list(value) if isinstance(value, tuple) else value
 
 
-def _options(settings: Table, name: str) -> dict[str, _Option]:
-    module, made = MODULES[name], {}
+def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str, _Option]:
+    module, made = part_of(name), {}
     plain = plain_tree(build(Experiment, _added(settings, {name}), f"with {name}"))
+    if shape is not None:
+        plain = shape(plain)
     for place, values in module.options.items():
         keys, held = tuple(place.split(".")), plain
         kind = None if module.block is None else str(module.block["kind"])
@@ -166,7 +220,7 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
         ConfigError: an unknown module.
     """
     wanted = set(names)
-    chosen = [(name, MODULES[name]) for name in sorted(wanted)]
+    chosen = [(name, part_of(name)) for name in sorted(wanted)]
     reasons = []
     for (one, first), (other, second) in combinations(chosen, 2):
         mine, theirs = dict(_leaves(first.change)), dict(_leaves(second.change))
@@ -198,13 +252,15 @@ def contradicting(settings: Table, names: Iterable[str], channels: Sequence[str]
 
 def _added(settings: Table, names: set[str]) -> Table:
     made = copy.deepcopy(settings)
-    for name, module in MODULES.items():
+    for name, module in (*MODULES.items(), *TOGGLES.items()):
         if name not in names:
             continue
         made = merged(made, copy.deepcopy(dict(module.change)))
         if module.block is not None and dict(module.block) not in made["model"]["blocks"]:
             held = [block for block in made["model"]["blocks"] if block["kind"] != module.block["kind"]]
             made["model"]["blocks"] = [*held, dict(module.block)]
+        if module.alter is not None:
+            module.alter(made)
     return made
 
 

@@ -25,7 +25,7 @@ from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, closest
 from edp.search.phases.isolation import DEFAULT_BACKBONE, arm_settings
 from edp.search.settings import SearchSpec
-from edp.search.space import DIMENSIONS, THESIS, Choice, Range, Real, Space, applicable, apply
+from edp.search.space import DIMENSIONS, THESIS, WIDTHS, Choice, Range, Real, Space, applicable, apply
 from edp.search.trainings import settings_of
 from edp.storage import parse_toml
 
@@ -113,23 +113,31 @@ def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
             )
     for backbone in spec.backbones:
         arm = arm_settings(settings, backbone, next(iter(spec.feature_sets.values())))
-        for name, range_ in applicable(spec.space, arm).items():
-            for value in range_.options if isinstance(range_, Choice) else (range_.low, range_.high):
-                try:
-                    build(Experiment, apply(arm, {name: value}), "of the search")
-                except (ConfigError, TypeError, ValueError) as error:
-                    raise ConfigError(f"{where}.space.{name} = {value!r} cannot be for {backbone}: {error}") from error
+        for key, space in (("space", applicable(spec.space, arm)), ("deferred", spec.deferred)):
+            _check_values(space, arm, f"{where}.{key}", backbone, spec.widths)
+
+
+def _check_values(space: Space, arm: Table, where: str, backbone: str, widths: str) -> None:
+    for name, range_ in space.items():
+        for value in range_.options if isinstance(range_, Choice) else (range_.low, range_.high):
+            try:
+                build(Experiment, WIDTHS[widths](apply(arm, {name: value})), "of the search")
+            except (ConfigError, KeyError, TypeError, ValueError) as error:
+                raise ConfigError(f"{where}.{name} = {value!r} cannot be for {backbone}: {error}") from error
 
 
 def _spec(table: Table, where: str) -> SearchSpec:
     space = space_of(table.pop("space", {}), THESIS, where)
+    deferred = space_of(table.pop("deferred", {}), None, where, "deferred")
     if not space:
         raise ConfigError(f"settings {where}: search.space holds no dimension; leave at least one in")
-    return replace(build(SearchSpec, table, f"{where}, search"), space=space)
+    return replace(build(SearchSpec, table, f"{where}, search"), space=space, deferred=deferred)
 
 
-def space_of(table: Mapping[str, Any], over: Space | None = None, where: str = "of a study") -> dict[str, Range]:
-    """A space from its form in a settings file, laid over another one.
+def space_of(
+    table: Mapping[str, Any], over: Space | None = None, where: str = "of a study", key: str = "space"
+) -> dict[str, Range]:
+    """A space from its form in a settings file, laid over another one; `key` is its name there.
 
     Raises:
         ConfigError: an unknown dimension, or a range that holds nothing.
@@ -137,11 +145,11 @@ def space_of(table: Mapping[str, Any], over: Space | None = None, where: str = "
     space = dict(over or {})
     for name, given in dict(table).items():
         if name not in DIMENSIONS:
-            raise ConfigError(f"settings {where}: unknown dimension 'search.space.{name}'{closest(name, DIMENSIONS)}")
+            raise ConfigError(f"settings {where}: unknown dimension 'search.{key}.{name}'{closest(name, DIMENSIONS)}")
         if given is False:
             space.pop(name, None)
         else:
-            space[name] = _range(given, f"{where}: search.space.{name}")
+            space[name] = _range(given, f"{where}: search.{key}.{name}")
     return space
 
 
@@ -162,7 +170,7 @@ def _range(given: Any, where: str) -> Range:
 def plain_spec(spec: SearchSpec) -> Table:
     """A spec as plain values."""
     made: Table = plain_tree(spec)
-    made["space"] = plain_space(spec.space)
+    made["space"], made["deferred"] = plain_space(spec.space), plain_space(spec.deferred)
     return made
 
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
-from edp.bounds import MOST_TICKS, MOST_UPDATES, SEED, above, between, check_bounds, shown, span, whole
+from edp.bounds import MOST_EPOCHS, MOST_TICKS, MOST_UPDATES, SEED, above, between, check_bounds, shown, span, whole
 from edp.config import FeatureSettings, plain_tree
 from edp.errors import ConfigError
-from edp.search.space import ELASTIC, THESIS, Space
+from edp.search.modules import TOGGLES
+from edp.search.space import ELASTIC, THESIS, WIDTHS, Space
 from edp.search.study import PRUNERS, SamplerSpec
 
 MODES = ("sound", "thesis")
@@ -24,10 +25,14 @@ class SearchSpec:
     """The settings of a search. The thesis's own numbers are those of the preset ``thesis``.
 
     Attributes:
-        mode: ``sound`` (docs/statistics.md) or ``thesis``, whose tests and rules are followed to the letter.
+        mode: ``sound`` (docs/statistics.md) or ``thesis``, whose tests and rules are followed (docs/thesis_preset.md).
         seed: root of folds, seeds of trainings and questions.
-        updates: training steps of every training but the final one.
-        final_updates: training steps of what is judged on the test sessions.
+        updates: training steps of every training but the final one, over all its epochs; 0 with several epochs makes
+            each of them one pass over the data.
+        final_updates: training steps of what is judged on the test sessions, likewise.
+        epochs: of every training, thesis: after each the sessions that judge validate it, the schedule takes notice,
+            and the best one counts. 1 is one long epoch that chooses nothing.
+        patience: epochs without a better validation before a training ends early; 0 never.
         horizon: at which scores are taken, one of the task's.
         test_share: share of the sessions that are set apart as test before anything else.
         test: names of the sessions to set apart, instead of a share that is drawn.
@@ -53,6 +58,10 @@ class SearchSpec:
         batch: questions that are asked before the first of them is answered.
         space: dimensions and ranges of phase 1.
         elastic: reach of the window around the baseline in later phases.
+        deferred: further dimensions of phases 4 and 5.
+        toggles: parts of the training that may be on or off in phases 4 and 5, beside the modules.
+        widths: ``equal``: every level has as many channels as units, and the head is left as it is; ``halved``: as in
+            the thesis (`edp.search.space.halved`).
         sampler: how questions are chosen.
         rungs: shares of the steps at which a question of phases 1, 4 and 5 is judged before its end; none without any.
         pruner: which questions end at a rung: ``none``, or ``median``: those worse than the median of the questions of
@@ -68,6 +77,8 @@ class SearchSpec:
     seed: int = 0
     updates: int = 400
     final_updates: int = 2000
+    epochs: int = 1
+    patience: int = 0
     horizon: int = 10
     test_share: float = 0.2
     test: tuple[str, ...] = ()
@@ -93,6 +104,9 @@ class SearchSpec:
     batch: int = 4
     space: Space = field(default_factory=lambda: dict(THESIS))
     elastic: dict[str, float] = field(default_factory=lambda: dict(ELASTIC))
+    deferred: Space = field(default_factory=dict)
+    toggles: tuple[str, ...] = ()
+    widths: str = "equal"
     sampler: SamplerSpec = field(default_factory=SamplerSpec)
     rungs: tuple[float, ...] = ()
     pruner: str = "none"
@@ -105,18 +119,25 @@ class SearchSpec:
             *("module_trials", "run_seeds", "joint_trials", "free_trials", "batch"),
         )
         bounds = dict.fromkeys(counts, whole(1, MOST_TRAININGS)) | {"seed": SEED, "horizon": whole(0, MOST_TICKS)}
-        bounds |= dict.fromkeys(("updates", "final_updates"), whole(1, MOST_UPDATES))
+        bounds |= {"epochs": whole(1, MOST_EPOCHS), "patience": whole(0, MOST_EPOCHS)}
+        check_bounds("search", self, epochs=bounds["epochs"])
+        steps = whole(1 if self.epochs == 1 else 0, MOST_UPDATES)  # 0: passes over the data
+        bounds |= dict.fromkeys(("updates", "final_updates"), steps)
         bounds |= dict.fromkeys(("folds", "variance_runs", "most_runs", "screening_runs"), whole(2, MOST_TRAININGS))
         bounds |= {"warm_rounds": whole(0, MOST_TRAININGS), "least_gain": span(0.0, 1.0)}
         bounds |= dict.fromkeys(("test_share", "least_effect", "power", "alpha"), between(0.0, 1.0))
         bounds |= {"rungs": between(0.0, 1.0)}
         check_bounds("search", self, **bounds)
-        wrong = []
+        wrong = self._wrong_epochs()
         if self.mode not in MODES:
             wrong.append(f"mode = '{self.mode}' ({' or '.join(MODES)})")
         if self.cost not in ("none", *COSTS):
             wrong.append(f"cost = '{self.cost}' (none, {' or '.join(COSTS)})")
         wrong += self._wrong_rungs()
+        if self.widths not in WIDTHS:
+            wrong.append(f"widths = '{self.widths}' ({' or '.join(WIDTHS)})")
+        wrong += [f"toggles = '{name}' ({', '.join(TOGGLES)})" for name in self.toggles if name not in TOGGLES]
+        wrong += [f"deferred.{name} (which is in the space)" for name in self.deferred if name in self.space]
         wrong += [f"limits.{name} ({' or '.join(COSTS)})" for name in self.limits if name not in COSTS]
         wrong += [f"limits.{name} = {most} (above 0)" for name, most in self.limits.items() if not LIMIT.holds(most)]
         wrong += [
@@ -147,9 +168,31 @@ class SearchSpec:
 
     @property
     def stops(self) -> tuple[int, ...]:
-        """The rungs as steps of a training; those that are the same step count once."""
-        steps = sorted({max(1, round(share * self.updates)) for share in self.rungs})
-        return tuple(step for step in steps if step < self.updates)
+        """The rungs as steps of a training, epochs where it has several; those that are the same one count once."""
+        steps = sorted({max(1, round(share * self.length)) for share in self.rungs})
+        return tuple(step for step in steps if step < self.length)
+
+    @property
+    def length(self) -> int:
+        """Of a training in what its rungs are counted in: epochs where it has several, else steps."""
+        return self.epochs if self.epochs > 1 else self.updates
+
+    def _wrong_epochs(self) -> list[str]:
+        wrong = []
+        for name in ("updates", "final_updates"):
+            if getattr(self, name) % self.epochs:
+                wrong.append(
+                    f"{name} = {getattr(self, name)} (a multiple of epochs = {self.epochs}, or 0: each epoch one pass "
+                    "over the data)"
+                )
+        if self.epochs > 1 and self.mode != "thesis":
+            wrong.append(
+                f"epochs = {self.epochs} with mode = '{self.mode}' (epochs = 1: the sessions that judge would choose "
+                "the best epoch, as only the thesis has it)"
+            )
+        if self.patience and self.epochs == 1:
+            wrong.append(f"patience = {self.patience} with epochs = {self.epochs} (0, or several epochs)")
+        return wrong
 
     def _wrong_rungs(self) -> list[str]:
         wrong = []

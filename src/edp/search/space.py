@@ -10,6 +10,9 @@ from typing import Any
 from edp.bounds import MOST_NAMES, check_bounds, check_count, span
 from edp.config import Table
 from edp.errors import ConfigError
+from edp.losses import Smoothness
+from edp.models.convolution import receptive_field
+from edp.models.heads import HEADS
 from edp.registry import Registry
 
 Value = float | int | str
@@ -40,12 +43,20 @@ class Real:
         """Whether a value lies in the range."""
         return isinstance(value, float | int) and self.low <= value <= self.high
 
-    def around(self, value: float, reach: float) -> Real:
-        """The part of the range within `reach` of a value: in decades where logarithmic (thesis 3.3.3)."""
+    def around(self, value: float, reach: float, beyond: bool = False) -> Real:
+        """What is within `reach` of a value: in decades where logarithmic (thesis 3.3.3).
+
+        Args:
+            value: the middle.
+            reach: to both sides.
+            beyond: whether it may leave the range, as in the thesis; what is not logarithmic then stays in [0, 1].
+        """
         if self.log:
             low, high = value / 10.0**reach, value * 10.0**reach
         else:
             low, high = value - reach, value + reach
+        if beyond:
+            return Real(low, high, self.log) if self.log else Real(max(0.0, low), min(1.0, high))
         return Real(max(self.low, low), min(self.high, high), self.log)
 
 
@@ -123,6 +134,43 @@ def _loss(settings: Table, value: str) -> None:
         settings["training"]["loss"] = {"kind": str(value)}
 
 
+SCHEDULES: dict[str, Table] = {
+    # Factor, patience and threshold of appendix B.1.1.
+    "plateau": {"kind": "plateau", "shrink": 0.5, "patience": 5, "threshold": 1e-4},
+    # Annealed to zero, as PyTorch's schedule does unless told otherwise; B.1.1 has no warm-up.
+    "cosine": {"kind": "cosine", "warmup": 0.0, "floor": 0.0},
+}
+"""The two schedules of thesis 3.2.4.2."""
+
+
+@DIMENSIONS.register("schedule")
+def _schedule(settings: Table, value: str) -> None:
+    if settings["training"]["schedule"]["kind"] != value:
+        settings["training"]["schedule"] = dict(SCHEDULES[value])
+
+
+@DIMENSIONS.register("patience")
+def _patience(settings: Table, value: int) -> None:
+    """Epochs that a plateau is waited for; another schedule has none."""
+    if settings["training"]["schedule"]["kind"] == "plateau":
+        settings["training"]["schedule"]["patience"] = int(value)
+
+
+@DIMENSIONS.register("smoothness")
+def _smoothness(settings: Table, value: float) -> None:
+    """Weight of the smoothness term; where it counts, windows are drawn in runs that have second differences."""
+    training = settings["training"]
+    training["terms"] = [term for term in training["terms"] if term["kind"] != "smoothness"]
+    if not value:
+        return
+    training["terms"].append({"kind": "smoothness", "weight": float(value)})
+    chunks = training["chunks"]
+    if chunks["regime"] == "window" and chunks.get("consecutive", 1) < Smoothness.span:
+        batch = int(chunks["batch"])
+        fitting = (size for size in range(Smoothness.span, batch + 1) if batch % size == 0)
+        chunks["consecutive"] = next(fitting, Smoothness.span)
+
+
 THESIS: Space = {
     "learning_rate": Real(1e-4, 5e-3, log=True),
     "weight_decay": Real(1e-5, 1e-2, log=True),
@@ -160,8 +208,40 @@ def applicable(space: Space, settings: Table) -> Space:
     return {name: held for name, held in space.items() if name != "kernel" or "kernel" in backbone}
 
 
-def elastic(space: Space, baseline: Candidate, reach: Mapping[str, float] = ELASTIC) -> Space:
+def halved(settings: Table) -> Table:
+    """Settings with the widths that the thesis's printed parameter counts have (Tables B.1, 4.8 and 4.9).
+
+    Channels start at C and halve from level to level. The hidden layers of a head are C / 2 wide where there is one of
+    them and C / 4 where there are more. A pure TCN gets as many levels as its receptive field needs for the window
+    (R >= W, thesis 3.2.3.2).
+    """
+    made = copy.deepcopy(settings)
+    backbone, head = made["model"]["backbone"], made["model"]["head"]
+    width = int(backbone.get("units", (backbone.get("channels") or [1])[0]))
+    if "channels" in backbone:
+        levels = len(backbone["channels"])
+        while backbone["kind"] == "tcn" and receptive_field(levels, backbone["kernel"]) < made["model"]["window"]:
+            if backbone["kernel"] < 2:
+                break  # which sees one sample, however many levels there are
+            levels += 1
+        backbone["channels"] = [max(1, width >> level) for level in range(levels)]
+    if hasattr(HEADS[head["kind"]], "hidden"):
+        head["hidden"] = max(1, width // (2 if head.get("layers", 1) == 1 else 4))
+    return made
+
+
+WIDTHS: dict[str, Callable[[Table], Table]] = {"equal": lambda settings: settings, "halved": halved}
+"""How widths follow from the hidden unit capacity: as they are, or as in the thesis."""
+
+
+def elastic(space: Space, baseline: Candidate, reach: Mapping[str, float] = ELASTIC, beyond: bool = False) -> Space:
     """The window around a baseline in which candidates of phase 2 are tuned; other dimensions stay as they are.
+
+    Args:
+        space: of phase 1.
+        baseline: its values.
+        reach: to both sides, by dimension.
+        beyond: whether the window may leave the space, as in thesis 3.3.3.
 
     Raises:
         ConfigError: the baseline lacks a value or has one outside the space.
@@ -172,7 +252,7 @@ def elastic(space: Space, baseline: Candidate, reach: Mapping[str, float] = ELAS
         if not isinstance(held, Real):
             continue
         check({name: held}, baseline)
-        window[name] = held.around(float(baseline[name]), share)
+        window[name] = held.around(float(baseline[name]), share, beyond)
     return window
 
 

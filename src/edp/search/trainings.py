@@ -10,15 +10,16 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
-from edp.bounds import MOST_UPDATES, SEED, check_bounds, whole
+from edp.bounds import MOST_EPOCHS, MOST_UPDATES, SEED, check_bounds, whole
 from edp.config import Experiment, Table, build, plain_tree
 from edp.data.prepared import Prepared, prepare
-from edp.data.splits import ByRecording
+from edp.data.splits import ByRecording, Split, Stretch
 from edp.errors import ConfigError, DataError
 from edp.evaluation.footprint import footprint
-from edp.evaluation.judge import JudgeSpec, judge
+from edp.evaluation.judge import JudgeSpec, judge, score_predictions
 from edp.evaluation.traced import check_counted
 from edp.models.predictor import build_model
+from edp.models.running import window_predictions
 from edp.recording import Recording
 from edp.sources import DataSource
 from edp.training.bundle import blank_scaler
@@ -35,12 +36,16 @@ class Order:
         settings: the whole experiment as plain tables; its split is not used.
         source: what `DataSource.to_plain` gave.
         train: names of the sessions that train.
-        judged: names of the sessions that judge; none of them trains or chooses anything.
+        judged: names of the sessions that judge; none of them trains, and with one epoch none chooses anything.
         seed: root of every random choice of the training.
-        updates: training steps; there is no early stop, so that no session that judges has a say.
-        until: the step after which this part of the training ends and is judged; None for the end. A part goes on to
-            the same bits as a training without a stop.
-        stops: steps at which earlier parts may have ended; they decide nothing, and are not part of a key.
+        updates: training steps over all epochs; 0 with several epochs makes each of them one pass over the data.
+        until: the step after which this part of the training ends and is judged, or with several epochs the epoch;
+            None for the end. A part goes on to the same bits as a training without a stop.
+        stops: where earlier parts may have ended; they decide nothing, and are not part of a key.
+        epochs: one for a training without an early stop, so that no session that judges has a say.
+        patience: epochs without a better validation score before an early stop; 0 never.
+        validation: names of the sessions that validate after each of several epochs; they may be those that judge, as
+            in the thesis, and do not train.
     """
 
     settings: Table
@@ -51,21 +56,39 @@ class Order:
     updates: int
     until: int | None = None
     stops: tuple[int, ...] = ()
+    epochs: int = 1
+    patience: int = 0
+    validation: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        both = sorted(set(self.train) & set(self.judged))
+        both = sorted(set(self.train) & {*self.judged, *self.validation})
         if both:
-            raise ConfigError(f"order: {', '.join(both)} would train and judge; each session must do one of the two")
+            raise ConfigError(f"order: {', '.join(both)} would train and judge or validate; each session must do one")
         if not self.train or not self.judged:
             raise ConfigError(
                 f"order: {len(self.train)} sessions train, {len(self.judged)} judge; at least one of each must hold"
             )
-        check_bounds("order", self, seed=SEED, updates=whole(1, MOST_UPDATES))
-        steps = [*self.stops, self.updates if self.until is None else self.until]
-        if steps[0] < 1 or any(a >= b for a, b in pairwise(steps)) or (self.until or 0) >= self.updates:
+        self._check_length()
+        length, what = (self.updates, "updates") if self.epochs == 1 else (self.epochs, "epochs")
+        steps = [*self.stops, length if self.until is None else self.until]
+        if steps[0] < 1 or any(a >= b for a, b in pairwise(steps)) or (self.until or 0) >= length:
             raise ConfigError(
-                f"order: stops {list(self.stops)} and an end at {self.until} of {self.updates} updates; steps from 1 "
+                f"order: stops {list(self.stops)} and an end at {self.until} of {length} {what}; steps from 1 "
                 "on, each after the one before and all before the last, must hold"
+            )
+
+    def _check_length(self) -> None:
+        check_bounds("order", self, seed=SEED, epochs=whole(1, MOST_EPOCHS), patience=whole(0, MOST_EPOCHS))
+        check_bounds("order", self, updates=whole(1 if self.epochs == 1 else 0, MOST_UPDATES))
+        if self.updates % self.epochs:
+            raise ConfigError(
+                f"order: updates = {self.updates} in {self.epochs} epochs; a multiple of them, or 0 for passes over "
+                "the data, must hold"
+            )
+        if (self.epochs > 1) != bool(self.validation):
+            raise ConfigError(
+                f"order: {self.epochs} epochs and {len(self.validation)} sessions that validate; several epochs need "
+                "some, and one has none"
             )
 
     @property
@@ -84,7 +107,13 @@ class Order:
             "updates": self.updates,
             "until": self.until,
             "stops": list(self.stops),
-        }
+        } | self.several()
+
+    def several(self) -> dict[str, Any]:
+        """What is said of a training of several epochs, plain; nothing of one epoch, whose keys stay what they were."""
+        if self.epochs == 1:
+            return {}
+        return {"epochs": self.epochs, "patience": self.patience, "validation": list(self.validation)}
 
     @staticmethod
     def from_json(plain: Mapping[str, Any]) -> Order:
@@ -98,6 +127,9 @@ class Order:
             plain["updates"],
             plain.get("until"),
             tuple(plain.get("stops", ())),
+            plain.get("epochs", 1),
+            plain.get("patience", 0),
+            tuple(plain.get("validation", ())),
         )
 
 
@@ -130,9 +162,14 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
     began = time.perf_counter()
     experiment = experiment_of(order)
     data = _prepared(order, experiment)
-    fitted, state = fit_part(data, experiment.model, experiment.training, order.until, start)
+    windowed = order.epochs > 1 and experiment.training.chunks.regime == "window"
+    fitted, state = fit_part(data, experiment.model, experiment.training, order.until, start, windowed)
     spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
-    found = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
+    if windowed:
+        skip = max(spec.skip or 0, experiment.model.window, data.task.features.starting_ticks)
+        found = score_predictions(window_predictions(fitted.predictor, data.test), data, skip)["recordings"]
+    else:
+        found = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
     sessions = {
         name: {k: {score: held["mean"][score] for score in SCORES} for k, held in horizons.items()}
         for name, horizons in found.items()
@@ -146,13 +183,26 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
         "train_loss": fitted.history[-1]["train_loss"],
         "seconds": round(time.perf_counter() - began, 3),
     }
+    if order.epochs > 1:
+        rows = fitted.history
+        result |= {"epochs": len(rows), "best_epoch": max((row["epoch"] for row in rows if row["best"]), default=0)}
     return result, state
 
 
 def experiment_of(order: Order) -> Experiment:
-    """The experiment that an order trains: one long epoch, so that schedules run to their end and nothing is chosen."""
+    """The experiment that an order trains.
+
+    With one long epoch schedules run to their end and nothing is chosen; with several, each is validated.
+    """
     made = build(Experiment, order.settings, "of a search")
-    training = replace(made.training, epochs=1, updates=order.updates, patience=0, refit="none", seed=order.seed)
+    training = replace(
+        made.training,
+        epochs=order.epochs,
+        updates=order.updates // order.epochs,
+        patience=order.patience,
+        refit="none",
+        seed=order.seed,
+    )
     return replace(made, training=training)
 
 
@@ -164,21 +214,40 @@ def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> di
 
 def _prepared(order: Order, experiment: Experiment) -> Prepared:
     recordings = {recording.name: recording for recording in _recordings(_frozen(order.source))}
-    missing = [name for name in (*order.train, *order.judged) if name not in recordings]
+    wanted = dict.fromkeys((*order.train, *order.validation, *order.judged))
+    missing = [name for name in wanted if name not in recordings]
     if missing:
         raise DataError(
             f"'{order.source['path']}' has no session {', '.join(missing)}; the data changed since the search began: "
             "restore them, or begin another search"
         )
-    chosen = [recordings[name] for name in (*order.train, *order.judged)]
-    # A training needs a part that validates; with one epoch it decides nothing, so it is one of those that train.
-    split = ByRecording(validation=order.train[:1], test=order.judged)
+    chosen = [recordings[name] for name in wanted]
     first = chosen[0]
     task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
     if len(order.train) == 1:
         raise DataError("a search needs two training sessions or more; give more recordings or fewer folds")
+    if order.validation:
+        data = prepare(chosen, task, _Named(order.train, order.validation, order.judged), experiment.model.window)
+        return data
+    # A training needs a part that validates; with one epoch it decides nothing, so it is one of those that train.
+    split = ByRecording(validation=order.train[:1], test=order.judged)
     data = prepare(chosen, task, split, experiment.model.window)
     return replace(data, train=[*data.validation, *data.train])
+
+
+@dataclass(frozen=True)
+class _Named:
+    """Whole sessions by name; those that validate may be those that judge, which `ByRecording` refuses."""
+
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+    judged: tuple[str, ...]
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Every session whole."""
+        whole = {recording.name: Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)}
+        parts = (self.train, self.validation, self.judged)
+        return Split(*(tuple(whole[name] for name in part) for part in parts))
 
 
 def _frozen(source: Mapping[str, Any]) -> str:

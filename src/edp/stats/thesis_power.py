@@ -1,4 +1,4 @@
-"""The thesis's power analysis, eq. 2.19 to 2.21 and 3.42 to the letter."""
+"""The thesis's power analysis, eq. 2.19 to 2.21 and 3.42."""
 
 from __future__ import annotations
 

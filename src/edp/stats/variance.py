@@ -32,7 +32,7 @@ class SplitVariance:
 
 
 def thesis_variance(scores: ArrayLike) -> SplitVariance:
-    """The thesis's eq. 2.17 and 2.18 to the letter.
+    """The thesis's eq. 2.17 and 2.18.
 
     The first holds a part of the seeds' variance too, and the second is a mean of standard deviations, biased low
     by c4(S): 0.886 with three seeds. `split_variance` has neither fault.

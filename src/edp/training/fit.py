@@ -83,7 +83,8 @@ class Loop:
     """One training: the net, its average, the optimiser, and where it stands.
 
     Where `refitted` holds the rows of an earlier training, all stretches train, for as many epochs as there are rows;
-    what the earlier one validated stands for what cannot be validated any more.
+    what the earlier one validated stands for what cannot be validated any more. With `windowed` what validates is
+    predicted from reset over each window, and not as a stream.
     """
 
     def __init__(
@@ -94,6 +95,7 @@ class Loop:
         run: tuple[RunFolder, str] | None,
         lesson: Lesson | None = None,
         refitted: list[dict[str, Any]] | None = None,
+        windowed: bool = False,
     ) -> None:
         self.data, self.spec, self.run, self.lesson, self.refitted = data, spec, run, lesson, refitted
         self.epochs = spec.epochs if refitted is None else len(refitted)
@@ -126,6 +128,7 @@ class Loop:
         self.average = {name: tensor.detach().clone() for name, tensor in self.net.named_parameters()}
         self.best = {name: tensor.clone() for name, tensor in self.average.items()}
         self.progress, self.within = Progress(), Within()
+        self.windowed = windowed
         self.objective = Objective(spec, self.net.code)
         self.updates = spec.updates or max(1, self.sampler.updates())
         if (
@@ -142,6 +145,11 @@ class Loop:
 
     def fit(self, on_event: Callable[[Event], None]) -> Fitted:
         self._resume()
+        self.go_on(on_event)
+        return self.finish()
+
+    def go_on(self, on_event: Callable[[Event], None]) -> None:
+        """Train to the last epoch, or until the early stop."""
         self.resumed_at, self.rate = self.progress.epoch, 0.0
         seen, busy = 0, 0.0
         while self.progress.epoch < self.epochs and not self._stalled():
@@ -151,6 +159,9 @@ class Loop:
             row = self._close_epoch(self.within.loss, time.perf_counter() - began)
             self.rate = seen / busy
             on_event(self._event(self.progress.epoch, self.updates, self.rate, time.perf_counter() - began, row))
+
+    def finish(self) -> Fitted:
+        """What a training gives whose last epoch was the latest; this one is over with it."""
         return self._fitted()
 
     def _fitted(self) -> Fitted:
@@ -348,7 +359,7 @@ class Loop:
         try:
             if isinstance(self.lesson, Episodic):
                 return self.lesson.judge(self.net, self.objective, self.data)
-            return validation_scores(self.net, self.data.validation, self.spec, self.data)
+            return validation_scores(self.net, self.data.validation, self.spec, self.data, self.windowed)
         finally:
             with torch.no_grad():
                 for name, parameter in self.net.named_parameters():

@@ -1,7 +1,11 @@
-"""A training of one epoch in parts: each goes on from what the one before left, to the same bits as without a stop."""
+"""A training in parts: each goes on from what the one before left, to the same bits as without a stop.
+
+One of a single epoch is parted at an update, one of several between two epochs.
+"""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -10,40 +14,46 @@ from torch import Tensor
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError
 from edp.models.predictor import ModelSpec
-from edp.training.checkpoint import optimizer_state, pack, unpack
+from edp.training.checkpoint import Progress, optimizer_state, pack, unpack
 from edp.training.fit import Loop, thread_count
 from edp.training.outcome import Fitted
+from edp.training.schedules import ScheduleState
 from edp.training.spec import TrainingSpec
 
 
 def fit_part(
-    data: Prepared, model: ModelSpec, spec: TrainingSpec, until: int | None = None, start: bytes | None = None
+    data: Prepared,
+    model: ModelSpec,
+    spec: TrainingSpec,
+    until: int | None = None,
+    start: bytes | None = None,
+    windowed: bool = False,
 ) -> tuple[Fitted, bytes | None]:
     """Train from the beginning, or from where a part ended, until an update or to the end.
 
     Args:
         data: prepared series.
         model: the network.
-        spec: how to train; of one epoch, without a refit.
-        until: the last update of this part; None for the end.
+        spec: how to train; without a refit.
+        until: the last update of this part where there is one epoch, else its last epoch; None for the end.
         start: what an earlier part of the same training left; None for the beginning.
+        windowed: whether what validates is predicted from reset over each window, and not as a stream.
 
     Returns:
-        What a training that ends there gives (its averaged weights, unless the start was better), and what the next
-        part goes on from; None at the end.
+        What a training that ends there gives (the averaged weights of one epoch, unless the start was better; of
+        several, those of the best epoch so far), and what the next part goes on from; None at the end.
 
     Raises:
-        ConfigError: several epochs or a refit, or an `until` that is not before the end or not after the start.
+        ConfigError: a refit, or an `until` that is not before the end or not after the start.
         DataError: a recording is shorter than the burn-in.
         Diverged: the loss is not finite any more.
     """
-    if spec.epochs != 1 or spec.refit != "none":
-        raise ConfigError(
-            f"a training of {spec.epochs} epochs with refit = '{spec.refit}' cannot be done in parts; epochs = 1 and "
-            "refit = 'none' must hold"
-        )
+    if spec.refit != "none":
+        raise ConfigError(f"a training with refit = '{spec.refit}' cannot be done in parts; refit = 'none' must hold")
     torch.set_num_threads(thread_count(spec))
-    loop = Loop(data, model, spec, None)
+    loop = Loop(data, model, spec, None, windowed=windowed)
+    if spec.epochs > 1:
+        return _epochs(loop, until, start)
     if start is not None:
         _restore(loop, unpack(start))
     if until is None:
@@ -56,6 +66,50 @@ def fit_part(
     loop.advance(until, lambda event: None)
     state = pack(_state(loop))
     return loop.pause(), state
+
+
+def _epochs(loop: Loop, until: int | None, start: bytes | None) -> tuple[Fitted, bytes | None]:
+    """A part of a training of several epochs; after an early stop later parts have nothing to do."""
+    if start is not None:
+        _restore_epochs(loop, unpack(start))
+    if until is None:
+        loop.go_on(lambda event: None)
+        return loop.finish(), None
+    if not loop.progress.epoch < until < loop.epochs:
+        raise ConfigError(
+            f"a part from epoch {loop.progress.epoch} to {until} of {loop.epochs}; it must end after its start and "
+            "before the end of the training"
+        )
+    loop.epochs = until  # of the loop only: schedules and averages count with the epochs of the spec
+    loop.go_on(lambda event: None)
+    state = pack(_state_of_epochs(loop))
+    return loop.finish(), state
+
+
+def _state_of_epochs(loop: Loop) -> dict[str, Any]:
+    """What later epochs depend on; every epoch seeds its own chances. No times: equal parts, equal bytes."""
+    progress = asdict(loop.progress) | {"seconds": 0.0}
+    progress["history"] = [row | {"seconds": 0.0} for row in progress["history"]]
+    return {
+        "progress": progress,
+        "current": dict(loop.net.named_parameters()),
+        "average": loop.average,
+        "best": loop.best,
+        "optimizer": loop.optimizer.state_dict(),
+        "running": loop.objective.running,
+    }
+
+
+def _restore_epochs(loop: Loop, held: dict[str, Any]) -> None:
+    progress = held["progress"]
+    loop.progress = Progress(**{**progress, "schedule": ScheduleState(**progress["schedule"])})
+    with torch.no_grad():
+        for name, parameter in loop.net.named_parameters():
+            parameter.copy_(held["current"][name])
+            loop.average[name].copy_(held["average"][name])
+            loop.best[name].copy_(held["best"][name])
+        loop.objective.running.copy_(held["running"])
+    loop.optimizer.load_state_dict(optimizer_state(held["optimizer"]))
 
 
 def _state(loop: Loop) -> dict[str, Any]:

@@ -19,16 +19,16 @@ from edp.training.spec import TrainingSpec
 
 
 def validation_scores(
-    net: Predictor, series: Sequence[Series], spec: TrainingSpec, data: Prepared
+    net: Predictor, series: Sequence[Series], spec: TrainingSpec, data: Prepared, windowed: bool = False
 ) -> tuple[float, float, float]:
     """Mean absolute error in standard deviations, in report units, and the loss, streamed over `series`.
 
-    The loss is the main one, without weights and terms.
+    The loss is the main one, without weights and terms. With `windowed` every prediction is from reset over its window.
     """
     scale = net.code.width.detach().cpu().double()
     factors = torch.tensor([KINDS[kind].report_factor for kind in data.target_kinds], dtype=torch.float64)
     absolute, count, loss = torch.zeros_like(scale), 0, 0.0
-    for answer, target in _answers(net, series, spec):
+    for answer, target in _answers(net, series, spec, windowed):
         absolute += (answer.center - target).abs().sum(dim=(0, 1))
         count += target.shape[1]
         loss += float(spec.loss.evaluate(answer, target).mean(dim=(-1, -2)).sum())
@@ -48,10 +48,12 @@ def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> N
     net.output.calibrate(answer, torch.cat([target for _, target in pairs], dim=1))
 
 
-def _answers(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> Iterator[tuple[Answer, Tensor]]:
+def _answers(
+    net: Predictor, series: Sequence[Series], spec: TrainingSpec, windowed: bool = False
+) -> Iterator[tuple[Answer, Tensor]]:
     """What the network says of each series after start-up, and the standardised targets; batches of one."""
     skip = spec.chunks.burn_in if spec.chunks.regime == "chunk" else net.spec.window - 1
-    for part, said in zip(series, stream_answers(net, series), strict=True):
+    for part, said in zip(series, stream_answers(net, series, windowed=windowed), strict=True):
         target = standard_targets(net, part)[:, skip:]
         ticks = slice(skip, skip + target.shape[1])
         yield replace(said, center=said.center[:, ticks], spread=said.spread[:, ticks]), target

@@ -185,7 +185,7 @@ def possible(ground: Ground, space: Space, arm: Table) -> tuple[Space, list[str]
         if not isinstance(held, Choice):
             kept[name] = held
             continue
-        fit = tuple(value for value in held.options if _costs(apply(arm, {name: value}), ground))
+        fit = tuple(value for value in held.options if _costs(ground.shaped(apply(arm, {name: value})), ground))
         out = [str(value) for value in held.options if value not in fit]
         if len(fit) > 1:
             kept[name] = Choice(fit)
@@ -224,7 +224,7 @@ def said_of_pruned(ground: Ground, answers: Sequence[Answer]) -> list[str]:
     pruned = [answer for answer in answers if answer.pruned]
     if not pruned:
         return []
-    saved = sum(1.0 - max(answer.rungs) / ground.spec.updates for answer in pruned)
+    saved = sum(1.0 - max(answer.rungs) / ground.spec.length for answer in pruned)
     share = saved / max(1, sum(bool(answer.outcomes) for answer in answers))
     return [
         f"{len(pruned)} of {len(answers)} questions were ended at a rung as worse than the median there, which spared "

@@ -113,7 +113,7 @@ def _quest(ground: Ground, backbone: str, arm: Table, space: Space) -> Quest:
     for _ in range(spec.warm_rounds):
         for size in sizes.options if isinstance(sizes, Choice) else ():
             study.suggest({"units": size})
-    return Quest(study, lambda trial: apply(arm, trial.values), spec.trials)
+    return Quest(study, lambda trial: ground.shaped(apply(arm, trial.values)), spec.trials)
 
 
 def _final(ground: Ground, backbones: list[str], outcomes: Sequence[Outcome]) -> dict[str, Any]:

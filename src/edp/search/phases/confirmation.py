@@ -10,7 +10,7 @@ import numpy as np
 
 from edp.config import Table
 from edp.search.ground import Array, Decision, Ground, Outcome
-from edp.search.modules import MODULES, with_modules
+from edp.search.modules import MODULES
 from edp.search.phases.base import PHASES, Course
 from edp.search.phases.screening import baseline_of
 from edp.stats.checks import Mask
@@ -42,7 +42,7 @@ class Confirmation:
             yield from ()
             return Decision("confirmation", {"confirmed": [], "evidence": []}, ("No module passed the screening.",))
         base = baseline_of(ground)[0]
-        arms = [base, *(with_modules(base, [name], ground.channels) for name in passed)]
+        arms = [base, *(ground.network(base, [name]) for name in passed)]
         return (yield from (_thesis if ground.spec.mode == "thesis" else _sound)(ground, passed, arms))
 
 

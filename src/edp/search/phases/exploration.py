@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from edp.search.ground import Decision, Ground, Outcome
-from edp.search.modules import MODULES, fitting, options_of
+from edp.search.modules import fitting, options_of, title_of
 from edp.search.phases.base import PHASES, Course, changed
 from edp.search.phases.joint import ask_together, winner_of
 from edp.search.phases.screening import baseline_of
@@ -32,9 +32,10 @@ class Exploration:
         free = fitting(base, ground.channels)
         earlier = ground.decided["synthesis"].facts
         starts = [(earlier["values"], earlier["modules"])]
-        options = {name: options_of(base, name) for name in free}
-        answers = yield from ask_together(ground, "exploration", free, spec.free_trials, starts, options)
-        facts = winner_of(ground, "exploration", free, answers)
+        options = {name: options_of(base, name, ground.shaped) for name in free}
+        switches = [*free, *spec.toggles]
+        answers = yield from ask_together(ground, "exploration", switches, spec.free_trials, starts, options)
+        facts = winner_of(ground, "exploration", switches, answers)
         facts["options"] = {key: list(held.options) for own in options.values() for key, held in own.items()}
         runs = fresh_runs(ground)
         arms = (earlier["settings"], facts["settings"])
@@ -53,7 +54,7 @@ class Exploration:
         fresh = [float(own[mask[:, seen]].mean()) for own in filled]
         found = changed(test, fresh[0])
         better = found["change"] < 0 and found["p"] < ground.spec.alpha
-        names = ", ".join(MODULES[name].title for name in facts["modules"]) or "no module"
+        names = ", ".join(map(title_of, facts["modules"])) or "no module"
         facts |= {
             **found,
             "fresh": {"synthesis": fresh[0], "exploration": fresh[1]},

@@ -64,7 +64,9 @@ class Isolation:
             for backbone, features in self.arms(ground)
             for seed in range(spec.variance_seeds)
             for order in ground.orders(
-                arm_settings(ground.base, backbone, spec.feature_sets[features]), range(spec.variance_runs), seed=seed
+                ground.shaped(arm_settings(ground.base, backbone, spec.feature_sets[features])),
+                range(spec.variance_runs),
+                seed=seed,
             )
         ]
         return self.decide(ground, outcomes)
@@ -82,8 +84,10 @@ class Isolation:
                 "by_run": by_run.tolist(),
                 "mae": _plain(estimate(np.nanmean(mae, axis=2).T)),
             }
+        # Table 4.3 compares feature sets by their mean absolute error.
+        what, judging = ("MAE", errors) if spec.mode == "thesis" else ("composite score", tables)
         means = {
-            features: float(np.mean([np.nanmean(t) for (_, f), t in zip(arms, tables, strict=True) if f == features]))
+            features: float(np.mean([np.nanmean(t) for (_, f), t in zip(arms, judging, strict=True) if f == features]))
             for features in spec.feature_sets
         }
         chosen = min(means, key=lambda name: means[name])
@@ -92,7 +96,7 @@ class Isolation:
         facts["backbones"] = lowest_against_others(own, _judged(ground)[0])
         facts["variance"] = _proxy(ground, tables, arms)
         sentences = [
-            f"Feature set {chosen} goes on: mean composite score "
+            f"Feature set {chosen} goes on: mean {what} "
             + ", ".join(f"{name} {value:.3g}" for name, value in means.items())
             + f" {ground.unit} over all backbones."
         ]

@@ -8,7 +8,7 @@ from typing import Any
 from edp.config import Table
 from edp.errors import DataError
 from edp.search.ground import Ground, Outcome
-from edp.search.modules import contradicting, present_options, with_modules
+from edp.search.modules import contradicting, present_options
 from edp.search.phases.base import Answer, Quest, answer_all, best, mean_of, new_study, said_of_pruned
 from edp.search.phases.screening import baseline_of
 from edp.search.space import Candidate, Choice, Real, Space, apply
@@ -27,26 +27,30 @@ def ask_together(
     starts: Sequence[tuple[Candidate, Sequence[str]]],
     options: Mapping[str, Mapping[str, Choice]] | None = None,
 ) -> Asked:
-    """Questions about modules on or off and rates inside the window, with warm starts first.
+    """Questions about modules on or off, rates inside the window and what was deferred, with warm starts first.
 
     Args:
         ground: with the baseline of phase 1.
         name: of the phase.
-        modules: that may be on.
+        modules: and toggles that may be on.
         trials: how many questions, the warm starts among them.
         starts: values and modules to begin with.
         options: what is varied of a module where it is on.
     """
     base, _, window = baseline_of(ground)
-    study = new_study(ground, name, window, modules, contradicting(base, modules, ground.channels))
+    space = {**window, **ground.spec.deferred}
+    study = new_study(ground, name, space, modules, contradicting(base, modules, ground.channels))
     study.options = options or {}
     for values, flags in starts[:trials]:
-        study.suggest(_inside(window, values), flags, present_options(base, flags) if options else None)
+        present = present_options(base, flags, ground.shaped) if options else None
+        study.suggest(_inside(space, values), flags, present)
 
     def settings(trial: Trial) -> Table:
-        return with_modules(apply(base, trial.values), trial.flags, ground.channels, trial.options)
+        return ground.network(apply(base, trial.values), trial.flags, trial.options)
 
-    (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)], ground.spec.stops)
+    # The thesis prunes in phase 1 only (3.3.2).
+    stops = () if ground.spec.mode == "thesis" else ground.spec.stops
+    (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)], stops)
     return answers
 
 
@@ -91,6 +95,6 @@ def _inside(window: Space, values: Candidate) -> dict[str, Any]:
     """Values of the window's dimensions, brought into it."""
     made: dict[str, Any] = {}
     for name, held in window.items():
-        if name in values and isinstance(held, Real):
-            made[name] = min(max(float(values[name]), held.low), held.high)
+        if name in values:
+            made[name] = min(max(float(values[name]), held.low), held.high) if isinstance(held, Real) else values[name]
     return made

@@ -10,7 +10,7 @@ import numpy as np
 
 from edp.config import Table
 from edp.search.ground import Decision, Ground, Outcome
-from edp.search.modules import MODULES, contradicting, fitting, with_modules
+from edp.search.modules import MODULES, contradicting, fitting
 from edp.search.phases.base import PHASES, Answer, Course, Quest, answer_all, new_study
 from edp.search.space import Candidate, Choice, Space, apply, elastic, names
 from edp.stats.factorial import Factorial, two_level_design
@@ -38,7 +38,8 @@ def baseline_of(ground: Ground) -> tuple[Table, Candidate, Space]:
     """Settings of the baseline, its values, and the window around them in which candidates are tuned."""
     facts = ground.decided["calibration"].facts
     space = {name: held for name, held in ground.spec.space.items() if name in ground.spec.elastic}
-    return facts["settings"], facts["baseline"], elastic(space, facts["baseline"], ground.spec.elastic)
+    beyond = ground.spec.mode == "thesis"
+    return facts["settings"], facts["baseline"], elastic(space, facts["baseline"], ground.spec.elastic, beyond)
 
 
 def _sound(ground: Ground) -> Course:
@@ -53,7 +54,7 @@ def _sound(ground: Ground) -> Course:
         for row, levels in enumerate(design.levels):
             values = drawn[repeat * len(design.levels) + row]
             chosen = [name for name, on in zip(free, levels, strict=True) if on]
-            settings = with_modules(apply(base, values), chosen, ground.channels)
+            settings = ground.network(apply(base, values), chosen)
             orders += ground.orders(settings, [repeat])
             rows.append((levels, values, repeat))
     outcomes = yield orders
@@ -122,7 +123,7 @@ def _thesis(ground: Ground) -> Course:
 
 
 def _quest(ground: Ground, base: Table, module: str, window: Space) -> Quest:
-    settings = with_modules(base, [module], ground.channels)
+    settings = ground.network(base, [module])
     study = new_study(ground, f"screening {module}", window)
     return Quest(study, lambda trial: apply(settings, trial.values), ground.spec.module_trials)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from edp.config import Table
 from edp.search.ground import Decision, Ground, Outcome
-from edp.search.modules import MODULES
+from edp.search.modules import title_of
 from edp.search.phases.base import PHASES, Course, changed
 from edp.search.phases.joint import ask_together, winner_of
 from edp.search.phases.screening import baseline_of
@@ -29,10 +29,13 @@ class Synthesis:
     def run(self, ground: Ground) -> Course:
         """Tune modules and rates together; then train the best and the baseline at length and judge both once."""
         confirmed = list(ground.decided["confirmation"].facts["confirmed"])
+        switches = [*confirmed, *ground.spec.toggles]
         base, values, _ = baseline_of(ground)
         starts = [(values, confirmed), (values, [])] if confirmed else [(values, [])]
-        answers = yield from ask_together(ground, "synthesis", confirmed, ground.spec.joint_trials, starts)
-        facts = winner_of(ground, "synthesis", confirmed, answers)
+        if ground.spec.mode == "thesis":  # whose phase 4 has no warm start (3.3.5)
+            starts = []
+        answers = yield from ask_together(ground, "synthesis", switches, ground.spec.joint_trials, starts)
+        facts = winner_of(ground, "synthesis", switches, answers)
         arms = {"synthesis": facts["settings"], "baseline": base}
         outcomes = yield [order for settings in arms.values() for order in final_orders(ground, settings)]
         facts["test"] = judged(ground, list(arms), outcomes)
@@ -42,11 +45,11 @@ class Synthesis:
     def decide(self, ground: Ground, confirmed: Sequence[str], facts: dict[str, Any]) -> Decision:
         """What stays, what works against the others, and what the test sessions say."""
         facts["antagonistic"] = [name for name in confirmed if name not in facts["modules"]]
-        names = ", ".join(MODULES[name].title for name in facts["modules"]) or "no module"
+        names = ", ".join(map(title_of, facts["modules"])) or "no module"
         sentences = [f"Best together: {names}; {facts['score']:.3g} {ground.unit} on development sessions."]
         sentences += facts["said_of_pruned"]
         if facts["antagonistic"]:
-            left = ", ".join(MODULES[name].title for name in facts["antagonistic"])
+            left = ", ".join(map(title_of, facts["antagonistic"]))
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
         test = facts["test"]
         ours, base = (_shown(test[arm]["composite"], ground.unit) for arm in ("synthesis", "baseline"))
@@ -60,15 +63,24 @@ class Synthesis:
 
 
 def final_orders(ground: Ground, settings: Table) -> list[Order]:
-    """Trainings on all development sessions at full length, judged on the test sessions; an order a seed."""
+    """Trainings on all development sessions at full length, judged on the test sessions; an order a seed.
+
+    Several epochs are validated by the development sessions that judge the first run, which then do not train: the test
+    sessions have no say.
+    """
+    train, validation = ground.development, ()
+    if ground.spec.epochs > 1:
+        first = ground.orders(settings, [0])[0]
+        train, validation = first.train, first.judged
     return [
         Order(
             settings,
             ground.source,
-            ground.development,
+            train,
             ground.test,
             ground.seed("final", seed),
             ground.spec.final_updates,
+            **ground.several(validation),
         )
         for seed in range(ground.spec.run_seeds)
     ]
