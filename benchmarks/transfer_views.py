@@ -103,7 +103,8 @@ def verdicts_of(
     # Each beginning against itself: a better one lowers both errors, and says nothing of what few minutes bring.
     for begun, own in (("M22's network", curves), ("network of many machines", foundation)):
         if own:
-            least, whole = min(rows[few]["mae"] for rows in own.values() if few in rows), own[OURS][minutes_of_all]["mae"]
+            least = min(rows[few]["mae"] for rows in own.values() if few in rows)
+            whole = own[OURS][minutes_of_all]["mae"]
             yield verdict(f"{begun}: best with {few} min over all logs", least, whole, "<= 1.1", "mm/s", quick)
     if foundation:
         zero = foundation[NONE][0]["mae"]

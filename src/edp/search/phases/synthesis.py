@@ -68,7 +68,8 @@ def final_orders(ground: Ground, settings: Table) -> list[Order]:
     Several epochs are validated by the development sessions that judge the first run, which then do not train: the test
     sessions have no say.
     """
-    train, validation = ground.development, ()
+    train = ground.development
+    validation: tuple[str, ...] = ()
     if ground.spec.epochs > 1:
         first = ground.orders(settings, [0])[0]
         train, validation = first.train, first.judged

@@ -94,7 +94,7 @@ def test_the_thesis_mode_has_its_own_figures(thesis, tmp_path):
     assert all(view.low is None and view.p is None for view in shown["screening"].effects)
     spec = figures_of(page_of(thesis))["confirmation"]
     assert {trace["meta"]["phase"] for trace in spec["figure"]["data"]} == set(shown) - {"screening"}
-    assert any("to the letter" in line for line in caveats(facts))
+    assert any("follows the thesis's tests" in line for line in caveats(facts))
     tests = sheets(facts)["tests"]
     assert len(tests.rows) == len(decision["facts"]["evidence"])
 
