@@ -27,9 +27,9 @@ import controller_memory
 import program_bytes
 from common import Verdict, finish, parser, table, verdict
 from edp.compress import FORMATS
+from edp.compress.planning import WAYS
 from edp.config import Experiment, load_experiment
 from edp.downsizing import Found, Judged, SearchSpec, search
-from edp.downsizing.plan import WAYS
 from edp.downsizing.quantise import quantise
 from edp.evaluation.controller import Budget
 from edp.training import load_bundle

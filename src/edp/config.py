@@ -19,7 +19,8 @@ from edp.bounds import shown
 from edp.data.augment import AUGMENTATIONS
 from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS, Derived, FeatureSet
-from edp.data.splits import SPLITS, ByRecording, SplitSpec
+from edp.data.frozen import SPLITS
+from edp.data.splits import ByRecording, SplitSpec
 from edp.data.task import TargetMode, Task, check_ends
 from edp.errors import ConfigError, closest
 from edp.evaluation.judge import JudgeSpec

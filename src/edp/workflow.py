@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from edp.config import (
     plain_tree,
 )
 from edp.data.coverage import Coverage, cover
+from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
 from edp.data.prepared import Prepared, prepare
 from edp.data.spectrum import LAGS
 from edp.data.splits import SPLITS
@@ -67,9 +68,20 @@ def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") ->
     return cover(recordings, inputs, None if chosen is None else chosen.split(recordings, LAGS))
 
 
-def prepare_data(source: DataSource, experiment: Experiment) -> Prepared:
-    """Read and cut a data set for an experiment."""
+def prepare_data(source: DataSource, experiment: Experiment, frozen: Mapping[str, str] | None = None) -> Prepared:
+    """Read and cut a data set for an experiment.
+
+    Args:
+        source: where the recordings are.
+        experiment: the settings.
+        frozen: names of sessions by digest that must not be among them, unless the split keeps them frozen.
+
+    Raises:
+        EdpError: recordings or settings that cannot be used, or a frozen session that would train.
+    """
     recordings = source.read()
+    others = {key: name for key, name in (frozen or {}).items() if key not in frozen_of(experiment.split)}
+    refuse_frozen(recordings, others, "would be divided into training and test part")
     first = recordings[0]
     task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
     check_combination(task, experiment.model)
@@ -84,10 +96,12 @@ class Teaching:
     Attributes:
         facts: plain values that decide what is taught; they are part of the run's key and provenance.
         lesson: makes the lesson for the prepared data.
+        frozen: names by digest of sessions that stay frozen for what comes of the run, beside those of its split.
     """
 
     facts: Mapping[str, Any]
     lesson: Callable[[Prepared], Lesson]
+    frozen: Mapping[str, str] = field(default_factory=dict)
 
 
 def train(
@@ -117,7 +131,8 @@ def train(
     if experiment.model.physics is not None:  # an unknown machine is told before recordings are read
         settings["machine"] = experiment.model.physics.digest()
     taught = {} if teaching is None else {"lesson": dict(teaching.facts)}
-    data = data or prepare_data(source, experiment)
+    frozen = {} if teaching is None else teaching.frozen
+    data = data or prepare_data(source, experiment, frozen)
     key = run_key(settings | taught, data.digest)
     with RunFolder(out) as run:
         run.claim(key, experiment_toml(experiment))
@@ -128,11 +143,11 @@ def train(
             fitted = fit(data, experiment.model, experiment.training, (run, key), on_event, lesson)
         except Diverged as end:
             if end.fitted is not None:
-                provenance = _provenance(source, experiment, data, end.fitted.seconds) | taught
+                provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen) | taught
                 _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
             run.write_status("diverged", message=str(end), **end.facts)
             raise
-        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds) | taught, data)
+        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, frozen) | taught, data)
         run.write_status("finished")
     return bundle
 
@@ -159,8 +174,11 @@ def _refuse_diverged(run: RunFolder) -> None:
         )
 
 
-def _provenance(source: DataSource, experiment: Experiment, data: Prepared, seconds: float) -> dict[str, Any]:
+def _provenance(
+    source: DataSource, experiment: Experiment, data: Prepared, seconds: float, frozen: Mapping[str, str]
+) -> dict[str, Any]:
     rate = data.task.rate_hz
+    sealed = {**frozen, **frozen_of(experiment.split)}
 
     def part(series: Sequence[Any]) -> dict[str, Any]:
         hours = sum(entry.samples for entry in series) / rate / 3600
@@ -183,6 +201,7 @@ def _provenance(source: DataSource, experiment: Experiment, data: Prepared, seco
             "validation": part(data.validation),
             "test": part(data.test),
             "digest": data.digest,
+            **({"frozen": sealed} if sealed else {}),
         },
     }
 
@@ -238,7 +257,7 @@ def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepa
     provenance = read_provenance(folder)
     experiment = load_experiment(folder / "config.toml", preset=None)
     torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
-    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment)
+    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment, frozen_before(provenance))
     if data.digest != provenance["data"]["digest"]:
         raise DataError(
             f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -88,8 +90,17 @@ def tiny_training() -> TrainingSpec:
 @pytest.fixture(scope="session")
 def lever_sessions(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
     """Five logs of a speed that follows a lever, on disk, for parts that read recordings themselves."""
-    folder = tmp_path_factory.mktemp("sessions")
-    for number in range(5):
+    return write_sessions(tmp_path_factory.mktemp("sessions"), 5)
+
+
+@pytest.fixture(scope="session")
+def six_sessions(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
+    """Six logs of the same kind: for a search with both lock-boxes."""
+    return write_sessions(tmp_path_factory.mktemp("six"), 6)
+
+
+def write_sessions(folder: Path, count: int) -> DataSource:
+    for number in range(count):
         rng = np.random.default_rng(number)
         lever = np.repeat(rng.normal(size=20), 15)
         speed = np.zeros(300)

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 from edp.blocks import AttentionBridge, TemporalDifference
 from edp.cli import app
 from edp.compress import taken
+from edp.compress.planning import make_plan
 from edp.config import load_experiment
 from edp.downsizing import SearchSpec, Watchers, search, searching
-from edp.downsizing.plan import make_plan
 from edp.errors import ConfigError, StorageError
 from edp.evaluation.controller import Budget
 from edp.export.c.sizes import constant_bytes

@@ -9,11 +9,13 @@ import pytest
 
 from edp.config import load_experiment, plain_tree
 from edp.errors import ConfigError, DataError
+from edp.evaluation.controller import Budget
 from edp.search.conduct import conduct
 from edp.search.ground import Ground, Outcome, set_apart
 from edp.search.modules import MODULES
 from edp.search.phases import PHASES
-from edp.search.settings import SearchSpec
+from edp.search.settings import CompressionSpec, SearchSpec
+from edp.search.smaller import Recipe
 from edp.search.space import Choice, Real
 from edp.search.study import SamplerSpec
 from edp.search.trainings import SCORES, settings_of
@@ -33,7 +35,7 @@ SPEC = SearchSpec(
 
 def ground(spec=SPEC):
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
-    return Ground(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:])
+    return Ground(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:])
 
 
 class World:
@@ -62,7 +64,26 @@ class World:
             name: {"10": dict.fromkeys(SCORES, score + 0.1 * int(name[1:]) / 12 + self.noise * rng.normal())}
             for name in order.judged
         }
-        return Outcome(order, "done", {"sessions": sessions})
+        more = {} if order.recipe is None else smaller_outcome(order, score)
+        return Outcome(order, "done", {"sessions": sessions, **more})
+
+
+def smaller_outcome(order, score):
+    """What phase 6 is told of a network: wider ones are better, and all but the teacher fit."""
+    recipe = Recipe.from_json(order.recipe)
+    width = recipe.units or order.settings["model"]["backbone"]["units"]
+    formats = {}
+    for name in [recipe.final] if recipe.final else recipe.formats:
+        if recipe.rounded and name != "w8a16":
+            continue
+        mae = score * (1 + 1 / width) * (1.0 if name == "float32" else 1.02)
+        size = 400 * width if name == "float32" else 100 * width
+        taken = {"parameters": 100 * width, "macs_tick": 100 * width, "macs_window": 900 * width}
+        taken |= {"cycles": [900 * width] * 3, "parameter_bytes": size, "ram_bytes": size, "flash_bytes": size}
+        over = {"cycles": [900 * width, 1]} if recipe.units is None else {}
+        formats[name] = {"scores": {"10": {"mae": mae, "composite": mae}}, "taken": taken, "over": over}
+    plain = {"10": {"mae": score * (1 + 1 / width), "composite": score}}
+    return {"formats": formats, "plain": plain, "left_out": {}}
 
 
 def by_rate(settings):
@@ -216,14 +237,17 @@ def test_the_thesis_mode_uses_its_own_estimates():
 def test_sessions_set_apart_are_spread_over_families_and_drawn_by_the_root():
     families = {name: "dig" if number % 3 else "grading" for number, name in enumerate(SESSIONS)}
     spec = dataclasses.replace(SPEC, test_share=0.25)
-    development, test = set_apart(SESSIONS, families, spec)
+    development, test, second = set_apart(SESSIONS, families, spec)
     assert len(test) == 3
+    assert len(second) == 1
     assert {families[name] for name in test} == {"dig", "grading"}
-    assert sorted(development + test) == list(SESSIONS)
-    assert set_apart(SESSIONS, families, spec) == (development, test)
+    assert sorted(development + test + second) == list(SESSIONS)
+    assert set_apart(SESSIONS, families, spec) == (development, test, second)
+    without = set_apart(SESSIONS, families, dataclasses.replace(spec, compression=CompressionSpec(on=False)))
+    assert without == (tuple(name for name in SESSIONS if name not in test), test, ())
     others = {set_apart(SESSIONS, families, dataclasses.replace(spec, seed=seed))[1] for seed in range(6)}
     assert len(others) > 1
-    with pytest.raises(DataError, match="2 are left for 3 folds"):
+    with pytest.raises(DataError, match="1 are left for 3 folds"):
         set_apart(SESSIONS[:3], {}, spec)
 
 
@@ -338,9 +362,9 @@ def test_without_a_survivor_nothing_is_trained():
 def test_the_synthesis_opens_the_test_sessions_once_and_only_there(sound):
     found, world = sound
     orders = [json.loads(key) for key in world.done]
-    opened = [order for order in orders if set(order["judged"]) & set(SESSIONS[9:])]
+    opened = [order for order in orders if set(order["judged"]) & set(SESSIONS[9:11])]
     assert len(opened) == 2 * CONFIRMED.run_seeds
-    assert all(order["judged"] == list(SESSIONS[9:]) and order["train"] == list(SESSIONS[:9]) for order in opened)
+    assert all(order["judged"] == list(SESSIONS[9:11]) and order["train"] == list(SESSIONS[:9]) for order in opened)
     assert {order["updates"] for order in opened} == {CONFIRMED.final_updates}
     assert not any(set(order["train"]) & set(SESSIONS[9:]) for order in orders)
     facts = found.decided["synthesis"].facts
@@ -395,3 +419,64 @@ def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
 
 def test_module_names_are_those_of_the_registry(sound):
     assert set(sound[0].decided["screening"].facts["registered"]) == set(MODULES)
+
+
+def test_phase_6_compares_on_development_sessions_and_opens_the_second_lock_box_for_two(sound):
+    found, world = sound
+    orders = [json.loads(key) for key in world.done]
+    made = [order for order in orders if "recipe" in order]
+    sealed = [order for order in made if set(order["judged"]) & set(SESSIONS[11:])]
+    assert [order["recipe"]["final"] for order in made[-2:]] == ["float32", sealed[-1]["recipe"]["final"]]
+    assert sealed == made[-2:]
+    ground = found
+    for order in made:
+        assert order["train"] == list(ground.training)
+        assert order["updates"] == CONFIRMED.final_updates
+        assert order["settings"] == found.decided["exploration"].facts["teacher_settings"]
+    assert all(order["judged"] == list(ground.validation) for order in made[:-2])
+    assert not any(set(order["judged"]) & set(SESSIONS[11:]) for order in orders if order not in sealed)
+    facts = found.decided["compression"].facts
+    assert facts["chosen"] is not None
+    row = facts["rows"][facts["chosen"]]
+    assert row["error"] == min(one["error"] for one in facts["rows"] if not one["over"])
+    assert facts["box"]["error"] > 0
+    assert len(made) <= PHASES["compression"].trainings(found)
+
+
+def test_phase_6_can_be_left_out_and_a_budget_that_nothing_meets_ends_in_a_sentence(sound):
+    before = dataclasses.replace(
+        sound[0], decided={name: held for name, held in sound[0].decided.items() if name != "compression"}
+    )
+    off = dataclasses.replace(CONFIRMED, compression=CompressionSpec(on=False))
+    world = World(with_effects)
+    found = conduct(dataclasses.replace(before, spec=off), world, phases=["compression"])
+    assert (world.trained, found.decided["compression"].facts["on"]) == (0, False)
+    assert PHASES["compression"].trainings(dataclasses.replace(before, spec=off)) == 0
+    tight = dataclasses.replace(CONFIRMED, compression=CompressionSpec(budget=Budget(name="none", cycles=10)))
+    found = conduct(dataclasses.replace(before, spec=tight), world, phases=["compression"])
+    assert world.trained == 1
+    assert "budget 'none': cycles = 10 can be met by no width" in found.decided["compression"].sentences[0]
+    assert found.decided["compression"].facts["chosen"] is None
+
+
+def test_phase_6_whose_teacher_fails_opens_nothing(sound):
+    world = World(lambda settings: None)
+    found = conduct(sound[0], world, phases=["compression"])
+    assert world.trained == 1
+    assert "did not end well (the loss is nan)" in found.decided["compression"].sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"units": (0,)}, "units"),
+        ({"shares": ()}, "shares"),
+        ({"shares": (2.0,)}, "shares"),
+        ({"formats": ("w8a61",)}, "did you mean 'w8a16'"),
+        ({"updates": -1}, "updates = -1"),
+        ({"units": (10**9,)}, "units"),
+    ],
+)
+def test_settings_of_phase_6_out_of_range_are_refused(change, match):
+    with pytest.raises(ConfigError, match=match):
+        CompressionSpec(**change)

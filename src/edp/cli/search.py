@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,6 +59,9 @@ def run(
         list[str], typer.Option("--set", help="One setting, for example search.trials=30 or model.window=40.")
     ] = [],  # noqa: B006
     phase: Annotated[str | None, typer.Option(help="The last phase to run now; all, where not given.")] = None,
+    budget: Annotated[
+        Path | None, typer.Option(help="Limits of the controller (TOML) for phase 6; by default those of the thesis.")
+    ] = None,
     workers: Annotated[int, typer.Option(help="Trainings side by side; 0: as many as cores.")] = 0,
     cluster: Annotated[str, typer.Option(help="Address of a Ray cluster that trains instead, or auto.")] = "",
     threads: Annotated[int, typer.Option(help="Of each training; another number is another training.")] = 1,
@@ -79,6 +83,7 @@ def run(
     from edp.search.runner import Crew, Watchers, run_search
 
     changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
+    changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
     crew = Crew(workers=workers, threads=threads, seconds=seconds, memory_mb=memory, cluster=cluster)
     source = source_of(data, signal_map, repair)
@@ -199,6 +204,7 @@ def _facts(found: Found) -> dict[str, Any]:
         "digest": found.digest,
         "decisions": [decision.to_json() for decision in found.ground.decided.values()],
         "teacher": None if found.teacher is None else str(found.teacher),
+        "networks": {name: str(folder) for name, folder in found.networks.items()},
     }
 
 
@@ -207,8 +213,22 @@ def _show(found: Found, data: Path, page: Path) -> None:
     out.print(f"report: {page}")
     if found.teacher is None:
         out.print("next: the same command without --phase, or with a later one")
-    else:
-        out.print(f"next: edp train {data} --config {found.teacher} --out runs/teacher")
+        return
+    if found.networks:
+        out.print(f"next: {_deploying(found)}")
+    out.print(
+        f"{'or' if found.networks else 'next'}: edp train {data} --config {found.teacher} --out runs/teacher (frozen "
+        "sessions stay frozen)"
+    )
+
+
+def _deploying(found: Found) -> str:
+    """The command that goes on with the network that phase 6 chose."""
+    facts = found.ground.decided["compression"].facts
+    run = found.networks.get("chosen", found.networks.get("teacher"))
+    if facts["rows"][facts["chosen"]]["format"] == "w8a16":
+        return f"edp quantise {run} --out {found.folder / 'w8a16'}"
+    return f"edp export {run} --to c --out firmware/predictor"
 
 
 def _show_status(held: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from edp.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, whole
 from edp.compress import DistillationSpec, Order, RoundingSpec, unlabelled
 from edp.config import Experiment, load_experiment, plain_tree
+from edp.data.frozen import frozen_before, frozen_of, keep_frozen, refuse_frozen
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.errors import ConfigError, StorageError
@@ -79,14 +80,15 @@ def distil(
     if model == teacher.spec:
         raise ConfigError(f"a student of {spec.units} units is the teacher itself; take fewer units or levels")
     teachers = [teacher, *(load_bundle(path).predictor for path in spec.teachers)]
-    series, digests = _unlabelled(teacher, spec.further)
+    frozen = frozen_sessions(run, experiment)
+    series, digests = _unlabelled(teacher, spec.further, frozen)
     facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
 
     def lesson(data: Prepared) -> Lesson:
         return order.lesson(teachers, data, None, series)
 
     made = replace(experiment, model=model)
-    return train(source or own, made, out, on_event, Teaching(facts, lesson))
+    return train(source or own, made, out, on_event, Teaching(facts, lesson, frozen))
 
 
 def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, Experiment, DataSource]:
@@ -95,9 +97,7 @@ def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, E
     Raises:
         EdpError: not a run folder.
     """
-    folder = Path(run)
-    if (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file():
-        folder = folder.parent
+    folder = _run_folder(run)
     bundle = load_bundle(folder)
     for name in ("config.toml", "provenance.json"):
         if not (folder / name).is_file():
@@ -106,14 +106,25 @@ def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, E
                 "folder of edp train"
             )
     experiment = load_experiment(folder / "config.toml", None, changes)
-    if (
-        experiment.task != load_experiment(folder / "config.toml", None).task
-        or experiment.model != bundle.predictor.spec
-    ):
+    before = load_experiment(folder / "config.toml", None)
+    if experiment.task != before.task or experiment.model != bundle.predictor.spec:
         raise ConfigError(
             "settings of the task or the model cannot be changed here: a student has those of its teacher"
         )
+    keep_frozen(before.split, experiment.split)
     return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder)["data"]["reader"])
+
+
+def frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:
+    """Names by digest of the sessions that stay frozen for what comes of a run: of its split and of runs before it."""
+    return frozen_before(read_provenance(_run_folder(run))) | frozen_of(experiment.split)
+
+
+def _run_folder(run: str | Path) -> Path:
+    """The folder of a run, or of the run that a bundle lies in."""
+    folder = Path(run)
+    inside = (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file()
+    return folder.parent if inside else folder
 
 
 def order_facts(order: Order) -> dict[str, Any]:
@@ -135,6 +146,9 @@ def _loss(spec: DistillationSpec) -> Any:
     return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}
 
 
-def _unlabelled(teacher: Predictor, source: DataSource | None) -> tuple[list[Series], list[str]]:
+def _unlabelled(
+    teacher: Predictor, source: DataSource | None, frozen: dict[str, str]
+) -> tuple[list[Series], list[str]]:
     recordings = [] if source is None else source.read()
+    refuse_frozen(recordings, frozen, "the student would learn from it")
     return [unlabelled(teacher.task, entry) for entry in recordings], [entry.digest for entry in recordings]

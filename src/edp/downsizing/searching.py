@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from edp.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, whole
 from edp.compress import FORMATS, VARIANTS, Bench, Candidate, Deployed, Order, deploy, width_of
+from edp.compress.judged import Found, Judged, choose, deployed_row, measure, on_validation, relative
+from edp.compress.planning import WAYS, Plan, make_plan
 from edp.config import Experiment, experiment_toml, plain_tree
+from edp.data.frozen import SECOND_BOX, ByFrozen
 from edp.data.prepared import Prepared
-from edp.downsizing.distil import order_facts, read_run
-from edp.downsizing.judged import Found, Judged, choose, deployed_row, measure, on_validation, relative
-from edp.downsizing.plan import WAYS, Plan, make_plan
+from edp.downsizing.distil import frozen_sessions, order_facts, read_run
 from edp.errors import ExportError
 from edp.evaluation.controller import Budget
 from edp.ledger import Ledger
@@ -41,7 +42,7 @@ class SearchSpec:
         budget: what the controller grants.
         units: widths; none given, they are planned from the budget.
         formats: number formats; none given, all.
-        ways: how each width is made, some of `edp.downsizing.plan.WAYS`.
+        ways: how each width is made, some of `edp.compress.planning.WAYS`.
         thesis: also make the variants of Table 4.9 that are narrower than the teacher.
         again: open the lock-box again for another choice, which weakens what it can show; it is recorded.
         changes: settings of the trainings that differ from the run's, as ``key.path=value``.
@@ -95,6 +96,7 @@ class DiskBench(Bench):
         watchers: Watchers,
     ) -> None:
         super().__init__(teacher, data, experiment.training)
+        self.frozen: Mapping[str, str] = {}
         self.experiment, self.source, self.folder, self.watchers = experiment, source, folder, watchers
         self.done, self.count = 0, 0
 
@@ -116,7 +118,7 @@ class DiskBench(Bench):
         model, training = order.model(self.teacher.spec), order.training(self.training)
         made = replace(self.experiment, model=model, training=training)
         tell = self.watchers.on_training
-        teaching = Teaching(facts, lesson)
+        teaching = Teaching(facts, lesson, self.frozen)
         return train(
             self.source, made, run, lambda event: tell(order.name, done, self.count, event), teaching, self.data
         ).predictor
@@ -132,7 +134,8 @@ def search(
     """Make smaller networks of a run, judge them in their formats, and choose the best that fits a budget.
 
     Choices rest on the validation part. The test part is opened once, for the chosen network and the teacher; that is
-    recorded in the folder. The same call goes on after a stop, and trains nothing twice.
+    recorded in the folder. For a run of a model search it is the second lock-box of the search, and the look is
+    recorded in its ledger, too. The same call goes on after a stop, and trains nothing twice.
 
     Args:
         run: run folder of the teacher.
@@ -150,20 +153,59 @@ def search(
     told = watchers or Watchers()
     for note in plan.notes:
         told.on_note(note)
-    data = prepare_data(source or own, experiment)
+    frozen = frozen_sessions(run, experiment)
+    data = prepare_data(source or own, experiment, frozen)
+    box = _box_of(source or own, experiment, data)
     settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
     with RunFolder(out) as folder:
         folder.claim(key, experiment_toml(experiment))
         bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), told)
-        court = _Court(bench, spec.budget, Path(run))
+        bench.frozen = frozen
+        court = _Court(bench, spec.budget, Path(run), box.data)
         rows, notes = _rows(bench, court, plan, spec)
         front, chosen = choose(rows)
         found = Found(court.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
         if found.best is not None:
-            found = replace(found, box=_open_box(found, court, folder, spec.again))
-        write_json(folder.file(RESULT), _plain(found, spec, data, _seen(Path(run), source, own)))
+            found = replace(found, box=_open_box(found, court, folder, box, spec.again))
+        seen = box.seen(found.box.get("openings", ())) or _seen(Path(run), source, own, box)
+        write_json(folder.file(RESULT), _plain(found, spec, data, seen, len(box.data.test)))
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """The recordings that are looked at once.
+
+    Attributes:
+        data: they are its test part.
+        name: of the lock-box.
+        study: folder of the model search that set it apart and records each look; None where none did, or it is gone.
+        known: whether a model search judged on it already.
+    """
+
+    data: Prepared
+    name: str = BOX
+    study: Path | None = None
+    known: bool = False
+
+    def seen(self, openings: Sequence[Mapping[str, Any]]) -> bool:
+        """Whether other networks were judged on it before these."""
+        return self.known or len(openings) > 1
+
+
+def _box_of(source: DataSource, experiment: Experiment, data: Prepared) -> _Box:
+    """The second lock-box of the model search that a run comes from, else the test part."""
+    split = experiment.split
+    if not isinstance(split, ByFrozen):
+        return _Box(data)
+    there = {recording.digest for recording in source.read()}
+    if not any(session.digest in there for session in split.second):
+        return _Box(data, known=any(session.digest in there for session in split.test))
+    study = Path(split.study)
+    recorded = split.study and (study / "study.json").is_file() and (study / "ledger" / "about.json").is_file()
+    opened = prepare_data(source, replace(experiment, split=split.opened()))
+    return _Box(opened, SECOND_BOX, study if recorded else None)
 
 
 def _rows(bench: DiskBench, court: _Court, plan: Plan, spec: SearchSpec) -> tuple[list[Judged], list[str]]:
@@ -200,10 +242,10 @@ def _variants(bench: Bench) -> list[str]:
 
 
 class _Court:
-    """Judges networks on the validation part, and at the end two on the test part."""
+    """Judges networks on the validation part, and at the end two on the lock-box: the test part of `box`."""
 
-    def __init__(self, bench: DiskBench, budget: Budget, run: Path) -> None:
-        self.bench, self.budget = bench, budget
+    def __init__(self, bench: DiskBench, budget: Budget, run: Path, box: Prepared) -> None:
+        self.bench, self.budget, self.box = bench, budget, box
         self.data, self.skip = on_validation(bench.data), bench.teacher.spec.window
         self.deployed: dict[str, tuple[Deployed, Predictor]] = {}
         self._float: dict[int, dict[str, dict[str, float]]] = {}
@@ -229,8 +271,8 @@ class _Court:
         return relative(self._plain(network), self.teacher.scores)
 
     def on_box(self, row: Judged) -> dict[str, dict[str, float]]:
-        """Scores on the test part."""
-        return measure(self.deployed[row.name][0], self.bench.data, self.skip)
+        """Scores on the lock-box."""
+        return measure(self.deployed[row.name][0], self.box, self.skip)
 
     def key(self, row: Judged) -> str:
         """What is judged: weights and format."""
@@ -253,32 +295,36 @@ class _Court:
         return deployed_row(name, order, made, (scores, before), self.budget, str(run))
 
 
-def _open_box(found: Found, court: _Court, folder: RunFolder, again: bool) -> dict[str, Any]:
-    """Judge teacher and chosen on the test part, once; the look is recorded before it is taken."""
+def _open_box(found: Found, court: _Court, folder: RunFolder, box: _Box, again: bool) -> dict[str, Any]:
+    """Judge teacher and chosen on the lock-box, once; the look is recorded before it is taken."""
     pair = {"teacher": found.teacher, "chosen": found.best}
     keys = [court.key(row) for row in pair.values() if row is not None]
-    with Ledger(folder.file("ledger")) as ledger:
-        opening = ledger.open_box(BOX, keys, "the network chosen by edp compress, and its teacher", again)
-        openings = [asdict(one) for one in ledger.openings(BOX)]
+    why = "the network chosen by edp compress, and its teacher"
+    ledgers = [folder.file("ledger")] if box.study is None else [box.study / "ledger", folder.file("ledger")]
+    openings: list[dict[str, Any]] = []
+    for place in ledgers:  # that of the search first: it knows of looks from other folders
+        with Ledger(place) as ledger:
+            opening = ledger.open_box(box.name, keys, why, again)
+            openings = openings or [asdict(one) for one in ledger.openings(box.name)]
     scores = {name: court.on_box(row) for name, row in pair.items() if row is not None}
     error = relative(scores["chosen"], scores["teacher"])
-    return {"opened": opening.time, "openings": openings, "scores": scores, "error": error}
+    return {"name": box.name, "opened": opening.time, "openings": openings, "scores": scores, "error": error}
 
 
-def _seen(run: Path, source: DataSource | None, own: DataSource) -> bool:
-    """Whether the test part was judged before, by the search for the teacher or by ``edp evaluate``."""
-    same = source is None or source.to_plain() == own.to_plain()
+def _seen(run: Path, source: DataSource | None, own: DataSource, box: _Box) -> bool:
+    """Whether the lock-box is the test part and was judged before, by ``edp evaluate``."""
+    same = box.name == BOX and (source is None or source.to_plain() == own.to_plain())
     return same and (run / "scores.json").is_file()
 
 
-def _plain(found: Found, spec: SearchSpec, data: Prepared, seen: bool) -> dict[str, Any]:
+def _plain(found: Found, spec: SearchSpec, data: Prepared, seen: bool, sealed: int) -> dict[str, Any]:
     units = sorted({KINDS[kind].report_unit for kind in data.target_kinds})
     return {
         "schema": 1,
         "budget": asdict(spec.budget),
         "task": {"horizons": list(data.task.horizons), "rate_hz": data.task.rate_hz},
         "unit": units[0] if len(units) == 1 else "mixed units",
-        "recordings": {part: len(getattr(data, part)) for part in ("train", "validation", "test")},
+        "recordings": {"train": len(data.train), "validation": len(data.validation), "test": sealed},
         "teacher": found.teacher.to_json(),
         "rows": [row.to_json() for row in found.rows],
         "front": found.front,

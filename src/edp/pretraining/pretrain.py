@@ -10,6 +10,7 @@ from typing import Any
 from edp import __version__
 from edp.config import Experiment
 from edp.data.episodes import by_machine
+from edp.data.frozen import frozen_before
 from edp.data.prepared import Prepared
 from edp.data.splits import ByMachine
 from edp.errors import BundleError, ConfigError
@@ -82,16 +83,16 @@ def pretrain(
             'split.kind = "machines"'
         )
     method = PRETRAININGS[order.method]()
-    begun = None if order.start is None else _start(order.start)
+    begun, frozen = (None, {}) if order.start is None else _start(order.start)
     lesson = method.lesson(order.meta, begun)
-    data = prepare_data(source, experiment)
+    data = prepare_data(source, experiment, frozen)
     experiment = _carrying(experiment, method.episodic, data.task.rate_hz)
     teaching = None
     if lesson is not None:
         facts: dict[str, Any] = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
         facts |= {"meta": asdict(order.meta)} if method.episodic else {}
         made = lesson
-        teaching = Teaching(facts, lambda prepared: made)
+        teaching = Teaching(facts, lambda prepared: made, frozen)
     network = train(source, experiment, out, on_event, teaching, data).predictor
     if on_step is not None:
         on_step("judging on machines that were never seen")
@@ -101,16 +102,17 @@ def pretrain(
     return result
 
 
-def _start(path: str | Path) -> Predictor:
-    """A network to begin with.
+def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:
+    """A network to begin with, and names by digest of sessions that stay frozen for what comes of it.
 
     Raises:
         BundleError: not a bundle, or one of a network in whole numbers.
     """
-    predictor = load_bundle(path).predictor
+    bundle = load_bundle(path)
+    predictor = bundle.predictor
     if predictor.number_format != "float32":
         raise BundleError(f"'{path}' is a network in {predictor.number_format}, which cannot be trained on")
-    return predictor
+    return predictor, frozen_before(bundle.provenance)
 
 
 def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experiment:

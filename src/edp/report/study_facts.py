@@ -9,6 +9,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
+from edp.data.frozen import SECOND_BOX
 from edp.errors import StorageError
 from edp.storage import read_json
 
@@ -22,9 +23,10 @@ TITLES = {
     "confirmation": "confirmation",
     "synthesis": "synthesis",
     "exploration": "exploration",
+    "compression": "compression",
 }
 """Phases in their order, as those are called that have not begun."""
-NUMBERS = dict(zip(TITLES, ("0", "1", "2", "2.5", "3", "4", "5"), strict=True))
+NUMBERS = dict(zip(TITLES, ("0", "1", "2", "2.5", "3", "4", "5", "6"), strict=True))
 """Phases in the thesis's count."""
 
 Made = TypeVar("Made")
@@ -99,7 +101,7 @@ class StudyFacts:
         unit: of the scores.
         data: path, number of sessions, hours and hash of the recordings.
         spec: settings of the search.
-        development, test: names of sessions.
+        development, test, second: names of sessions; `second` are those of the second lock-box.
         modules: title of each module by name.
         phases: in their order, those that have not begun among them.
         facts: what each decided phase found, by name.
@@ -122,6 +124,7 @@ class StudyFacts:
     sentences: Mapping[str, tuple[str, ...]]
     history: tuple[Training, ...]
     openings: tuple[Mapping[str, Any], ...]
+    second: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -185,8 +188,9 @@ def _facts_of(study: Mapping[str, Any]) -> StudyFacts:
         phases=_phases(study["phases"]),
         facts={str(held["phase"]): dict(held["facts"]) for held in decisions},
         sentences={str(held["phase"]): tuple(map(str, held["sentences"])) for held in decisions},
-        history=_history(study["history"], sum(len(held["judged"]) for held in study["openings"])),
+        history=_history(study["history"], study["openings"]),
         openings=tuple(dict(held) for held in study["openings"]),
+        second=tuple(map(str, sessions.get("second", ()))),
     )
 
 
@@ -213,10 +217,14 @@ def _phase(held: Mapping[str, Any]) -> PhaseFacts:
     )
 
 
-def _history(rows: Sequence[Mapping[str, Any]], sealed: int) -> tuple[Training, ...]:
-    """What has ended. The last trainings that phase 4 asked for are those that the lock-box was opened for."""
-    places = [place for place, held in enumerate(rows) if held["phase"] == "synthesis"]
-    test = set(places[len(places) - sealed :] if sealed else ())
+def _history(rows: Sequence[Mapping[str, Any]], openings: Sequence[Mapping[str, Any]]) -> tuple[Training, ...]:
+    """What has ended. The last trainings that phases 4 and 6 asked for are those that a lock-box was opened for."""
+    test: set[int] = set()
+    for phase, second in (("synthesis", False), ("compression", True)):
+        places = [place for place, held in enumerate(rows) if held["phase"] == phase]
+        looks = [len(held["judged"]) for held in openings if (str(held["box"]) == SECOND_BOX) == second]
+        sealed = (looks[-1] if second else sum(looks)) if looks else 0  # looks of edp compress trained nothing here
+        test |= set(places[len(places) - sealed :] if sealed and places else ())
     return tuple(_training(held, place in test) for place, held in enumerate(rows) if held["status"] != "waiting")
 
 

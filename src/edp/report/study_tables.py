@@ -10,6 +10,7 @@ import numpy as np
 from edp.report.sheets import Column, Sheet, Value, chance, figures, plainly
 from edp.report.study_facts import StudyFacts, known, of_phase, real
 from edp.report.study_modules import modules_sheets, ordered, span
+from edp.report.study_smaller import smaller_sheet
 from edp.report.study_views import arm_views, titled
 from edp.report.wording import duration, moment, number, percent, whole
 
@@ -24,6 +25,7 @@ def sheets(study: StudyFacts) -> dict[str, Sheet]:
         selection_sheet(study),
         identifiers_sheet(study),
         holdout_sheet(study),
+        smaller_sheet(study),
         openings_sheet(study),
         phases_sheet(study),
     )

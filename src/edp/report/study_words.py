@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from edp.report.study_facts import NUMBERS, StudyFacts, known, of_phase, real
+from edp.report.study_smaller import chosen_words
 from edp.report.study_views import titled
 from edp.report.wording import duration, listed, number, percent, whole
 
@@ -49,6 +50,7 @@ def verdict(study: StudyFacts) -> list[str]:
         _baseline(study),
         _confirmed(study),
         _teacher(study),
+        chosen_words(study),
     ]
     if study.state != "finished":
         where = next((phase for phase in study.phases if phase.name not in study.facts), None)
@@ -118,7 +120,8 @@ def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
         confirmed, asked = study.facts["confirmation"]["confirmed"], study.facts["screening"]["registered"]
         made.append((whole(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
     looks = len(study.openings)
-    made.append((whole(looks), "", f"look{'s' * (looks != 1)} at {_count(len(study.test), 'test session')}"))
+    sealed = _count(len(study.test) + len(study.second), "session")
+    made.append((whole(looks), "", f"look{'s' * (looks != 1)} at {sealed} set apart"))
     return made
 
 
@@ -135,8 +138,9 @@ def caveats(study: StudyFacts) -> list[str]:
         "modules."
         if final > updates
         else f"The last trainings are no longer ({_length(spec, final)}), so nothing is known of long ones.",
-        f"Sessions: {len(study.development)} that train and judge in turn, {len(study.test)} set apart. Intervals and "
-        "p-values speak of sessions like these, not of another machine.",
+        f"Sessions: {len(study.development)} that train and judge in turn, {len(study.test)} set apart"
+        + (f", {len(study.second)} more for phase 6" if study.second else "")
+        + ". Intervals and p-values speak of sessions like these, not of another machine.",
         *_power(study),
         "Modules are tried on one baseline with one feature set; on another network they may do otherwise.",
         f"Winners were tuned further than the baseline ({_count(int(spec['joint_trials']), 'more question')} in phase "

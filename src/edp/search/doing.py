@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from edp.ledger import FINAL, Ledger, Record
 from edp.search.batch import complete
 from edp.search.executor import START, Executor, Job
 from edp.search.ground import Outcome
 from edp.search.jobs import job_of
+from edp.search.smaller import before
 from edp.search.trainings import Order
 
 
@@ -26,6 +27,7 @@ class Doing:
         memory_mb: cap on its memory.
         on_record: told of each record and whether it was trained now.
         on_orders: told of each batch before it is done: keys and orders.
+        kept: keys of the networks of phase 6, whose states later ones are made of.
     """
 
     ledger: Ledger
@@ -36,6 +38,7 @@ class Doing:
     memory_mb: float | None = None
     on_record: Callable[[Record, bool], None] | None = None
     on_orders: Callable[[list[str], list[Order]], None] | None = None
+    kept: set[str] = field(default_factory=set)
 
     def __call__(self, orders: list[Order]) -> list[Outcome]:
         """Outcomes in the order of the orders; equal orders are done once.
@@ -48,9 +51,10 @@ class Doing:
             self.on_orders([job.key for job in jobs], orders)
         new = any(self.ledger.finished(job.key) is None for job in jobs)
         found = complete(self.ledger, self.executor, [self._begun(*pair) for pair in zip(jobs, orders)], self.on_record)
+        self.kept.update(job.key for job, order in zip(jobs, orders) if order.recipe is not None)
         # A search that goes on comes by earlier batches first, and one that stops here needs what it had.
         if new and all(record.status in FINAL for record in found.values()):
-            self.ledger.keep_states([job.key for job in jobs])
+            self.ledger.keep_states({*self.kept, *(job.key for job in jobs)})
         records = [found[job.key] for job in jobs]
         return [Outcome(o, str(r.status), r.result, r.message) for o, r in zip(orders, records)]
 
@@ -61,8 +65,9 @@ class Doing:
         """The job with the state from which it goes on, where there is one."""
         if self.ledger.finished(job.key):
             return job
-        for stop in reversed(order.stops):
-            file = self.ledger.state(self._job(replace(order, until=stop, stops=())).key)
+        earlier = [replace(order, until=stop, stops=()) for stop in reversed(order.stops)]
+        for one in [*earlier, *before(order)]:
+            file = self.ledger.state(self._job(one).key)
             if file is not None:
                 return replace(job, where={**job.where, START: str(file)})
         return job

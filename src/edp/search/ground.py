@@ -88,6 +88,7 @@ class Ground:
         test: names of the sessions set apart.
         channels: of the recordings.
         unit: of the scores, for sentences.
+        second: names of the sessions of the second lock-box; none without phase 6.
         decided: what earlier phases decided, by name.
     """
 
@@ -99,6 +100,18 @@ class Ground:
     channels: tuple[str, ...] = ()
     unit: str = "mm/s"
     decided: Mapping[str, Decision] = field(default_factory=dict)
+    second: tuple[str, ...] = ()
+
+    @property
+    def validation(self) -> tuple[str, ...]:
+        """Development sessions that judge where the others train: those of the first run; two at least are left."""
+        chosen = [name for name, judges in zip(self.development, self.folds(1)[0], strict=True) if judges]
+        return tuple(chosen[: max(1, len(self.development) - 2)])
+
+    @property
+    def training(self) -> tuple[str, ...]:
+        """The other development sessions."""
+        return tuple(name for name in self.development if name not in self.validation)
 
     def folds(self, runs: int) -> NDArray[np.bool_]:
         """Which development sessions each run is judged on, ``(run, session)``; more runs have the same first ones.
@@ -166,8 +179,8 @@ class Ground:
 
 def set_apart(
     sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Development and test sessions: of each family its share, drawn once from the root.
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Development sessions, test sessions, and those of the second lock-box: of each family its share, drawn once.
 
     Args:
         sessions: names in order.
@@ -175,27 +188,44 @@ def set_apart(
         spec: share and seed.
 
     Raises:
-        ConfigError: a session that is to test is not there.
+        ConfigError: a session that is to be set apart is not there, or is named for both lock-boxes.
         DataError: too few sessions for the folds.
     """
-    strange = [name for name in spec.test if name not in sessions]
-    if strange:
-        raise ConfigError(
-            f"search: test names '{strange[0]}', and there is no such session{closest(strange[0], sessions)}"
-        )
-    test = tuple(name for name in sessions if name in spec.test) or _drawn(sessions, families, spec)
-    development = tuple(name for name in sessions if name not in test)
-    if len(development) < max(spec.folds, 3):
+    for part, named in (("test", spec.test), ("second", spec.second)):
+        strange = [name for name in named if name not in sessions]
+        if strange:
+            raise ConfigError(
+                f"search: {part} names '{strange[0]}', and there is no such session{closest(strange[0], sessions)}"
+            )
+    both = sorted(set(spec.test) & set(spec.second))
+    if both:
+        raise ConfigError(f"search: {', '.join(both)} is named in test and in second; each must be in one of them")
+    free = [name for name in sessions if name not in spec.second]
+    named = tuple(name for name in sessions if name in spec.test)
+    test = named or _drawn(free, families, [spec.seed, 0x7E57], max(1, round(spec.test_share * len(sessions))))
+    rest = [name for name in free if name not in test]
+    second: tuple[str, ...] = ()
+    if spec.compression.on:
+        count = max(1, round(spec.second_share * len(sessions)))
+        named = tuple(name for name in sessions if name in spec.second)
+        second = named or _drawn(rest, families, [spec.seed, 0x7E58], count)
+    development = tuple(name for name in sessions if name not in (*test, *second))
+    fold = -(-len(development) // spec.folds)
+    if len(development) < max(spec.folds, 3) or len(development) - fold < 2:
+        less = "a smaller test_share" + (", --set search.compression.on=false" if second else "")
         raise DataError(
-            f"{len(sessions)} sessions came: {len(test)} are set apart as test, and {len(development)} are left for "
-            f"{spec.folds} folds; give more recordings, a smaller test_share, or fewer folds"
+            f"{len(sessions)} sessions came: {len(test)} are set apart as test"
+            + (f", {len(second)} for phase 6" if second else "")
+            + f", and {len(development)} are left for {spec.folds} folds, "
+            f"which must leave two to train; give more recordings, {less}, or another number of folds"
         )
-    return development, test
+    return development, test, second
 
 
-def _drawn(sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec) -> tuple[str, ...]:
-    rng = np.random.default_rng([spec.seed, 0x7E57])
-    wanted = max(1, round(spec.test_share * len(sessions)))
+def _drawn(sessions: Sequence[str], families: Mapping[str, str], seed: list[int], wanted: int) -> tuple[str, ...]:
+    rng = np.random.default_rng(seed)
+    if wanted >= len(sessions):
+        return tuple(sessions)
     kinds: dict[str, list[str]] = {}
     for name in sessions:
         kinds.setdefault(families.get(name, ""), []).append(name)

@@ -9,6 +9,7 @@ from typing import Any
 from edp.ledger import Identity, WithState, code_version, read_state
 from edp.runs import environment
 from edp.search.executor import START, Job
+from edp.search.smaller import make_smaller
 from edp.search.trainings import Order, experiment_of, train_part
 
 
@@ -35,6 +36,8 @@ def job_of(
         sessions["validation"] = list(order.validation)
     if order.until is not None:
         config["until"] = order.until
+    if order.recipe is not None:
+        config["recipe"] = order.recipe
     if settings.get("model", {}).get("physics"):
         physics = experiment_of(order).model.physics
         config["machine"] = None if physics is None else physics.digest()  # its file may change, and its name stays
@@ -63,6 +66,7 @@ def train(identity: Identity, where: Mapping[str, Any]) -> dict[str, Any] | With
         EdpError: as `edp.search.trainings.train_part`.
     """
     plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
-    found, state = train_part(plain, read_state(where[START]) if START in where else None)
+    part = train_part if identity.config.get("recipe") is None else make_smaller
+    found, state = part(plain, read_state(where[START]) if START in where else None)
     del found["seconds"]
     return found if state is None else WithState(found, state)

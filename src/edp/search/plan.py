@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from edp.config import (
 from edp.data.feature_files import is_set_file, read_set_table
 from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, closest
+from edp.evaluation.controller import load_budget
 from edp.search.phases.isolation import DEFAULT_BACKBONE, arm_settings
 from edp.search.settings import SearchSpec
 from edp.search.space import DIMENSIONS, THESIS, WIDTHS, Choice, Range, Real, Space, applicable, apply
@@ -88,9 +89,15 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
 
 
 def _with_files(table: Table, folder: Path) -> Table:
-    """`table` with the feature sets that it names by files."""
+    """`table` with the feature sets and the budget that it names by files."""
     made, search = with_set_file(table, folder), table.get("search")
-    if not isinstance(search, Mapping) or not isinstance(search.get("features"), list):
+    if not isinstance(search, Mapping):
+        return made
+    held = search.get("compression")
+    if isinstance(held, Mapping) and isinstance(held.get("budget"), str):
+        search = {**search, "compression": {**held, "budget": asdict(load_budget(folder / held["budget"]))}}
+        made = {**made, "search": search}
+    if not isinstance(search.get("features"), list):
         return made
     sets = [
         build(FeatureSettings, read_set_table(folder / one), f"'{folder / one}'") if is_set_file(one) else one

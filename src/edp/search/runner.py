@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +15,8 @@ from typing import Any
 import tomli_w
 
 from edp.bounds import MOST_THREADS, above, check_bounds, whole
-from edp.config import Experiment, Table, build
+from edp.config import Experiment, Table, build, plain_tree
+from edp.data.frozen import SECOND_BOX, ByFrozen
 from edp.errors import ConfigError, DataError, LostError
 from edp.ledger import Ledger, Record, Status
 from edp.recording import Recording
@@ -25,6 +26,7 @@ from edp.search.doing import Doing
 from edp.search.executor import Executor
 from edp.search.ground import Decision, Ground, Outcome, set_apart
 from edp.search.local import LocalPool
+from edp.search.networks import frozen_split, network_name, write_networks
 from edp.search.phases import PHASES
 from edp.search.plan import SearchPlan, plain_spec
 from edp.search.trainings import Order, settings_of
@@ -111,6 +113,7 @@ class Found:
         digest: hash over the results of all trainings.
         trained: trainings of this sitting.
         teacher: settings of the winner as an experiment file; None before phase 4.
+        networks: runs that phase 6 left: the teacher, and the network that was chosen; none before.
     """
 
     folder: Path
@@ -119,6 +122,7 @@ class Found:
     digest: str
     trained: int
     teacher: Path | None = field(default=None)
+    networks: Mapping[str, Path] = field(default_factory=dict)
 
 
 def run_search(
@@ -134,7 +138,7 @@ def run_search(
     Args:
         source: where the recordings are; each is a session.
         plan: what is searched.
-        folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml``.
+        folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml`` and ``networks``.
         crew: who does the trainings.
         until: name of the last phase to run.
         watchers: are told of what happens.
@@ -150,15 +154,16 @@ def run_search(
     if until is not None:
         _ = PHASES[until]
     data = _Data.read(source, plan)  # before anything is made on disk
-    development, test = set_apart(data.names, data.families, plan.spec)
+    development, test, second = set_apart(data.names, data.families, plan.spec)
     target = make_folder(folder)
     with ExitStack() as open_things:
         ledger = open_things.enter_context(Ledger(target / "ledger"))
         if ledger.damaged:
             watchers.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
         ledger.bind({"data": data.digest, **plan.to_plain()})
+        settings = settings_of(plan.experiment)
         ground = Ground(
-            plan.spec, settings_of(plan.experiment), source.to_plain(), development, test, data.channels, data.unit
+            plan.spec, settings, source.to_plain(), development, test, data.channels, data.unit, second=second
         )
         diary = Diary(target, _facts(plan, data, source, ground), ground)
         executor = open_things.enter_context(crew.gather())
@@ -177,7 +182,10 @@ def run_search(
         finally:
             diary.openings = ledger.openings()
             diary.end(state)
-        return Found(target, ground, state, ledger.digest(), diary.trained, _write_teacher(target, ground))
+        split = frozen_split(target, ground, data.digests)
+        networks = write_networks(target, source, ground, split, work.made)
+        teacher = _write_teacher(target, ground, split)
+        return Found(target, ground, state, ledger.digest(), diary.trained, teacher, networks)
 
 
 @dataclass(frozen=True)
@@ -190,6 +198,7 @@ class _Data:
     digest: str
     hours: float
     unit: str
+    digests: dict[str, str]
 
     @staticmethod
     def read(source: DataSource, plan: SearchPlan) -> _Data:
@@ -205,15 +214,22 @@ class _Data:
         for recording in recordings:
             state.update(f"{recording.name}\0{recording.digest}\0".encode())
         hours = sum(recording.duration_s for recording in recordings) / 3600
-        return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit)
+        digests = {recording.name: recording.digest for recording in recordings}
+        return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit, digests)
 
 
 class _Work:
-    """Passes on what happens, and opens the lock-box when a batch is to be judged on the test sessions."""
+    """Passes on what happens, and opens a lock-box when a batch is to be judged on its sessions.
+
+    Attributes:
+        orders: of the batch under way, by key.
+        made: networks that were judged on the second lock-box, by name: order and result.
+    """
 
     def __init__(self, ledger: Ledger, diary: Diary, ground: Ground, watchers: Watchers) -> None:
         self.ledger, self.diary, self.ground, self.watchers = ledger, diary, ground, watchers
         self.orders: dict[str, Order] = {}
+        self.made: dict[str, tuple[Order, Mapping[str, Any]]] = {}
 
     def on_phase(self, name: str, ground: Ground) -> None:
         self.diary.on_phase(name, ground)
@@ -221,15 +237,31 @@ class _Work:
 
     def on_orders(self, keys: Sequence[str], orders: Sequence[Order]) -> None:
         self.orders = dict(zip(keys, orders, strict=True))
-        sealed = sorted({key for key, order in self.orders.items() if set(order.judged) & set(self.ground.test)})
-        if sealed:
-            self.ledger.open_box(BOX, sealed, "phase 4: its winner and the baseline, trained at length")
-            self.diary.openings = self.ledger.openings()
+        for box, sessions, why in (
+            (BOX, self.ground.test, "phase 4: its winner and the baseline, trained at length"),
+            (SECOND_BOX, self.ground.second, "phase 6: the chosen network and its teacher"),
+        ):
+            sealed = sorted({key for key, order in self.orders.items() if set(order.judged) & set(sessions)})
+            if sealed:
+                self._open(box, sealed, why)
         self.diary.on_orders(keys, orders)
         self.watchers.on_progress(self.diary)
 
+    def _open(self, box: str, keys: Sequence[str], why: str) -> None:
+        """Record a look before it is taken. ``edp compress`` may have opened the second lock-box before phase 6."""
+        earlier = [one for one in self.ledger.openings(box) if one.judged != tuple(keys)]
+        self.ledger.open_box(box, keys, why, again=box == SECOND_BOX)
+        if earlier:
+            self.watchers.on_note(
+                f"lock-box '{box}' was opened on {earlier[0].time} ({earlier[0].why}), so this look shows less"
+            )
+        self.diary.openings = self.ledger.openings()
+
     def on_record(self, record: Record, trained: bool) -> None:
-        self.diary.on_record(record, self.orders[record.key], trained)
+        order = self.orders[record.key]
+        if record.result is not None and set(order.judged) & set(self.ground.second):
+            self.made[network_name(order)] = order, record.result
+        self.diary.on_record(record, order, trained)
         self.watchers.on_progress(self.diary)
 
     def on_decision(self, decision: Decision) -> None:
@@ -304,12 +336,16 @@ def _facts(plan: SearchPlan, data: _Data, source: DataSource, ground: Ground) ->
             "hash": data.digest,
         },
         "spec": plain_spec(plan.spec),
-        "sessions": {"development": list(ground.development), "test": list(ground.test)},
+        "sessions": {
+            "development": list(ground.development),
+            "test": list(ground.test),
+            "second": list(ground.second),
+        },
     }
 
 
-def _write_teacher(folder: Path, ground: Ground) -> Path | None:
-    """The winner's settings, as `edp train --config` takes them."""
+def _write_teacher(folder: Path, ground: Ground, split: ByFrozen) -> Path | None:
+    """The winner's settings with the sessions that stay frozen, as `edp train --config` takes them."""
     settings: Any = None
     if "exploration" in ground.decided:
         settings = ground.decided["exploration"].facts["teacher_settings"]
@@ -318,5 +354,5 @@ def _write_teacher(folder: Path, ground: Ground) -> Path | None:
     if settings is None:
         return None
     file = folder / TEACHER
-    write_bytes(file, tomli_w.dumps(settings).encode())
+    write_bytes(file, tomli_w.dumps({**settings, "split": plain_tree(split, "split")}).encode())
     return file

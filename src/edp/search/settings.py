@@ -6,9 +6,24 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
-from edp.bounds import MOST_EPOCHS, MOST_TICKS, MOST_UPDATES, SEED, above, between, check_bounds, shown, span, whole
+from edp.bounds import (
+    MOST_EPOCHS,
+    MOST_TICKS,
+    MOST_UNITS,
+    MOST_UPDATES,
+    SEED,
+    above,
+    between,
+    check_bounds,
+    shown,
+    span,
+    whole,
+)
+from edp.compress import FORMATS
+from edp.compress.planning import SHARES
 from edp.config import FeatureSettings, plain_tree
-from edp.errors import ConfigError
+from edp.errors import ConfigError, closest
+from edp.evaluation.controller import Budget
 from edp.search.modules import TOGGLES
 from edp.search.space import ELASTIC, THESIS, WIDTHS, Space
 from edp.search.study import PRUNERS, SamplerSpec
@@ -18,6 +33,40 @@ COSTS = ("parameters", "macs_tick")
 MOST_TRAININGS = 1_000_000
 """Of a phase, in runs, seeds, repeats or questions; of a second each they would take eleven days."""
 LIMIT = above(0.0, 1e18)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressionSpec:
+    """Phase 6: the best network that a controller can run.
+
+    Attributes:
+        on: whether it is made; without it no second lock-box is set apart.
+        budget: what the controller grants: a table, or the path of a budget file.
+        units: widths to make; none given, they are planned from the budget.
+        shares: of the widest that fits; each plans a width.
+        formats: number formats to judge in; none given, all.
+        updates: training steps of each smaller network; 0 for as many as the teacher has, `SearchSpec.final_updates`.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    on: bool = True
+    budget: Budget = field(default_factory=Budget)
+    units: tuple[int, ...] = ()
+    shares: tuple[float, ...] = SHARES
+    formats: tuple[str, ...] = ()
+    updates: int = 0
+
+    def __post_init__(self) -> None:
+        bounds = {"units": whole(1, MOST_UNITS), "shares": above(0.0, 1.0), "updates": whole(0, MOST_UPDATES)}
+        check_bounds("compression", self, **bounds)
+        wrong = [] if self.shares else ["shares = [] (at least one)"]
+        for name in self.formats:
+            if name not in FORMATS:
+                wrong.append(f"formats = {shown(name)} ({', '.join(FORMATS)}{closest(name, FORMATS)})")
+        if wrong:
+            raise ConfigError("compression: " + "; ".join(wrong) + " must hold")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +85,8 @@ class SearchSpec:
         horizon: at which scores are taken, one of the task's.
         test_share: share of the sessions that are set apart as test before anything else.
         test: names of the sessions to set apart, instead of a share that is drawn.
+        second_share: share of the sessions that are set apart beside them, as second lock-box, for phase 6 alone.
+        second: names of these, instead of a share that is drawn.
         folds: into which the other sessions are dealt.
         backbones: registered backbones that are compared.
         features: feature sets that are compared: names, or sets of one's own.
@@ -68,6 +119,7 @@ class SearchSpec:
             earlier batches, once five of them were trained to the end (Optuna's median rule with its defaults).
         cost: ``none``, or a cost that is made small beside the score in phases 1, 4 and 5: a Pareto front comes out.
         limits: the most that a cost may be; what exceeds it is not trained.
+        compression: phase 6.
 
     Raises:
         ConfigError: a value out of range.
@@ -82,6 +134,8 @@ class SearchSpec:
     horizon: int = 10
     test_share: float = 0.2
     test: tuple[str, ...] = ()
+    second_share: float = 0.1
+    second: tuple[str, ...] = ()
     folds: int = 5
     backbones: tuple[str, ...] = ("lstm", "tcn", "hybrid")
     features: tuple[str | FeatureSettings, ...] = ("FG1", "FG2")
@@ -112,6 +166,7 @@ class SearchSpec:
     pruner: str = "none"
     cost: str = "none"
     limits: dict[str, float] = field(default_factory=dict)
+    compression: CompressionSpec = field(default_factory=CompressionSpec)
 
     def __post_init__(self) -> None:
         counts = (
@@ -125,7 +180,7 @@ class SearchSpec:
         bounds |= dict.fromkeys(("updates", "final_updates"), steps)
         bounds |= dict.fromkeys(("folds", "variance_runs", "most_runs", "screening_runs"), whole(2, MOST_TRAININGS))
         bounds |= {"warm_rounds": whole(0, MOST_TRAININGS), "least_gain": span(0.0, 1.0)}
-        bounds |= dict.fromkeys(("test_share", "least_effect", "power", "alpha"), between(0.0, 1.0))
+        bounds |= dict.fromkeys(("test_share", "second_share", "least_effect", "power", "alpha"), between(0.0, 1.0))
         bounds |= {"rungs": between(0.0, 1.0)}
         check_bounds("search", self, **bounds)
         wrong = self._wrong_epochs()

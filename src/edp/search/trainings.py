@@ -46,6 +46,7 @@ class Order:
         patience: epochs without a better validation score before an early stop; 0 never.
         validation: names of the sessions that validate after each of several epochs; they may be those that judge, as
             in the thesis, and do not train.
+        recipe: what is made of the network in phase 6 (`edp.search.smaller.Recipe`), plain; None in the other phases.
     """
 
     settings: Table
@@ -59,6 +60,7 @@ class Order:
     epochs: int = 1
     patience: int = 0
     validation: tuple[str, ...] = ()
+    recipe: Table | None = None
 
     def __post_init__(self) -> None:
         both = sorted(set(self.train) & {*self.judged, *self.validation})
@@ -107,6 +109,7 @@ class Order:
             "updates": self.updates,
             "until": self.until,
             "stops": list(self.stops),
+            **({} if self.recipe is None else {"recipe": self.recipe}),
         } | self.several()
 
     def several(self) -> dict[str, Any]:
@@ -130,6 +133,7 @@ class Order:
             plain.get("epochs", 1),
             plain.get("patience", 0),
             tuple(plain.get("validation", ())),
+            plain.get("recipe"),
         )
 
 
@@ -161,7 +165,7 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
     order = Order.from_json(plain)
     began = time.perf_counter()
     experiment = experiment_of(order)
-    data = _prepared(order, experiment)
+    data = prepared(order, experiment)
     windowed = order.epochs > 1 and experiment.training.chunks.regime == "window"
     fitted, state = fit_part(data, experiment.model, experiment.training, order.until, start, windowed)
     spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
@@ -212,7 +216,13 @@ def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> di
     return {name: sum(row[name] for row in rows) / len(rows) for name in SCORES}
 
 
-def _prepared(order: Order, experiment: Experiment) -> Prepared:
+def prepared(order: Order, experiment: Experiment) -> Prepared:
+    """Series of an order: those that train, the first of them as validation part, too; those that judge as test part.
+
+    Raises:
+        ConfigError: settings that contradict the data.
+        DataError: a session is missing or cannot be read.
+    """
     recordings = {recording.name: recording for recording in _recordings(_frozen(order.source))}
     wanted = dict.fromkeys((*order.train, *order.validation, *order.judged))
     missing = [name for name in wanted if name not in recordings]

@@ -74,9 +74,9 @@ class Case:
         if lesson is not None:
             make, told = lesson, {"method": name, "source": self.source.facts, **(facts or {})}
             if centred and self.spec.center and not phase:
-                teaching = Teaching({**told, "centred": True}, lambda data: Centred(make()))
+                teaching = Teaching({**told, "centred": True}, lambda data: Centred(make()), self.source.frozen)
             else:
-                teaching = Teaching(told, lambda data: make())
+                teaching = Teaching(told, lambda data: make(), self.source.frozen)
         experiment = replace(self.experiment, training=training)
         folder = self.folder / "phases" / phase if phase else self.folder
         data = replace(self.data, validation=[*self.data.validation, *judged])

@@ -13,6 +13,7 @@ from safetensors.numpy import save
 
 from edp import __version__
 from edp.config import Experiment
+from edp.data.frozen import refuse_frozen
 from edp.data.prepared import Prepared, prepare
 from edp.errors import ConfigError
 from edp.models.predictor import describe
@@ -154,6 +155,7 @@ def _target(source: Source, logs: DataSource, experiment: Experiment, order: Ord
     """The logs, divided and held against the source; and what could not be held."""
     task, window = source.bundle.task, source.predictor.spec.window
     recordings = logs.read()
+    refuse_frozen(recordings, source.frozen, "would be trained on")
     check_channels(recordings, task)
     data = prepare(recordings, task, experiment.split, window)
     check_lengths(data, tuned(experiment.training, order.spec).chunks, window)

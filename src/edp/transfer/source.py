@@ -9,6 +9,7 @@ from typing import Any
 
 from edp.config import Experiment, FeatureSettings, TaskSettings, build, load_experiment, merged, override, plain_tree
 from edp.data.features import FEATURE_SETS
+from edp.data.frozen import frozen_before
 from edp.data.prepared import Prepared
 from edp.data.splits import ByTime
 from edp.data.task import Task
@@ -43,6 +44,11 @@ class Source:
     def predictor(self) -> Predictor:
         """The network, in evaluation mode."""
         return self.bundle.predictor
+
+    @property
+    def frozen(self) -> dict[str, str]:
+        """Names by digest of sessions that a model search set apart for good."""
+        return frozen_before(self.bundle.provenance)
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def cluster(monkeypatch):
 @needs_ray
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_finds(cluster, lever_sessions, tmp_path):
+def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_finds(cluster, six_sessions, tmp_path):
     plan = load_plan(None, "quick", CHANGES)
     done = []
 
@@ -117,13 +117,13 @@ def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_fi
             cluster.kill(2)
 
     crew = Crew(cluster=cluster.address)
-    there = run_search(lever_sessions, plan, tmp_path / "there", crew, "calibration", Watchers(on_progress=kill_one))
+    there = run_search(six_sessions, plan, tmp_path / "there", crew, "calibration", Watchers(on_progress=kill_one))
     assert done == [3]
-    here = run_search(lever_sessions, plan, tmp_path / "here", Crew(workers=1), "calibration")
+    here = run_search(six_sessions, plan, tmp_path / "here", Crew(workers=1), "calibration")
     assert there.digest == here.digest
     assert there.trained == here.trained == 11
     assert there.ground.decided == here.ground.decided
-    again = run_search(lever_sessions, plan, tmp_path / "there", crew, "calibration")
+    again = run_search(six_sessions, plan, tmp_path / "there", crew, "calibration")
     assert again.trained == 0
 
 

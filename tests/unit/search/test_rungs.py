@@ -235,9 +235,9 @@ def plan():
 
 
 @pytest.fixture(scope="module")
-def study(lever_sessions, plan, tmp_path_factory):
+def study(six_sessions, plan, tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
-    return run_search(lever_sessions, plan, folder, CREW, until="calibration")
+    return run_search(six_sessions, plan, folder, CREW, until="calibration")
 
 
 def untimed(folder):
@@ -278,7 +278,7 @@ def test_the_copy_for_the_dashboard_has_them_as_optuna_does(study):
     assert all(trial.value == trial.intermediate_values[max(trial.intermediate_values)] for trial in pruned)
 
 
-def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same(lever_sessions, plan, study, tmp_path):
+def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same(six_sessions, plan, study, tmp_path):
     stops = 0
     for _ in range(20):
         heard = []
@@ -289,7 +289,7 @@ def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same
                 raise Stop
 
         try:
-            again = run_search(lever_sessions, plan, tmp_path, CREW, "calibration", Watchers(on_progress=stop))
+            again = run_search(six_sessions, plan, tmp_path, CREW, "calibration", Watchers(on_progress=stop))
             break
         except Stop:
             stops += 1
@@ -299,12 +299,12 @@ def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same
     assert untimed(tmp_path) == untimed(study.folder)
 
 
-def test_a_search_whose_states_cannot_be_written_is_stopped(lever_sessions, plan, tmp_path, monkeypatch):
+def test_a_search_whose_states_cannot_be_written_is_stopped(six_sessions, plan, tmp_path, monkeypatch):
     def full(folder, key, state):
         raise StorageError("cannot write 'states': No space left on device; free space")
 
     monkeypatch.setattr("edp.search.worker.leave_state", full)
     with pytest.raises(LostError, match="No space left"):
-        run_search(lever_sessions, plan, tmp_path, CREW, "calibration")
+        run_search(six_sessions, plan, tmp_path, CREW, "calibration")
     monkeypatch.undo()
-    assert run_search(lever_sessions, plan, tmp_path, CREW, "calibration").trained == 16
+    assert run_search(six_sessions, plan, tmp_path, CREW, "calibration").trained == 16

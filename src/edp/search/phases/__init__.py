@@ -10,6 +10,7 @@ from edp.search.phases import planning  # isort: skip
 from edp.search.phases import confirmation  # isort: skip
 from edp.search.phases import synthesis  # isort: skip
 from edp.search.phases import exploration  # isort: skip
+from edp.search.phases import compression  # isort: skip
 from edp.search.phases.base import PHASES, Course, PhaseSpec
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "Course",
     "PhaseSpec",
     "calibration",
+    "compression",
     "confirmation",
     "exploration",
     "isolation",

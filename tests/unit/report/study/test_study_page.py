@@ -16,7 +16,16 @@ from edp.report.study_tables import identifiers, sheets
 from edp.report.study_views import PointView, arm_views, forests, front, point_views, top_of, tracks
 from edp.report.study_words import caveats, decided, headline, missing, tiles, verdict
 
-PHASES = ("isolation", "calibration", "screening", "planning", "confirmation", "synthesis", "exploration")
+PHASES = (
+    "isolation",
+    "calibration",
+    "screening",
+    "planning",
+    "confirmation",
+    "synthesis",
+    "exploration",
+    "compression",
+)
 
 
 def page_of(study):
@@ -112,7 +121,7 @@ def test_a_study_that_is_only_partly_done(request, unfinished, mode, last):
         assert known or lines[1][0].startswith(("Under way: ", "Has not begun."))
     assert ("variance" in study_plots(facts)) == (place > 0)
     assert ("confirmation" in study_plots(facts)) == (place > 4)
-    assert f"{place} of 7 phases are decided" in headline(facts) or place > 5
+    assert f"{place} of 8 phases are decided" in headline(facts) or place > 5
     assert f"The search is running in phase {NUMBERS[last]}" in " ".join(verdict(facts))
     ended = sum(held["status"] != "waiting" for held in study["history"])
     assert ended == len(facts.history) < len(study["history"]) or last == "planning"
@@ -127,7 +136,7 @@ def test_an_empty_study_is_a_report_too(unfinished, sound, tmp_path):
     made = write_study_page(study, tmp_path)
     assert made.pictures == ()
     assert "No training has a score yet." in made.page.read_text(encoding="utf-8")
-    assert "was killed: 0 of 7" in headline(facts_of(study | {"state": "killed"}))
+    assert "was killed: 0 of 8" in headline(facts_of(study | {"state": "killed"}))
 
 
 def test_the_headline_says_what_the_test_sessions_say(sound):
@@ -149,7 +158,7 @@ def test_words_follow_the_settings(sound):
     text = " ".join(caveats(facts_of(sound)))
     assert "400 updates" in text
     assert "2,000 updates" in text
-    assert "9 that train and judge in turn, 3 set apart" in text
+    assert "9 that train and judge in turn, 2 set apart, 1 more for phase 6" in text
     assert "6 more questions in phase 4, 12 in phase 5" in text
     sound["spec"]["final_updates"] = 400
     assert "no longer (400 updates)" in " ".join(caveats(facts_of(sound)))
@@ -204,7 +213,7 @@ def test_what_was_pruned_is_no_failure(sound, tmp_path):
     assert tiles(facts)[0][2] == f"trainings, 1 of them pruned, {failed} of them failed"
     sheet = sheets(facts)["phases"]
     assert [column.heading for column in sheet.columns].index("Pruned") == 3
-    assert [row[3] for row in sheet.rows] == [0, 1, 0, 0, 0, 0, 0, 1]
+    assert [row[3] for row in sheet.rows] == [0, 1, 0, 0, 0, 0, 0, 0, 1]
     assert write_study_page(sound, tmp_path).pictures
 
 

@@ -57,15 +57,17 @@ def make_plan(
     units: Sequence[int] = (),
     formats: Sequence[str] = (),
     ways: Sequence[str] = WAYS,
+    shares: Sequence[float] = SHARES,
 ) -> Plan:
     """Plan a search: the widest network that fits in each format, and its halves and quarters.
 
     Args:
-        teacher: the trained network.
+        teacher: the network; its weights need not be trained.
         budget: what the controller grants.
         units: widths to make; none given, they are planned.
         formats: names of number formats; none given, all.
         ways: some of `WAYS`.
+        shares: of the widest that fits; each plans a width.
 
     Raises:
         ConfigError: an unknown format or way, a width that is none, or a budget that no network of this kind meets.
@@ -89,8 +91,8 @@ def make_plan(
         if not width:
             notes.append(f"no width fits the budget in {FORMATS[name].label}")
     tops = set(fitting.values()) - {0}
-    shares = {max(tops) * share for share in SHARES}
-    widths = set(units) or tops | {max([width for width in possible if width <= share] or tops) for share in shares}
+    goals = {max(tops) * share for share in shares}
+    widths = set(units) or tops | {max([width for width in possible if width <= goal] or tops) for goal in goals}
     orders = {width: _orders(teacher, width, ways, notes) for width in sorted(widths - {full}, reverse=True)}
     return Plan(orders, tuple(able), tuple(dict.fromkeys(notes)))
 

@@ -1,0 +1,259 @@
+"""The split of a model search: its frozen sessions are known by their content and never train, whatever their name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from edp.bounds import SEED, check_bounds, shown
+from edp.data.splits import PART, SPLITS, ByRecording, Split, SplitSpec, Stretch
+from edp.errors import ConfigError, DataError, StorageError
+from edp.recording import Recording
+
+SECOND_BOX = "second test sessions"
+"""What ledgers call the second lock-box of a search."""
+SHARED_SHARE, SHARED_ROWS = 0.2, 50
+"""A recording is a piece of another one where so large a share of its different rows, and so many, stand in both.
+Rows of a machine at rest repeat, but are few among the different ones; sensors that move never repeat all channels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """A session by its content.
+
+    Attributes:
+        name: that it had; for messages only.
+        digest: of its content (`edp.recording.Recording.digest`).
+    """
+
+    name: str
+    digest: str
+
+
+@SPLITS.register("frozen")
+@dataclass(frozen=True, kw_only=True)
+class ByFrozen:
+    """Sessions as a model search divided them; each is known by the hash of its content, not by its name.
+
+    Frozen sessions never train or validate. Of two copies of one the second is left out. Sessions that the search did
+    not know train, unless they are a piece of a frozen one.
+
+    Attributes:
+        test: frozen sessions that test: the first lock-box of the search.
+        second: frozen sessions of the second lock-box, for what is compressed; left out of all parts otherwise.
+        validation: development sessions that validate.
+        train: development sessions that train.
+        study: folder of the search, whose ledger records each look at the second lock-box.
+        missing: what happens where a frozen session is not among the recordings: ``refuse``, or ``draw`` for other
+            data: a share of what is left tests, and validates where no session of `validation` is there.
+        validation_share: share that is drawn to validate.
+        test_share: share that is drawn to test.
+        seed: of the draw.
+
+    Raises:
+        ConfigError: a session in two parts, or an unknown `missing`.
+    """
+
+    test: tuple[Session, ...] = ()
+    second: tuple[Session, ...] = ()
+    validation: tuple[Session, ...] = ()
+    train: tuple[Session, ...] = ()
+    study: str = ""
+    missing: str = "refuse"
+    validation_share: float = 0.15
+    test_share: float = 0.2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds("split", self, seed=SEED, validation_share=PART, test_share=PART)
+        if self.missing not in ("refuse", "draw"):
+            raise ConfigError(f"split: missing = {shown(self.missing)}; 'refuse' or 'draw' must hold")
+        part_of: dict[str, str] = {}
+        for part in ("test", "second", "validation", "train"):
+            for session in getattr(self, part):
+                other = part_of.setdefault(session.digest, part)
+                if other != part:
+                    raise ConfigError(
+                        f"split: session '{session.name}' is in {other} and in {part}; each must be in one part"
+                    )
+
+    @property
+    def frozen(self) -> dict[str, str]:
+        """Names of all frozen sessions by digest."""
+        return {session.digest: session.name for session in (*self.test, *self.second)}
+
+    def opened(self) -> ByFrozen:
+        """The same split with the second lock-box in the place of the test sessions.
+
+        Raises:
+            ConfigError: the search set no second lock-box apart.
+        """
+        if not self.second:
+            raise ConfigError("split: the search set no second lock-box apart, so it cannot be opened")
+        return replace(self, test=self.second, second=self.test)
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Divide by content; `gap` is not needed between whole recordings.
+
+        Raises:
+            ConfigError: it names no test sessions.
+            DataError: a frozen session is missing or changed, a recording is a piece of one, or a part is empty.
+        """
+        if not self.test:
+            raise ConfigError(
+                "split: kind = 'frozen' names no test sessions; edp search writes such a split into teacher.toml, "
+                "others are kind = 'recordings', 'time', 'blocks' or 'machines'"
+            )
+        first: dict[str, int] = {}
+        for i, recording in enumerate(recordings):
+            first.setdefault(recording.digest, i)
+        self._check_there(recordings, first)
+        _refuse_pieces(recordings, self.frozen, {s.digest for s in (*self.train, *self.validation)})
+        test = [first[s.digest] for s in self.test if s.digest in first]
+        validation = [first[s.digest] for s in self.validation if s.digest in first]
+        free = [
+            i for i, recording in enumerate(recordings) if recording.digest not in self.frozen and i not in validation
+        ]
+        if self.missing == "draw" or not validation:
+            return self._drawn(recordings, free, test, validation, gap)
+        return _whole(recordings, {"train": free, "validation": validation, "test": test})
+
+    def _drawn(
+        self, recordings: Sequence[Recording], free: list[int], test: list[int], validation: list[int], gap: int
+    ) -> Split:
+        """Parts for which no session is there are drawn from those that are free."""
+        candidates = [recordings[i] for i in (*free, *validation, *test)]
+        names = {i: recordings[i].name for i in (*free, *validation, *test)}
+        rule = ByRecording(
+            validation_share=self.validation_share,
+            test_share=self.test_share,
+            seed=self.seed,
+            validation=tuple(names[i] for i in validation),
+            test=tuple(names[i] for i in test),
+        )
+        place = dict(enumerate(names))
+        found = rule.split(candidates, gap)
+
+        def moved(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
+            return tuple(sorted((replace(s, recording=place[s.recording]) for s in stretches), key=_order))
+
+        return Split(moved(found.train), moved(found.validation), moved(found.test))
+
+    def _check_there(self, recordings: Sequence[Recording], there: Mapping[str, int]) -> None:
+        """Refuse data that lack a frozen session, unless other data are expected."""
+        lacking = {digest: name for digest, name in self.frozen.items() if digest not in there}
+        if self.missing == "draw" or not lacking:
+            return
+        by_name = {recording.name: recording for recording in recordings}
+        changed = [name for name in lacking.values() if name in by_name]
+        how = f"'{changed[0]}' is there with another content" if changed else "no recording has their content"
+        raise DataError(
+            f"split: {len(lacking)} of {len(self.frozen)} frozen sessions of the search are missing: "
+            f"{', '.join(sorted(lacking.values()))}; {how} (hash {next(iter(lacking))} is wanted for "
+            f"'{next(iter(lacking.values()))}'). What was changed could train unseen: restore the recordings and read "
+            "them with the same signal map, or, for other data, --set split.missing=draw"
+        )
+
+
+def frozen_of(split: SplitSpec) -> dict[str, str]:
+    """Names of frozen sessions by digest; none where a split has none."""
+    return split.frozen if isinstance(split, ByFrozen) else {}
+
+
+def frozen_before(provenance: Mapping[str, Any]) -> dict[str, str]:
+    """Names of the frozen sessions by digest that a run's provenance names; they stay frozen for what comes of it.
+
+    Raises:
+        StorageError: it is no table of names.
+    """
+    data = provenance.get("data", {})
+    held = data.get("frozen", {}) if isinstance(data, Mapping) else {}
+    if not isinstance(held, Mapping) or not all(isinstance(name, str) for name in held.values()):
+        raise StorageError(
+            "provenance.json: data.frozen is no table of hashes and names of sessions; it was edited or is damaged: "
+            "restore it"
+        )
+    return {str(digest): name for digest, name in held.items()}
+
+
+def refuse_frozen(recordings: Sequence[Recording], frozen: Mapping[str, str], what: str) -> None:
+    """See that no recording is a frozen session.
+
+    Args:
+        recordings: that are to train, calibrate or choose.
+        frozen: names of frozen sessions by digest.
+        what: what they are to do, for the message.
+
+    Raises:
+        DataError: one is; the message names it.
+    """
+    for recording in recordings:
+        if recording.digest in frozen:
+            raise DataError(
+                f"'{recording.name}' ({recording.source}) is the frozen session '{frozen[recording.digest]}' of the "
+                f"search that the run comes from, and {what}; leave it out: it may only test"
+            )
+
+
+def keep_frozen(before: SplitSpec, after: SplitSpec) -> None:
+    """See that a change of settings does not let go of frozen sessions.
+
+    Raises:
+        ConfigError: it does.
+    """
+    lost = set(frozen_of(before)) - set(frozen_of(after))
+    if lost:
+        raise ConfigError(
+            f"the run comes from a search, and --set split lets go of {len(lost)} of its frozen sessions; they stay "
+            "frozen: leave the change out, or, for other data, --set split.missing=draw"
+        )
+
+
+def _refuse_pieces(recordings: Sequence[Recording], frozen: Mapping[str, str], known: set[str]) -> None:
+    """Refuse a recording that the search did not know and that shares rows with a frozen one."""
+    strange = [
+        recording for recording in recordings if recording.digest not in frozen and recording.digest not in known
+    ]
+    sealed = [recording for recording in recordings if recording.digest in frozen] if strange else []
+    for recording in strange:
+        for other in sealed:
+            names = [name for name in recording.channel_names if name in other.channel_names]
+            if not names:
+                continue
+            own, theirs = (np.unique(_rows(one.select(names))) for one in (recording, other))
+            shared = len(np.intersect1d(own, theirs, assume_unique=True))
+            if shared >= min(SHARED_ROWS, len(own)) and shared >= SHARED_SHARE * len(own):
+                raise DataError(
+                    f"'{recording.name}' ({recording.source}) shares {shared} of its {len(own)} different rows with "
+                    f"the frozen session '{frozen[other.digest]}' of the search; a piece of it must not train: "
+                    "remove it"
+                )
+
+
+def _rows(values: np.ndarray) -> np.ndarray:
+    """Each row as one value that can be compared."""
+    solid = np.ascontiguousarray(values)
+    return solid.view(np.dtype((np.void, solid.dtype.itemsize * solid.shape[1]))).ravel()
+
+
+def _whole(recordings: Sequence[Recording], parts: Mapping[str, Sequence[int]]) -> Split:
+    """Whole recordings by part.
+
+    Raises:
+        DataError: a part is empty.
+    """
+    for part, places in parts.items():
+        if not places:
+            raise DataError(
+                f"split: no recording is left for {part}; {len(recordings)} recording(s) given. Give the recordings of "
+                "the search, or, for other data, --set split.missing=draw"
+            )
+    made = {part: tuple(Stretch(i, 0, recordings[i].samples) for i in sorted(places)) for part, places in parts.items()}
+    return Split(made["train"], made["validation"], made["test"])
+
+
+def _order(stretch: Stretch) -> tuple[int, int]:
+    return stretch.recording, stretch.start
