@@ -231,7 +231,7 @@ class World:
 def walked():
     world = World()
     small = {"module_trials": 2, "free_trials": 4, "joint_trials": 3, "variance_runs": 10, "most_runs": 5, "trials": 6}
-    found = conduct(ground(**small, warm_rounds=1, rungs=(0.5,)), world)
+    found = conduct(ground(**small, warm_rounds=1, rungs=(0.5,)), world, until="exploration")
     return found, world.orders
 
 

@@ -17,8 +17,11 @@ from edp.evaluation.controller import Budget
 from edp.ledger import Ledger
 from edp.logs import read_recording, write_recording
 from edp.search.diary import look_at
+from edp.search.phases.compression import order_of, recipe_of, teacher_settings
 from edp.search.plan import load_plan
 from edp.search.runner import Crew, Watchers, run_search
+from edp.search.smaller import Recipe, before, make_smaller
+from edp.search.trainings import experiment_of
 from edp.search.worker import perform
 from edp.sources import DataSource
 from edp.storage import read_json
@@ -290,3 +293,22 @@ def test_a_split_that_contradicts_itself_is_refused():
     with pytest.raises(ConfigError, match="no second lock-box"):
         ByFrozen(test=(session,)).opened()
     assert plain_tree(ByFrozen(test=(session,)), "split")["test"] == [{"name": "a", "digest": "1"}]
+
+
+def test_a_network_of_several_epochs_is_the_same_from_a_state_and_from_nothing(study, plan):
+    ground = replace(study.ground, spec=replace(plan.spec, mode="thesis", epochs=3, updates=6, final_updates=6))
+    settings = teacher_settings(ground)
+    recipe = replace(recipe_of(ground, 2), rounded=True, final="w8a16")
+    order = order_of(ground, settings, recipe, ground.second)
+    assert (order.epochs, order.validation) == (3, ground.validation)
+    assert not set(order.train) & {*ground.validation, *ground.test, *ground.second}
+    whole, state = make_smaller(order.to_json())
+    assert state is None
+    earlier = before(order)
+    assert [Recipe.from_json(one.recipe).name for one in earlier] == ["u2_qat", "u2", "teacher"]
+    assert not any(set(one.judged) & set(ground.second) for one in earlier)
+    for one in earlier:
+        found = make_smaller(order.to_json(), make_smaller(one.to_json())[1])[0]
+        assert {**found, "seconds": 0} == {**whole, "seconds": 0}
+    experiment = Recipe.from_json(order.recipe).experiment(experiment_of(order))
+    assert (experiment.training.epochs, experiment.training.updates) == (1, 1)

@@ -11,7 +11,7 @@ from edp.report import read_study, write_study_page
 from edp.search.doing import Doing
 from edp.search.plan import load_plan
 from edp.search.runner import Crew, Watchers, run_search
-from edp.search.trainings import Order, _prepared, experiment_of, settings_of, train_order, train_part
+from edp.search.trainings import Order, experiment_of, prepared, settings_of, train_order, train_part
 from edp.search.worker import perform
 from edp.training.parts import fit_part
 
@@ -22,6 +22,7 @@ CHANGES = (
     'search={horizon=1, backbones=["hybrid"], features=["all"], updates=6, final_updates=6, epochs=3, patience=1}',
     "search={folds=2, variance_runs=4, variance_seeds=2, trials=3, warm_rounds=1, module_trials=1, most_runs=2}",
     "search={run_seeds=2, joint_trials=2, free_trials=3, rungs=[0.3, 0.6]}",
+    'search.compression={formats=["float32"], shares=[0.5]}',
     "search.space={units=[2, 4], layers=[1, 2], kernel=[3, 5]}",
 )
 
@@ -108,7 +109,7 @@ def test_the_plateau_lowers_the_rate(order):
     settings["training"]["schedule"] = {"kind": "plateau", "shrink": 0.5, "patience": 0, "threshold": 1e-4}
     wild = dataclasses.replace(order, settings=settings, patience=0)
     experiment = experiment_of(wild)
-    fitted, _ = fit_part(_prepared(wild, experiment), experiment.model, experiment.training, windowed=True)
+    fitted, _ = fit_part(prepared(wild, experiment), experiment.model, experiment.training, windowed=True)
     rates = [row["learning_rate"] for row in fitted.history]
     assert rates[0] == 0.5
     assert min(rates) <= 0.25
@@ -144,8 +145,8 @@ def test_the_judging_sessions_validate_and_predictions_are_made_window_by_window
 
 
 @pytest.fixture(scope="module")
-def finished(lever_sessions, plan, tmp_path_factory):
-    return run_search(lever_sessions, plan, tmp_path_factory.mktemp("study"), CREW)
+def finished(six_sessions, plan, tmp_path_factory):
+    return run_search(six_sessions, plan, tmp_path_factory.mktemp("study"), CREW)
 
 
 def test_all_phases_run_by_the_rules_of_the_thesis_and_leave_a_teacher(finished, plan):
@@ -160,10 +161,13 @@ def test_all_phases_run_by_the_rules_of_the_thesis_and_leave_a_teacher(finished,
     with Ledger(finished.folder / "ledger") as ledger:
         held = list(ledger)
     assert {record.identity.epochs for record in held} == {3}
-    tests = set(finished.ground.test)
+    tests = {*finished.ground.test, *finished.ground.second}
+    assert finished.ground.decided["compression"].facts["chosen"] is not None
     for record in held:
         split = record.identity.split
         assert not tests & {*split["train"], *split["validation"]}
+        if "recipe" in record.identity.config:
+            continue
         assert record.result["best_epoch"] <= record.result["epochs"] <= 3
 
 
@@ -175,7 +179,7 @@ def test_its_report_is_written_and_speaks_of_epochs(finished, tmp_path):
 
 
 @pytest.mark.slow
-def test_stopped_again_and_again_it_comes_to_the_same(lever_sessions, plan, finished, tmp_path):
+def test_stopped_again_and_again_it_comes_to_the_same(six_sessions, plan, finished, tmp_path):
     def stop_every_25(diary):
         if diary.trained >= 25:
             raise Stop
@@ -183,7 +187,7 @@ def test_stopped_again_and_again_it_comes_to_the_same(lever_sessions, plan, fini
     trained = 0
     for _ in range(20):
         try:
-            found = run_search(lever_sessions, plan, tmp_path, CREW, watchers=Watchers(on_progress=stop_every_25))
+            found = run_search(six_sessions, plan, tmp_path, CREW, watchers=Watchers(on_progress=stop_every_25))
         except Stop:
             trained += 25
             continue
