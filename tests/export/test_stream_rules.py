@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from pathlib import Path
 
@@ -167,7 +168,7 @@ def test_inputs_that_are_no_tick_are_refused_and_change_nothing(inputs, words, b
 
 
 def test_a_network_that_overflows_restarts(bundle_of):
-    predictor = bundle_of("tcn").predictor
+    predictor = copy.deepcopy(bundle_of("tcn").predictor)  # the networks are shared between tests
     stream = Stream(predictor)
     rows = random_inputs(predictor, 12, seed=1)
     for row in rows:

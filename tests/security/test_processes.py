@@ -73,6 +73,11 @@ def descendants(pid):
     return found
 
 
+def heeds_interrupts() -> None:
+    """In a new process: a shell starts what runs in its background with Ctrl-C ignored, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @LINUX
 @pytest.mark.parametrize(
     ("number", "code"),
@@ -82,7 +87,8 @@ def descendants(pid):
 def test_helpers_of_a_simulation_end_with_it(tmp_path, number, code):
     script = tmp_path / "forever.py"
     script.write_text(FOREVER.replace("FOLDER", str(tmp_path)).replace("sys.argv[1], job", f"{str(tmp_path)!r}, job"))
-    with subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True) as parent:
+    command = [sys.executable, str(script)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heeds_interrupts) as parent:
         until(lambda: (tmp_path / "a").exists() and (tmp_path / "b").exists())
         helpers = descendants(parent.pid)
         assert len(helpers) >= 2

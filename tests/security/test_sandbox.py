@@ -267,6 +267,11 @@ def test_low_memory_is_not_told_as_damage(hostile):
     assert done.stderr == ""
 
 
+def heed_interrupts() -> None:
+    """In a new process: a shell starts what runs in its background with Ctrl-C ignored, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @linux
 def test_readers_end_with_whoever_asked(tmp_path):
     path = write_recording(recording(300_000), tmp_path / "a.parquet")
@@ -277,7 +282,9 @@ def test_readers_end_with_whoever_asked(tmp_path):
     for how in (signal.SIGKILL, signal.SIGINT):
         command = [sys.executable, "-c", code, str(path)]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        asking = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment)
+        asking = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, preexec_fn=heed_interrupts
+        )
         assert asking.stdout.readline() == b"open\n"
         started = descendants(asking.pid)
         assert len(started) == 2  # the worker and the reader
