@@ -17,6 +17,7 @@ from edp.config import load_experiment
 from edp.errors import EdpError
 from edp.logs.detect import format_for
 from edp.logs.raw import FORMATS
+from edp.logs.served import keep_temporary_files_in_memory
 from edp.signals import SignalMap
 from edp.sim import Snapshot
 from edp.sources import load_signal_map
@@ -40,7 +41,7 @@ LIBRARIES = tuple(
     | {
         os.path.dirname(os.path.realpath(edp.__file__)),
         "/usr/share/zoneinfo",
-        "/proc/self",
+        f"/proc/{os.getpid()}",  # what /proc/self leads to: free memory is asked for before it is taken
         "/proc/meminfo",
         "/sys/fs/cgroup",
     }
@@ -63,7 +64,8 @@ class Trace:
         if event == "exec":
             return self.code(getattr(arguments[0], "co_filename", "?"))
         if event == "compile":
-            return self.code(arguments[1])
+            # NumPy parses headers of arrays with `ast.literal_eval`, to a tree that is not run; running is `exec`.
+            return "" if arguments[1] == "<unknown>" else self.code(arguments[1])
         if event == "open":
             return self.opened(arguments[0], arguments[1], arguments[2])
         if event == "import":
@@ -115,6 +117,7 @@ def main() -> None:
     files = sorted(folder.iterdir())
     for path in [file for file in files if file.name.startswith("honest")]:
         ends[path.name] = read(path)
+    keep_temporary_files_in_memory()
     for path in [file for file in files if not file.name.startswith(("honest", "other"))]:
         trace.seen, trace.now, trace.armed = [], os.path.realpath(path), True
         ends[path.name] = read(path)

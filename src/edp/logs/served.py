@@ -54,7 +54,7 @@ def serve(requests: int, answers: int) -> None:
         os.chdir(order["folder"])
         path = Path(order["path"])
         allowance = Allowance(path, order["size"])
-        _keep_temporary_files_in_memory()
+        keep_temporary_files_in_memory()
         lock_down([Path(os.path.realpath(path))])
         served = _answer(write, allowance, 0, lambda: _read(order, path))
         while served is not None:
@@ -226,7 +226,7 @@ def _parts(table: Table, keys: Sequence[str], start: int, stop: int) -> Iterator
             yield [column[start : start + rows] for column in columns]
 
 
-def _keep_temporary_files_in_memory() -> None:
+def keep_temporary_files_in_memory() -> None:
     """The library of MDF opens a temporary file for what may be appended to a log, also where nothing is."""
     for name in ("asammdf.blocks.mdf_v4", "asammdf.blocks.mdf_v3"):
         if name in sys.modules:
