@@ -22,7 +22,7 @@ from edp.runs import command_line
 from edp.screening import FlagKind, OnProgress, Screening, ScreeningSpec, screen
 from edp.signals import VOCABULARY, SignalMap
 from edp.sources import DataSource
-from edp.storage import make_folder, write_bytes, write_json
+from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
 
 PROPOSED, DIFFERENCES, ALL = "proposed", "proposed + differences", "all candidates"
@@ -109,7 +109,7 @@ def select_features(
         EdpError: the recordings cannot be read as they are, or nothing can be told from them.
     """
     order, listeners = order or SelectionOrder(), listeners or Listeners()
-    folder = make_folder(out)
+    folder = check_writable(out)
     mapped = source if source.signal_map is not None or _lists_maps(source) else _taken_whole(source)
     quality = mapped.inspect(listeners.on_log)
     recordings, notes = _read(mapped, quality)

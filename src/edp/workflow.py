@@ -41,7 +41,7 @@ from edp.onboard import Adaptation
 from edp.report import build_report
 from edp.runs import RunFolder, command_line, environment, read_provenance, run_key
 from edp.sources import DataSource
-from edp.storage import make_folder, read_object, write_bytes, write_json
+from edp.storage import check_writable, make_folder, read_object, write_bytes, write_json
 from edp.training import Bundle, Diverged, Event, Fitted, fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler, weights_digest
 from edp.training.fit import thread_count
@@ -226,6 +226,7 @@ def evaluate(
         The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
     """
     folder = Path(run)
+    _check_run_writable(folder)
     bundle, experiment, provenance, data = trained_run(folder)
     target, judged = folder, [data.digest]
     if source is not None:
@@ -245,6 +246,12 @@ def evaluate(
     if source is None:
         save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
     return target
+
+
+def _check_run_writable(folder: Path) -> None:
+    """See before minutes of work that a run folder can be written; one that is not there is told by its reader."""
+    if folder.is_dir():
+        check_writable(folder)
 
 
 def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepared]:
@@ -284,6 +291,7 @@ def channel_worths(
         The figures, and the file ``worth.json`` with them: in the run folder, or in the folder in it for `source`.
     """
     folder = Path(run)
+    _check_run_writable(folder)
     bundle, _, _, data = trained_run(folder)
     target = folder
     if source is not None:

@@ -64,6 +64,10 @@ def run(
     ] = None,
     workers: Annotated[int, typer.Option(help="Trainings side by side; 0: as many as cores.")] = 0,
     cluster: Annotated[str, typer.Option(help="Address of a Ray cluster that trains instead, or auto.")] = "",
+    open_cluster: Annotated[
+        bool,
+        typer.Option("--open-cluster", help="Take a cluster without a token, on which whoever reaches it runs code."),
+    ] = False,
     threads: Annotated[int, typer.Option(help="Of each training; another number is another training.")] = 1,
     seconds: Annotated[float | None, typer.Option(help="Cap on the time of a training.")] = None,
     memory: Annotated[float | None, typer.Option(help="Cap on the memory of a training, MB.")] = None,
@@ -85,7 +89,14 @@ def run(
     changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
-    crew = Crew(workers=workers, threads=threads, seconds=seconds, memory_mb=memory, cluster=cluster)
+    crew = Crew(
+        workers=workers,
+        threads=threads,
+        seconds=seconds,
+        memory_mb=memory,
+        cluster=cluster,
+        open_cluster=open_cluster,
+    )
     source = source_of(data, signal_map, repair)
     with progress(as_json) as shown:
         display = SearchDisplay(shown, Steps(as_json), as_json)

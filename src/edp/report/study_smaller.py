@@ -63,4 +63,4 @@ def chosen_words(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     if facts["box"] is None:
         return f"{text}; it could not be judged on the second lock-box."
     change = percent(real(facts["box"]["error"]) - 1, signed=True)
-    return f"{text}; on the second lock-box its error is {change} of the teacher's."
+    return f"{text}; on the second lock-box its error is {change} against the teacher's."

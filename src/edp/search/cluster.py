@@ -6,6 +6,8 @@ Only the coordinator writes the ledger; a node needs this version of EDP and the
 from __future__ import annotations
 
 import contextlib
+import ipaddress
+import os
 import socket
 import tempfile
 from collections import deque
@@ -37,12 +39,15 @@ class RayPool(ClosedAtExit):
         address: of the cluster, for example ``10.0.0.1:6379``, or ``auto``.
         threads: of each training, and cores that it takes.
         retries: how often a training whose node or worker is lost starts again.
+        open_cluster: take a cluster without a token at an address that other computers may reach.
 
     Raises:
-        ConfigError: Ray is missing, the cluster cannot be reached, or a node has other code or other versions.
+        ConfigError: Ray is missing, the cluster cannot be reached or is open, or a node has other code or versions.
     """
 
-    def __init__(self, address: str, threads: int = 1, retries: int = RETRIES) -> None:
+    def __init__(self, address: str, threads: int = 1, retries: int = RETRIES, open_cluster: bool = False) -> None:
+        if not open_cluster:
+            check_closed(address)
         self.ray = _ray()
         self.threads, self.retries = threads, retries
         _reach(self.ray, address)
@@ -200,6 +205,34 @@ def _ray() -> Any:
             "on every node, or take --workers"
         ) from error
     return ray
+
+
+def check_closed(address: str) -> None:
+    """Refuse a cluster at which anybody in the network may run code.
+
+    Ray listens on all interfaces and, without a token, runs what any client sends. A cluster that checks tokens turns
+    away a client without one, so a client that is set up without a token can only ever reach an open cluster.
+
+    Args:
+        address: of the cluster; ``auto`` may lead anywhere.
+
+    Raises:
+        ConfigError: the address is not loopback, and Ray's token authentication is off here.
+    """
+    if _is_loopback(address.rpartition(":")[0] or address) or os.environ.get("RAY_AUTH_MODE", "").lower() == "token":
+        return
+    raise ConfigError(
+        f"the cluster at '{address}' is used without a token: whoever reaches it can run code on its nodes. Start its "
+        "nodes with RAY_AUTH_MODE=token and RAY_AUTH_TOKEN, and set both here; or give --open-cluster where nobody "
+        "else is in that network"
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def _reach(ray: Any, address: str) -> None:

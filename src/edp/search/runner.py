@@ -50,6 +50,7 @@ class Crew:
         seconds: cap on the time of a training.
         memory_mb: cap on its memory.
         cluster: address of a Ray cluster that does them instead; empty for this machine.
+        open_cluster: take a cluster without a token at an address that other computers may reach.
 
     Raises:
         ConfigError: a number out of range, or workers of this machine and a cluster.
@@ -60,6 +61,7 @@ class Crew:
     seconds: float | None = None
     memory_mb: float | None = None
     cluster: str = ""
+    open_cluster: bool = False
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -81,7 +83,7 @@ class Crew:
         if self.cluster:
             from edp.search.cluster import RayPool  # Ray takes seconds to import, and few have it
 
-            return RayPool(self.cluster, self.threads)
+            return RayPool(self.cluster, self.threads, open_cluster=self.open_cluster)
         return LocalPool(self.workers or max(1, len(os.sched_getaffinity(0)) // self.threads), self.threads)
 
 

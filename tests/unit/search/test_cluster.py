@@ -153,7 +153,7 @@ def test_no_cluster_at_an_address_is_told_at_once():
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"\[cluster\]"):
-        Crew(cluster="auto").gather()
+        Crew(cluster="auto", open_cluster=True).gather()
 
 
 def test_workers_of_two_kinds_are_refused():
@@ -211,7 +211,7 @@ def node(monkeypatch):
 
 def test_states_travel_with_jobs_and_nodes_never_see_the_ledger(node, job_of, tmp_path):
     folder = tmp_path / "ledger"
-    with RayPool("somewhere") as pool, Ledger(folder) as ledger:
+    with RayPool("somewhere", open_cluster=True) as pool, Ledger(folder) as ledger:
         first = job_of(1, "goes_on")
         complete(ledger, pool, [first])
         file = ledger.state(first.key)
@@ -225,7 +225,7 @@ def test_states_travel_with_jobs_and_nodes_never_see_the_ledger(node, job_of, tm
 
 
 def test_a_state_that_breaks_on_its_way_to_a_node_is_not_gone_on_from(node, job_of, tmp_path):
-    with RayPool("somewhere") as pool, Ledger(tmp_path / "ledger") as ledger:
+    with RayPool("somewhere", open_cluster=True) as pool, Ledger(tmp_path / "ledger") as ledger:
         broken = tmp_path / "0.state"
         broken.write_bytes(b"edp state 1")
         job = job_of(3, "tells_of_a_state")

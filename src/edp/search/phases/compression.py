@@ -112,8 +112,8 @@ class Compression:
         row = rows[chosen]
         sentences.append(
             f"Chosen for '{budget.name}': {row['name']} with {row['taken']['parameter_bytes']:,} bytes of parameters "
-            f"and {row['taken']['cycles'][2]:,} cycles a tick; its error is {100 * (row['error'] - 1):+.1f} % of the "
-            "teacher's there."
+            f"and {row['taken']['cycles'][2]:,} cycles a tick; its error there is {100 * (row['error'] - 1):+.1f} % "
+            "against the teacher's."
         )
         formats = ("float32", row["format"])
         held = [o.result["formats"].get(f) if o.result is not None else None for o, f in zip(outcomes, formats)]
@@ -124,8 +124,8 @@ class Compression:
         error = relative(scores["chosen"], scores["teacher"])
         facts["box"] = {"scores": scores, "error": error}
         sentences.append(
-            f"On {len(ground.second)} sessions of the second lock-box, opened for these two alone: "
-            f"{100 * (error - 1):+.1f} % of the teacher's error."
+            f"On the second lock-box ({', '.join(ground.second)}), opened for these two alone: "
+            f"{100 * (error - 1):+.1f} % against the teacher's error."
         )
         return Decision(NAME, facts, tuple(sentences))
 

@@ -1,0 +1,37 @@
+"""Commands that compute for minutes say first that their folder cannot be written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import edp.storage.writing
+import edp.workflow
+from edp.errors import EdpError, StorageError
+from edp.selection import select_features
+from edp.sources import DataSource
+
+
+def full(target: Path) -> tuple[int, str]:
+    raise OSError(30, "Read-only file system")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "channel_worths"])
+def test_a_run_that_cannot_be_written_is_told_before_it_is_read(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(edp.storage.writing, "_temporary", full)
+    monkeypatch.setattr(edp.workflow, "trained_run", lambda folder: pytest.fail("it was read first"))
+    with pytest.raises(StorageError, match="Read-only file system"):
+        getattr(edp.workflow, command)(tmp_path)
+
+
+def test_a_missing_run_is_not_made(tmp_path):
+    with pytest.raises(EdpError, match="run"):
+        edp.workflow.evaluate(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_screening_that_cannot_be_written_reads_no_log(tmp_path, monkeypatch):
+    monkeypatch.setattr(edp.storage.writing, "_temporary", full)
+    with pytest.raises(StorageError, match="Read-only file system"):
+        select_features(DataSource.of(tmp_path / "no_logs"), tmp_path / "screen")
