@@ -42,7 +42,7 @@ def bomb(kind: str) -> bytes:
     if kind == "bz2":
         # Streams one after the other are one content.
         return bz2.compress(bytes(1 << 24)) * 64
-    return lz4.frame.compress(bytes(1 << 28))
+    return lz4.frame.compress(bytes(1 << 26))  # small enough to be packed under a limit, too
 
 
 @pytest.fixture(scope="module")
@@ -329,14 +329,10 @@ def test_bags_of_ros_1_are_unpacked_within_bounds(little_memory):
 
     with pytest.raises(FileNotFoundError):
         open_reader(Path("missing.db3"))
-    for kind in ("bz2", "lz4"):
-        packed = bomb(kind)
-        if kind == "lz4":
-            # lz4 cannot pack better than 255 to 1, so all of it is within the bound.
-            assert len(lz4.frame.compress(bytes(1 << 24))) > (1 << 24) / 1100
-            continue
-        with pytest.raises(DataError, match="unpack to more than"):
-            reader.decompressors[kind](packed)
+    # lz4 cannot pack better than 255 to 1, so all of it is within the bound.
+    assert len(lz4.frame.compress(bytes(1 << 24))) > (1 << 24) / 1100
+    with pytest.raises(DataError, match="unpack to more than"):
+        reader.decompressors["bz2"](bomb("bz2"))
 
 
 @pytest.mark.parametrize("count", [1_000_000_000, 100_001])
