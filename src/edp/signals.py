@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from edp.bounds import shown
 from edp.errors import ConfigError, closest
 
 
@@ -298,7 +299,7 @@ class SignalMap:
         if twice:
             raise ConfigError(f"signal map names channel(s) twice: {', '.join(twice)}; keep one entry each")
         if self.time_unit not in TIME_UNITS:
-            raise ConfigError(f"signal map: time_unit '{self.time_unit}' is not one of {', '.join(TIME_UNITS)}")
+            raise ConfigError(f"signal map: time_unit {shown(self.time_unit)} is not one of {', '.join(TIME_UNITS)}")
         for key in ("sample_time_s", "rate_hz"):
             value = getattr(self, key)
             if value is not None and not (math.isfinite(value) and _SLOWEST <= value <= _FASTEST):
@@ -306,9 +307,9 @@ class SignalMap:
                     f"signal map: {key} = {value:g}; give a number from {_SLOWEST:g} to {_FASTEST:g}, or leave it out"
                 )
         if self.delimiter is not None and (len(self.delimiter) != 1 or self.delimiter in '"\r\n\0'):
-            raise ConfigError(f"signal map: delimiter = {self.delimiter!r}; give one character, such as ',' or ';'")
+            raise ConfigError(f"signal map: delimiter = {shown(self.delimiter)}; give one character, such as ',' or ';'")
         if self.decimal not in (".", ","):
-            raise ConfigError(f"signal map: decimal = {self.decimal!r}; give '.' or ','")
+            raise ConfigError(f"signal map: decimal = {shown(self.decimal)}; give '.' or ','")
         for entry in self.channels:
             entry.check()
 
