@@ -307,7 +307,9 @@ class SignalMap:
                     f"signal map: {key} = {value:g}; give a number from {_SLOWEST:g} to {_FASTEST:g}, or leave it out"
                 )
         if self.delimiter is not None and (len(self.delimiter) != 1 or self.delimiter in '"\r\n\0'):
-            raise ConfigError(f"signal map: delimiter = {shown(self.delimiter)}; give one character, such as ',' or ';'")
+            raise ConfigError(
+                f"signal map: delimiter = {shown(self.delimiter)}; give one character, such as ',' or ';'"
+            )
         if self.decimal not in (".", ","):
             raise ConfigError(f"signal map: decimal = {shown(self.decimal)}; give '.' or ','")
         for entry in self.channels:

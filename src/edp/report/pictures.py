@@ -23,6 +23,7 @@ from edp.report.screening_views import (
     stability_views,
     value_views,
 )
+from edp.report.wording import short_label
 from edp.screening import Screening
 
 if TYPE_CHECKING:
@@ -107,14 +108,14 @@ def _lags(figure: Figure, view: LagView, rate_hz: float) -> None:
     axes.axhline(0, color="#c4cbd2", lw=0.8)
     for k, curve in enumerate(view.curves):
         colour, dash = LINES[k % len(LINES)], DASHES[k // len(LINES) % len(DASHES)]
-        label = f"{curve.channel} ({curve.best:+d})".replace("-", "−")
+        label = f"{short_label(curve.channel)} ({curve.best:+d})".replace("-", "−")
         axes.plot(curve.lags, curve.correlation, color=colour, ls=dash, lw=1.8 if k == 0 else 1.2, label=label)
         axes.plot([curve.best], [curve.value], "o" if curve.certain else "x", color=colour, ms=4)
     axes.set_xlabel(f"Lag [samples of {1e3 / rate_hz:g} ms]; left: the channel leads")
     axes.set_ylabel("Cross-correlation")
     axes.set_xlim(float(view.curves[0].lags.min()), float(view.curves[0].lags.max()))
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8)
-    axes.set_title(f"Lags against {view.target}")
+    axes.set_title(f"Lags against {short_label(view.target)}")
 
 
 def _bars(figure: Figure, views: Sequence[BarView]) -> None:
@@ -145,4 +146,5 @@ def _panel(axes: Axes, view: BarView) -> None:
     axes.set_axisbelow(True)
     axes.axvline(0, color="#c4cbd2", lw=0.8)
     more = f" (+ {view.more} more)" if view.more else ""
-    axes.set_title(("mean of all targets" if view.target == "all" else view.target) + more, fontsize=9, weight="normal")
+    title = "mean of all targets" if view.target == "all" else short_label(view.target)
+    axes.set_title(title + more, fontsize=9, weight="normal")

@@ -22,6 +22,7 @@ from edp.report.screening_views import (
     value_views,
 )
 from edp.report.style import BLUE, INK, MUTED, RULE, SOFT, Control, Plot, styled
+from edp.report.wording import short_label
 from edp.screening import Screening
 
 SEQUENTIAL = [[0.0, "#f7fafe"], [0.25, "#b7d0f7"], [0.5, "#6d9fec"], [0.75, "#2567d3"], [1.0, "#062c74"]]
@@ -99,7 +100,7 @@ def lag_plot(views: Sequence[LagView], rate_hz: float) -> Plot | None:
             figure.add_scatter(
                 x=curve.lags.tolist(),
                 y=np.round(curve.correlation, 4).tolist(),
-                name=f"{html.escape(curve.channel)} ({curve.best:+d})".replace("-", "−"),
+                name=f"{html.escape(short_label(curve.channel))} ({curve.best:+d})".replace("-", "−"),
                 mode="lines",
                 line={
                     "color": LINES[k % len(LINES)],

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.report.wording import short_label, short_labels
 from edp.screening import Importance, LagCurve, Screening, Stability, Value
 
 Array = NDArray[np.float64]
@@ -112,7 +113,8 @@ def matrix_views(found: Screening) -> tuple[MatrixView, ...]:
             np.fill_diagonal(values, np.nan)
             good = values[np.isfinite(values)]
             top = max(float(np.quantile(good, 0.995)), 1e-3) if len(good) else 1.0
-        made.append(MatrixView(measure, title, UNITS.get(measure, ""), found.matrices.names, values, top, signed))
+        names = short_labels(found.matrices.names)
+        made.append(MatrixView(measure, title, UNITS.get(measure, ""), names, values, top, signed))
     return tuple(made)
 
 
@@ -195,7 +197,13 @@ def _stability(found: Screening, metric: str, target: str, title: str, entries: 
         )
         for e in ranked[:MOST_BARS]
     )
-    return BarView(metric, target, title, bars, max(0, len(ranked) - MOST_BARS))
+    return BarView(metric, target, title, _told_apart(bars), max(0, len(ranked) - MOST_BARS))
+
+
+def _told_apart(bars: Sequence[Bar]) -> tuple[Bar, ...]:
+    """Bars under short labels, each its own."""
+    labels = short_labels(bar.label for bar in bars)
+    return tuple(replace(bar, label=label) for bar, label in zip(bars, labels, strict=True))
 
 
 def importance_views(found: Screening) -> tuple[BarView, ...]:
@@ -210,7 +218,11 @@ def importance_views(found: Screening) -> tuple[BarView, ...]:
             for e in ranked[:MOST_BARS]
         )
         if bars:
-            made.append(BarView("importance", target, "Permutation importance", bars, max(0, len(ranked) - MOST_BARS)))
+            made.append(
+                BarView(
+                    "importance", target, "Permutation importance", _told_apart(bars), max(0, len(ranked) - MOST_BARS)
+                )
+            )
     return tuple(made)
 
 
@@ -223,13 +235,13 @@ def value_views(found: Screening) -> tuple[BarView, ...]:
         ranked = sorted(entries, key=lambda entry: -entry.gain)
         bars = tuple(Bar(e.channel, e.gain, e.low, e.high, kept=e.channel in kept) for e in ranked[:MOST_BARS])
         if bars:
-            made.append(BarView("value", target, "Linear value", bars, max(0, len(ranked) - MOST_BARS)))
+            made.append(BarView("value", target, "Linear value", _told_apart(bars), max(0, len(ranked) - MOST_BARS)))
     return tuple(made)
 
 
 def joined(members: Sequence[str]) -> str:
     """A group by its first members."""
-    shown = ", ".join(members[:3])
+    shown = ", ".join(map(short_label, members[:3]))
     return shown if len(members) <= 3 else f"{shown} + {len(members) - 3}"
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import plotly.graph_objects as go
 
 from edp.report.facts import NETWORK, TRUTH, Facts, horizon_text, label_of
+from edp.report.wording import short_label
 
 INK, SOFT, RULE = "#26303a", "#66717d", "#e4e8ec"
 BLUE, GREY = "#0b57d0", "#3c4650"
@@ -62,7 +63,7 @@ def mark(facts: Facts, model: str) -> str:
 
 def name_of(facts: Facts, model: str) -> str:
     """Plotly reads a subset of HTML in its texts, so names from files are escaped."""
-    return "Measured" if model == TRUTH else html.escape(label_of(facts, model))
+    return "Measured" if model == TRUTH else html.escape(short_label(label_of(facts, model)))
 
 
 def styled(figure: go.Figure, height: int, **layout: Any) -> go.Figure:

@@ -14,6 +14,7 @@ from edp.report.drawing import BLUE as DRAWN_BLUE
 from edp.report.drawing import DROPPED, INK
 from edp.report.style import BLUE, GREY, MUTED, Control, Plot, styled, with_unit
 from edp.report.transfer_facts import SOURCE, TARGET, Transfer
+from edp.report.wording import short_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +48,7 @@ def _controls(facts: Transfer, *more: Control) -> tuple[Control, ...]:
 def prediction_plot(facts: Transfer) -> Plot:
     """Truth, prediction before and after, a row for each target (figures 4.8 and 4.10)."""
     rows = len(facts.targets)
-    titles = [with_unit(facts.name(target), target["unit"]) for target in facts.targets]
+    titles = [with_unit(short_label(facts.name(target)), target["unit"]) for target in facts.targets]
     figure = make_subplots(rows=rows, cols=1, shared_xaxes=True, vertical_spacing=0.18 / rows, subplot_titles=titles)
     names = _excerpts(facts)
     for name in names:
@@ -74,7 +75,7 @@ def prediction_plot(facts: Transfer) -> Plot:
 def error_plot(facts: Transfer) -> Plot:
     """Distribution of the errors before and after, a panel for each target (figures 4.9 and 4.11)."""
     columns = len(facts.targets)
-    titles = [html.escape(facts.name(target)) for target in facts.targets]
+    titles = [html.escape(short_label(facts.name(target))) for target in facts.targets]
     figure = make_subplots(rows=1, cols=columns, horizontal_spacing=0.06, subplot_titles=titles)
     for horizon, held in facts.held["distributions"].items():
         for key, label, ink, _ in _curves(facts)[1:]:
@@ -111,7 +112,7 @@ def method_plot(facts: Transfer) -> Plot:
             for place, target in enumerate(facts.targets):
                 figure.add_bar(
                     x=labels, y=[facts.score(name, horizon, target["name"], world)["mae"] for name in order],
-                    row=row, col=1, name=html.escape(facts.name(target)), legendgroup=target["name"],
+                    row=row, col=1, name=html.escape(short_label(facts.name(target))), legendgroup=target["name"],
                     showlegend=row == 1, marker={"color": MUTED[place % len(MUTED)]}, meta={AHEAD: horizon},
                     visible=horizon == facts.horizons[0], hovertemplate="%{y:.4~g}",
                 )  # fmt: skip
@@ -141,7 +142,7 @@ def _draw_course(figure: Figure, facts: Transfer, method: str, place: int) -> No
         axes, factor = rows[row, 0], target["factor"]
         axes.plot(time, truth[:, place, row] * factor, color=DROPPED, linewidth=2.4, label="measured")
         axes.plot(time, said[:, place, row] * factor, color=DRAWN_BLUE, linewidth=0.9, label="predicted")
-        axes.set(ylabel=f"{facts.name(target)}\n[{target['unit']}]")
+        axes.set(ylabel=f"{short_label(facts.name(target))}\n[{target['unit']}]")
     rows[0, 0].legend(frameon=False, fontsize=7, ncols=2)
     rows[-1, 0].set(xlabel="Time in the test part [s]")
     figure.suptitle(f"{facts.methods[method]['label']}, {name}", fontsize=10)
@@ -155,7 +156,7 @@ def _draw_errors(figure: Figure, facts: Transfer, method: str, horizon: str) -> 
         row = facts.score(method, horizon, target["name"])
         axes.stairs(100 * np.array(held["shares"][method]), held["edges"], fill=True, color=DRAWN_BLUE, alpha=0.7)
         axes.axvline(row["bias"], color=INK, linewidth=0.8, linestyle=":")
-        axes.set(xlabel=f"Error [{target['unit']}]", title=facts.name(target))
+        axes.set(xlabel=f"Error [{target['unit']}]", title=short_label(facts.name(target)))
         axes.text(0.02, 0.97, f"bias {row['bias']:.2f}\nskew {row['skew']:.2f}", transform=axes.transAxes, va="top")
     panels[0, 0].set(ylabel="Share of samples [%]")
     figure.suptitle(f"{facts.methods[method]['label']}, {facts.ahead(horizon)}", fontsize=10)

@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from datetime import datetime
 
 MISSING = "–"
+LABEL_START, LABEL_END = 40, 19
+"""Characters of a long name that a picture shows, around an ellipsis: 60 in all leave room for what is drawn."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 """With what a spreadsheet takes a cell for a formula."""
 
@@ -42,6 +44,23 @@ def percent(share: float | None, signed: bool = False) -> str:
 def printable(text: str) -> str:
     """Text without control characters, turns of direction and halves of characters, each of them as one mark."""
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else "\ufffd" for c in text)
+
+
+def short_label(name: str) -> str:
+    """A name as a picture shows it: at most 60 characters, the middle of a longer one left out."""
+    if len(name) <= LABEL_START + 1 + LABEL_END:
+        return name
+    return f"{name[:LABEL_START]}…{name[-LABEL_END:]}"
+
+
+def short_labels(names: Iterable[str]) -> tuple[str, ...]:
+    """Short names of one picture, told apart by a number where only the middle did: axes go by their labels."""
+    seen: dict[str, int] = {}
+    labels = []
+    for label in map(short_label, names):
+        seen[label] = seen.get(label, 0) + 1
+        labels.append(label if seen[label] == 1 else f"{label} ({seen[label]})")
+    return tuple(labels)
 
 
 def in_cell(text: str) -> str:
