@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from datetime import datetime
 
 MISSING = "–"
-LABEL_START, LABEL_END = 40, 19
-"""Characters of a long name that a picture shows, around an ellipsis: 60 in all leave room for what is drawn."""
+LABEL_START, LABEL_END = 20, 11
+"""Characters of a long name that a picture shows, around an ellipsis: 32 in all leave half of a panel to the drawing."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 """With what a spreadsheet takes a cell for a formula."""
 
@@ -47,7 +47,7 @@ def printable(text: str) -> str:
 
 
 def short_label(name: str) -> str:
-    """A name as a picture shows it: at most 60 characters, the middle of a longer one left out."""
+    """A name as a picture shows it: at most 32 characters, the middle of a longer one left out."""
     if len(name) <= LABEL_START + 1 + LABEL_END:
         return name
     return f"{name[:LABEL_START]}…{name[-LABEL_END:]}"
