@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError
 from edp.limits import check_memory
+from edp.logs.names import name_of_file
 from edp.logs.raw import RawLog, RawSignal, Table
 from edp.logs.repair import Mask, Repair, mend_gaps, mend_stamps, mend_values
 from edp.logs.resolve import Wanted
@@ -93,7 +94,7 @@ class Assembly:
         if self.resampled:
             meta["resampled_from_hz"] = max(clock.rate_hz for clock in self.clocks)
         return Recording(
-            name=name or self.raw.name or self.raw.path.stem,
+            name=name or self.raw.name or name_of_file(self.raw.path),
             channels=tuple(entry.channel for entry in self.wanted),
             values=values,
             rate_hz=self.rate_hz,

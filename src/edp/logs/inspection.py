@@ -11,6 +11,7 @@ from edp.errors import DataError, closest
 from edp.logs.assemble import assemble
 from edp.logs.checks import Finding
 from edp.logs.detect import open_log
+from edp.logs.names import name_of_file
 from edp.logs.quality import ClockFacts, QualityReport, inspect
 from edp.logs.raw import RawLog
 from edp.logs.repair import Repair
@@ -70,7 +71,7 @@ def look_into(
         recording, _ = assemble(raw, usable, signal_map, _LENIENT, (name, rows))
     except DataError as error:
         findings.append(Finding("error", None, str(error)))
-        empty = Recording(name or raw.path.stem, (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
+        empty = Recording(name or name_of_file(raw.path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
         return inspect(empty, tuple(findings)), None
     findings += _changed(raw, recording, signal_map, rows)
     for signal, clock in clocks:

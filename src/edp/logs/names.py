@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from edp.logs.raw import RawSignal
 
@@ -39,6 +40,11 @@ def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
         signals[full] = replace(signal, name=full)
         repeated.setdefault(signal.name, []).append(full)
     return signals, aliases, repeated
+
+
+def name_of_file(path: Path) -> str:
+    r"""The name of a recording from that of its file; bytes that are not UTF-8 stand as ``\xff``."""
+    return path.stem.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 SHOWN = 80

@@ -11,6 +11,7 @@ import numpy as np
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
 from edp.logs.detect import BAG_MARK, format_for, known_suffixes, open_log
+from edp.logs.names import name_of_file
 from edp.logs.raw import TRUTH, RawLog, is_truth
 from edp.logs.repair import Repair
 from edp.logs.resolve import Wanted, resolve
@@ -76,7 +77,7 @@ def read_parts(
         raise DataError(f"parts of {samples} samples asked for; give at least 1")
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
     raw, wanted = _opened(path, signal_map)
-    yield from parts(prepare(raw, wanted, signal_map, repair), samples, raw.name or raw.path.stem)
+    yield from parts(prepare(raw, wanted, signal_map, repair), samples, raw.name or name_of_file(raw.path))
 
 
 def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[Wanted]]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, EdpError
 from edp.limits import announce
-from edp.logs.raw import FORMATS, Column, RawLog, RawSignal, Table
+from edp.logs.raw import FORMATS, Column, LogFormat, RawLog, RawSignal, Table
 from edp.sandbox import lock_down
 from edp.sandbox.allowance import Allowance, is_exhausted
 from edp.sandbox.protocol import Header, is_plain, reader, receive, send, writer
@@ -30,6 +30,8 @@ from edp.signals import ChannelMap, Kind, SignalMap
 
 MESSAGE_BYTES = 1 << 24
 """Of the numbers of one message; larger pieces are sent in parts."""
+BAGS = ("mcap", "rosbag1", "rosbag2")
+"""Formats whose library tells them by the suffix of the path."""
 _TEXT = 20_000
 """Longest message about what is wrong."""
 _STAMP_BYTES = 128
@@ -63,8 +65,25 @@ def serve(requests: int, answers: int) -> None:
 
 
 def _read(order: Header, path: Path) -> tuple[Header, _Served]:
-    served = _Served(FORMATS[order["format"]].read(path, map_of(order["map"])))
+    chosen, signal_map = FORMATS[order["format"]], map_of(order["map"])
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        served = _Served(_read_oddly_named(chosen, path, signal_map))
+    else:
+        served = _Served(chosen.read(path, signal_map))
     return served.facts(), served
+
+
+def _read_oddly_named(chosen: LogFormat, path: Path, signal_map: SignalMap) -> RawLog:
+    """Libraries take names in UTF-8 only; the link of an open file has one, but no suffix, by which bags are told."""
+    if chosen.name in BAGS:
+        raise DataError(f"'{path}' cannot be read: the name of a bag must be UTF-8; rename it")
+    link = Path(f"/proc/self/fd/{os.open(path, os.O_RDONLY)}")
+    try:
+        return chosen.read(link, signal_map)
+    except EdpError as error:
+        raise type(error)(str(error).replace(str(link), str(path))) from error
 
 
 def _answer(

@@ -10,7 +10,7 @@ from datetime import datetime
 
 MISSING = "–"
 LABEL_START, LABEL_END = 20, 11
-"""Characters of a long name that a picture shows, around an ellipsis: 32 in all leave half of a panel to the drawing."""
+"""Characters of a long name that a picture shows around an ellipsis: 32 in all leave half of a panel to the drawing."""
 FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 """With what a spreadsheet takes a cell for a formula."""
 
