@@ -52,6 +52,16 @@ class NotFiniteError(EdpError):
     """A loss, score or result is NaN or infinite."""
 
 
+SHOWN_CAUSE = 300
+"""Characters of what a library says, in a message: some quote the file."""
+
+
+def brief(error: BaseException | str, most: int = SHOWN_CAUSE) -> str:
+    """What a library says about a file, on one line of bounded length; its kind where it says nothing."""
+    told = " ".join(str(error).split()) or type(error).__name__
+    return told if len(told) <= most else f"{told[:most]}..."
+
+
 def closest(name: str, options: Iterable[str]) -> str:
     """A suffix for messages: ``; did you mean 'x'?`` or ``; known: a, b, c``."""
     known = sorted(options)

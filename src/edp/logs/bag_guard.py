@@ -15,7 +15,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from edp.errors import DataError
+from edp.errors import DataError, brief
 from edp.limits import check_memory
 from edp.logs.bag_memory import MemoryFile, NoFolder, place
 from edp.logs.mcap_check import RATIO, SPARE, check_records
@@ -198,7 +198,7 @@ def _check_database(path: Path | MemoryFile) -> None:
             if count != different:
                 raise DataError(f"'{path}': {count} topics have {different} numbers; record the bag again")
     except sqlite3.Error as error:
-        raise DataError(f"'{path}' cannot be read as a bag: {error}; copy or record it again") from error
+        raise DataError(f"'{path}' cannot be read as a bag: {brief(error)}; copy or record it again") from error
     finally:
         base.close()
 

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.csv as arrow_csv
 from numpy.typing import NDArray
 
-from edp.errors import DataError
+from edp.errors import DataError, brief
 from edp.limits import free_bytes
 from edp.logs.raw import PIECE_ROWS
 
@@ -95,7 +95,7 @@ class CsvTable:
             except (pa.ArrowException, OSError, ValueError) as error:
                 column = re.search(r"CSV column #(\d+)", str(error))
                 if column is None or self.types[self.keys[int(column[1])]] == pa.string():
-                    raise DataError(f"'{path}' cannot be read as CSV: {error}") from error
+                    raise DataError(f"'{path}' cannot be read as CSV: {brief(error)}") from error
                 # Text further down a column of numbers: keep it as text, so that only a map that needs it is refused.
                 self.types[self.keys[int(column[1])]] = pa.string()
                 if tried:

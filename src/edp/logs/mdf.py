@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError
+from edp.errors import DataError, brief
 from edp.logs.mdf_check import check_blocks
 from edp.logs.mdf_conversion import Conversion, refuse_engines
-from edp.logs.names import shown_name, told_apart
+from edp.logs.names import only, shown_name, told_apart
 from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
 from edp.logs.units import normalise_unit
@@ -76,7 +76,7 @@ class MdfFormat:
             raise DataError(f"'{path}' holds no channels of numbers; {_advice(log)}")
         signals, aliases, repeated = told_apart(found)
         if own.channels:
-            signals = {name: signals[name] for name in own.channels if name in signals}
+            signals, repeated = only(own.channels, signals, repeated)
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
@@ -272,8 +272,8 @@ def _damage(path: Path) -> Iterator[None]:
         ) from error
     except Exception as error:
         raise DataError(
-            f"'{path}' cannot be read as MDF ({type(error).__name__}: {error}); it may be truncated or damaged: copy "
-            "or export it again"
+            f"'{path}' cannot be read as MDF ({type(error).__name__}: {brief(error)}); it may be truncated or "
+            "damaged: copy or export it again"
         ) from error
     finally:
         logger.setLevel(level)

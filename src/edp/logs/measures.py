@@ -147,6 +147,7 @@ def noise_floor(values: Values) -> tuple[float, bool]:
     return float((np.quantile(power_of, 0.25) / (1.0 - _QUARTILE * _SPREAD) / _GAIN) ** 0.5), steady
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def spikes(values: Values, floor: float) -> NDArray[np.intp]:
     """Rows of single samples that leave both neighbours by over half the usual range, while these agree.
 
@@ -156,5 +157,5 @@ def spikes(values: Values, floor: float) -> NDArray[np.intp]:
     least = max(0.5 * float(high - low), 40.0 * floor)
     before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
     size = np.minimum(np.abs(before), np.abs(after))
-    alone = (size > least) & (before * after > 0) & (np.abs(values[2:] - values[:-2]) < 0.25 * size)
+    alone = (size > least) & ((before > 0) == (after > 0)) & (np.abs(values[2:] - values[:-2]) < 0.25 * size)
     return np.flatnonzero(alone) + 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
     """
     counts = Counter(signal.name for _, signal in found)
     often = {name for name, count in counts.items() if count > 1}
+    once = counts.keys() - often
     signals: dict[str, RawSignal] = {}
     aliases: dict[str, str] = {}
     repeated: dict[str, list[str]] = {}
@@ -34,7 +35,7 @@ def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
             signals[signal.name] = signal
             aliases[full] = signal.name
             continue
-        while full in signals:
+        while full in signals or full in once:
             numbers[name] += 1
             full = f"{name}#{numbers[name] + 1}"
         signals[full] = replace(signal, name=full)
@@ -45,6 +46,15 @@ def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
 def name_of_file(path: Path) -> str:
     r"""The name of a recording from that of its file; bytes that are not UTF-8 stand as ``\xff``."""
     return path.stem.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def only(
+    wanted: Iterable[str], signals: Mapping[str, RawSignal], repeated: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, RawSignal], dict[str, list[str]]]:
+    """The wanted columns of a log, in that order, and the names that several of them have."""
+    kept = {name: signals[name] for name in wanted if name in signals}
+    among = {name: [full for full in several if full in kept] for name, several in repeated.items()}
+    return kept, {name: several for name, several in among.items() if len(several) > 1}
 
 
 SHOWN = 80

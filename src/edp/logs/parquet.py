@@ -19,9 +19,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from edp.errors import DataError
+from edp.errors import DataError, brief
 from edp.limits import check_memory
-from edp.logs.names import told_apart
+from edp.logs.names import only, told_apart
 from edp.logs.own import OwnFacts, facts_text, own_facts
 from edp.logs.raw import (
     FORMATS,
@@ -76,7 +76,7 @@ class ParquetFormat:
             table = _Table(path)
         except (pa.ArrowException, OSError, ValueError) as error:
             advice = "decrypt it with its keys first" if "crypt" in str(error) else "copy or export it again"
-            raise DataError(f"'{path}' is a damaged or encrypted Parquet file: {error}; {advice}") from error
+            raise DataError(f"'{path}' is a damaged or encrypted Parquet file: {brief(error)}; {advice}") from error
         own = _own(table.schema.metadata or {}, path)
         clocks = {} if own.rate_hz else _clocks(table, signal_map)
         times = {clock.place for clock in clocks.values()}
@@ -86,7 +86,7 @@ class ParquetFormat:
                 found += _signals(table, place, field, clocks.get(place))
         signals, aliases, repeated = told_apart(found)
         if own.channels:
-            signals = {name: signals[name] for name in own.channels if name in signals}
+            signals, repeated = only(own.channels, signals, repeated)
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
@@ -205,7 +205,9 @@ class _Table:
                 skipped += batch.num_rows
         except (pa.ArrowException, OSError, ValueError, IndexError) as error:
             shown = ", ".join(wanted[:4])
-            raise DataError(f"'{self.path}': column(s) {shown} cannot be read ({error}); copy or export it") from error
+            raise DataError(
+                f"'{self.path}': column(s) {shown} cannot be read ({brief(error)}); copy or export it"
+            ) from error
 
     def whole(self, place: int) -> pa.Array:
         """One column."""

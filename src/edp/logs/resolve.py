@@ -33,12 +33,12 @@ class Wanted:
         # Damaged files hold bits that are no numbers; what they become is reported as missing.
         with np.errstate(invalid="ignore"):
             values = values.astype(np.float64, copy=False)
-        if self.scale != 1.0 or self.unit.factor != 1.0:
-            values = values * (self.scale * self.unit.factor)
-        if self.unit.offset:
-            values = values + self.unit.offset
-        # Too large for float32 becomes infinite, which the value check then reports.
+        # Too large for float32, or for a number, becomes infinite, which the value check then reports.
         with np.errstate(over="ignore", invalid="ignore"):
+            if self.scale != 1.0 or self.unit.factor != 1.0:
+                values = values * (self.scale * self.unit.factor)
+            if self.unit.offset:
+                values = values + self.unit.offset
             return values.astype(np.float32)
 
 

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError
+from edp.errors import DataError, brief
 from edp.logs.bag_guard import check_counts, definitions_of, open_reader
-from edp.logs.names import told_apart
+from edp.logs.names import only, told_apart
 from edp.logs.own import OwnFacts, own_facts
 from edp.logs.raw import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
 from edp.logs.ros_message import columns_of, layout_of
@@ -62,7 +62,7 @@ class BagFormat:
         signals, aliases, repeated = told_apart(found)
         bag.wanted = {aliases.get(name, name) for name in wanted}
         if own.channels:
-            signals = {name: signals[name] for name in own.channels if name in signals}
+            signals, repeated = only(own.channels, signals, repeated)
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
@@ -288,14 +288,14 @@ def damage(path: Path) -> Iterator[None]:
     except DataError as error:
         if str(path) in str(error):
             raise
-        raise DataError(f"'{path}' holds {error}; it may be damaged: copy or record it again") from error
+        raise DataError(f"'{path}' holds {brief(error)}; it may be damaged: copy or record it again") from error
     except MemoryError as error:
         raise DataError(
             f"'{path}' announces more data than this machine has memory for; it may be damaged: copy or record it again"
         ) from error
     except Exception as error:
         text = str(error) or type(error).__name__
-        raise DataError(f"'{path}' cannot be read: {text}{_advice(text)}") from error
+        raise DataError(f"'{path}' cannot be read: {brief(text)}{_advice(text)}") from error
 
 
 def _advice(text: str) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import ConfigError, DataError, EdpError, StorageError
+from edp.errors import ConfigError, DataError, EdpError, StorageError, brief
 from edp.limits import check_memory
 from edp.logs.raw import FORMATS, Column, LogFormat, RawLog, RawSignal, load_column
 from edp.sandbox import Channel, open_channel
@@ -59,7 +59,9 @@ def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) 
     try:
         return _raw_log(path, log, facts)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"'{path}' cannot be read: its facts are damaged ({type(error).__name__}: {error})") from error
+        raise DataError(
+            f"'{path}' cannot be read: its facts are damaged ({type(error).__name__}: {brief(error)})"
+        ) from error
 
 
 def plain_map(signal_map: SignalMap) -> Header:
@@ -98,7 +100,7 @@ def _raw_log(path: Path, log: _Log, facts: Header) -> RawLog:
         source=str(facts["source"]),
         meta=dict(facts["meta"]),
         aliases={str(key): str(full) for key, full in facts["aliases"].items()},
-        repeated={str(key): [str(full) for full in among] for key, among in facts["repeated"].items()},
+        repeated={str(key): [full for full in among if full in signals] for key, among in facts["repeated"].items()},
         digest=None if digest is None else str(digest),
     )
 

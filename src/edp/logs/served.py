@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.errors import DataError, EdpError
+from edp.errors import DataError, EdpError, brief
 from edp.limits import announce
 from edp.logs.raw import FORMATS, Column, LogFormat, RawLog, RawSignal, Table
 from edp.sandbox import lock_down
@@ -32,8 +32,9 @@ MESSAGE_BYTES = 1 << 24
 """Of the numbers of one message; larger pieces are sent in parts."""
 BAGS = ("mcap", "rosbag1", "rosbag2")
 """Formats whose library tells them by the suffix of the path."""
-_TEXT = 20_000
-"""Longest message about what is wrong."""
+_TEXT = 4000
+"""Longest message about what is wrong; its end, which says what to change, is kept."""
+_END = 500
 _STAMP_BYTES = 128
 """What a time stamp takes while it is collected, message by message."""
 _KEPT_BYTES = 24
@@ -110,8 +111,10 @@ def refusal(error: Exception, allowance: Allowance) -> Header:
     if is_exhausted(error):
         error = allowance.exhausted()
     if isinstance(error, EdpError):
-        return {"refused": str(error)[:_TEXT], "kind": type(error).__name__}
-    told = f"{type(error).__name__}: {error}"[:_TEXT]
+        told = str(error)
+        told = told if len(told) <= _TEXT else f"{told[: _TEXT - _END - 5]} ... {told[-_END:]}"
+        return {"refused": told, "kind": type(error).__name__}
+    told = f"{type(error).__name__}: {brief(error)}"
     advice = "it may be truncated or damaged: copy or export it again"
     return {"refused": f"'{allowance.path}' cannot be read ({told}); {advice}", "kind": DataError.__name__}
 

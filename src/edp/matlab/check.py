@@ -15,7 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from edp.errors import DataError
+from edp.errors import DataError, brief
 from edp.limits import check_memory
 
 _HEADER = 128
@@ -99,8 +99,8 @@ def _announced_v73(path: Path) -> tuple[int, int]:
     except Exception as error:
         # h5py meets damaged bytes with exceptions of many kinds; every one means the same to the user.
         raise DataError(
-            f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {error}); it may be truncated or damaged: "
-            "copy or export it again"
+            f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {brief(error)}); it may be truncated or "
+            "damaged: copy or export it again"
         ) from error
 
 

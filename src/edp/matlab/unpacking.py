@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from edp.errors import DataError
+from edp.errors import DataError, brief
 from edp.limits import announce
 from edp.matlab.check import check_size
 from edp.matlab.found import INFO, MAGIC, Found, is_v4
@@ -64,12 +64,14 @@ def _load(path: Path) -> dict[str, Any]:
         except Exception as error:
             # The parsers meet damaged bytes with any exception there is; every one means the same to the user.
             raise DataError(
-                f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {error}); it may be truncated or "
-                "damaged: copy or export it again"
+                f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {brief(error)}); it may be truncated "
+                "or damaged: copy or export it again"
             ) from error
     failed = [str(item.message) for item in caught if "Failed to load" in str(item.message)]
     if failed:
-        raise DataError(f"'{path}': an object in this MAT file is damaged ({failed[0]}); copy or export it again")
+        raise DataError(
+            f"'{path}': an object in this MAT file is damaged ({brief(failed[0])}); copy or export it again"
+        )
     nameless = [name for name in variables if not isinstance(name, str)]
     if nameless:
         raise DataError(

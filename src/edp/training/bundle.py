@@ -23,7 +23,7 @@ from edp import __version__
 from edp.data.prepared import Prepared
 from edp.data.scaling import Scaler
 from edp.data.task import Task
-from edp.errors import BundleError, EdpError
+from edp.errors import BundleError, EdpError, brief
 from edp.integer import Formats
 from edp.integer.quantise import weights_of
 from edp.models.integer import IntegerPredictor
@@ -49,8 +49,6 @@ ARRAYS = ("weights", "integers", "adaptation")
 """Beginnings of the names of a bundle's files of arrays."""
 MOST_RATE_HZ, MOST_BITS = 1e6, 64
 """Bounds of the ticks in a second, and of the fraction of a number."""
-SHOWN_REASON = 300
-"""Of what is wrong, in a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,12 +221,13 @@ def _as_damage(path: Path) -> Iterator[None]:
     kinds = (EdpError, LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError)
     try:
         yield
-    except BundleError:
-        raise
+    except BundleError as error:
+        if str(path) in str(error):
+            raise
+        raise BundleError(f"bundle '{path}' is damaged: {brief(error)}; restore it or train again") from error
     except (*kinds, SafetensorError) as error:
-        told = " ".join(str(error).split())
-        told = f"it lacks {told}" if isinstance(error, KeyError) else told
-        raise BundleError(f"bundle '{path}' is damaged: {told[:SHOWN_REASON]}; restore it or train again") from error
+        told = f"it lacks {brief(error)}" if isinstance(error, KeyError) else brief(error)
+        raise BundleError(f"bundle '{path}' is damaged: {told}; restore it or train again") from error
 
 
 def _read_header(path: Path) -> dict[str, Any]:
