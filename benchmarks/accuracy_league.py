@@ -31,16 +31,16 @@ from pathlib import Path
 from typing import Any
 
 from common import Verdict, finish, in_folder, kept, parser, table, verdict
-from edp.config import Experiment, load_experiment
+from edp.config.experiment import Experiment, load_experiment
 from edp.data.prepared import Prepared
-from edp.data_sets import find_data_set_limit
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import JudgeSpec, judge
-from edp.sim.limit import LimitSpec
+from edp.sim.data_set import find_data_set_limit
+from edp.sim.predictability import LimitSpec
 from edp.storage import make_folder
-from edp.training import Event, fit
+from edp.training import TrainingProgress, fit
 from edp.training.schedules import Plateau
-from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set
 
 ROOT = Path(__file__).resolve().parents[1]
 THESIS = ROOT / "examples" / "thesis"
@@ -150,7 +150,7 @@ class League:
         curve: list[tuple[float, float]] = []
         began = time.process_time()
 
-        def on_event(event: Event) -> None:
+        def on_event(event: TrainingProgress) -> None:
             if event.row is not None:
                 curve.append((event.row["updates"] * cost, event.row["validation_mae"]))
 

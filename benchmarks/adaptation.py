@@ -31,19 +31,19 @@ from numpy.typing import NDArray
 
 from common import Verdict, finish, parser, table, verdict
 from controller_cycles import PROGRAM
-from edp.adaptation import fit_adaptation, motion_s
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.scaling import Scaler
 from edp.data.series import Series
 from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
-from edp.models.backbones import HybridSpec
-from edp.models.predictor import Predictor, build_model
-from edp.models.running import stream_hidden, stream_predictions
-from edp.onboard import Adaptation, AdaptationSpec
-from edp.sim import machine_files
+from edp.ir.rls import Adaptation, AdaptationSpec
+from edp.networks.backbones import HybridSpec
+from edp.networks.predictor import Predictor, build_model
+from edp.networks.running import stream_hidden, stream_predictions
+from edp.sim.machine import machine_files
 from edp.training.bundle import Bundle
-from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set, train
+from edp.workflows.adaptation import fit_adaptation, motion_s
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set, train
 from embedded_step import on_board
 
 PROGRAMS = Path(__file__).parents[1] / "tests/export"

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from edp.runs import command_line, environment
 from edp.storage import make_folder, read_json, write_json
+from edp.storage.runs import command_line, environment
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -1,13 +1,13 @@
 """What accuracy does a network give up to fit the controller, and what do the thesis's ways of making it smaller?
 
 A full-size teacher (preset ``standard``, Huber 0.1) learns 1 or 10 ticks ahead on simulated recordings of machine
-M22. ``edp.downsizing`` then makes a network of 68 units, the widest multiple of four whose constants fit in whole
-numbers (W8A16), and the rival in the same run: the variants of the thesis's Table 4.9 of the same teacher (with seed 0,
-judged on the validation part). The chosen network is put into whole numbers, exported, compiled for a Cortex-M4F and
-run on an emulated one: bytes of constants, program, state and stack are those of that where compiler and emulator are
-there, else the estimates. Students have as many updates as their teacher, and a third of that with rounded numbers.
-All choices rest on the validation part. The test part is a second lock-box: nothing was chosen or judged on it before,
-and it is opened once, for the teacher and the chosen network. Seeds are those of weights and of the split; the
+M22. ``edp.workflows.compression`` then makes a network of 68 units, the widest multiple of four whose constants fit in
+whole numbers (W8A16), and the rival in the same run: the variants of the thesis's Table 4.9 of the same teacher (with
+seed 0, judged on the validation part). The chosen network is put into whole numbers, exported, compiled for a
+Cortex-M4F and run on an emulated one: bytes of constants, program, state and stack are those of that where compiler and
+emulator are there, else the estimates. Students have as many updates as their teacher, and a third of that with rounded
+numbers. All choices rest on the validation part. The test part is a second lock-box: nothing was chosen or judged on it
+before, and it is opened once, for the teacher and the chosen network. Seeds are those of weights and of the split; the
 recordings stay.
 
 Every training is a run below ``--work``: a benchmark that was stopped goes on.
@@ -26,14 +26,13 @@ from typing import Any
 import controller_memory
 import program_bytes
 from common import Verdict, finish, parser, table, verdict
-from edp.compress import FORMATS
-from edp.compress.planning import WAYS
-from edp.config import Experiment, load_experiment
-from edp.downsizing import Found, Judged, SearchSpec, search
-from edp.downsizing.quantise import quantise
+from edp.config.experiment import Experiment, load_experiment
 from edp.evaluation.controller import Budget
 from edp.training import load_bundle
-from edp.workflow import DataSource, SimulationOrder, simulate_data_set, train
+from edp.workflows.compression import FORMATS, CompressionResult, CompressionSearchSpec, Judged, search
+from edp.workflows.compression.planning import WAYS
+from edp.workflows.compression.quantise import quantise
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set, train
 
 BUDGET = Budget()  # thesis 3.5.2: 720,000 cycles, 100 KB of parameters
 TIGHT = 360_000  # cycles, half the slice
@@ -48,12 +47,12 @@ def settings(horizon: int, seed: int, epochs: int, updates: int) -> Experiment:
     return load_experiment(None, "standard", changes)
 
 
-def one(source: DataSource, horizon: int, seed: int, folder: Path, arguments: argparse.Namespace) -> Found:
+def one(source: DataSource, horizon: int, seed: int, folder: Path, arguments: argparse.Namespace) -> CompressionResult:
     """A teacher, and the search for what fits."""
     epochs, updates = (1, 5) if arguments.quick else (5, max(1, arguments.updates // 5))
     run = folder / f"k{horizon}_seed{seed}"
     train(source, settings(horizon, seed, epochs, updates), run / "teacher")
-    spec = SearchSpec(
+    spec = CompressionSearchSpec(
         budget=BUDGET,
         units=tuple(arguments.units),
         formats=(FORMAT,),
@@ -63,7 +62,7 @@ def one(source: DataSource, horizon: int, seed: int, folder: Path, arguments: ar
     return search(run / "teacher", spec, run / "small")
 
 
-def rows_of(found: Found, horizon: int) -> list[list[object]]:
+def rows_of(found: CompressionResult, horizon: int) -> list[list[object]]:
     """Lines of a table in the form of Table 4.9."""
     lines = []
     for place, row in enumerate([found.teacher, *found.rows]):
@@ -75,7 +74,7 @@ def rows_of(found: Found, horizon: int) -> list[list[object]]:
     return lines
 
 
-def facts_of(found: Found, horizon: int, made: dict[str, int]) -> dict[str, Any]:
+def facts_of(found: CompressionResult, horizon: int, made: dict[str, int]) -> dict[str, Any]:
     """What is kept of a search."""
 
     def plain(row: Judged) -> dict[str, Any]:
@@ -107,7 +106,9 @@ def memory(row: Judged) -> int:
     return row.taken.ram_bytes - row.taken.parameter_bytes
 
 
-def verdicts_of(found: Sequence[Found], objects: Sequence[dict[str, int]], horizon: int, quick: bool) -> list[Verdict]:
+def verdicts_of(
+    found: Sequence[CompressionResult], objects: Sequence[dict[str, int]], horizon: int, quick: bool
+) -> list[Verdict]:
     """The goals at one horizon: the largest of what is taken, the median of errors over the seeds.
 
     Args:
@@ -168,7 +169,7 @@ def main() -> None:
         data = arguments.data or folder / "data"
         minutes, recordings = (4.0, 6) if quick else (arguments.minutes, int(arguments.minutes / 3))
         simulate_data_set(data, SimulationOrder(minutes=minutes, recordings=recordings))
-        searches: dict[int, list[Found]] = {horizon: [] for horizon in horizons}
+        searches: dict[int, list[CompressionResult]] = {horizon: [] for horizon in horizons}
         objects: dict[int, list[dict[str, int]]] = {horizon: [] for horizon in horizons}
         for seed in range(arguments.seed, arguments.seed + seeds):
             for horizon in horizons:

@@ -22,14 +22,14 @@ from pathlib import Path
 import numpy as np
 
 from common import finish, parser, table, verdict
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.evaluation.controller import FORMATS
 from edp.evaluation.footprint import footprint
 from edp.export.c.target import CTarget
-from edp.models import build_model
-from edp.models.predictor import ModelSpec
+from edp.networks import build_model
+from edp.networks.predictor import ModelSpec
 from edp.signals import TABLE_A1, Kind
 from edp.training.bundle import Bundle
 from embedded_step import BOARD, M4, make, on_board, sources_of, whole

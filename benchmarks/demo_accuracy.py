@@ -12,9 +12,9 @@ from pathlib import Path
 
 from common import Verdict, finish, parser, table, verdict
 from edp.cli.demo import MINUTES, RECORDINGS
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.storage import read_json
-from edp.workflow import DataSource, SimulationOrder, evaluate, simulate_data_set, train
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, evaluate, simulate_data_set, train
 
 BASELINES = ("persistence", "ridge_arx", "boosted_trees", "small_mlp")
 

@@ -26,10 +26,10 @@ from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.export.c.target import CTarget
 from edp.export.golden import random_inputs
-from edp.integer import calibrate
-from edp.models import ModelSpec, Stream, build_model
-from edp.models.backbones import HybridSpec
-from edp.models.integer import IntegerPredictor
+from edp.ir.w8a16 import calibrate
+from edp.networks import ModelSpec, Stream, build_model
+from edp.networks.backbones import HybridSpec
+from edp.networks.integer import IntegerPredictor
 from edp.signals import TABLE_A1, Kind
 from edp.training.bundle import Bundle
 

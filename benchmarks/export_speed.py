@@ -21,9 +21,9 @@ from common import finish, parser, table, verdict
 from edp.export.fmu import FmuTarget
 from edp.export.golden import random_inputs
 from edp.export.onnx import OnnxTarget
-from edp.parity import compare, golden_case
-from edp.parity.forms.fmu import Slave
 from edp.training.bundle import Bundle
+from edp.workflows.parity import compare, golden_case
+from edp.workflows.parity.forms.fmu import Slave
 from embedded_step import make, whole
 
 SIZES = ((32, 64), (64, 128))

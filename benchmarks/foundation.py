@@ -26,16 +26,16 @@ import torch
 
 from accuracy_league import kept
 from common import Verdict, finish, in_folder, parser, table, verdict
-from edp.config import Experiment, load_experiment
+from edp.config.experiment import Experiment, load_experiment
 from edp.data.series import Series
 from edp.evaluation.context import context_errors
-from edp.models.predictor import Predictor
-from edp.models.running import stream_predictions
-from edp.pretraining import MetaSpec, Pretrain, pretrain
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
 from edp.signals import Kind
-from edp.training import Event, load_bundle
-from edp.transfer import FinetuneSpec, Order, finetune
-from edp.workflow import DataSource, SimulationOrder, simulate_data_set, train, trained_run
+from edp.training import TrainingProgress, load_bundle
+from edp.workflows.pretraining import MetaSpec, Pretrain, pretrain
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set, train, trained_run
+from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
 SCENARIOS = Path(__file__).resolve().parents[1] / "examples" / "scenarios"
 HORIZON = 10
@@ -125,7 +125,7 @@ def trained(bench: Bench, name: str) -> Predictor:
         began = time.process_time()
         epochs, updates = bench.length
 
-        def tell(event: Event) -> None:
+        def tell(event: TrainingProgress) -> None:
             if event.row is not None and event.epoch % 4 == 0:
                 print(f"{name}: epoch {event.epoch}, validation MAE {event.row['validation_mae']:.3f}", flush=True)
 
@@ -189,7 +189,9 @@ def after_minutes(bench: Bench, start: str, minutes: int, method: str) -> dict[s
         rounds, updates = (2, 4) if bench.quick else (8, 15)
         spec = FinetuneSpec(rounds=rounds, batch=16, patience=0, smoothness=0.0, check_signs=False)
         changes = ("split.validation_share=0.2", "split.test_share=0.05", f"training.updates={updates}")
-        order = Order(spec=spec, method=method, changes=(*changes, "training.loss.delta=0.1", "training.threads=1"))
+        order = FinetuneRequest(
+            spec=spec, method=method, changes=(*changes, "training.loss.delta=0.1", "training.threads=1")
+        )
         began = time.process_time()
         out = bench.work / "tuned" / f"{start}_{minutes}_{method}".replace(" ", "_")
         finetune(alone, DataSource.of(logs), order, out)

@@ -19,16 +19,16 @@ from pathlib import Path
 from typing import Any
 
 from common import finish, parser, table, verdict
-from edp.ledger import Identity, Ledger, known, read_records
-from edp.search.batch import complete
-from edp.search.executor import Job
-from edp.search.local import LocalPool
+from edp.storage.ledger import Ledger, TrainingIdentity, known, read_records
+from edp.workflows.search.batch import complete
+from edp.workflows.search.executor import Job
+from edp.workflows.search.local import LocalPool
 
 STUDY = "study"
 """First argument of the coordinator's own process."""
 
 
-def tiny(identity: Identity, where: Mapping[str, Any]) -> dict[str, Any]:
+def tiny(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any]:
     """A training of some milliseconds: gradient descent on a quadratic drawn with the seed."""
     folder = Path(where["study"])
     word = "twice" if known(folder, identity.key) else "start"
@@ -55,8 +55,8 @@ def coordinate(study: str, log: str, trainings: int, seconds: float) -> None:
         print(ledger.digest())
 
 
-def _identity(seed: int, seconds: float) -> Identity:
-    return Identity("kill_storm:tiny", {"seconds": seconds}, {}, seed, 1, "code", "data", {"threads": "1"})
+def _identity(seed: int, seconds: float) -> TrainingIdentity:
+    return TrainingIdentity("kill_storm:tiny", {"seconds": seconds}, {}, seed, 1, "code", "data", {"threads": "1"})
 
 
 class Round:

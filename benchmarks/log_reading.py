@@ -33,7 +33,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from common import finish, parser, table, verdict
 from edp.logs import WriteOptions, read_recording, write_recording
-from edp.matlab.library import matio
+from edp.logs.formats.matlab.library import matio
 from edp.recording import Recording
 from edp.signals import Channel, ChannelMap, Kind, SignalMap
 

@@ -21,21 +21,21 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from common import finish, parser, table, verdict
-from edp.blocks import TemporalDifference
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.export.c.target import CTarget
 from edp.export.golden import SHARE
-from edp.integer import calibrate
-from edp.models import ModelSpec, build_model
-from edp.models.backbones import HybridSpec
-from edp.models.heads import MlpHead
-from edp.models.input_range import usual_range
-from edp.models.integer import IntegerPredictor
-from edp.models.predictor import Predictor
+from edp.ir.w8a16 import calibrate
+from edp.networks import ModelSpec, build_model
+from edp.networks.backbones import HybridSpec
+from edp.networks.blocks import TemporalDifference
+from edp.networks.heads import MlpHead
+from edp.networks.input_range import usual_range
+from edp.networks.integer import IntegerPredictor
+from edp.networks.predictor import Predictor
+from edp.networks.streaming import reset_where
 from edp.signals import TABLE_A1, Kind
-from edp.streaming import reset_where
 from edp.training.bundle import Bundle
 
 PIECE = 1_000

@@ -6,7 +6,7 @@ changes some cylinder's velocity by more than the sensors' noise. A channel that
 computed from others as it is logged (the acceleration, from the velocity) is none.
 
 A cause is *needed* where no law of the simulator gives it from the other channels: the demand of a conflux spool is a
-function of the primary demand at the same tick (`edp.sim.valve.shape_demand`), so a network can do without it.
+function of the primary demand at the same tick (`edp.sim.physics.valve.shape_demand`), so a network can do without it.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from edp.recording import Recording
 from edp.signals import TABLE_A1
-from edp.sim import Scenario, linkage, load_machine, sensors
-from edp.sim import layout as at
-from edp.sim.parameters import pack
+from edp.sim import Scenario, load_machine
+from edp.sim.machine import layout as at
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import linkage
+from edp.sim.sensors import sensors
 from edp.sim.simulate import Simulation
 
 Array = NDArray[np.float64]

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import Verdict, finish, parser, table, verdict
-from edp.metrics import COMPOSITE_WEIGHTS
 from edp.stats import (
     Rule,
     benjamini_hochberg,
@@ -28,6 +27,7 @@ from edp.stats import (
     run_means,
     thesis_confirm,
 )
+from edp.stats.metrics import COMPOSITE_WEIGHTS
 from score_worlds import METRICS, STRESS, WORLDS, Array, Mask, Source
 
 ALPHA = 0.05

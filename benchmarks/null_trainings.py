@@ -18,12 +18,12 @@ import torch
 from numpy.typing import NDArray
 
 from common import finish, parser, verdict
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.logs import write_recording
+from edp.logs.source import DataSource
 from edp.recording import Recording
-from edp.search.trainings import Order, settings_of, train_order
 from edp.signals import Channel, Kind
-from edp.sources import DataSource
+from edp.workflows.search.trainings import TrainingRequest, settings_of, train_order
 from null_calibration import ALPHA, SOUND, THESIS, Way, null_table, sound_studies, thesis_studies
 from score_worlds import METRICS, Array, Mask
 
@@ -81,7 +81,7 @@ class TrainedWorld:
         if key not in self._pool:
             names = np.array(self.names)
             orders = [
-                Order(
+                TrainingRequest(
                     settings_of(load_experiment(None, "quick", SETTINGS)),
                     self.source.to_plain(),
                     tuple(names[~tested].tolist()),
@@ -94,7 +94,7 @@ class TrainedWorld:
             self._pool[key] = np.stack([self._train(order, tested) for order in orders])
         return self._pool[key]
 
-    def _train(self, order: Order, tested: Mask) -> Array:
+    def _train(self, order: TrainingRequest, tested: Mask) -> Array:
         sessions = train_order(order.to_json())["sessions"]
         self.trained += 1
         scores = np.zeros((len(METRICS), self.sessions))

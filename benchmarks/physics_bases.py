@@ -18,17 +18,17 @@ import torch
 from numpy.typing import NDArray
 
 from common import finish, parser, table, verdict
-from edp.config import TaskSettings, load_experiment
+from edp.config.experiment import TaskSettings, load_experiment
 from edp.data.features import FG2, FeatureSet
 from edp.data.prepared import prepare
 from edp.data.task import TargetMode, Task
-from edp.models import stream_predictions
-from edp.models.physics import ForceSpec, HybridPhysicsSpec, KinematicSpec, PhysicsSpec
-from edp.models.physics.base import POSES
+from edp.networks import stream_predictions
+from edp.networks.physics import ForceSpec, HybridPhysicsSpec, KinematicSpec, PhysicsSpec
+from edp.networks.physics.base import POSES
 from edp.recording import Recording
 from edp.sim import load_machine
 from edp.training import fit
-from edp.workflow import DataSource, SimulationOrder, simulate_data_set
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set
 
 HORIZONS = (1, 10)
 MACHINE = "M22"

@@ -33,8 +33,8 @@ from edp.export.c.model import computed, make_model, remembered
 from edp.export.c.program import features
 from edp.export.c.sizes import sizes_of
 from edp.export.c.target import core_files
-from edp.integer import calibrate
-from edp.models.integer import IntegerPredictor
+from edp.ir.w8a16 import calibrate
+from edp.networks.integer import IntegerPredictor
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 from embedded_step import whole

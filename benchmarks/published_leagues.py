@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from common import Verdict, finish, parser, table, verdict
-from edp.config import read_toml
+from edp.config.experiment import read_toml
 from real_recordings import EXAMPLES, VARIABLE, rmse, scores_of, shared_folder
 
 QUICK_SETS = ("tanks.toml",)

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from common import Verdict, finish, parser, table, verdict
-from edp.config import load_experiment, read_toml
+from edp.config.experiment import load_experiment, read_toml
 from edp.storage import read_json
-from edp.workflow import DataSource, evaluate, train
+from edp.workflows.train_evaluate import DataSource, evaluate, train
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples" / "real"

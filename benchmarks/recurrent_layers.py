@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from common import finish, parser, table, verdict
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared
-from edp.models.cells import CELLS
-from edp.streaming import parameters_of
+from edp.networks.cells import CELLS
+from edp.networks.streaming import parameters_of
 from edp.training import fit
 from edp.training.validation import validation_scores
-from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set
 
 EPOCHS = 6
 

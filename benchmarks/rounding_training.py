@@ -15,15 +15,24 @@ from dataclasses import replace
 from pathlib import Path
 
 from common import finish, parser, table, verdict
-from edp.compress import Distillation, QuantisationAware, Rounding, RoundingSpec, deploy, prune, student, tuning
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared
 from edp.evaluation.controller import Budget
 from edp.evaluation.judge import score_predictions
-from edp.models.predictor import Predictor
-from edp.models.running import stream_predictions
+from edp.networks.narrow import student
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
 from edp.training import fit
-from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
+from edp.workflows.compression import (
+    Distillation,
+    NetworkRounding,
+    QuantisationAware,
+    RoundingSpec,
+    deploy,
+    prune,
+    tuning,
+)
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set
 
 FORMS = ("float32", "w8a16", "nearest, 16 bits", "nearest, 8 bits")
 
@@ -33,7 +42,7 @@ def errors(network: Predictor, data: Prepared) -> dict[str, float]:
     said = {name: deploy(network, name, data.train, Budget()).predict(data.test) for name in FORMS[:2]}
     for name, bits in zip(FORMS[2:], (16, 8), strict=True):
         made = copy.deepcopy(network)
-        Rounding(made, bits).install(data.train)
+        NetworkRounding(made, bits).install(data.train)
         said[name] = stream_predictions(made, data.test)
     last = str(data.task.horizons[-1])
     skip = network.spec.window

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.metrics import COMPOSITE_WEIGHTS
+from edp.stats.metrics import COMPOSITE_WEIGHTS
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -36,15 +36,15 @@ from threadpoolctl import threadpool_limits
 
 from common import finish, parser, table, verdict
 from decoys import lay_decoys
+from edp.data.screening import ScreeningSpec, screen
+from edp.data.screening.forest import rows_of
+from edp.data.screening.stability import piece_rows
+from edp.data.screening.table import CandidateTable, build_table
+from edp.data.screening.values import held_out_pieces
 from edp.logs import read_data_set, write_recording
 from edp.recording import Recording
-from edp.screening import ScreeningSpec, screen
-from edp.screening.forest import rows_of
-from edp.screening.stability import piece_rows
-from edp.screening.table import Table, build_table
-from edp.screening.values import held_out_pieces
 from edp.signals import TABLE_A1
-from edp.workflow import SimulationOrder, simulate_data_set
+from edp.workflows.train_evaluate import SimulationOrder, simulate_data_set
 
 RECORDINGS = 12
 CHANNELS = 120
@@ -95,7 +95,7 @@ def ours(folder: Path, out: Path) -> None:
 class Rival:
     """The same figures by library calls, an evenly spread share of each kind."""
 
-    def __init__(self, data: Table, found: dict[str, Any], share: float) -> None:
+    def __init__(self, data: CandidateTable, found: dict[str, Any], share: float) -> None:
         self.data, self.found, self.share = data, found, share
         self.spec = ScreeningSpec()
         self.live = [int(i) for i in np.flatnonzero(data.live)]

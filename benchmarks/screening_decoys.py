@@ -24,21 +24,21 @@ import numpy as np
 
 from common import Verdict, finish, parser, table, verdict
 from decoys import FAMILIES, Decoy, lay_decoys
-from edp.config import FeatureSettings, load_experiment
-from edp.data_sets import SimulationOrder
+from edp.config.experiment import FeatureSettings, load_experiment
+from edp.data.screening import FlagKind, ScreeningResult, ScreeningSpec, screen
 from edp.logs import write_recording
+from edp.logs.source import DataSource
 from edp.recording import Recording
-from edp.screening import FlagKind, Screening, ScreeningSpec, screen
 from edp.signals import TABLE_A1, ChannelMap, SignalMap
 from edp.sim import simulate_many
-from edp.sources import DataSource
-from edp.trials import Trials, TrialSpec, try_feature_sets, with_differences
-from edp.workflow import channel_worths
+from edp.sim.data_set import SimulationOrder
+from edp.workflows.feature_selection.trials import Trials, TrialSpec, try_feature_sets, with_differences
+from edp.workflows.train_evaluate import channel_worths
 from m22_truth import Cause, causes
 from screening_thesis import TARGETS, only_table_a1
 
 
-def judged(found: Screening, decoys: Sequence[Decoy], truth: Sequence[Cause]) -> dict[str, Any]:
+def judged(found: ScreeningResult, decoys: Sequence[Decoy], truth: Sequence[Cause]) -> dict[str, Any]:
     """What the proposal did with causes and decoys."""
     kept = set(found.proposal.kept)
     flagged = {flag.channel for flag in found.flags if flag.kind is FlagKind.LEAK}
@@ -103,7 +103,7 @@ def on_disk(recordings: Sequence[Recording], folder: Path) -> DataSource:
 
 
 def tried(
-    source: DataSource, found: Screening, truth: Sequence[Cause], folder: Path, given: argparse.Namespace
+    source: DataSource, found: ScreeningResult, truth: Sequence[Cause], folder: Path, given: argparse.Namespace
 ) -> Trials:
     """Train and judge the network on every set."""
     quick, seed = given.quick, given.seed

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from common import finish, parser, table, verdict
-from edp.data_sets import SimulationOrder
+from edp.data.screening import ScreeningResult, ScreeningSpec, screen
 from edp.recording import Recording
-from edp.screening import Screening, ScreeningSpec, screen
 from edp.signals import TABLE_A1
 from edp.sim import simulate_many
+from edp.sim.data_set import SimulationOrder
 
 CYLINDERS = ("boom", "arm", "bucket")
 TARGETS = ("CylVels_1", "CylVels_2", "CylVels_3")
@@ -61,7 +61,7 @@ class Statement:
 class Figures:
     """A screening with places by name."""
 
-    found: Screening
+    found: ScreeningResult
 
     def at(self, metric: str, channel: str, target: str) -> float:
         """An entry of one of the matrices."""
@@ -111,7 +111,7 @@ class Lag:
     open: bool
 
 
-def lag_of(found: Screening, channel: str, target: str) -> Lag:
+def lag_of(found: ScreeningResult, channel: str, target: str) -> Lag:
     """One row of the table of lags."""
     curve = found.curve(channel, target)
     retracts = channel.removesuffix("Conf") in {pair[1] for pair in PILOTS} or channel[-1] in "567"
@@ -122,7 +122,7 @@ def lag_of(found: Screening, channel: str, target: str) -> Lag:
                float(driven[peak]), peak in (0, len(driven) - 1))  # fmt: skip
 
 
-def lag_rows(found: Screening) -> list[dict[str, Any]]:
+def lag_rows(found: ScreeningResult) -> list[dict[str, Any]]:
     """Lags of each group's channels against their own cylinder, beside Table 4.2."""
     rows = []
     for group, (low, high) in TABLE_4_2.items():
@@ -239,7 +239,7 @@ def of_the_information(figures: Figures) -> list[Statement]:
     return statements
 
 
-def of_the_lags(found: Screening, rows: Sequence[dict[str, Any]]) -> list[Statement]:
+def of_the_lags(found: ScreeningResult, rows: Sequence[dict[str, Any]]) -> list[Statement]:
     """What the thesis says of Table 4.2."""
     statements = [
         Statement(f"lags of the {row['group']}", f"{row['thesis'][0]} to {row['thesis'][1]}",

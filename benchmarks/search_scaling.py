@@ -16,15 +16,15 @@ from pathlib import Path
 from statistics import median
 
 from common import finish, parser, table, verdict
-from edp.config import load_experiment
-from edp.ledger import Identity, Ledger, Record, Status, digest_of
-from edp.runs import environment
-from edp.search.batch import complete
-from edp.search.executor import Job
-from edp.search.jobs import job_of
-from edp.search.local import LocalPool
-from edp.search.trainings import Order, settings_of
-from edp.workflow import DataSource, SimulationOrder, simulate_data_set
+from edp.config.experiment import load_experiment
+from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, digest_of
+from edp.storage.runs import environment
+from edp.workflows.search.batch import complete
+from edp.workflows.search.executor import Job
+from edp.workflows.search.jobs import job_of
+from edp.workflows.search.local import LocalPool
+from edp.workflows.search.trainings import TrainingRequest, settings_of
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set
 
 OPEN_S, SHARE, SPEEDUP = 1.0, 0.02, 1.8
 HORIZONS, SCORES, SESSIONS = ("1", "10"), ("mae", "rmse", "p95", "p99", "composite"), 5
@@ -38,11 +38,11 @@ def fill(folder: Path, count: int) -> None:
     for seed in range(count):
         split = {"train": [f"session {i}" for i in range(20)], "judged": [f"session {i}" for i in range(20, 25)]}
         config = {"settings": settings, "updates": 800}
-        identity = Identity("edp.search.jobs:train", config, split, seed, 1, "code", "data", machine)
+        identity = TrainingIdentity("edp.workflows.search.jobs:train", config, split, seed, 1, "code", "data", machine)
         scores = {name: seed / (7 + i) for i, name in enumerate(SCORES)}
         result = {"sessions": {name: dict.fromkeys(HORIZONS, scores) for name in split["judged"]}, "scores": scores}
         measured = {"seconds": 12.3, "peak_mb": 456.7, "host": "host", "attempts": 1}
-        record = Record(identity, Status.DONE, result, "", measured)
+        record = Record(identity, TrainingStatus.DONE, result, "", measured)
         (folder / "records" / f"{record.key}.json").write_bytes(record.to_bytes())
 
 
@@ -69,7 +69,7 @@ def orders(data: Path, count: int, updates: int, first_seed: int) -> list[Job]:
     for number in range(count):
         judged = (names[number % len(names)],)
         train = tuple(name for name in names if name not in judged)
-        order = Order(settings, source.to_plain(), train, judged, first_seed + number, updates)
+        order = TrainingRequest(settings, source.to_plain(), train, judged, first_seed + number, updates)
         found.append(job_of(order, digest))
     return found
 
@@ -81,7 +81,7 @@ def rate(workers: int, warm: Sequence[Job], jobs: Sequence[Job]) -> dict[str, fl
         began, spent = time.perf_counter(), time.process_time()
         found = complete(ledger, pool, jobs)
         wall, processor = time.perf_counter() - began, time.process_time() - spent
-        bad = [record.message for record in found.values() if record.status is not Status.DONE]
+        bad = [record.message for record in found.values() if record.status is not TrainingStatus.DONE]
         if bad:
             raise SystemExit(f"a training ended badly: {bad[0]}")
         seconds = median(record.measured["seconds"] for record in found.values())

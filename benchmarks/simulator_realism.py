@@ -22,11 +22,11 @@ from scipy import signal
 from sklearn.feature_selection import mutual_info_regression
 
 from common import finish, parser, table, verdict
-from edp.data_sets import SimulationOrder
 from edp.recording import Recording
 from edp.sim import Scenario, load_machine, simulate_many
-from edp.sim import layout as at
-from edp.sim.plant import Plant
+from edp.sim.data_set import SimulationOrder
+from edp.sim.machine import layout as at
+from edp.sim.physics.plant import Plant
 
 Array = NDArray[np.float64]
 CYLINDERS = ("boom", "arm", "bucket")

@@ -12,14 +12,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from common import finish, parser, table, verdict
-from edp.compress import Distillation, DistillationSpec, dynamic_int8, prune, student
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import JudgeSpec, judge
-from edp.models.predictor import Predictor
+from edp.networks.narrow import student
+from edp.networks.predictor import Predictor
 from edp.training import TrainingSpec, fit
-from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
+from edp.workflows.compression import Distillation, DistillationSpec, dynamic_int8, prune
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set
 
 
 def error(predictor: Predictor, data: Prepared) -> float:

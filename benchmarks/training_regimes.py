@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from common import finish, parser, table, verdict
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.chunks import ChunkSpec
 from edp.data.prepared import Prepared
-from edp.training import Event, fit
+from edp.training import TrainingProgress, fit
 from edp.training.optimizers import AdamW, Soap
 from edp.training.schedules import Constant
-from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set
 
 
 class ReachedError(Exception):
@@ -39,7 +39,7 @@ def measure(
     rates: list[float] = []
     began = time.process_time()
 
-    def on_event(event: Event) -> None:
+    def on_event(event: TrainingProgress) -> None:
         if event.row is None:
             return
         curve.append((time.process_time() - began, event.row["validation_mae"]))

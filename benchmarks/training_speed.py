@@ -23,14 +23,14 @@ from torch.nn.utils.parametrizations import weight_norm
 from torch.utils.data import DataLoader, Dataset
 
 from common import finish, parser, table, verdict
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.prepared import Prepared
-from edp.models.predictor import build_model
-from edp.streaming import parameters_of
+from edp.networks.predictor import build_model
+from edp.networks.streaming import parameters_of
 from edp.training import fit
 from edp.training.optimizers import AdamW
-from edp.workflow import DataSource, SimulationOrder, prepare_data, simulate_data_set
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, prepare_data, simulate_data_set
 
 WINDOW, KERNEL, UNITS, BURN_IN = 50, 5, 64, 50
 
@@ -95,7 +95,7 @@ def standardised(data: Prepared, model: Any) -> list[tuple[Tensor, Tensor]]:
     net, parts = build_model(data.task, model, data.scaler(), 0), []
     with torch.no_grad():
         for part in data.train:
-            ticks = part.samples - data.task.reach
+            ticks = part.samples - data.task.max_horizon
             x = torch.from_numpy(part.inputs[:ticks]).unsqueeze(0)
             features, _ = net.front(x, net.front.initial_state(1, x))
             future = np.stack([part.targets[k : k + ticks] for k in data.task.horizons], axis=1)

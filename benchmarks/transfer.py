@@ -24,21 +24,21 @@ from typing import Any
 import numpy as np
 
 from common import finish, in_folder, kept, parser
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared, prepare
-from edp.data_sets import find_data_set_limit
-from edp.models.predictor import build_model
-from edp.report.drawing import write_drawings
-from edp.sim.limit import LimitSpec
-from edp.sim.soil import material_names
+from edp.networks.predictor import build_model
+from edp.report.common.drawing import write_drawings
+from edp.sim.data_set import find_data_set_limit
+from edp.sim.physics.soil import material_names
+from edp.sim.predictability import LimitSpec
 from edp.storage import make_folder
 from edp.training.bundle import blank_scaler, weights_digest
-from edp.transfer import METHODS, FinetuneSpec
-from edp.transfer.case import Case
-from edp.transfer.methods import Made
-from edp.transfer.scores import errors_of, measure
-from edp.transfer.source import Source, read_source, target_experiment
-from edp.workflow import DataSource, SimulationOrder, simulate_data_set, train
+from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set, train
+from edp.workflows.transfer import METHODS, FinetuneSpec
+from edp.workflows.transfer.case import TransferCase
+from edp.workflows.transfer.methods import Made
+from edp.workflows.transfer.scores import errors_of, measure
+from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
 from transfer_views import HORIZON, KEYS, NONE, OURS, SOILS, WORLDS, draw, interval, show, verdicts_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -129,7 +129,7 @@ QUICK = replace(
 class World:
     """A source, the logs of a target, and where finished cells lie."""
 
-    source: Source
+    source: SourceModel
     logs: DataSource
     data: Prepared
     work: Path
@@ -156,7 +156,7 @@ class World:
         experiment = target_experiment(self.source, (f"training.seed={seed}", *shorter))
         folder = self.work / "runs" / f"{method}_{minutes}_{seed}"
         data = shortened(self.data, minutes, seed) if minutes else self.data
-        case = Case(self.source, self.logs, data, experiment, self.size.spec, folder, lambda name, event: None)
+        case = TransferCase(self.source, self.logs, data, experiment, self.size.spec, folder, lambda name, event: None)
         return METHODS[method]().make(case)
 
     def scores(self, made: Made, both: bool) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def world_of(work: Path, size: Size, seed: int) -> World:
     return World(source, logs, divided(source, logs), work, size)
 
 
-def divided(source: Source, logs: DataSource) -> Prepared:
+def divided(source: SourceModel, logs: DataSource) -> Prepared:
     """The logs of the target, each divided by time."""
     experiment = target_experiment(source)
     return prepare(logs.read(), source.bundle.task, experiment.split, source.predictor.spec.window)
@@ -301,7 +301,7 @@ def physics_of(world: World, size: Size, seed: int) -> dict[str, dict[str, float
     return found
 
 
-def of_machine(source: Source, machine: str) -> Source:
+def of_machine(source: SourceModel, machine: str) -> SourceModel:
     """The source with the geometry of another machine in its physics base, its weights as they are."""
     old = source.predictor
     physics = replace(old.spec.physics, machine=machine)

@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from common import Verdict, finish, parser, table, verdict
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.logs import write_recording
 from edp.storage import make_folder
-from edp.transfer import METHODS, FinetuneSpec, Order, finetune
-from edp.workflow import DataSource, train
+from edp.workflows.train_evaluate import DataSource, train
+from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec, finetune
 from real_recordings import EXAMPLES, PRESET, QUICK, shared_folder
 
 OURS, NONE = "full", "direct"
@@ -70,7 +70,7 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     train(DataSource.of(work / "source"), experiment, work / "run")
     specs = [replace(SPEC, rounds=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
     logs = DataSource.of(work / "target")
-    tried = {work / f"tuned_{number}": Order(spec=spec, method=OURS) for number, spec in enumerate(specs)}
+    tried = {work / f"tuned_{number}": FinetuneRequest(spec=spec, method=OURS) for number, spec in enumerate(specs)}
     for folder, order in tried.items():
         finetune(work / "run", logs, order, folder)
     best = min(tried, key=validation)

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from common import Verdict, table, verdict
-from edp.report.drawing import BLUE, DROPPED, INK
-from edp.transfer import METHODS
+from edp.report.common.drawing import BLUE, DROPPED, INK
+from edp.workflows.transfer import METHODS
 
 HORIZON = "10"
 OURS, NONE = "full", "direct"

@@ -2,10 +2,10 @@
 
 import sys
 
-from edp.config import load_experiment
-from edp.models import Stream
+from edp.config.experiment import load_experiment
+from edp.networks import Stream
 from edp.training import load_bundle
-from edp.workflow import DataSource, build_report, evaluate, train
+from edp.workflows.train_evaluate import DataSource, build_report, evaluate, train
 
 
 def main(data: str, run: str, *changes: str) -> None:

@@ -2,14 +2,14 @@
 
 import sys
 
-from edp.search.plan import load_plan
-from edp.search.runner import Crew, run_search
-from edp.sources import DataSource
+from edp.logs.source import DataSource
+from edp.workflows.search.plan import load_plan
+from edp.workflows.search.runner import Resources, run_search
 
 
 def main(data: str, study: str, *changes: str) -> None:
     plan = load_plan(preset="quick", overrides=changes)
-    found = run_search(DataSource.of(data), plan, study, Crew(workers=2))
+    found = run_search(DataSource.of(data), plan, study, Resources(workers=2))
     for decision in found.ground.decided.values():
         print(decision.phase, *decision.sentences, sep="\n  ")
     print("settings of the winner:", found.teacher)

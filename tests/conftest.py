@@ -13,22 +13,22 @@ import numpy as np
 import pytest
 import torch
 
-from edp.blocks import BLOCKS
-from edp.blocks.base import OUTPUT_SLOTS, SHARED_SLOTS
 from edp.data.features import Derived, FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, ExportError
-from edp.integer import calibrate
-from edp.models.activations import ACTIVATIONS
-from edp.models.backbones import BACKBONES, GruSpec, HybridSpec, LstmSpec, TcnSpec
-from edp.models.cells import CELLS
-from edp.models.heads import HEADS, GluHead, MlpHead
-from edp.models.initial import INITIAL_STATES
-from edp.models.integer import IntegerPredictor
-from edp.models.outputs import OUTPUTS, Point
-from edp.models.physics import PHYSICS
-from edp.models.predictor import ModelSpec, Predictor, build_model, check_combination
+from edp.ir.w8a16 import calibrate
+from edp.networks.activations import ACTIVATIONS
+from edp.networks.backbones import BACKBONES, GruSpec, HybridSpec, LstmSpec, TcnSpec
+from edp.networks.blocks import BLOCKS
+from edp.networks.blocks.base import OUTPUT_SLOTS, SHARED_SLOTS
+from edp.networks.cells import CELLS
+from edp.networks.heads import HEADS, GluHead, MlpHead
+from edp.networks.initial import INITIAL_STATES
+from edp.networks.integer import IntegerPredictor
+from edp.networks.outputs import OUTPUTS, Point
+from edp.networks.physics import PHYSICS
+from edp.networks.predictor import ModelSpec, Predictor, build_model, check_combination
 
 WINDOW = 9
 # Small options, so that every combination is cheap; a part that is absent here is tested with its defaults.

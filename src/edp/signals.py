@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from edp.bounds import shown
 from edp.errors import ConfigError, closest
+from edp.settings.bounds import shown
 
 
 class Kind(StrEnum):

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from edp.blocks import BLOCKS
-from edp.blocks.base import OutputSpace
 from edp.data.features import FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
-from edp.models.backbones import HybridSpec
-from edp.models.heads import HEADS, MlpHead
-from edp.models.predictor import ModelSpec, build_model
-from edp.trailing import TrailingMean
+from edp.networks.backbones import HybridSpec
+from edp.networks.blocks import BLOCKS
+from edp.networks.blocks.base import OutputSpace
+from edp.networks.heads import HEADS, MlpHead
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.trailing import StreamingTrailingMean
 
 
 @pytest.fixture(autouse=True)
@@ -116,12 +116,12 @@ def trailing(x, window):
 @pytest.mark.parametrize("ticks", [1, 6, 7, 8, 133])
 def test_the_trailing_mean_is_the_mean_of_the_last_ticks(window, ticks):
     x = draw(2, ticks, 3)
-    torch.testing.assert_close(run(TrailingMean(3, window), x), trailing(x, window), rtol=0, atol=1e-13)
+    torch.testing.assert_close(run(StreamingTrailingMean(3, window), x), trailing(x, window), rtol=0, atol=1e-13)
 
 
 def test_the_trailing_mean_stays_exact_over_hours():
     """Three hours at 100 Hz in single precision: a far offset and a burst of huge values leave no trace behind."""
-    layer = TrailingMean(1, 50)
+    layer = StreamingTrailingMean(1, 50)
     x = torch.sin(torch.arange(5_000, dtype=torch.float32) / 30)[None, :, None] + 100.0
     state = layer.initial_state(1, x)
     burst = x.clone()
@@ -243,7 +243,7 @@ def test_the_cylinder_gate_is_open_at_the_start(form):
 
 
 def test_the_trailing_mean_has_the_same_bits_however_a_stream_is_cut():
-    layer, x = TrailingMean(2, 13), torch.randn(1, 90, 2)
+    layer, x = StreamingTrailingMean(2, 13), torch.randn(1, 90, 2)
     whole, _ = layer(x, layer.initial_state(1, x))
     state, pieces = layer.initial_state(1, x), []
     for piece in x.split((1, 1, 40, 7, 41), dim=1):

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.blocks import BLOCKS
-from edp.blocks.base import Particular
 from edp.data.features import FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
-from edp.models.activations import ACTIVATIONS
-from edp.models.backbones import BACKBONES
-from edp.models.heads import HEADS
-from edp.models.outputs import OUTPUTS
-from edp.models.physics import PHYSICS
-from edp.models.physics.base import SPEEDS
-from edp.models.predictor import ModelSpec, build_model, check_combination
+from edp.networks.activations import ACTIVATIONS
+from edp.networks.backbones import BACKBONES
+from edp.networks.blocks import BLOCKS
+from edp.networks.blocks.base import HasConflicts
+from edp.networks.heads import HEADS
+from edp.networks.outputs import OUTPUTS
+from edp.networks.physics import PHYSICS
+from edp.networks.physics.base import SPEEDS
+from edp.networks.predictor import ModelSpec, build_model, check_combination
 
 REGISTRIES = (BACKBONES, HEADS, OUTPUTS, ACTIVATIONS, BLOCKS, PHYSICS)
 TASK = Task(FeatureSet("two", ("v_1", "v_2")), ("v_1", "v_2"), (1,), TargetMode.ABSOLUTE, 100.0)
@@ -63,7 +63,7 @@ REFUSED = [
     ),
     ("hybrid", reads("hybrid"), with_physics("hybrid", "linear_bypass"), "start = 'zero'"),
 ]
-ALONE = {name: make() for registry in REGISTRIES for name, make in registry.items() if issubclass(make, Particular)}
+ALONE = {name: make() for registry in REGISTRIES for name, make in registry.items() if issubclass(make, HasConflicts)}
 
 
 def test_every_part_that_can_refuse_is_refused_here():

@@ -10,16 +10,16 @@ import pytest
 import torch
 from torch import nn
 
-from edp.blocks.base import Slot
-from edp.compress import dynamic_int8
 from edp.errors import ConfigError
-from edp.evaluation.traced import Trace, check_counted
-from edp.models.backbones import HybridSpec
-from edp.models.cells import CELLS
-from edp.models.predictor import ModelSpec, build_model
-from edp.streaming import Cost, Streaming
+from edp.evaluation.mac_check import Trace, check_counted
+from edp.networks.backbones import HybridSpec
+from edp.networks.blocks.base import BlockSlot
+from edp.networks.cells import CELLS
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.streaming import Cost, Streaming
 from edp.training.bundle import blank_scaler
-from edp.workflow import footprint_of
+from edp.workflows.compression import dynamic_int8
+from edp.workflows.train_evaluate import footprint_of
 
 
 def test_every_network_of_the_registries_passes(structure, predictor_of):
@@ -139,7 +139,7 @@ def test_a_custom_cell_with_weights_that_are_not_counted_is_found(product, count
 class Pooled(Streaming):
     """Products of data with data: every output reads every feature by weights that the features make."""
 
-    slot = Slot.BYPASS
+    slot = BlockSlot.BYPASS
 
     def __init__(self, fused):
         super().__init__()

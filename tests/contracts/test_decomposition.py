@@ -1,6 +1,6 @@
 """Backbone and head: every backbone declares its parts, and every parameter belongs to one of them."""
 
-from edp.models.decomposition import decompose
+from edp.networks.decomposition import decompose
 
 
 def test_every_parameter_belongs_to_one_part(structure, predictor_of):

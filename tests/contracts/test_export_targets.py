@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from edp.compress import student
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.scaling import Scaler
 from edp.errors import ExportError
 from edp.export import TARGETS, make_target
-from edp.models import build_model
+from edp.networks import build_model
+from edp.networks.narrow import student
 from edp.signals import TABLE_A1, Channel, Kind
 from edp.training.bundle import Bundle
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from edp.errors import ExportError
-from edp.graph import base, layers, memory
-from edp.graph.reference import STEPS, Reference
-from edp.streaming import parameters_of, state_numbers
+from edp.ir import base, layers, memory
+from edp.ir.reference import STEPS, Reference
+from edp.networks.streaming import parameters_of, state_numbers
 from edp.training.bundle import blank_scaler
 
 TICKS = 24

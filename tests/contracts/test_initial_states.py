@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from edp.models.cells import CELLS, Stack
-from edp.models.initial import INITIAL_STATES
-from edp.streaming import map_state, reset_where
+from edp.networks.cells import CELLS, Stack
+from edp.networks.initial import INITIAL_STATES
+from edp.networks.streaming import map_state, reset_where
 
 LEARNED = [name for name in INITIAL_STATES if name != "zero"]
 PREFIX = 6

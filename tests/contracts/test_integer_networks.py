@@ -10,14 +10,14 @@ import torch
 
 from edp.data.series import Series
 from edp.errors import ExportError
-from edp.graph import base
-from edp.graph.reference import Reference
-from edp.integer import Integers, calibrate, quantise
-from edp.integer.quantise import FLOAT, LOWER, REFUSED
-from edp.integer.reference import WHOLE
-from edp.integer.single import OVER_TIME
-from edp.models.integer import IntegerPredictor
-from edp.models.running import stream_intervals, stream_predictions
+from edp.ir import base
+from edp.ir.reference import Reference
+from edp.ir.w8a16 import Integers, calibrate, quantise
+from edp.ir.w8a16.quantise import FLOAT, LOWER, REFUSED
+from edp.ir.w8a16.reference import WHOLE
+from edp.ir.w8a16.single import OVER_TIME
+from edp.networks.integer import IntegerPredictor
+from edp.networks.running import stream_intervals, stream_predictions
 
 
 def series_of(rows, predictor):
@@ -111,7 +111,7 @@ def test_no_weight_stays_real(network):
 
 
 def test_every_kind_of_layer_is_known():
-    kinds = {kind for kind in base.Layer.__subclasses__() if kind.__module__.startswith("edp.graph.")}
+    kinds = {kind for kind in base.Layer.__subclasses__() if kind.__module__.startswith("edp.ir.")}
     kinds |= {kind for parent in kinds for kind in parent.__subclasses__()}
     known = set(LOWER) | set(OVER_TIME) | set(REFUSED)
     assert {kind for kind in kinds if not kind.__name__.startswith("_")} <= known

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from edp.blocks import BLOCKS
-from edp.models.activations import ACTIVATIONS, ScaledTanh
-from edp.models.convolution import CausalConv, ConvolutionStack, TemporalBlock, receptive_field
-from edp.models.heads import MlpHead
-from edp.models.pooling import AttentionPooling
+from edp.networks.activations import ACTIVATIONS, ScaledTanh
+from edp.networks.blocks import BLOCKS
+from edp.networks.convolution import CausalConv, ConvolutionStack, TemporalBlock, receptive_field
+from edp.networks.heads import MlpHead
+from edp.networks.pooling import AttentionPooling
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from edp.training.spec import TrainingSpec
-from edp.transfer.lessons import LowRank
+from edp.workflows.transfer.strategies import LowRank
 
 
 def test_changes_begin_at_nothing_and_are_added_at_the_end(structure, predictor_of, rows_of):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from edp.evaluation.traced import Trace, trace
-from edp.models.activations import ACTIVATIONS
-from edp.streaming import Operation, Streaming, operations_of
+from edp.evaluation.mac_check import Trace, trace
+from edp.networks.activations import ACTIVATIONS
+from edp.networks.streaming import Operation, Streaming, operations_of
 
 # Which declarations allow an operation of PyTorch; double precision keeps recurrent layers off the fused kernels.
 PRODUCTS = {Operation.LINEAR, Operation.MATMUL, Operation.LSTM, Operation.GRU}

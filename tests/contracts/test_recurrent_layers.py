@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from edp.errors import ConfigError
-from edp.models.backbones import GruSpec, HybridSpec, LstmSpec
-from edp.models.cells import CELLS
-from edp.models.cells.scan import linear_scan
-from edp.streaming import map_state, parameters_of
+from edp.networks.backbones import GruSpec, HybridSpec, LstmSpec
+from edp.networks.cells import CELLS
+from edp.networks.cells.scan import linear_scan
+from edp.networks.streaming import map_state, parameters_of
 
 KINDS = [(name, rate) for name in CELLS for rate in ((0.0, 0.3) if CELLS[name].zoneout else (0.0,))]
 

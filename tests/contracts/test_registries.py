@@ -1,28 +1,29 @@
 """The parts that exist: what is registered, what fits where, and that the contract tests reach all of it."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
 
-import edp.blocks
-import edp.models.cells
-from edp.blocks import BLOCKS
-from edp.blocks.base import OUTPUT_SLOTS, BlockSpec, Slot
+import edp.networks.blocks
+import edp.networks.cells
+from edp.config.experiment import SETTINGS, plain_tree
 from edp.data.augment import AUGMENTATIONS
 from edp.data.features import DERIVATIONS
 from edp.data.splits import SPLITS
 from edp.errors import ConfigError, EdpError
-from edp.losses import LOSSES, TERMS
-from edp.models.activations import ACTIVATIONS
-from edp.models.backbones import BACKBONES, TcnSpec
-from edp.models.cells import CELLS
-from edp.models.heads import HEADS
-from edp.models.initial import INITIAL_STATES
-from edp.models.outputs import OUTPUTS
-from edp.models.physics import PHYSICS
-from edp.models.plain import tagged, untagged
-from edp.models.predictor import ModelSpec
+from edp.networks.activations import ACTIVATIONS
+from edp.networks.backbones import BACKBONES, TcnSpec
+from edp.networks.blocks import BLOCKS
+from edp.networks.blocks.base import OUTPUT_SLOTS, BlockSlot, BlockSpec
+from edp.networks.cells import CELLS
+from edp.networks.heads import HEADS
+from edp.networks.initial import INITIAL_STATES
+from edp.networks.losses import LOSSES, TERMS
+from edp.networks.outputs import OUTPUTS
+from edp.networks.physics import PHYSICS
+from edp.networks.predictor import ModelSpec
 from edp.registry import Registry
 from edp.training.averages import AVERAGES
 from edp.training.optimizers import OPTIMIZERS
@@ -73,12 +74,12 @@ def test_every_backbone_is_tested_with_every_block_that_fits_and_in_every_form(p
 
 def test_every_file_in_cells_registers_a_recurrent_layer():
     shared = {"__init__", "base", "lstm_steps", "scan"}
-    files = {path.stem for path in Path(edp.models.cells.__path__[0]).glob("*.py")} - shared
+    files = {path.stem for path in Path(edp.networks.cells.__path__[0]).glob("*.py")} - shared
     assert files == {CELLS[name].__module__.rpartition(".")[2] for name in CELLS}
 
 
 def test_every_file_in_blocks_registers_a_block():
-    files = {path.stem for path in Path(edp.blocks.__path__[0]).glob("*.py")} - {"__init__", "base"}
+    files = {path.stem for path in Path(edp.networks.blocks.__path__[0]).glob("*.py")} - {"__init__", "base"}
     assert files == {BLOCKS[name].__module__.rpartition(".")[2] for name in BLOCKS}
 
 
@@ -86,7 +87,7 @@ def test_every_file_in_blocks_registers_a_block():
 def test_a_block_names_its_slot_and_a_search_space_of_its_options(name):
     part = BLOCKS[name]
     assert isinstance(part(), BlockSpec)
-    assert part.slot in Slot
+    assert part.slot in BlockSlot
     options = {field.name for field in dataclasses.fields(part)}
     for option, values in part.space.items():
         assert option in options
@@ -98,7 +99,7 @@ def test_a_block_names_its_slot_and_a_search_space_of_its_options(name):
 def test_a_spec_is_frozen_has_defaults_and_survives_json(registry, name):
     spec = registry[name]()
     assert dataclasses.is_dataclass(spec)
-    assert untagged(tagged(spec, registry), registry) == spec
+    assert SETTINGS.build(registry[name], json.loads(json.dumps(plain_tree(spec))), name) == spec
     assert registry.name_of(spec) == name
     for field in dataclasses.fields(spec):
         with pytest.raises(dataclasses.FrozenInstanceError):

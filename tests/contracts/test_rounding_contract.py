@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from edp.compress import Rounding, RoundingSpec, weight_levels
 from edp.data.series import Series
 from edp.errors import ConfigError
-from edp.graph.layers import Dense, GroupedDense
-from edp.graph.memory import AttentionPool, Convolution, Gru, LayerNormLstm, Lstm, PrefixCorrection
+from edp.ir.layers import Dense, GroupedDense
+from edp.ir.memory import AttentionPool, Convolution, Gru, LayerNormLstm, Lstm, PrefixCorrection
+from edp.workflows.compression import NetworkRounding, RoundingSpec, weight_levels
 
 TICKS = 24
 WEIGHTS = {
@@ -38,7 +38,7 @@ def series_of(predictor, ticks=200):
 
 
 def rounded(predictor, bits):
-    rounding = Rounding(predictor, bits)
+    rounding = NetworkRounding(predictor, bits)
     rounding.install(series_of(predictor))
     return rounding
 

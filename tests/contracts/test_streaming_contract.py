@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from edp.export.golden import random_inputs
-from edp.models.stream import Stream
-from edp.streaming import detach_state, map_state, reset_where, state_numbers
+from edp.networks.stream import Stream
+from edp.networks.streaming import detach_state, map_state, reset_where, state_numbers
 
 TICKS = 24
 

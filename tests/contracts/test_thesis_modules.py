@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from edp.config import Experiment, build, load_experiment
+from edp.config.experiment import Experiment, build, load_experiment
 from edp.data.scaling import Scaler
 from edp.errors import ConfigError
-from edp.models.predictor import build_model
-from edp.search.modules import MODULES, options_of, present_options, with_modules
-from edp.search.trainings import settings_of
+from edp.networks.predictor import build_model
+from edp.workflows.search.modules import MODULES, options_of, present_options, with_modules
+from edp.workflows.search.trainings import settings_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
 PRINTED = {

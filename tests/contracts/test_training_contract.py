@@ -14,12 +14,12 @@ from edp.data.scaling import Scaler
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
-from edp.losses import LOSSES, TERMS, AdaptiveWeights
-from edp.models.backbones import LstmSpec
-from edp.models.heads import MlpHead
-from edp.models.outputs import OUTPUTS, Laplace, Normal, Quantiles
-from edp.models.predictor import ModelSpec, build_model
-from edp.models.stream import Stream
+from edp.networks.backbones import LstmSpec
+from edp.networks.heads import MlpHead
+from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights
+from edp.networks.outputs import OUTPUTS, Laplace, Normal, Quantiles
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.stream import Stream
 from edp.training.averages import AVERAGES
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec, check_training

@@ -16,27 +16,28 @@ from edp.cli import app
 from edp.cli.console import run_app
 from edp.cli.finetune import finetune
 from edp.cli.pretrain import pretrain
-from edp.compress import DistillationSpec
-from edp.config import TAGGED, FeatureSettings, TaskSettings, load_experiment
+from edp.config.experiment import SETTINGS as TREE
+from edp.config.experiment import FeatureSettings, TaskSettings, load_experiment
 from edp.data.chunks import ChunkSpec
 from edp.data.features import Derived
-from edp.data_sets import SimulationOrder, simulate_data_set
+from edp.data.screening import ForestSpec, ScreeningSpec
 from edp.evaluation.controller import Budget
 from edp.evaluation.judge import JudgeSpec
 from edp.logs import write_recording
-from edp.losses import AdaptiveWeights
-from edp.models.predictor import ModelSpec
-from edp.pretraining import PRETRAININGS, MetaSpec
+from edp.logs.source import RecordingEntry, load_data_set, load_signal_map
+from edp.networks.losses import AdaptiveWeights
+from edp.networks.predictor import ModelSpec
 from edp.recording import Recording
-from edp.screening import ForestSpec, ScreeningSpec
-from edp.search.ground import Ground
-from edp.search.phases import PHASES
-from edp.search.plan import load_plan
-from edp.search.settings import SearchSpec
 from edp.signals import TABLE_A1
-from edp.sources import RecordingEntry, load_data_set, load_signal_map
+from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import TrainingSpec
-from edp.transfer import METHODS, FinetuneSpec
+from edp.workflows.compression import DistillationSpec
+from edp.workflows.pretraining import PRETRAININGS, MetaSpec
+from edp.workflows.search.context import SearchContext
+from edp.workflows.search.phases import PHASES
+from edp.workflows.search.plan import load_plan
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.transfer import METHODS, FinetuneSpec
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -107,7 +108,7 @@ def test_links_of_the_documents_lead_somewhere():
 def test_settings_page_names_every_part_and_key():
     page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
     sections = dict(part.partition("\n")[::2] for part in re.split(r"^#+ ", page, flags=re.MULTILINE))
-    classes = {f'{name}: `kind = "{kind}"`': TAGGED[name][kind] for name in TAGGED for kind in TAGGED[name]}
+    classes = {f'{name}: `kind = "{kind}"`': TREE.parts[name][kind] for name in TREE.parts for kind in TREE.parts[name]}
     classes |= {"`[task]`": TaskSettings, "`[model]`": ModelSpec, "`[training]`": TrainingSpec, "`[judge]`": JudgeSpec}
     classes |= {
         "`[training.chunks]`": ChunkSpec,
@@ -197,7 +198,7 @@ def test_search_page_names_every_phase_and_key_and_shows_the_examples():
 def test_search_page_tells_how_much_a_preset_trains(preset):
     page = (ROOT / "docs" / "search.md").read_text(encoding="utf-8")
     spec = load_plan(preset=preset).spec
-    ground = Ground(spec, {}, {}, tuple(f"session {i}" for i in range(20)), ())
+    ground = SearchContext(spec, {}, {}, tuple(f"session {i}" for i in range(20)), ())
     trainings = sum(phase.trainings(ground) for phase in PHASES.values())
     steps = f"{spec.updates:,}, {spec.final_updates:,}"
     if spec.epochs > 1:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.config import load_experiment, read_toml
+from edp.config.experiment import load_experiment, read_toml
 from edp.errors import ConfigError
-from edp.sources import load_data_set
-from edp.workflow import DataSource
+from edp.logs.source import load_data_set
+from edp.workflows.train_evaluate import DataSource
 
 ROOT = Path(__file__).parents[2]
 REAL = ROOT / "examples" / "real"

@@ -10,7 +10,7 @@ import pytest
 
 from edp.logs import read_recording
 from edp.storage import read_json
-from edp.workflow import DataSource
+from edp.workflows.train_evaluate import DataSource
 
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("EDP_SHARED_DATA") or ROOT.parent / "shared" / "data")

@@ -18,8 +18,8 @@ from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
 from edp.export.golden import random_inputs
 from edp.export.simulink import SimulinkTarget
-from edp.models.input_range import usual_range
-from edp.models.predictor import Predictor
+from edp.networks.input_range import usual_range
+from edp.networks.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 

@@ -13,9 +13,9 @@ from edp.export import TARGETS
 from edp.export.c.model import make_model
 from edp.export.c.target import CTarget
 from edp.export.golden import random_inputs
-from edp.models.input_range import usual_range
-from edp.onboard import Adaptation, AdaptationSpec, Adapter, Status
-from edp.onboard.law import CLIP, FEATURE_LIMIT, MOST_ERROR
+from edp.ir.rls import Adaptation, AdaptationSpec, RlsCorrector, RlsStatus
+from edp.ir.rls.constants import CLIP, FEATURE_LIMIT, MOST_ERROR
+from edp.networks.input_range import usual_range
 
 HERE = Path(__file__).parent
 NETWORKS = [("hybrid", False), ("lstm+quantiles", False), ("tcn+all", False), ("hybrid", True)]
@@ -84,7 +84,7 @@ def test_c_gives_the_bits_of_the_reference(c, network, whole, driven):
     x, what = hard(bundle)
     base, found, statuses = fed(c, program, bundle, x, what)
     law, window = bundle.adaptation, bundle.predictor.spec.window
-    adapter, age, last, held = Adapter(law), 0, x[0], 0
+    adapter, age, last, held = RlsCorrector(law), 0, x[0], 0
     seen = set()
     for tick in range(len(x)):
         good = what[tick] != MISSED and bool(np.isfinite(x[tick]).all())
@@ -101,7 +101,7 @@ def test_c_gives_the_bits_of_the_reference(c, network, whole, driven):
             adapter.theta[0, 0, 0], adapter.covariance[0, 0, 0] = np.nan, -1.0
         if age == 0:
             adapter.interrupt()
-            assert statuses[tick] == Status.NONE
+            assert statuses[tick] == RlsStatus.NONE
             continue
         y = base[tick, : law.unit.size].reshape(law.unit.shape)
         wanted, status = adapter.step(last, y, fresh=good and age >= window, learn=what[tick] != FROZEN)
@@ -109,7 +109,7 @@ def test_c_gives_the_bits_of_the_reference(c, network, whole, driven):
         np.testing.assert_array_equal(found[tick, : law.unit.size], wanted.ravel(), err_msg=str(tick))
         seen.add(status)
     assert adapter.repairs == 2
-    assert {Status.LEARNING, Status.HOLDING} <= seen
+    assert {RlsStatus.LEARNING, RlsStatus.HOLDING} <= seen
 
 
 def test_bounds_of_intervals_move_with_the_prediction(c, driven):

@@ -17,9 +17,9 @@ from edp.export.c.target import CTarget
 from edp.export.c.text import number
 from edp.export.escape import c_names
 from edp.export.golden import SHARE, random_inputs, stream, tolerance
-from edp.graph import Graph, Layer, memory
-from edp.graph.reference import STEPS
-from edp.models.input_range import LIMIT, usual_range
+from edp.ir import Graph, Layer, memory
+from edp.ir.reference import STEPS
+from edp.networks.input_range import LIMIT, usual_range
 
 
 def differs_by(c, program, predictor, ticks):

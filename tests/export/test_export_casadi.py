@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.features import FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import Task
@@ -18,9 +18,9 @@ from edp.errors import ExportError
 from edp.export import make_target
 from edp.export.casadi.target import KNOWN, CasadiTarget
 from edp.export.golden import random_inputs, stream, tolerance
-from edp.graph.reference import STEPS
-from edp.models.backbones import LstmSpec
-from edp.models.predictor import ModelSpec, build_model
+from edp.ir.reference import STEPS
+from edp.networks.backbones import LstmSpec
+from edp.networks.predictor import ModelSpec, build_model
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 

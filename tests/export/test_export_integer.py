@@ -7,8 +7,8 @@ import pytest
 
 from edp.export.c.integer_calls import INTEGER_CALLS
 from edp.export.golden import random_inputs, stream
-from edp.integer.layers import Quantise
-from edp.integer.reference import WHOLE
+from edp.ir.w8a16.layers import Quantise
+from edp.ir.w8a16.reference import WHOLE
 
 EXTREME = 30.0
 """Standard widths: far beyond the range of the formats."""

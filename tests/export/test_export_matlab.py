@@ -18,8 +18,8 @@ from edp.export.golden import random_inputs, stream, tolerance
 from edp.export.simulink import native as native_file
 from edp.export.simulink.folder import Folder
 from edp.export.simulink.native import WRITERS, functions_for
-from edp.graph import memory
-from edp.graph.reference import STEPS
+from edp.ir import memory
+from edp.ir.reference import STEPS
 
 TICKS = 24
 """More than two windows of the small networks."""

@@ -15,8 +15,8 @@ from edp.export.onnx.nodes import ALLOWED, OPSETS
 from edp.export.onnx.plain import PLAIN
 from edp.export.onnx.step import INPUTS, SPOILT, states_of, step_model
 from edp.export.onnx.window import rows_needed, window_model
-from edp.graph import memory
-from edp.graph.reference import STEPS as REFERENCE
+from edp.ir import memory
+from edp.ir.reference import STEPS as REFERENCE
 
 needed = "needs the packages onnx and onnxruntime: pip install 'excavator-dynamics-predictor[dev]'"
 onnx = pytest.importorskip("onnx", reason=needed)

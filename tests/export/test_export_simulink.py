@@ -20,7 +20,7 @@ from edp.export.golden import random_inputs, stream, tolerance
 from edp.export.simulink.folder import Folder
 from edp.export.simulink.native import Native
 from edp.export.simulink.target import SimulinkTarget
-from edp.graph import Graph, Layer
+from edp.ir import Graph, Layer
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-O1")
 HEAP = {"malloc", "calloc", "realloc", "free", "alloca"}

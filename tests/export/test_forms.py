@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError, DataError, ExportError
-from edp.parity import FORMS, Broken, Missing, Ran, compare, golden_case
-from edp.parity.base import held
+from edp.workflows.parity import FORMS, Broken, Missing, Ran, compare, golden_case
+from edp.workflows.parity.base import held
 
 WHOLE = {"c", "torch_ticks"}
 """Forms that whole numbers have at least."""

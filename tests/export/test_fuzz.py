@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from edp.export.c.target import CTarget
-from edp.models.input_range import usual_range
+from edp.networks.input_range import usual_range
 
 ADDRESSES = "-fsanitize=fuzzer,address,undefined,float-cast-overflow"
 UNINITIALISED = "-fsanitize=fuzzer,memory"

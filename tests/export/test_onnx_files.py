@@ -21,7 +21,7 @@ from edp.export.onnx.nodes import ALLOWED, OPSETS, Nodes
 from edp.export.onnx.step import INPUTS, states_of, step_model
 from edp.export.onnx.target import OnnxTarget
 from edp.export.onnx.window import window_model
-from edp.graph import Graph, Layer, memory
+from edp.ir import Graph, Layer, memory
 
 needed = "needs the packages onnx and onnxruntime: pip install 'excavator-dynamics-predictor[dev]'"
 onnx = pytest.importorskip("onnx", reason=needed)

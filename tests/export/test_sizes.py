@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from edp.compress.formats import FORMATS
-from edp.compress.formats.base import taken
 from edp.errors import ExportError
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
@@ -22,9 +20,11 @@ from edp.export.c.model import make_model
 from edp.export.c.program import runtime_bytes
 from edp.export.c.sizes import constant_bytes, program_bytes, sizes_of
 from edp.export.c.target import core_files
-from edp.integer.quantise import outline
-from edp.models.input_range import usual_range
-from edp.onboard import Adaptation, AdaptationSpec
+from edp.ir.rls import Adaptation, AdaptationSpec
+from edp.ir.w8a16.quantise import outline
+from edp.networks.input_range import usual_range
+from edp.workflows.compression.formats import FORMATS
+from edp.workflows.compression.formats.base import taken
 
 ARM = ("-std=c99", "-O2", "-ffp-contract=off", "-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16",
        "-ffunction-sections", "-fdata-sections")  # fmt: skip

@@ -14,8 +14,8 @@ from edp.errors import ConfigError, DataError
 from edp.export.c.target import CTarget
 from edp.export.golden import random_inputs, tolerance
 from edp.export.golden import stream as in_one_piece
-from edp.models.input_range import HOLD_TICKS, input_limits
-from edp.models.stream import Stream, StreamStatus
+from edp.networks.input_range import HOLD_TICKS, input_limits
+from edp.networks.stream import Stream, StreamStatus
 
 STEP, MISSED, RESET = range(3)
 BAD = (np.nan, np.inf, -np.inf, 3.3e38, -3.3e38)

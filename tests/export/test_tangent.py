@@ -15,8 +15,8 @@ from edp.export.c.model import make_model
 from edp.export.c.plan import plan
 from edp.export.c.tangents import TANGENTS, Tangents
 from edp.export.golden import random_inputs
-from edp.graph import Graph, Layer
-from edp.models.input_range import usual_range
+from edp.ir import Graph, Layer
+from edp.networks.input_range import usual_range
 
 DRIVER = Path(__file__).with_name("tangent_driver.c")
 MISSED = -12345.0

@@ -24,13 +24,13 @@ import tomli_w
 from asammdf.blocks.conversion_utils import from_dict
 from safetensors.numpy import load_file, save_file
 
-from edp.config import experiment_toml, load_experiment
+from edp.config.experiment import experiment_toml, load_experiment
 from edp.data.features import FeatureSet
 from edp.data.task import TargetMode, Task
 from edp.logs import WriteOptions, write_recording
-from edp.models.backbones import HybridSpec
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec, build_model
+from edp.networks.backbones import HybridSpec
+from edp.networks.heads import MlpHead
+from edp.networks.predictor import ModelSpec, build_model
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
 from edp.storage import parse_toml

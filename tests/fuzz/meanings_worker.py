@@ -19,13 +19,13 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 import meanings
 
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import EdpError
 from edp.logs import inspect_log, read_recording
-from edp.models import Stream
+from edp.logs.source import load_signal_map
+from edp.networks import Stream
 from edp.sandbox import end
 from edp.signals import SignalMap
-from edp.sources import load_signal_map
 from edp.training import load_bundle
 
 SECONDS = 10.0

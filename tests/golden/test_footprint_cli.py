@@ -9,9 +9,9 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
-from edp.config import load_experiment
-from edp.losses import TERMS
-from edp.models.predictor import ModelSpec, describe
+from edp.config.experiment import load_experiment
+from edp.networks.losses import TERMS
+from edp.networks.predictor import ModelSpec, describe
 
 FOLDER = Path(__file__).parents[2] / "examples" / "thesis"
 # Parameters as stored; MACs of a window in M to three digits as printed; MACs per tick in k to four digits.

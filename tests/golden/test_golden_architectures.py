@@ -7,16 +7,16 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from edp.blocks import AttentionBridge, CylinderGate, MultiScaleTcn, TemporalDifference
 from edp.data.features import FG2
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.evaluation.footprint import footprint
-from edp.models.activations import Identity, ScaledTanh
-from edp.models.backbones import HybridSpec
-from edp.models.cells import LayerNormLstmCell, LstmCell
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec, build_model
+from edp.networks.activations import Identity, ScaledTanh
+from edp.networks.backbones import HybridSpec
+from edp.networks.blocks import AttentionBridge, CylinderGate, MultiScaleTcn, TemporalDifference
+from edp.networks.cells import LayerNormLstmCell, LstmCell
+from edp.networks.heads import MlpHead
+from edp.networks.predictor import ModelSpec, build_model
 
 W = 50
 

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from edp.sim import Scenario, dynamics, friction, linkage, load_machine, plan_data_set, simulate, soil, terramechanics
-from edp.sim import layout as at
-from edp.sim.layout import LOG_STROKE, LOG_VELOCITY
-from edp.sim.plant import Plant
+from edp.sim import Scenario, load_machine, plan_data_set, simulate
+from edp.sim.machine import layout as at
+from edp.sim.machine.layout import LOG_STROKE, LOG_VELOCITY
+from edp.sim.physics import dynamics, friction, linkage, soil, terramechanics
+from edp.sim.physics.plant import Plant
 
 CYLINDERS = range(3)
 machines = pytest.mark.parametrize("name", ["M22", "C14"])

@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from edp.sim import hydraulics, linkage, load_machine, pump, valve
-from edp.sim import layout as at
-from edp.sim.plant import Plant
+from edp.sim import load_machine
+from edp.sim.machine import layout as at
+from edp.sim.physics import hydraulics, linkage, pump, valve
+from edp.sim.physics.plant import Plant
 
 STEP_S = 1e-3
 

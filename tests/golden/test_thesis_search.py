@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError
-from edp.search.conduct import conduct
-from edp.search.ground import Ground, Outcome
-from edp.search.modules import MODULES, TOGGLES, fitting
-from edp.search.phases import PHASES
-from edp.search.phases.isolation import arm_settings
-from edp.search.plan import load_plan
-from edp.search.settings import SearchSpec
-from edp.search.space import Choice, Real, apply, elastic, halved
-from edp.search.trainings import SCORES, costs_of, settings_of
+from edp.workflows.search.context import Outcome, SearchContext
+from edp.workflows.search.modules import MODULES, TOGGLES, fitting
+from edp.workflows.search.phases import PHASES
+from edp.workflows.search.phases.isolation import arm_settings
+from edp.workflows.search.plan import load_plan
+from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.space import Choice, Real, apply, elastic, halved
+from edp.workflows.search.trainings import SCORES, costs_of, settings_of
 
 PLAN = load_plan(None, "thesis")
 DOC = Path(__file__).parents[2] / "docs/thesis_preset.md"
@@ -27,7 +27,7 @@ SESSIONS = tuple(f"s{number:02d}" for number in range(31))
 
 def ground(**changes):
     spec = dataclasses.replace(PLAN.spec, **changes)
-    return Ground(spec, settings_of(PLAN.experiment), {"path": "nowhere"}, SESSIONS[:25], SESSIONS[25:])
+    return SearchContext(spec, settings_of(PLAN.experiment), {"path": "nowhere"}, SESSIONS[:25], SESSIONS[25:])
 
 
 def network(values, modules=(), options=None):
@@ -231,7 +231,7 @@ class World:
 def walked():
     world = World()
     small = {"module_trials": 2, "free_trials": 4, "joint_trials": 3, "variance_runs": 10, "most_runs": 5, "trials": 6}
-    found = conduct(ground(**small, warm_rounds=1, rungs=(0.5,)), world, until="exploration")
+    found = run_phases(ground(**small, warm_rounds=1, rungs=(0.5,)), world, until="exploration")
     return found, world.orders
 
 

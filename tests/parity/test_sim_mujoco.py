@@ -9,9 +9,10 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import newton
 
-from edp.sim import dynamics, linkage, load_machine
-from edp.sim import layout as at
-from edp.sim.parameters import pack
+from edp.sim import load_machine
+from edp.sim.machine import layout as at
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import dynamics, linkage
 
 RANGES = np.radians([(-47.0, 60.0), (-148.0, -30.0), (-138.0, 30.0)])
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from edp.sim import layout as at
 from edp.sim import load_machine
-from edp.sim.layout import LOG_VELOCITY
-from edp.sim.plant import Plant
+from edp.sim.machine import layout as at
+from edp.sim.machine.layout import LOG_VELOCITY
+from edp.sim.physics.plant import Plant
 
 ATM = 1.013e5
 LEVERS = ((0.6, -0.45, 0.5), (-0.35, 0.7, -0.3), (0.0, 0.0, 0.0))

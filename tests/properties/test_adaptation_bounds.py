@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edp.errors import ConfigError
-from edp.onboard import Adaptation, AdaptationSpec, Adapter, Learned, Status
-from edp.onboard.law import BOUND
+from edp.ir.rls import Adaptation, AdaptationSpec, RlsCorrector, RlsState, RlsStatus
+from edp.ir.rls.constants import BOUND
 
 HARD = st.sampled_from([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-40, 0.0, 1.0, -1.0, 50.0])
 
@@ -56,7 +56,7 @@ def test_without_fading_it_is_ridge_regression():
     """Independent: the normal equations of all errors that have come due."""
     held = law(forgetting_s=1e6, limit=1000.0, prior=0.3)
     x, y = machine(400, fault=0.05)
-    adapter = Adapter(held)
+    adapter = RlsCorrector(held)
     run(adapter, x, y)
     phi, error = [], []
     for t in range(3, 400):
@@ -75,54 +75,54 @@ def test_without_fading_it_is_ridge_regression():
 
 def test_a_step_change_is_learned_and_a_frozen_one_learns_nothing():
     x, y = machine(3000)
-    adapted, status = run(Adapter(law()), x, y)
+    adapted, status = run(RlsCorrector(law()), x, y)
     assert mae(adapted[1000:], x[1000:]) < 0.4 * mae(y[1000:], x[1000:])
-    assert status.count(Status.LEARNING) > 2900
-    adapter = Adapter(law())
+    assert status.count(RlsStatus.LEARNING) > 2900
+    adapter = RlsCorrector(law())
     run(adapter, x[:1000], y[:1000])
     before = adapter.theta.copy()
     frozen, status = run(adapter, x[1000:], y[1000:], learn=False)
     np.testing.assert_array_equal(adapter.theta, before)
-    assert Status.LEARNING not in status
+    assert RlsStatus.LEARNING not in status
     assert mae(frozen, x[1000:]) < 0.6 * mae(y[1000:], x[1000:])
 
 
 def test_what_was_learned_comes_back_and_another_ones_is_refused():
     x, y = machine(1500)
-    adapter, fresh = Adapter(law()), Adapter(law())
+    adapter, fresh = RlsCorrector(law()), RlsCorrector(law())
     run(adapter, x, y)
     fresh.restore(adapter.learned)
     np.testing.assert_array_equal(fresh.theta, adapter.theta)
     with pytest.raises(ConfigError, match="another adaptation"):
-        Adapter(law(prior=0.2)).restore(adapter.learned)
+        RlsCorrector(law(prior=0.2)).restore(adapter.learned)
     for bad in (np.nan, 1e6):
         with pytest.raises(ConfigError, match="out of its bounds"):
-            fresh.restore(Learned(adapter.learned.digest, np.full_like(adapter.theta, bad)))
+            fresh.restore(RlsState(adapter.learned.digest, np.full_like(adapter.theta, bad)))
 
 
 def test_a_correction_that_does_harm_is_taken_back_and_returns():
     x, y = machine(6000)
     turned = y.copy()
     turned[2000:] = x[2000:, None, :2] * 2 - y[2000:]  # errors of the other sign, frozen: what was learned does harm
-    adapter = Adapter(law())
+    adapter = RlsCorrector(law())
     run(adapter, x[:2000], y[:2000])
     made, status = run(adapter, x[2000:], turned[2000:], learn=False)
-    assert status[-1] is Status.FALLBACK
+    assert status[-1] is RlsStatus.FALLBACK
     assert adapter.fallback.any()
     np.testing.assert_array_equal(made[-1][adapter.fallback], turned[-1][adapter.fallback])
     _, status = run(adapter, x[:4000], y[:4000])
-    assert status[-1] is Status.LEARNING
+    assert status[-1] is RlsStatus.LEARNING
 
 
 def test_nothing_is_learned_at_rest_or_from_ticks_that_are_missing():
     x, y = machine(500)
-    adapter = Adapter(law())
+    adapter = RlsCorrector(law())
     run(adapter, x, y)
     theta, covariance = adapter.theta.copy(), adapter.covariance.copy()
     still = np.zeros((200, 5), dtype=np.float32)
     out, status = run(adapter, still, np.full((200, 1, 2), 0.01, dtype=np.float32))
     np.testing.assert_array_equal(out, np.full((200, 1, 2), np.float32(0.01)))
-    assert set(status[3:]) == {Status.HOLDING}
+    assert set(status[3:]) == {RlsStatus.HOLDING}
     adapter.theta, adapter.covariance = theta.copy(), covariance.copy()
     for tick in range(30):
         adapter.step(x[tick], y[tick], fresh=tick % 3 != 0)
@@ -143,10 +143,10 @@ def test_no_input_makes_it_leave_its_bounds(seed, faults, horizons, noise, size)
             x[tick, place] = value
         else:
             y[tick, 0, place - 5] = value
-    adapter, most = Adapter(held), held.unit * held.numbers["limit"]
+    adapter, most = RlsCorrector(held), held.unit * held.numbers["limit"]
     for tick in range(300):
         out, status = adapter.step(x[tick], y[tick], fresh=tick % 97 != 0, learn=tick % 50 < 40)
-        if status is Status.NONE:
+        if status is RlsStatus.NONE:
             np.testing.assert_array_equal(out, y[tick])
             continue
         assert np.isfinite(out).all()
@@ -159,7 +159,7 @@ def test_no_input_makes_it_leave_its_bounds(seed, faults, horizons, noise, size)
 
 def test_standstill_and_one_direction_alone_wind_nothing_up():
     held = law(forgetting_s=1.0)
-    adapter = Adapter(held)
+    adapter = RlsCorrector(held)
     x = np.tile(np.array([1, 0.5, 0.2, 0, 0], dtype=np.float32), (5000, 1))
     y = np.full((5000, 1, 2), 1.1, dtype=np.float32)
     run(adapter, x, y)
@@ -170,7 +170,7 @@ def test_standstill_and_one_direction_alone_wind_nothing_up():
 
 def test_damaged_memory_heals():
     x, y = machine(300)
-    adapter = Adapter(law())
+    adapter = RlsCorrector(law())
     run(adapter, x[:100], y[:100])
     adapter.theta[0, 0, 0], adapter.covariance[0, 1, 1] = np.nan, -1e3
     out, _ = run(adapter, x[100:], y[100:])

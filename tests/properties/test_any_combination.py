@@ -8,20 +8,20 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edp.blocks import BLOCKS
 from edp.data.features import FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
-from edp.models.activations import ACTIVATIONS
-from edp.models.backbones import BACKBONES
-from edp.models.cells import CELLS
-from edp.models.heads import HEADS
-from edp.models.initial import INITIAL_STATES
-from edp.models.outputs import OUTPUTS
-from edp.models.physics import PHYSICS
-from edp.models.plain import model_from_plain, model_to_plain
-from edp.models.predictor import ModelSpec, build_model
+from edp.networks.activations import ACTIVATIONS
+from edp.networks.backbones import BACKBONES
+from edp.networks.blocks import BLOCKS
+from edp.networks.cells import CELLS
+from edp.networks.heads import HEADS
+from edp.networks.initial import INITIAL_STATES
+from edp.networks.outputs import OUTPUTS
+from edp.networks.physics import PHYSICS
+from edp.networks.plain import model_from_plain, model_to_plain
+from edp.networks.predictor import ModelSpec, build_model
 
 FEATURES = FeatureSet("three", ("CylVels_1", "CylVels_2", "lever"))
 

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from edp.metrics import score
+from edp.stats.metrics import score
 
 FINITE = st.floats(-1e4, 1e4, allow_nan=False, width=32)
 PAIRS = st.integers(1, 60).flatmap(

@@ -7,11 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from edp.config import TaskSettings
-from edp.models.physics import PHYSICS, ForceSpec, HybridPhysicsSpec, KinematicSpec
-from edp.sim import layout as at
-from edp.sim import linkage, load_machine, pose
-from edp.sim.parameters import pack
+from edp.config.experiment import TaskSettings
+from edp.networks.physics import PHYSICS, ForceSpec, HybridPhysicsSpec, KinematicSpec
+from edp.sim import load_machine
+from edp.sim.machine import layout as at
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import linkage, pose
 
 
 def base_and_inputs(spec, horizons, seed, ticks=7):

@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edp.sim import friction, hydraulics, linkage, load_machine, pump, valve
-from edp.sim import layout as at
+from edp.sim import load_machine
 from edp.sim.excitation.base import extend_probability
-from edp.sim.parameters import conductance, pack
+from edp.sim.machine import layout as at
+from edp.sim.machine.parameters import conductance, pack
+from edp.sim.physics import friction, hydraulics, linkage, pump, valve
 
 AXES, PLANT = pack(load_machine("M22"))
 

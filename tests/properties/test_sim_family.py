@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from edp.errors import ConfigError
 from edp.sim import DataSetSpec, load_machine, machine_family, over_family, plan_data_set, simulate
-from edp.sim.family import WIDEST, Draws, scaled_machine
-from edp.sim.machine_checks import check_machine
-from edp.sim.plant import Plant
+from edp.sim.machine.family import WIDEST, Draws, scaled_machine
+from edp.sim.machine.machine_checks import check_machine
+from edp.sim.physics.plant import Plant
 
 
 @settings(max_examples=30, deadline=None)

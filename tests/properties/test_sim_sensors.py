@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edp.sim import can, dynamics, load_machine, pins, sensors, transducers
-from edp.sim import layout as at
-from edp.sim.layout import LOG_COLUMNS, LOG_VELOCITY
-from edp.sim.plant import Plant
+from edp.sim import load_machine
+from edp.sim.machine import layout as at
+from edp.sim.machine.layout import LOG_COLUMNS, LOG_VELOCITY
+from edp.sim.physics import dynamics, pins
+from edp.sim.physics.plant import Plant
+from edp.sim.sensors import can, sensors, transducers
 
 BUS = can.Bus(period=0.010, latency=(0.002, 0.012), jitter=1.5e-3, loss=0.02)
 FULL = {

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from edp import limits
-from edp.logs.raw import FORMATS, RawLog, RawSignal
+from edp.logs.formats.base import FORMATS, RawLog, RawSignal
 from edp.sandbox import lockdown
+from edp.storage import memory as limits
 
 
 def _connect(_: str) -> None:

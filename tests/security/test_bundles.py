@@ -13,9 +13,9 @@ from safetensors.torch import load, save
 from edp.data.features import FeatureSet
 from edp.data.task import TargetMode, Task
 from edp.errors import BundleError
-from edp.models.backbones import HybridSpec, TcnSpec
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec, build_model
+from edp.networks.backbones import HybridSpec, TcnSpec
+from edp.networks.heads import MlpHead
+from edp.networks.predictor import ModelSpec, build_model
 from edp.signals import Channel, Kind
 from edp.training.bundle import (
     HASH,

@@ -16,8 +16,8 @@ from edp.export import folder as room
 from edp.export.c.model import _check
 from edp.export.folder import LIST, UNFINISHED, write_export
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
-from edp.graph import Graph, layers
-from edp.graph.base import INPUT
+from edp.ir import Graph, layers
+from edp.ir.base import INPUT
 from edp.storage import hold
 
 FIRST = {"a.h": b"first", "core/b.c": b"b of the first", "core/c.c": b"same"}

@@ -19,8 +19,8 @@ from rosbags.rosbag2 import Reader
 
 from edp.errors import DataError
 from edp.logs import read_recording, write_recording
-from edp.logs.bag_guard import definitions_of
-from edp.logs.unpack import unpack_to, unpacked_size
+from edp.logs.formats.bag_guard import definitions_of
+from edp.logs.formats.unpack import unpack_to, unpacked_size
 from edp.recording import Recording
 from edp.signals import TABLE_A1
 
@@ -325,7 +325,7 @@ def test_metadata_nested_deep_is_refused(tmp_path, deep):
 def test_bags_of_ros_1_are_unpacked_within_bounds(little_memory):
     from rosbags.rosbag1 import reader
 
-    from edp.logs.bag_guard import open_reader
+    from edp.logs.formats.bag_guard import open_reader
 
     with pytest.raises(FileNotFoundError):
         open_reader(Path("missing.db3"))
@@ -337,7 +337,7 @@ def test_bags_of_ros_1_are_unpacked_within_bounds(little_memory):
 
 @pytest.mark.parametrize("count", [1_000_000_000, 100_001])
 def test_lists_of_nothing_do_not_fill_memory(count):
-    from edp.logs.ros_message import layout_of
+    from edp.logs.formats.ros_message import layout_of
 
     class Types:
         fielddefs = {  # noqa: RUF012

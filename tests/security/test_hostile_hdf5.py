@@ -13,8 +13,8 @@ import pytest
 
 from edp.errors import DataError
 from edp.logs import read_recording, write_recording
-from edp.logs.raw import WriteOptions
-from edp.matlab.check import check_size
+from edp.logs.formats.base import WriteOptions
+from edp.logs.formats.matlab.check import check_size
 from edp.recording import Recording
 from edp.signals import TABLE_A1
 

@@ -28,12 +28,12 @@ from edp.data.task import TargetMode, Task
 from edp.errors import ExportError
 from edp.export import TARGETS, escape, make_target
 from edp.export.fmu.interface import OWN
-from edp.integer import calibrate
-from edp.models import build_model
-from edp.models.backbones import LstmSpec
-from edp.models.heads import MlpHead
-from edp.models.integer import IntegerPredictor
-from edp.models.predictor import ModelSpec
+from edp.ir.w8a16 import calibrate
+from edp.networks import build_model
+from edp.networks.backbones import LstmSpec
+from edp.networks.heads import MlpHead
+from edp.networks.integer import IntegerPredictor
+from edp.networks.predictor import ModelSpec
 from edp.signals import Channel, Kind
 from edp.training.bundle import Bundle
 

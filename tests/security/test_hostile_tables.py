@@ -13,9 +13,9 @@ import pytest
 
 from edp.errors import DataError
 from edp.logs import inspect_log, read_recording, write_recording
-from edp.logs.csv_table import CsvTable
 from edp.logs.detect import open_log
-from edp.logs.own import own_facts
+from edp.logs.formats.csv_table import CsvTable
+from edp.logs.formats.edp_metadata import own_facts
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, SignalMap
 

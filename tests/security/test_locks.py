@@ -7,9 +7,9 @@ import sys
 import pytest
 
 from edp.errors import BusyError, StorageError
-from edp.ledger import Identity, Ledger, Record, Status, claim
-from edp.runs import RunFolder
 from edp.storage import check_held, check_writable, held_by, hold, release, replacing, write_bytes
+from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, claim
+from edp.storage.runs import RunFolder
 
 PRECIOUS = "the only copy"
 
@@ -95,11 +95,11 @@ def test_a_holder_whose_lock_was_removed_stops(folder):
 
 
 def test_a_coordinator_whose_lock_was_removed_enters_nothing(folder):
-    identity = Identity("job", {}, {}, 0, 1, "code", "data", {})
+    identity = TrainingIdentity("job", {}, {}, 0, 1, "code", "data", {})
     with Ledger(folder) as first:
         (folder / ".lock").unlink()
         with Ledger(folder) as second, pytest.raises(StorageError, match="removed or replaced"):
-            first.put(Record(identity, Status.DONE, {"score": 1.0}))
+            first.put(Record(identity, TrainingStatus.DONE, {"score": 1.0}))
         assert len(second) == 0
 
 

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from edp.cli import app
-from edp.report.wording import short_label, short_labels
+from edp.report.common.wording import short_label, short_labels
 
 
 @pytest.mark.parametrize("length", [0, 1, 31, 32])

@@ -15,7 +15,7 @@ from asammdf.blocks.conversion_utils import from_dict
 
 from edp.errors import DataError
 from edp.logs import FORMATS, inspect_log, read_recording
-from edp.logs.mdf_formula import DEEPEST, FUNCTIONS, LONGEST, Formula, FormulaError
+from edp.logs.formats.mdf_formula import DEEPEST, FUNCTIONS, LONGEST, Formula, FormulaError
 from edp.signals import ChannelMap, SignalMap
 
 CODE = "X1*0.001+0*len(repr(__import__('pathlib').Path('x').touch()))"

@@ -4,15 +4,17 @@ from importlib import resources
 
 import pytest
 
-from edp.report import animation, page
+from edp.report.animation import page as animation
+from edp.report.run import page
 
-PAGES = sorted(entry.name for entry in resources.files("edp.report").iterdir() if entry.name.endswith(".html.jinja"))
+ASSETS = resources.files("edp.report").joinpath("assets")
+PAGES = sorted(entry.name for entry in ASSETS.iterdir() if entry.name.endswith(".html.jinja"))
 HOSTILE = ["</script><script>alert(1)</script>", "<!--<script>", "--></script>", "]]>", "&lt;/script&gt;"]
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_every_page_has_a_policy_before_anything_that_runs(name):
-    text = resources.files("edp.report").joinpath(name).read_text(encoding="utf-8")
+    text = resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
     head = text[: text.index("<style")]
     assert 'http-equiv="Content-Security-Policy"' in head
     for rule in ("default-src 'none'", "form-action 'none'", "base-uri 'none'", "img-src data:"):

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edp.report.drawing import NOT_XML, write_drawings
-from edp.report.page import script_json
-from edp.report.sheets import Column, Sheet
-from edp.report.templates import template
-from edp.report.wording import in_cell, in_markdown, printable
+from edp.report.common.drawing import NOT_XML, write_drawings
+from edp.report.common.sheets import Column, Sheet
+from edp.report.common.templates import template
+from edp.report.common.wording import in_cell, in_markdown, printable
+from edp.report.run.page import script_json
 
 HOSTILE = [
     '=HYPERLINK("http://a.b")',

@@ -8,7 +8,7 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
-from edp.parity import from_own_run
+from edp.workflows.parity import from_own_run
 
 
 @pytest.fixture

@@ -100,13 +100,13 @@ def test_helpers_of_a_simulation_end_with_it(tmp_path, number, code):
 
 @LINUX
 def test_a_helper_whose_parent_is_gone_before_it_asks_ends_too():
-    code = "from edp.processes import die_with_parent; die_with_parent(1); print('lives')"
+    code = "from edp.sandbox.processes import die_with_parent; die_with_parent(1); print('lives')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (1, "")
 
 
 def test_without_the_systems_help_a_helper_looks(monkeypatch):
-    from edp import processes
+    from edp.sandbox import processes
 
     ended, parents = [], iter([7, 7, 1])
     monkeypatch.setattr(processes.os, "getppid", lambda: next(parents))

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 import edp.storage.writing
-import edp.workflow
+import edp.workflows.train_evaluate
 from edp.errors import EdpError, StorageError
-from edp.selection import select_features
-from edp.sources import DataSource
+from edp.logs.source import DataSource
+from edp.workflows.feature_selection.select import select_features
 
 
 def full(target: Path) -> tuple[int, str]:
@@ -20,14 +20,14 @@ def full(target: Path) -> tuple[int, str]:
 @pytest.mark.parametrize("command", ["evaluate", "channel_worths"])
 def test_a_run_that_cannot_be_written_is_told_before_it_is_read(command, tmp_path, monkeypatch):
     monkeypatch.setattr(edp.storage.writing, "_temporary", full)
-    monkeypatch.setattr(edp.workflow, "trained_run", lambda folder: pytest.fail("it was read first"))
+    monkeypatch.setattr(edp.workflows.train_evaluate, "trained_run", lambda folder: pytest.fail("it was read first"))
     with pytest.raises(StorageError, match="Read-only file system"):
-        getattr(edp.workflow, command)(tmp_path)
+        getattr(edp.workflows.train_evaluate, command)(tmp_path)
 
 
 def test_a_missing_run_is_not_made(tmp_path):
     with pytest.raises(EdpError, match="run"):
-        edp.workflow.evaluate(tmp_path / "run")
+        edp.workflows.train_evaluate.evaluate(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

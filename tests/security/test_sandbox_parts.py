@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp import limits
 from edp.cli import slow
 from edp.errors import DataError
 from edp.logs import FORMATS, WriteOptions, read_recording, write_recording
@@ -20,6 +19,7 @@ from edp.sandbox import sandbox, syscalls, watch
 from edp.sandbox.audit import hook
 from edp.sandbox.protocol import HEADER_BYTES, packed, receive
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
+from edp.storage import memory as limits
 
 SUFFIXES = [part.suffixes[0] for part in FORMATS.values()]
 
@@ -152,7 +152,7 @@ def test_free_memory_is_the_least_of_machine_group_and_limits(tmp_path, monkeypa
 
 @pytest.mark.parametrize("version", ["v5", "v7.3"])
 def test_limits_grow_with_what_a_mat_file_holds(tmp_path, version):
-    from edp.matlab.unpacking import unpack
+    from edp.logs.formats.matlab.unpacking import unpack
 
     told = []
     limits.listen(lambda *limit: told.append(limit))

@@ -11,31 +11,31 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edp.bounds import MOST_SEED, Bound, shown
-from edp.compress.distillation import DistillationSpec, SoftmaxDivergence
-from edp.config import TAGGED, Experiment, FeatureSettings, TaskSettings, build, load_experiment
+from edp.config.experiment import SETTINGS, Experiment, FeatureSettings, TaskSettings, build, load_experiment
 from edp.data.chunks import ChunkSpec
+from edp.data.screening.spec import ForestSpec, ScreeningSpec
 from edp.data.series import Series
 from edp.errors import ConfigError, EdpError
+from edp.evaluation.channel_importance import WorthSpec
 from edp.evaluation.controller import Budget
 from edp.evaluation.judge import JudgeSpec
-from edp.evaluation.worth import WorthSpec
-from edp.losses import AdaptiveWeights
-from edp.models.predictor import ModelSpec, Predictor, build_model
-from edp.models.size import size_at_most
-from edp.onboard import AdaptationSpec
-from edp.pretraining.spec import MetaSpec
-from edp.screening.spec import ForestSpec, ScreeningSpec
-from edp.search.runner import Crew
-from edp.search.settings import SearchSpec
-from edp.search.study import SamplerSpec
+from edp.ir.rls import AdaptationSpec
+from edp.networks.losses import AdaptiveWeights
+from edp.networks.predictor import ModelSpec, Predictor, build_model
+from edp.networks.size import size_at_most
+from edp.settings.bounds import MOST_SEED, Bound, shown
 from edp.signals import Kind
 from edp.training.bundle import blank_scaler
 from edp.training.fit import Loop
 from edp.training.spec import TrainingSpec
-from edp.transfer.both_worlds import BothSpec
-from edp.transfer.spec import FinetuneSpec
-from edp.trials import TrialSpec
+from edp.workflows.compression.distillation import DistillationSpec, SoftmaxDivergence
+from edp.workflows.feature_selection.trials import TrialSpec
+from edp.workflows.pretraining.spec import MetaSpec
+from edp.workflows.search.runner import Resources
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.study import SamplerSpec
+from edp.workflows.transfer.both_domains import BothSpec
+from edp.workflows.transfer.spec import FinetuneSpec
 
 TREE = [FeatureSettings, TaskSettings, ModelSpec, TrainingSpec, ChunkSpec, AdaptiveWeights, JudgeSpec]
 OTHERS = [
@@ -52,10 +52,10 @@ OTHERS = [
     DistillationSpec,
     SoftmaxDivergence,
     AdaptationSpec,
-    Crew,
+    Resources,
 ]
 REGISTERED = sorted(
-    {cls for registry in TAGGED.values() for cls in registry.values()}, key=lambda cls: cls.__qualname__
+    {cls for registry in SETTINGS.parts.values() for cls in registry.values()}, key=lambda cls: cls.__qualname__
 )
 SPECS = [*TREE, *OTHERS, *REGISTERED]
 BASE = {FeatureSettings: {"channels": ["a"]}}
@@ -131,7 +131,7 @@ def test_any_number_is_accepted_or_refused_by_name(place, value):
 PARTS = [
     (place, kind, name, listed)
     for place in ("backbone", "head", "activation", "output", "blocks")
-    for kind, cls in TAGGED[place].items()
+    for kind, cls in SETTINGS.parts[place].items()
     for name, listed in numeric(cls)
 ] + [("model", "", "window", False), ("task", "", "horizons", True)]
 
@@ -252,7 +252,7 @@ def prepared(task, ticks=400):
     ],
 )
 def test_memory_that_a_training_needs_is_refused_before_it_is_taken(changes, monkeypatch):
-    monkeypatch.setattr("edp.limits.free_bytes", lambda: 20 * 10**9)
+    monkeypatch.setattr("edp.storage.memory.free_bytes", lambda: 20 * 10**9)
     experiment = load_experiment(preset="quick", overrides=changes)
     task = experiment.task.resolve(100.0)
     taken = []
@@ -284,7 +284,7 @@ def test_the_memory_of_a_training_leaves_its_random_numbers_alone():
 def test_a_judgement_of_too_many_predictions_is_refused(monkeypatch):
     from edp.evaluation.judge import judge
 
-    monkeypatch.setattr("edp.limits.free_bytes", lambda: 10_000_000)
+    monkeypatch.setattr("edp.storage.memory.free_bytes", lambda: 10_000_000)
     experiment = load_experiment(preset="small", overrides=[f"task.horizons={list(range(1, 1001))}"])
     task = experiment.task.resolve(100.0)
     net = build_model(task, experiment.model, blank_scaler(task), 0)
@@ -296,7 +296,7 @@ def test_a_regression_on_too_long_a_history_is_refused(monkeypatch):
     from edp.data.ridge_moments import moments_of, standard_of
     from edp.evaluation.judge import baseline_task
 
-    monkeypatch.setattr("edp.limits.free_bytes", lambda: 100_000_000)
+    monkeypatch.setattr("edp.storage.memory.free_bytes", lambda: 100_000_000)
     task = load_experiment(preset="small").task.resolve(100.0)
     data = prepared(task, 5000)
     lagged = baseline_task(data, JudgeSpec(history=1000))

@@ -7,10 +7,10 @@ import sys
 
 import pytest
 
-from edp import data_sets
-from edp.data_sets import LOCK, MANIFEST, SimulationOrder, simulate_data_set
 from edp.errors import BusyError, ConfigError, EdpError, StorageError
-from edp.sim.limit import LimitSpec
+from edp.sim import data_set as data_sets
+from edp.sim.data_set import LOCK, MANIFEST, SimulationOrder, simulate_data_set
+from edp.sim.predictability import LimitSpec
 from edp.sim.scenario import Scenario
 from edp.storage import hold
 

@@ -9,22 +9,22 @@ from pathlib import Path
 import pytest
 
 from edp import storage
-from edp.config import load_experiment, override
+from edp.config.experiment import load_experiment, override
 from edp.data.feature_files import read_set_table
 from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.evaluation.controller import load_budget
-from edp.ledger import Ledger, read_records
+from edp.logs.source import load_data_set, load_signal_map
 from edp.report import read_facts, read_study
-from edp.report.compression_facts import read_compression
-from edp.report.limit import read_limit
-from edp.report.transfer_facts import read_transfer
-from edp.runs import RunFolder, read_provenance
-from edp.search.plan import load_plan
-from edp.sim.machine_files import load_machine
+from edp.report.compression.facts import read_compression
+from edp.report.run.predictability import read_limit
+from edp.report.transfer.facts import read_transfer
+from edp.sim.machine.machine_files import load_machine
+from edp.sim.physics.soil import load_material
 from edp.sim.scenario_file import read_scenario_file
-from edp.sim.soil import load_material
-from edp.sources import load_data_set, load_signal_map
+from edp.storage.ledger import Ledger, read_records
+from edp.storage.runs import RunFolder, read_provenance
 from edp.training import load_bundle
+from edp.workflows.search.plan import load_plan
 
 DEEP = 100_000
 TOML = {

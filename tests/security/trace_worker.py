@@ -13,14 +13,14 @@ import sysconfig
 from pathlib import Path
 
 import edp
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import EdpError
 from edp.logs.detect import format_for
-from edp.logs.raw import FORMATS
+from edp.logs.formats.base import FORMATS
 from edp.logs.served import keep_temporary_files_in_memory
+from edp.logs.source import load_signal_map
 from edp.signals import SignalMap
 from edp.sim import Snapshot
-from edp.sources import load_signal_map
 from edp.training import load_bundle
 
 RUNS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "pty.spawn")

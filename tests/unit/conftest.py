@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.blocks import LinearBypass, TemporalDifference
 from edp.data.chunks import ChunkSpec
 from edp.data.features import Derived, FeatureSet
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.logs import write_recording
-from edp.models.backbones import HybridSpec
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec
+from edp.logs.source import DataSource
+from edp.networks.backbones import HybridSpec
+from edp.networks.blocks import LinearBypass, TemporalDifference
+from edp.networks.heads import MlpHead
+from edp.networks.predictor import ModelSpec
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.sources import DataSource
 from edp.training.fit import TrainingSpec
 
 SPEEDS = ("boom", "arm", "bucket")

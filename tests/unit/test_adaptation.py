@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from edp.adaptation import adapt, fit_adaptation, replay
 from edp.cli import app
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import BundleError, ConfigError, ExportError
-from edp.models import AdaptedStream
-from edp.onboard import AdaptationSpec, Status
+from edp.ir.rls import AdaptationSpec, RlsStatus
+from edp.networks import AdaptedStream
 from edp.storage import read_json, write_json
 from edp.training import load_bundle, save_bundle
 from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
-from edp.workflow import evaluate, footprint_of, train, trained_run
+from edp.workflows.adaptation import adapt, fit_adaptation, replay
+from edp.workflows.train_evaluate import evaluate, footprint_of, train, trained_run
 
 SETTINGS = (
     'task.features={name="levers", channels=["speed", "lever"]}',
@@ -101,7 +101,7 @@ def test_a_stream_and_a_replay_give_the_same_numbers(run, adapted):
         np.testing.assert_allclose(found[-1] - stream.correction, held.base[len(found) - 1], atol=1e-5)
     np.testing.assert_allclose(np.stack(found), held.adapted, atol=1e-4)
     assert np.abs(held.adapted - held.base).max() > 0
-    assert stream.status is not Status.NONE
+    assert stream.status is not RlsStatus.NONE
     theta = stream.adapter.theta.copy()
     stream.reset()
     np.testing.assert_array_equal(stream.adapter.theta, theta)  # what was learned stays

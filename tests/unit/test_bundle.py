@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from edp.errors import BundleError, StorageError
-from edp.models.outputs import OUTPUTS
-from edp.models.predictor import Predictor, build_model
-from edp.models.running import stream_intervals, stream_predictions
+from edp.networks.outputs import OUTPUTS
+from edp.networks.predictor import Predictor, build_model
+from edp.networks.running import stream_intervals, stream_predictions
 from edp.signals import Channel, Kind
 from edp.training.bundle import (
     ADAPTED_SCHEMA,

@@ -10,24 +10,23 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from edp.blocks import AttentionBridge, TemporalDifference
 from edp.cli import app
-from edp.compress import taken
-from edp.compress.planning import make_plan
-from edp.config import load_experiment
-from edp.downsizing import SearchSpec, Watchers, search, searching
+from edp.config.experiment import load_experiment
 from edp.errors import ConfigError, StorageError
 from edp.evaluation.controller import Budget
 from edp.export.c.sizes import constant_bytes
-from edp.integer.quantise import outline
-from edp.models.backbones import GruSpec, HybridSpec, LstmSpec, TcnSpec
-from edp.models.cells import LayerNormLstmCell
-from edp.models.predictor import build_model
+from edp.ir.w8a16.quantise import outline
+from edp.networks.backbones import GruSpec, HybridSpec, LstmSpec, TcnSpec
+from edp.networks.blocks import AttentionBridge, TemporalDifference
+from edp.networks.cells import LayerNormLstmCell
+from edp.networks.predictor import build_model
 from edp.report import read_compression, write_compression_page
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler
-from edp.workflow import train
+from edp.workflows.compression import CompressionCallbacks, CompressionSearchSpec, search, searching, taken
+from edp.workflows.compression.planning import make_plan
+from edp.workflows.train_evaluate import train
 
 SETTINGS = (
     'task.features={name="levers", channels=["speed", "lever"]}',
@@ -62,7 +61,7 @@ def tight(run):
 @pytest.fixture(scope="module")
 def done(run, tight, tmp_path_factory):
     folder = tmp_path_factory.mktemp("search") / "out"
-    return folder, search(run, SearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
+    return folder, search(run, CompressionSearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
 
 
 def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight):
@@ -89,7 +88,7 @@ def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight)
 def test_the_same_call_trains_and_opens_nothing_again(run, tight, done, monkeypatch):
     folder, found = done
     monkeypatch.setattr(searching, "train", None)
-    again = search(run, SearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
+    again = search(run, CompressionSearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
     assert [row.name for row in again.rows] == [row.name for row in found.rows]
     assert [row.error for row in again.rows] == [row.error for row in found.rows]
     assert len(again.box["openings"]) == 1
@@ -104,16 +103,16 @@ def test_a_stopped_search_goes_on_to_the_same_result(run, tight, done, tmp_path)
         if number == 1 and event.row is not None:
             raise Pulled
 
-    spec = SearchSpec(budget=tight, formats=("float32", "w8a16"))
+    spec = CompressionSearchSpec(budget=tight, formats=("float32", "w8a16"))
     with pytest.raises(Pulled):
-        search(run, spec, tmp_path / "out", watchers=Watchers(on_training=pull))
+        search(run, spec, tmp_path / "out", watchers=CompressionCallbacks(on_training=pull))
     found = search(run, spec, tmp_path / "out")
     assert [row.error for row in found.rows] == [row.error for row in done[1].rows]
 
 
 def test_another_choice_needs_a_word_and_is_recorded(run, tight, done, tmp_path):
     folder = shutil.copytree(done[0], tmp_path / "out")
-    other = SearchSpec(budget=tight, units=(2,), formats=("float32",))
+    other = CompressionSearchSpec(budget=tight, units=(2,), formats=("float32",))
     with pytest.raises(ConfigError, match="was opened on"):
         search(run, other, folder)
     looked = search(run, replace(other, again=True), folder)
@@ -125,16 +124,16 @@ def test_a_budget_that_nobody_can_meet_is_refused_with_the_nearest(run, tmp_path
     with pytest.raises(
         ConfigError, match=r"cycles = 100 can be met by no width .* single unit in INT8, with cycles = \d"
     ):
-        search(run, SearchSpec(budget=Budget(name="none", cycles=100)), tmp_path / "out")
+        search(run, CompressionSearchSpec(budget=Budget(name="none", cycles=100)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("spec", "reason"),
     [
-        (SearchSpec(budget=Budget(), units=(17,)), "1 <= units <= 16"),
-        (SearchSpec(budget=Budget(), formats=("w8a6",)), "w8a16"),
-        (SearchSpec(budget=Budget(), changes=("model.window=20",)), "those of its teacher"),
+        (CompressionSearchSpec(budget=Budget(), units=(17,)), "1 <= units <= 16"),
+        (CompressionSearchSpec(budget=Budget(), formats=("w8a6",)), "w8a16"),
+        (CompressionSearchSpec(budget=Budget(), changes=("model.window=20",)), "those of its teacher"),
     ],
 )
 def test_what_cannot_be_is_refused(run, tmp_path, spec, reason):

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from edp.config import (
+from edp.config.experiment import (
     PRESETS,
-    TAGGED,
+    SETTINGS,
     build,
     experiment_toml,
     load_experiment,
@@ -16,11 +16,11 @@ from edp.config import (
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError
 from edp.logs.repair import Repair
-from edp.models.heads import GluHead, MlpHead
-from edp.models.plain import model_from_plain, model_to_plain
-from edp.models.predictor import ModelSpec
+from edp.logs.source import DataSetSettings, load_data_set, load_signal_map
+from edp.networks.heads import GluHead, MlpHead
+from edp.networks.plain import model_from_plain, model_to_plain
+from edp.networks.predictor import ModelSpec
 from edp.signals import Kind
-from edp.sources import DataSetSettings, load_data_set, load_signal_map
 
 
 def saved(tmp_path, text, name="settings.toml"):
@@ -52,14 +52,16 @@ def test_every_registered_part_survives_a_round_trip(tmp_path):
         "physics": ("model", "physics"),
     }
     lists = {"terms", "augmentations"}
-    assert set(TAGGED) == {*places, *lists, "blocks"}
+    assert set(SETTINGS.parts) == {*places, *lists, "blocks"}
     for name in lists:
-        kinds = ", ".join(f'{{kind="{kind}"}}' for kind in TAGGED[name])
+        kinds = ", ".join(f'{{kind="{kind}"}}' for kind in SETTINGS.parts[name])
         experiment = load_experiment(overrides=[f"training.{name}=[{kinds}]"])
         again = load_experiment(saved(tmp_path, experiment_toml(experiment)))
-        assert [TAGGED[name].name_of(part) for part in getattr(again.training, name)] == list(TAGGED[name])
+        assert [SETTINGS.parts[name].name_of(part) for part in getattr(again.training, name)] == list(
+            SETTINGS.parts[name]
+        )
     for name, place in places.items():
-        for kind in TAGGED[name]:
+        for kind in SETTINGS.parts[name]:
             experiment = load_experiment(overrides=[f"{'.'.join(place)}.kind={kind}", "model.blocks=[]"])
             again = load_experiment(saved(tmp_path, experiment_toml(experiment)))
             assert plain_tree(again) == plain_tree(experiment)

@@ -7,8 +7,8 @@ import pytest
 
 from edp.errors import ConfigError, DataError
 from edp.evaluation.context import context_errors
-from edp.models.predictor import build_model
-from edp.models.stream import Stream
+from edp.networks.predictor import build_model
+from edp.networks.stream import Stream
 from edp.signals import Kind
 
 KINDS = [Kind.VELOCITY] * 3

@@ -12,9 +12,9 @@ from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
 from edp.evaluation.controller import CORES, FORMATS, Budget, load_budget
 from edp.evaluation.footprint import check_possible, footprint
-from edp.models.backbones import HybridSpec
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec, build_model
+from edp.networks.backbones import HybridSpec
+from edp.networks.heads import MlpHead
+from edp.networks.predictor import ModelSpec, build_model
 
 BUDGETS = sorted((Path(__file__).parents[2] / "examples" / "budgets").glob("*.toml"))
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from edp.data import events, spectrum
 from edp.data.coverage import CELLS, INTEGRATED, MEASURED, cover, mutual_information
+from edp.data.coverage_targets import wanted
 from edp.data.roles import roles_of
 from edp.data.splits import ByRecording, ByTime, Split, Stretch
-from edp.data.wanted import wanted
 from edp.errors import DataError
 from edp.recording import Recording
 from edp.signals import VOCABULARY, Channel, Kind

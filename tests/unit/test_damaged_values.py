@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from edp.errors import brief
-from edp.logs.measures import spikes
-from edp.logs.names import only, told_apart
-from edp.logs.raw import RawSignal
+from edp.logs.formats.base import RawSignal
+from edp.logs.formats.names import only, told_apart
+from edp.logs.quality.measures import spikes
 
 
 def _signal(name: str) -> RawSignal:

@@ -1,6 +1,6 @@
 """Learning rates by part of the network."""
 
-from edp.models.predictor import build_model
+from edp.networks.predictor import build_model
 from edp.training.optimizers import Discriminative
 
 

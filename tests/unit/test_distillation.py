@@ -8,33 +8,28 @@ import numpy as np
 import pytest
 import torch
 
-from edp.compress import (
-    Distillation,
-    DistillationSpec,
-    SoftmaxDivergence,
-    continue_from,
-    student,
-    unlabelled,
-    width_of,
-)
-from edp.compress.hints import Components, hint_error
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.augment import TimeWarp
 from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.series import Series
+from edp.data.unlabelled import unlabelled
 from edp.errors import ConfigError, DataError
-from edp.losses import Answer, MeanSquared
-from edp.models.backbones import HybridSpec, LstmSpec, TcnSpec
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec, build_model
-from edp.models.running import stream_predictions
+from edp.networks.backbones import HybridSpec, LstmSpec, TcnSpec
+from edp.networks.heads import MlpHead
+from edp.networks.losses import MeanSquared, Prediction
+from edp.networks.narrow import student, width_of
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.running import stream_predictions
 from edp.recording import Recording
-from edp.runs import RunFolder
 from edp.signals import Channel, Kind
+from edp.storage.runs import RunFolder
 from edp.training.averages import NoAverage
 from edp.training.fit import fit
-from edp.training.lesson import Moment
 from edp.training.objective import Objective
+from edp.training.strategy import BatchContext
+from edp.training.warm_start import continue_from
+from edp.workflows.compression import Distillation, DistillationSpec, SoftmaxDivergence
+from edp.workflows.compression.hints import Components, hint_error
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 
@@ -71,11 +66,11 @@ def same(one, other):
 
 def test_a_student_of_the_teacher_alone_does_as_it_does_whatever_the_truth_says(tiny, brief, teacher, small):
     spec = dataclasses.replace(brief, updates=150)
-    taught, plain = (
+    teacher_targets, plain = (
         fit(tiny, small, spec, lesson=lesson).predictor
         for lesson in (Distillation([teacher], DistillationSpec(truth=0.0)), None)
     )
-    assert gap(taught, teacher, tiny.test) < 0.5 * gap(plain, teacher, tiny.test)
+    assert gap(teacher_targets, teacher, tiny.test) < 0.5 * gap(plain, teacher, tiny.test)
 
 
 def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
@@ -85,12 +80,12 @@ def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
 
     def loss(truth):
         lesson = Distillation([teacher], DistillationSpec(truth=truth, soft=MeanSquared()))
-        taught = lesson.series(tiny.task, tiny.train)
-        batch = next(ChunkSampler(taught, tiny.task.horizons, training.chunks, 0).epoch(0))
+        teacher_targets = lesson.series(tiny.task, tiny.train)
+        batch = next(ChunkSampler(teacher_targets, tiny.task.horizons, training.chunks, 0).epoch(0))
         x = torch.from_numpy(batch.inputs)
-        answer, features, hidden, _ = net.expose(x, net.initial_state(len(x), x))
-        future, valid, said = (torch.from_numpy(part) for part in (batch.future, batch.valid, batch.taught))
-        moment = Moment(answer, future, features, hidden, valid, said)
+        answer, features, hidden, _ = net.forward_features(x, net.initial_state(len(x), x))
+        future, valid, said = (torch.from_numpy(part) for part in (batch.future, batch.valid, batch.teacher_targets))
+        moment = BatchContext(answer, future, features, hidden, valid, said)
         hard = objective.evaluate(answer, future, features, valid)
         goal = objective.code.encode(said[..., 1:].unflatten(-1, (2, 3)), features)
         soft = ((answer.center - goal) ** 2)[valid].mean()
@@ -103,21 +98,23 @@ def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
 
 def test_what_is_taught_is_the_stream_of_the_mean_teacher(tiny, tiny_model, tiny_training, teacher):
     other = build_model(tiny.task, tiny_model, tiny.scaler(), seed=9)
-    taught = Distillation([teacher, other]).series(tiny.task, tiny.train)
-    for part, series in zip(taught[:1], tiny.train[:1], strict=True):
+    teacher_targets = Distillation([teacher, other]).series(tiny.task, tiny.train)
+    for part, series in zip(teacher_targets[:1], tiny.train[:1], strict=True):
         alone = [stream_predictions(net, [series])[0] for net in (teacher, other)]
-        assert part.taught.shape == (series.samples, 1 + 6)
-        np.testing.assert_allclose(part.taught[:, 1:].reshape(-1, 2, 3), np.mean(alone, axis=0), rtol=1e-5, atol=1e-7)
-        assert (part.taught[:, 0] == 1).all()
+        assert part.teacher_targets.shape == (series.samples, 1 + 6)
+        np.testing.assert_allclose(
+            part.teacher_targets[:, 1:].reshape(-1, 2, 3), np.mean(alone, axis=0), rtol=1e-5, atol=1e-7
+        )
+        assert (part.teacher_targets[:, 0] == 1).all()
         assert part.inputs is series.inputs
 
 
 def test_chunks_and_windows_carry_the_lesson_of_their_own_ticks(tiny, teacher):
-    taught = Distillation([teacher]).series(tiny.task, tiny.train)
-    marked = [dataclasses.replace(part, taught=part.inputs) for part in taught]
+    teacher_targets = Distillation([teacher]).series(tiny.task, tiny.train)
+    marked = [dataclasses.replace(part, teacher_targets=part.inputs) for part in teacher_targets]
     for spec in (ChunkSpec(length=32, batch=4, burn_in=20), ChunkSpec(regime="window", length=10, batch=8)):
         for batch in ChunkSampler(marked, (1, 3), spec, seed=2, augmentations=(TimeWarp(),)).epoch(1):
-            np.testing.assert_array_equal(batch.taught, batch.inputs)
+            np.testing.assert_array_equal(batch.teacher_targets, batch.inputs)
 
 
 def test_series_without_truth_teach_without_a_share_in_the_loss_of_the_truth(tiny, brief, teacher, small):
@@ -129,7 +126,7 @@ def test_series_without_truth_teach_without_a_share_in_the_loss_of_the_truth(tin
     assert same(*made)
     assert not same(made[0], fit(tiny, small, brief, lesson=Distillation([teacher])).predictor)
     assert torch.equal(made[0].code.width, build_model(tiny.task, small, tiny.scaler(), seed=0).code.width)
-    assert [part.taught[0, 0] for part in lessons[0].series(tiny.task, tiny.train)] == [1, 1, 0]
+    assert [part.teacher_targets[0, 0] for part in lessons[0].series(tiny.task, tiny.train)] == [1, 1, 0]
 
 
 def test_unlabelled_takes_a_recording_that_has_inputs_only(tiny):
@@ -176,12 +173,12 @@ def test_a_refit_learns_from_the_teacher_too(tiny, tiny_training, teacher, small
 def test_the_gradient_of_a_hint_pulls_hidden_features_towards_the_teachers(tiny, teacher, small):
     lesson = Distillation([teacher], DistillationSpec(hint=1.0, components=6))
     part = lesson.series(tiny.task, tiny.train)[0]
-    wanted, x = torch.from_numpy(part.taught[None, :, 7:]), torch.from_numpy(part.inputs[None])
+    wanted, x = torch.from_numpy(part.teacher_targets[None, :, 7:]), torch.from_numpy(part.inputs[None])
     net = build_model(tiny.task, small, tiny.scaler(), seed=1)
     optimizer = torch.optim.Adam(net.backbone.parameters(), 1e-2)
     errors = []
     for _ in range(15):
-        hidden = net.expose(x, net.initial_state(1, x))[2]
+        hidden = net.forward_features(x, net.initial_state(1, x))[2]
         loss = hint_error(hidden, wanted, torch.ones(hidden.shape[:2], dtype=torch.bool))
         optimizer.zero_grad()
         loss.backward()
@@ -220,8 +217,10 @@ def test_softmax_divergence_is_that_of_the_equation_and_blind_to_a_common_shift(
     wanted = 4 * torch.nn.functional.kl_div(
         q.log_softmax(-1).flatten(0, 2), p.softmax(-1).flatten(0, 2), reduction="batchmean"
     )
-    assert float(loss.evaluate(Answer(student_z, student_z[..., :0]), teacher_z).mean()) == pytest.approx(float(wanted))
-    moved = Answer(teacher_z + 1.0, teacher_z[..., :0])
+    assert float(loss.evaluate(Prediction(student_z, student_z[..., :0]), teacher_z).mean()) == pytest.approx(
+        float(wanted)
+    )
+    moved = Prediction(teacher_z + 1.0, teacher_z[..., :0])
     assert float(loss.evaluate(moved, teacher_z).abs().max()) < 1e-6
 
 
@@ -305,4 +304,4 @@ def test_a_teacher_that_is_not_finite_is_told(tiny, tiny_model):
 
 def test_series_is_plain_without_a_lesson():
     part = Series("x", np.zeros((3, 1), np.float32), np.zeros((3, 1), np.float32))
-    assert part.taught is None
+    assert part.teacher_targets is None

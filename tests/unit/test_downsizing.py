@@ -8,15 +8,14 @@ import torch
 from typer.testing import CliRunner
 
 from edp.cli import app
-from edp.compress import DistillationSpec
-from edp.config import load_experiment
-from edp.downsizing import DistilSpec, distil
-from edp.downsizing.distil import read_run
+from edp.config.experiment import load_experiment
 from edp.errors import ConfigError, EdpError, StorageError
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflow import DataSource, evaluate, train
+from edp.workflows.compression import DistillationSpec, DistilSpec, distil
+from edp.workflows.compression.distil import read_run
+from edp.workflows.train_evaluate import DataSource, evaluate, train
 
 SETTINGS = (
     'task.features={name="levers", channels=["speed", "lever"]}',

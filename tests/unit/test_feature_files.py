@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from edp.config import FeatureSettings, experiment_toml, load_experiment
+from edp.config.experiment import FeatureSettings, experiment_toml, load_experiment
 from edp.data.feature_files import read_set_table, set_text
 from edp.data.features import FG2, Derived, FeatureSet
 from edp.errors import ConfigError

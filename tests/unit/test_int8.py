@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from edp.blocks import CrossCylinderAttention
-from edp.compress import dynamic_int8
-from edp.compress.int8 import round_tick
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import BundleError, ExportError
-from edp.models.backbones import HybridSpec
-from edp.models.heads import GluHead
-from edp.models.predictor import ModelSpec, build_model
-from edp.models.running import stream_predictions
-from edp.models.stream import Stream
+from edp.networks.backbones import HybridSpec
+from edp.networks.blocks import CrossCylinderAttention
+from edp.networks.heads import GluHead
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.running import stream_predictions
+from edp.networks.stream import Stream
 from edp.training.bundle import blank_scaler, make_bundle, save_bundle
+from edp.workflows.compression import dynamic_int8
+from edp.workflows.compression.int8 import round_tick
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 MODEL = ModelSpec(

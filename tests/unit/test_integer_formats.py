@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.integer import calibrate
-from edp.integer.calibration import finer
-from edp.models.integer import integer_predictor, spread
-from edp.models.running import mean_error, stream_predictions
+from edp.ir.w8a16 import calibrate
+from edp.ir.w8a16.calibration import finer
+from edp.networks.integer import integer_predictor, spread
+from edp.networks.running import mean_error, stream_predictions
 from edp.training import fit
 
 SCALED = "front.scaled"

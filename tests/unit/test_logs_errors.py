@@ -14,8 +14,8 @@ import scipy.io
 
 from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.logs import FORMATS, LAYOUTS, WriteOptions, inspect_log, read_recording, write_recording
-from edp.logs.own import facts_text, own_facts
-from edp.matlab.check import check_size
+from edp.logs.formats.edp_metadata import facts_text, own_facts
+from edp.logs.formats.matlab.check import check_size
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
 
@@ -267,7 +267,7 @@ def test_a_mat_file_that_unpacks_to_more_than_memory_is_refused_unread(tmp_path,
 def test_a_mat_file_larger_than_free_memory_is_refused_unread(tmp_path, monkeypatch):
     path = tmp_path / "large.mat"
     scipy.io.savemat(path, {"x": np.zeros((100_000, 1))})
-    monkeypatch.setattr("edp.limits.free_bytes", lambda: 1_000_000)
+    monkeypatch.setattr("edp.storage.memory.free_bytes", lambda: 1_000_000)
     with pytest.raises(DataError, match=r"variables of this MAT file would take .* of memory.*made to exhaust memory"):
         check_size(path)
 
@@ -334,8 +334,8 @@ def test_numbers_changed_behind_our_back_are_never_read_silently(tmp_path, suffi
 def test_text_block_by_block_is_read_as_the_whole(tmp_path, monkeypatch):
     recording = make(5000)
     path = write_recording(recording, tmp_path / "a.csv")
-    monkeypatch.setattr("edp.logs.csv_table.WHOLE_BYTES", 0)
-    monkeypatch.setattr("edp.logs.csv_table._BLOCK_BYTES", 4096)
+    monkeypatch.setattr("edp.logs.formats.csv_table.WHOLE_BYTES", 0)
+    monkeypatch.setattr("edp.logs.formats.csv_table._BLOCK_BYTES", 4096)
     assert same_columns(read_recording(path), recording)
     assert same_columns(read_recording(path, rows=(1234, 1300)), recording.rows(1234, 1300))
     with path.open("a") as stream:

@@ -21,8 +21,8 @@ from edp.logs import (
     read_recording,
     write_recording,
 )
-from edp.matlab.library import MatlabOpaque, matio
-from edp.matlab.library import pandas as pd
+from edp.logs.formats.matlab.library import MatlabOpaque, matio
+from edp.logs.formats.matlab.library import pandas as pd
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
 

@@ -114,6 +114,6 @@ def test_a_stamp_that_is_far_off_does_not_fill_the_memory(tmp_path):
 def test_a_recording_larger_than_memory_names_the_ways_out(tmp_path, monkeypatch):
     channels = (TABLE_A1["BmUp"],)
     path = write_recording(Recording("R", channels, np.zeros((50_000, 1), dtype=np.float32), 10.0), tmp_path / "a.mf4")
-    monkeypatch.setattr("edp.limits.free_bytes", lambda: 200_000)
+    monkeypatch.setattr("edp.storage.memory.free_bytes", lambda: 200_000)
     with pytest.raises(DataError, match="would take"):
         read_recording(path)

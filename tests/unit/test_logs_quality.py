@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from edp.logs import find_repeats, inspect, sketch, write_recording
-from edp.logs.measures import measure, noise_floor
+from edp.logs.quality.measures import measure, noise_floor
+from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
-from edp.sources import DataSource
 
 RATE = 100.0
 

@@ -194,8 +194,8 @@ def test_lists_types_of_ones_own_and_large_messages(tmp_path, container):
 def test_topics_are_read_in_pieces_where_they_are_large(tmp_path, container, monkeypatch):
     path = drive(tmp_path, container).file()
     whole = read_recording(path)
-    monkeypatch.setattr("edp.logs.rosbag.KEPT_BYTES", 0)
-    monkeypatch.setattr("edp.logs.rosbag.PIECE_ROWS", 16)
+    monkeypatch.setattr("edp.logs.formats.rosbag.KEPT_BYTES", 0)
+    monkeypatch.setattr("edp.logs.formats.rosbag.PIECE_ROWS", 16)
     assert read_recording(path).values.tobytes() == whole.values.tobytes()
     assert read_recording(path, rows=(33, 70)).values.tobytes() == whole.values[33:70].tobytes()
 

@@ -16,7 +16,7 @@ from edp.logs import (
     truth_path,
     write_recording,
 )
-from edp.matlab.library import matio
+from edp.logs.formats.matlab.library import matio
 from edp.recording import Recording
 from edp.signals import TABLE_A1, VOCABULARY, Channel, Kind, SignalMap
 

@@ -5,11 +5,10 @@ import pytest
 import torch
 
 from edp.errors import ConfigError
-from edp.losses import (
+from edp.networks.losses import (
     LOSSES,
     TERMS,
     AdaptiveWeights,
-    Answer,
     Correlation,
     Course,
     Derivative,
@@ -19,6 +18,7 @@ from edp.losses import (
     Huber,
     MeanSquared,
     Penalty,
+    Prediction,
     Quantile,
     Smoothness,
     horizon_weights,
@@ -31,7 +31,7 @@ SHAPE = (3, 11, 2, 4)  # stream, time, horizon, output
 
 
 def point(center):
-    return Answer(center, center.new_zeros(*center.shape[:-1], 0, center.shape[-1]))
+    return Prediction(center, center.new_zeros(*center.shape[:-1], 0, center.shape[-1]))
 
 
 def draw(*shape, seed=0):
@@ -115,7 +115,7 @@ def test_focal_weighs_huber_by_a_power_of_the_error(gamma, delta):
 @pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
 def test_heteroscedastic_is_the_likelihood_weighted_by_a_power_of_the_variance(law, beta):
     center, target, s = draw(*SHAPE), draw(*SHAPE, seed=1), draw(*SHAPE, seed=2)
-    answer = Answer(tensor(center), tensor(s).unsqueeze(-2), law=law)
+    answer = Prediction(tensor(center), tensor(s).unsqueeze(-2), law=law)
     found = Heteroscedastic(beta=beta).evaluate(answer, tensor(target)).numpy()
     e, sigma = center - target, np.exp(s / 2)
     if law == "normal":
@@ -130,7 +130,7 @@ def test_heteroscedastic_is_the_likelihood_weighted_by_a_power_of_the_variance(l
 def test_no_gradient_flows_through_the_weight_of_the_likelihood():
     s = torch.zeros(1, 1, 1, 1, 1, requires_grad=True)
     for beta in (0.0, 1.0):
-        answer = Answer(torch.full((1, 1, 1, 1), 2.0), s, law="normal")
+        answer = Prediction(torch.full((1, 1, 1, 1), 2.0), s, law="normal")
         loss = Heteroscedastic(beta=beta).evaluate(answer, torch.zeros(1, 1, 1, 1)).sum()
         assert torch.autograd.grad(loss, s)[0].item() == pytest.approx(0.5 * (1 - 4))
 
@@ -139,7 +139,7 @@ def test_quantile_is_twice_the_pinball_loss_over_all_levels():
     center, target = draw(*SHAPE), draw(*SHAPE, seed=1)
     levels, offsets = (0.1, 0.3, 0.7, 0.9), np.array([-1.2, -0.4, 0.5, 1.1])
     spread = np.broadcast_to(offsets[:, None], (*SHAPE[:3], 4, SHAPE[3]))
-    found = Quantile().evaluate(Answer(tensor(center), tensor(spread.copy()), levels=levels), tensor(target))
+    found = Quantile().evaluate(Prediction(tensor(center), tensor(spread.copy()), levels=levels), tensor(target))
     total = np.zeros(SHAPE)
     for level, offset in [(0.5, 0.0), *zip(levels, offsets, strict=True)]:
         u = target - (center + offset)
@@ -153,7 +153,7 @@ def test_the_pinball_loss_is_least_at_the_quantiles():
 
     def loss(distance):
         spread = torch.tensor([-distance, distance]).double().reshape(1, 1, 1, 2, 1).expand(1, sample.shape[1], 1, 2, 1)
-        return Quantile().evaluate(Answer(still, spread, levels=(0.05, 0.95)), sample).mean().item()
+        return Quantile().evaluate(Prediction(still, spread, levels=(0.05, 0.95)), sample).mean().item()
 
     tried = np.linspace(1.0, 2.4, 57)
     assert tried[np.argmin([loss(distance) for distance in tried])] == pytest.approx(1.645, abs=0.06)

@@ -5,7 +5,7 @@ import pytest
 from sklearn import metrics as sk
 
 from edp.errors import DataError
-from edp.metrics import COMPOSITE_WEIGHTS, Scores, composite, interval_scores, mean_scores, score, spread
+from edp.stats.metrics import COMPOSITE_WEIGHTS, Scores, composite, interval_scores, mean_scores, score, spread
 
 
 @pytest.fixture

@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-from edp.config import TaskSettings
+from edp.config.experiment import TaskSettings
 from edp.data.features import FG1
 from edp.data.prepared import prepare
 from edp.data.splits import ByRecording
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
 from edp.evaluation.judge import JudgeSpec, judge
-from edp.models.physics import PHYSICS, ForceSpec, HybridPhysicsSpec, KinematicSpec
-from edp.models.physics.geometry import Geometry
-from edp.models.physics.hybrid import solve
-from edp.models.predictor import ModelSpec, build_model
-from edp.sim import Scenario, dynamics, friction, linkage, load_machine, pose, simulate
-from edp.sim import layout as at
-from edp.sim.parameters import pack
+from edp.networks.physics import PHYSICS, ForceSpec, HybridPhysicsSpec, KinematicSpec
+from edp.networks.physics.geometry import Geometry
+from edp.networks.physics.hybrid import solve
+from edp.networks.predictor import ModelSpec, build_model
+from edp.sim import Scenario, load_machine, simulate
+from edp.sim.machine import layout as at
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import dynamics, friction, linkage, pose
 from edp.sim.simulate import Simulation
 from edp.training import Bundle, load_bundle, save_bundle
 from edp.training.bundle import blank_scaler

@@ -5,17 +5,18 @@ import dataclasses
 import pytest
 import torch
 
-from edp.blocks import BLOCKS, CylinderGate, MultiScaleTcn, TemporalDifference
-from edp.compress import importance, prune, student
-from edp.compress.taylor import _loss
 from edp.errors import ConfigError, DataError
-from edp.models.backbones import GruSpec, HybridSpec, LstmSpec, TcnSpec
-from edp.models.cells import CELLS, MinGruCell, Stack
-from edp.models.convolution import CausalConv, TemporalBlock
-from edp.models.heads import GluHead, MlpHead
-from edp.models.initial import ConstantState
-from edp.models.predictor import ModelSpec, build_model
-from edp.models.running import stream_predictions
+from edp.networks.backbones import GruSpec, HybridSpec, LstmSpec, TcnSpec
+from edp.networks.blocks import BLOCKS, CylinderGate, MultiScaleTcn, TemporalDifference
+from edp.networks.cells import CELLS, MinGruCell, Stack
+from edp.networks.convolution import CausalConv, TemporalBlock
+from edp.networks.heads import GluHead, MlpHead
+from edp.networks.initial import ConstantState
+from edp.networks.narrow import student
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.running import stream_predictions
+from edp.workflows.compression import importance, prune
+from edp.workflows.compression.taylor import _loss
 
 HYBRID = HybridSpec(channels=(8, 8, 6), kernel=3, units=8, layers=2)
 NETWORKS = {

@@ -7,29 +7,29 @@ import numpy as np
 import pytest
 import torch
 
-from edp.compress import (
-    Distillation,
-    DistillationSpec,
-    QuantisationAware,
-    Rounding,
-    RoundingSpec,
-    matrices_of,
-    weight_levels,
-)
-from edp.compress.rounding import Site
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
 from edp.export import TARGETS
-from edp.graph.layers import GroupedDense
-from edp.graph.memory import Lstm
-from edp.integer import calibrate, quantise
-from edp.integer.quantise import weights_of
-from edp.models.predictor import build_model
-from edp.models.running import stream_predictions
-from edp.runs import RunFolder
+from edp.ir.layers import GroupedDense
+from edp.ir.memory import Lstm
+from edp.ir.w8a16 import calibrate, quantise
+from edp.ir.w8a16.quantise import weights_of
+from edp.networks.matrices import matrices_of
+from edp.networks.predictor import build_model
+from edp.networks.running import stream_predictions
+from edp.storage.runs import RunFolder
 from edp.training import fit, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import blank_scaler
 from edp.training.validation import validation_scores
+from edp.workflows.compression import (
+    Distillation,
+    DistillationSpec,
+    NetworkRounding,
+    QuantisationAware,
+    RoundingSpec,
+    weight_levels,
+)
+from edp.workflows.compression.rounding import Site
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 
@@ -66,7 +66,7 @@ def test_the_result_is_an_ordinary_network_on_the_grid(tiny, tiny_model, brief, 
     TARGETS["c"]().write(load_bundle(tmp_path / "bundle"), "rounded", tmp_path / "c")
     with torch.no_grad():
         once = [value.clone() for value in net.parameters()]
-    Rounding(net, 0).keep()
+    NetworkRounding(net, 0).keep()
     for value, before in zip(net.parameters(), once, strict=True):
         torch.testing.assert_close(value, before, rtol=1e-6, atol=0)
 
@@ -84,7 +84,7 @@ def test_training_rounded_is_better_than_rounding_afterwards(tiny, tiny_model, b
     """With 8-bit activations rounding costs enough to be seen on so small a problem."""
 
     def error(net):
-        rounding = Rounding(net, 8)
+        rounding = NetworkRounding(net, 8)
         rounding.install(tiny.train)
         said = stream_predictions(net, tiny.validation)[0]
         rounding.remove()
@@ -150,7 +150,7 @@ def test_sizes_are_those_of_table_4_9(name, size):
 
 
 def test_whole_numbers_of_a_deployed_network_are_those_that_training_saw(tiny, tiny_model, brief, start):
-    """W8A16 of `edp.integer`, with weights of least error on data, finds the levels that are there already."""
+    """W8A16 of `edp.ir.w8a16`, with weights of least error on data, finds the levels that are there already."""
     net = fit(tiny, tiny_model, brief, lesson=QuantisationAware(start, Distillation([start]))).predictor
     graph = net.graph()
     found = weights_of(quantise(graph, calibrate(graph, [part.inputs for part in tiny.train])))

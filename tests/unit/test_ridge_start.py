@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-from edp.blocks import LinearBypass
 from edp.data.features import Derived, FeatureSet
 from edp.data.lags import LagTask
 from edp.data.ridge import crossed_solution, ridge_solution
@@ -10,9 +9,10 @@ from edp.data.scaling import fit_scaler
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import DataError
-from edp.models.backbones import TcnSpec
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec, Predictor, build_model
+from edp.networks.backbones import TcnSpec
+from edp.networks.blocks import LinearBypass
+from edp.networks.heads import MlpHead
+from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.signals import Kind
 from edp.training.ridge_start import start_bypass
 

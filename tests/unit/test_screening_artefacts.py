@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from edp.data.screening import FlagKind, ScreeningSpec
+from edp.data.screening.artefacts import broken_flags
+from edp.data.screening.table import build_table
 from edp.recording import Recording
-from edp.screening import FlagKind, ScreeningSpec
-from edp.screening.artefacts import broken_flags
-from edp.screening.table import build_table
 from edp.signals import Channel, Kind
 
 NAMES = ("v", "turned", "steady", "weak", "sloped", "sometimes")

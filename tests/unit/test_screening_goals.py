@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.data_sets import SimulationOrder
-from edp.screening import ForestSpec, ScreeningSpec, screen
+from edp.data.screening import ForestSpec, ScreeningSpec, screen
 from edp.sim import simulate
+from edp.sim.data_set import SimulationOrder
 
 pytestmark = pytest.mark.slow
 FOLDER = Path(__file__).parents[2] / "benchmarks"

@@ -7,18 +7,18 @@ import json
 import numpy as np
 import pytest
 
-from edp.config import load_experiment, plain_tree
+from edp.config.experiment import load_experiment, plain_tree
 from edp.errors import ConfigError, DataError
 from edp.evaluation.controller import Budget
-from edp.search.conduct import conduct
-from edp.search.ground import Ground, Outcome, set_apart
-from edp.search.modules import MODULES
-from edp.search.phases import PHASES
-from edp.search.settings import CompressionSpec, SearchSpec
-from edp.search.smaller import Recipe
-from edp.search.space import Choice, Real
-from edp.search.study import SamplerSpec
-from edp.search.trainings import SCORES, settings_of
+from edp.workflows.search.context import Outcome, SearchContext, set_apart
+from edp.workflows.search.modules import MODULES
+from edp.workflows.search.phases import PHASES
+from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.settings import CompressionSpec, SearchSpec
+from edp.workflows.search.smaller import Recipe
+from edp.workflows.search.space import Choice, Real
+from edp.workflows.search.study import SamplerSpec
+from edp.workflows.search.trainings import SCORES, settings_of
 
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8, 16))}
@@ -35,7 +35,7 @@ SPEC = SearchSpec(
 
 def ground(spec=SPEC):
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
-    return Ground(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:])
+    return SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:])
 
 
 class World:
@@ -96,7 +96,7 @@ def by_rate(settings):
 
 @pytest.fixture(scope="module")
 def found():
-    return conduct(ground(), World(by_rate), until="calibration")
+    return run_phases(ground(), World(by_rate), until="calibration")
 
 
 def test_phase_0_takes_the_better_feature_set_and_says_how_sure_it_is(found):
@@ -115,7 +115,7 @@ def test_phase_0_holds_the_best_backbone_against_the_others():
     def hybrid_gains(settings):
         return by_rate(settings) * (0.9 if settings["model"]["backbone"]["kind"] == "hybrid" else 1.0)
 
-    facts = conduct(ground(), World(hybrid_gains), until="isolation").decided["isolation"].facts
+    facts = run_phases(ground(), World(hybrid_gains), until="isolation").decided["isolation"].facts
     (held,) = facts["backbones"].values()
     assert held["best"] == "hybrid"
     assert list(facts["backbones"]) == ["lstm"]
@@ -124,7 +124,7 @@ def test_phase_0_holds_the_best_backbone_against_the_others():
 
 def test_phase_0_pairs_all_arms_on_the_same_folds_and_seeds():
     world = World(by_rate)
-    conduct(ground(), world, until="isolation")
+    run_phases(ground(), world, until="isolation")
     orders = [json.loads(key) for key in world.done]
     assert len(orders) == 4 * 6 * 2
     pairs = {(tuple(order["judged"]), order["seed"]) for order in orders}
@@ -163,7 +163,7 @@ def test_backbones_are_chosen_on_all_folds_but_in_the_thesis_by_one(mode):
         return by_rate(settings) - 0.7 * (settings["model"]["backbone"]["kind"] == "hybrid")
 
     spec = dataclasses.replace(SPEC, mode=mode)
-    facts = conduct(ground(spec), OneFoldMisleads(hybrid_gains), until="calibration").decided["calibration"].facts
+    facts = run_phases(ground(spec), OneFoldMisleads(hybrid_gains), until="calibration").decided["calibration"].facts
     kept = {name: held["score"] for name, held in facts["backbones"].items()}
     if mode == "sound":
         assert kept["lstm"] < kept["hybrid"]
@@ -178,9 +178,9 @@ def test_backbones_are_chosen_on_all_folds_but_in_the_thesis_by_one(mode):
 
 def test_decisions_are_plain_and_come_again_without_a_training(found):
     world = World(by_rate)
-    first = conduct(ground(), world, until="calibration")
+    first = run_phases(ground(), world, until="calibration")
     trained = world.trained
-    again = conduct(ground(), world, until="calibration")
+    again = run_phases(ground(), world, until="calibration")
     assert world.trained == trained
     for name in ("isolation", "calibration"):
         plain = json.loads(json.dumps(again.decided[name].to_json()))
@@ -193,7 +193,7 @@ def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
     def brittle(settings):
         return None if settings["training"]["optimizer"]["learning_rate"] > 1e-2 else by_rate(settings)
 
-    facts = conduct(ground(), World(brittle), until="calibration").decided["calibration"].facts
+    facts = run_phases(ground(), World(brittle), until="calibration").decided["calibration"].facts
     assert facts["baseline"]["learning_rate"] <= 1e-2
     statuses = [status for trial in facts["backbones"]["lstm"]["trials"] for status in trial["statuses"]]
     assert "diverged" in statuses
@@ -203,20 +203,20 @@ def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
             None if settings["task"]["features"] == "FG1" and settings["model"]["backbone"]["kind"] == "lstm" else 5.0
         )
 
-    assert conduct(ground(), World(fg1_breaks), until="isolation").decided["isolation"].facts["features"] == "FG2"
+    assert run_phases(ground(), World(fg1_breaks), until="isolation").decided["isolation"].facts["features"] == "FG2"
     usual = ground().base["training"]["optimizer"]["learning_rate"]
 
     def only_as_it_was(settings):
         return 9.0 if settings["training"]["optimizer"]["learning_rate"] == usual else None
 
     with pytest.raises(DataError, match="no training of any backbone ended well"):
-        conduct(ground(), World(only_as_it_was), until="calibration")
+        run_phases(ground(), World(only_as_it_was), until="calibration")
 
 
 def test_what_costs_too_much_is_not_trained_and_a_cost_gives_a_front():
     spec = dataclasses.replace(SPEC, limits={"parameters": 4000.0}, cost="parameters", backbones=("lstm",))
     world = World(by_rate)
-    facts = conduct(ground(spec), world, until="calibration").decided["calibration"].facts
+    facts = run_phases(ground(spec), world, until="calibration").decided["calibration"].facts
     trials = facts["backbones"]["lstm"]["trials"]
     assert any(trial["parameters"] > 4000 for trial in trials)
     assert all((trial["score"] is None) == (trial["parameters"] > 4000) for trial in trials)
@@ -228,7 +228,7 @@ def test_what_costs_too_much_is_not_trained_and_a_cost_gives_a_front():
 def test_the_thesis_mode_uses_its_own_estimates():
     spec = dataclasses.replace(SPEC, mode="thesis")
     sound, thesis = (
-        conduct(ground(s), World(by_rate), until="isolation").decided["isolation"].facts for s in (SPEC, spec)
+        run_phases(ground(s), World(by_rate), until="isolation").decided["isolation"].facts for s in (SPEC, spec)
     )
     assert sound["arms"]["lstm FG1"]["split_interval"] is not None
     assert thesis["arms"]["lstm FG1"]["split_interval"] is None
@@ -268,7 +268,7 @@ def test_settings_out_of_range_are_refused(options, message):
 
 def test_an_unknown_phase_is_named():
     with pytest.raises(ConfigError, match="unknown phase 'calibratoin'"):
-        conduct(ground(), World(by_rate), until="calibratoin")
+        run_phases(ground(), World(by_rate), until="calibratoin")
     assert list(PHASES)[:2] == ["isolation", "calibration"]
     assert plain_tree(load_experiment(None, "quick"))["task"]["features"] == "FG2"
 
@@ -288,7 +288,7 @@ CONFIRMED = dataclasses.replace(
 @pytest.fixture(scope="module")
 def sound():
     world = World(with_effects)
-    return conduct(ground(CONFIRMED), world), world
+    return run_phases(ground(CONFIRMED), world), world
 
 
 def test_the_design_passes_what_helps_and_stops_what_harms(sound):
@@ -308,7 +308,7 @@ def test_the_plan_says_how_many_runs_and_why(sound):
 
 def test_a_plan_that_no_number_of_runs_meets_makes_the_most_that_are_allowed(sound):
     small = dataclasses.replace(sound[0], spec=dataclasses.replace(CONFIRMED, least_effect=1e-4))
-    decision = conduct(small, World(with_effects), phases=["planning"]).decided["planning"]
+    decision = run_phases(small, World(with_effects), phases=["planning"]).decided["planning"]
     assert decision.facts["runs"] == 6
     assert decision.facts["enough"] is None
     assert "6 runs are made nevertheless" in decision.sentences[1]
@@ -333,7 +333,7 @@ def test_what_a_look_drops_is_not_trained_any_more(sound):
 
 def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
     spec = dataclasses.replace(CONFIRMED, mode="thesis", module_trials=3, run_seeds=2, most_runs=4)
-    found = conduct(ground(spec), World(with_effects), until="confirmation")
+    found = run_phases(ground(spec), World(with_effects), until="confirmation")
     screening, confirmation = (found.decided[name].facts for name in ("screening", "confirmation"))
     assert "squeeze_excitation" in screening["passed"]
     assert found.decided["planning"].facts["runs"] <= 4
@@ -343,7 +343,7 @@ def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
 
 def test_without_a_survivor_nothing_is_trained():
     world = World(lambda settings: 5.0 + bool(settings["model"]["blocks"]), noise=0.0)
-    first = conduct(ground(CONFIRMED), world, until="planning")
+    first = run_phases(ground(CONFIRMED), world, until="planning")
     first = dataclasses.replace(
         first,
         decided={
@@ -354,7 +354,7 @@ def test_without_a_survivor_nothing_is_trained():
         },
     )
     trained = world.trained
-    found = conduct(first, world, phases=["confirmation"])
+    found = run_phases(first, world, phases=["confirmation"])
     assert world.trained == trained
     assert found.decided["confirmation"].facts["confirmed"] == []
 
@@ -410,7 +410,7 @@ def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
 
     spec = dataclasses.replace(CONFIRMED, free_trials=40)
     world = World(together)
-    found = conduct(ground(spec), world)
+    found = run_phases(ground(spec), world)
     facts = found.decided["exploration"].facts
     assert {"squeeze_excitation", "temporal_difference"} <= set(facts["modules"])
     alone = found.decided["confirmation"].facts["confirmed"]
@@ -449,11 +449,11 @@ def test_phase_6_can_be_left_out_and_a_budget_that_nothing_meets_ends_in_a_sente
     )
     off = dataclasses.replace(CONFIRMED, compression=CompressionSpec(on=False))
     world = World(with_effects)
-    found = conduct(dataclasses.replace(before, spec=off), world, phases=["compression"])
+    found = run_phases(dataclasses.replace(before, spec=off), world, phases=["compression"])
     assert (world.trained, found.decided["compression"].facts["on"]) == (0, False)
     assert PHASES["compression"].trainings(dataclasses.replace(before, spec=off)) == 0
     tight = dataclasses.replace(CONFIRMED, compression=CompressionSpec(budget=Budget(name="none", cycles=10)))
-    found = conduct(dataclasses.replace(before, spec=tight), world, phases=["compression"])
+    found = run_phases(dataclasses.replace(before, spec=tight), world, phases=["compression"])
     assert world.trained == 1
     assert "budget 'none': cycles = 10 can be met by no width" in found.decided["compression"].sentences[0]
     assert found.decided["compression"].facts["chosen"] is None
@@ -461,7 +461,7 @@ def test_phase_6_can_be_left_out_and_a_budget_that_nothing_meets_ends_in_a_sente
 
 def test_phase_6_whose_teacher_fails_opens_nothing(sound):
     world = World(lambda settings: None)
-    found = conduct(sound[0], world, phases=["compression"])
+    found = run_phases(sound[0], world, phases=["compression"])
     assert world.trained == 1
     assert "did not end well (the loss is nan)" in found.decided["compression"].sentences[0]
 

@@ -8,14 +8,14 @@ import random
 import numpy as np
 import pytest
 
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
-from edp.search.conduct import conduct
-from edp.search.ground import Decision, Ground, Outcome
-from edp.search.settings import SearchSpec
-from edp.search.space import Choice, Real
-from edp.search.study import SamplerSpec, Study
-from edp.search.trainings import SCORES, Order, settings_of
+from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.space import Choice, Real
+from edp.workflows.search.study import SamplerSpec, Study
+from edp.workflows.search.trainings import SCORES, TrainingRequest, settings_of
 
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((4, 8))}
@@ -36,7 +36,7 @@ ISOLATION = Decision("isolation", {"features": "FG2"}, ())
 def ground(**changes):
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
     spec = dataclasses.replace(SPEC, **changes)
-    return Ground(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:], decided={"isolation": ISOLATION})
+    return SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:], decided={"isolation": ISOLATION})
 
 
 class World:
@@ -63,7 +63,7 @@ class World:
 
 
 def calibrated(do, **changes):
-    decision = conduct(ground(**changes), do, phases=["calibration"]).decided["calibration"]
+    decision = run_phases(ground(**changes), do, phases=["calibration"]).decided["calibration"]
     return decision, decision.facts["backbones"]["lstm"]["trials"]
 
 
@@ -206,8 +206,8 @@ def test_the_order_in_which_answers_come_has_no_say(pruned):
 
 
 def test_orders_in_parts_that_cannot_be_are_refused():
-    order = Order({}, {}, ("a", "b"), ("c",), 0, updates=10, until=5, stops=(2,))
-    assert Order.from_json(json.loads(json.dumps(order.to_json()))) == order
+    order = TrainingRequest({}, {}, ("a", "b"), ("c",), 0, updates=10, until=5, stops=(2,))
+    assert TrainingRequest.from_json(json.loads(json.dumps(order.to_json()))) == order
     assert order.whole == dataclasses.replace(order, until=None, stops=())
     for change in ({"until": 10}, {"until": 2}, {"until": 0, "stops": ()}, {"stops": (4, 3)}, {"stops": (0,)}):
         with pytest.raises(ConfigError, match=r"stops .* of 10 updates"):

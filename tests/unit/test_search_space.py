@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edp.config import Experiment, build, load_experiment, merged, plain_tree
+from edp.config.experiment import Experiment, build, load_experiment, merged, plain_tree
 from edp.errors import ConfigError
-from edp.models.predictor import check_combination
-from edp.search.modules import MODULES, conflicts, contradicting, fitting, with_modules
-from edp.search.space import DIMENSIONS, THESIS, Choice, Real, applicable, apply, check, elastic, names
+from edp.networks.predictor import check_combination
+from edp.workflows.search.modules import MODULES, conflicts, contradicting, fitting, with_modules
+from edp.workflows.search.space import DIMENSIONS, THESIS, Choice, Real, applicable, apply, check, elastic, names
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
 BACKBONES = ("hybrid", "lstm", "gru", "tcn")

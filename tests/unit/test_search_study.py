@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edp.errors import ConfigError
-from edp.search.space import Choice, Real
-from edp.search.study import SAMPLERS, SamplerSpec, Study
 from edp.stats.pareto import pareto
+from edp.workflows.search.space import Choice, Real
+from edp.workflows.search.study import SAMPLERS, SamplerSpec, Study
 
 SPACE = {"learning_rate": Real(1e-4, 1e-1, log=True), "units": Choice((16, 32, 64))}
 FLAGS = ("a", "b", "c")

@@ -6,13 +6,13 @@ import json
 import numpy as np
 import pytest
 
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import ConfigError, DataError
-from edp.ledger import Ledger
-from edp.search.doing import Doing
-from edp.search.jobs import job_of
-from edp.search.local import LocalPool
-from edp.search.trainings import SCORES, Order, experiment_of, settings_of, train_order
+from edp.storage.ledger import Ledger
+from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.jobs import job_of
+from edp.workflows.search.local import LocalPool
+from edp.workflows.search.trainings import SCORES, TrainingRequest, experiment_of, settings_of, train_order
 
 CHANGES = (
     'task.features={name="tiny", channels=["lever", "speed"]}',
@@ -34,7 +34,7 @@ def source(lever_sessions):
 @pytest.fixture(scope="module")
 def order(source):
     settings = settings_of(load_experiment(None, "quick", CHANGES))
-    return Order(settings, source.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
+    return TrainingRequest(settings, source.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def record(order):
 
 def test_an_order_goes_through_json_and_equal_orders_give_equal_records(order, record):
     plain = json.loads(json.dumps(order.to_json()))
-    assert Order.from_json(plain) == order
+    assert TrainingRequest.from_json(plain) == order
     again = train_order(plain)
     assert {**again, "seconds": 0} == {**record, "seconds": 0}
     assert json.loads(json.dumps(record)) == record
@@ -108,7 +108,7 @@ def test_a_process_of_a_pool_does_an_order_to_the_same_bits(order, record, tmp_p
         len({job.key, job_of(order, "other").key, *(job_of(other, "digest of the data").key for other in others)}) == 5
     )
     with LocalPool(1) as pool, Ledger(tmp_path) as ledger:
-        do = Doing(ledger, pool, "digest of the data", on_record=lambda _, trained: told.append(trained))
+        do = Dispatcher(ledger, pool, "digest of the data", on_record=lambda _, trained: told.append(trained))
         bad = dataclasses.replace(order, train=("s0", "s9"))
         outcomes = do([order, bad, order])
         assert [outcome.order for outcome in outcomes] == [order, bad, order]

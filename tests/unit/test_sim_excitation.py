@@ -5,10 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from edp.sim import EXCITATIONS, Scenario, Simulation, load_machine, pose
-from edp.sim import layout as at
+from edp.sim import EXCITATIONS, Scenario, Simulation, load_machine
 from edp.sim.excitation.levers import dead_lever, speed_table
-from edp.sim.parameters import pack
+from edp.sim.machine import layout as at
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import pose
 from edp.sim.view import view_of
 
 MACHINE = load_machine("M22")

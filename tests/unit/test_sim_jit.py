@@ -5,7 +5,8 @@ from types import ModuleType
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from edp.sim import jit, scenario_file
+from edp.sim import scenario_file
+from edp.sim.physics import jit
 
 
 def test_compiles_without_a_writable_cache(monkeypatch, tmp_path):
@@ -43,8 +44,9 @@ def test_compiled_code_uses_nothing_outside_the_files_of_the_fingerprint():
     known = {path.resolve() for path in jit.fingerprinted()}
     assert {path.name for path in known} >= {"jit.py", "layout.py", "integrator.py", "plant.py", "terramechanics.py"}
     assert Path(scenario_file.__file__) not in known
+    root = Path(jit.__file__).resolve().parents[1]
     for path in known:
-        module = importlib.import_module(f"edp.sim.{path.stem}")
+        module = importlib.import_module(".".join(["edp.sim", *path.relative_to(root).with_suffix("").parts]))
         for function in vars(module).values():
             if not isinstance(function, Dispatcher):
                 continue

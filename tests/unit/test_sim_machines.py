@@ -7,7 +7,7 @@ import pytest
 
 from edp.errors import ConfigError
 from edp.sim import Scenario, load_machine, machine_names, simulate
-from edp.sim.machine_files import parse_machine
+from edp.sim.machine.machine_files import parse_machine
 
 TEXT = resources.files("edp.sim").joinpath("machines", "m22.toml").read_text(encoding="utf-8")
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-import edp.data_sets
-from edp.data_sets import SimulationOrder, bytes_needed, simulate_data_set
+import edp.sim.data_set
 from edp.errors import ConfigError, StorageError
 from edp.sim import DEFAULT_MIX, DataSetSpec, Scenario, plan_data_set, read_scenario_file, simulate_many
+from edp.sim.data_set import SimulationOrder, bytes_needed, simulate_data_set
 from edp.sim.scenario import plain
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "scenarios").glob("*.toml"))
@@ -184,7 +184,7 @@ def test_an_absent_file_is_refused(tmp_path):
 
 def test_a_data_set_longer_than_the_disk_is_refused_before_the_first_step(tmp_path, monkeypatch):
     order = SimulationOrder.of(minutes=1e6, recordings=50)
-    monkeypatch.setattr(edp.data_sets.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 10**9}))
+    monkeypatch.setattr(edp.sim.data_set.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 10**9}))
     with pytest.raises(StorageError, match=r"minutes: 1e\+06 min as .parquet need about .* GB free; simulate at most"):
         simulate_data_set(tmp_path / "set", order)
     assert list((tmp_path / "set").iterdir()) == []

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError
-from edp.sim import Scenario, load_machine, simulate, soil
-from edp.sim import layout as at
-from edp.sim import terramechanics as tm
-from edp.sim.plant import Plant
+from edp.sim import Scenario, load_machine, simulate
+from edp.sim.machine import layout as at
+from edp.sim.physics import soil
+from edp.sim.physics import terramechanics as tm
+from edp.sim.physics.plant import Plant
 
 MATERIALS = soil.material_names()
 

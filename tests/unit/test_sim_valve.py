@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from edp.sim import load_machine, valve
+from edp.sim import load_machine
+from edp.sim.physics import valve
 
 
 @pytest.mark.parametrize("step_s", [1e-4, 5e-4, 1e-3])

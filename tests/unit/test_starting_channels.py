@@ -13,9 +13,9 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
 from edp.evaluation.judge import JudgeSpec, baseline_task, judge
-from edp.models.plain import task_from_plain, task_to_plain
-from edp.models.predictor import build_model
-from edp.models.stream import Stream
+from edp.networks.plain import task_from_plain, task_to_plain
+from edp.networks.predictor import build_model
+from edp.networks.stream import Stream
 from edp.signals import Channel, Kind
 from edp.training.fit import fit
 from edp.training.optimizers import AdamW

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from edp.errors import ExportError
-from edp.graph import Builder
-from edp.graph.base import INPUT
-from edp.graph.reference import Reference
-from edp.models.physics.symbols import Symbol
+from edp.ir import Builder
+from edp.ir.base import INPUT
+from edp.ir.reference import Reference
+from edp.networks.physics.symbols import Symbol
 
 KNOWN = torch.tensor([2.0, -3.0, 0.5])
 EQUATIONS = {

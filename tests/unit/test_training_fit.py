@@ -10,11 +10,11 @@ from edp.data.augment import AUGMENTATIONS
 from edp.data.chunks import ChunkSpec
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
-from edp.losses import LOSSES, TERMS, AdaptiveWeights, MeanSquared
-from edp.models.outputs import OUTPUTS
-from edp.models.predictor import build_model
-from edp.models.running import stream_predictions
-from edp.runs import RunFolder
+from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights, MeanSquared
+from edp.networks.outputs import OUTPUTS
+from edp.networks.predictor import build_model
+from edp.networks.running import stream_predictions
+from edp.storage.runs import RunFolder
 from edp.training.averages import NoAverage, Stochastic
 from edp.training.fit import Diverged, TrainingError, TrainingSpec, fit, thread_count, validation_scores
 from edp.training.objective import Objective

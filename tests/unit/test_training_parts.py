@@ -8,8 +8,8 @@ import torch
 from edp.data.augment import AUGMENTATIONS
 from edp.data.chunks import ChunkSpec
 from edp.errors import ConfigError
-from edp.losses import AdaptiveWeights
-from edp.models.backbones import LstmSpec
+from edp.networks.backbones import LstmSpec
+from edp.networks.losses import AdaptiveWeights
 from edp.training.averages import Stochastic
 from edp.training.fit import fit
 from edp.training.optimizers import OPTIMIZERS

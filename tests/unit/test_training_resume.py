@@ -10,11 +10,11 @@ import torch
 from edp.data.augment import AUGMENTATIONS
 from edp.data.chunks import ChunkSpec
 from edp.errors import StorageError
-from edp.losses import LOSSES, TERMS, AdaptiveWeights
-from edp.models.cells import CELLS
-from edp.models.initial import INITIAL_STATES
-from edp.models.outputs import OUTPUTS
-from edp.runs import RunFolder, run_key
+from edp.networks.cells import CELLS
+from edp.networks.initial import INITIAL_STATES
+from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights
+from edp.networks.outputs import OUTPUTS
+from edp.storage.runs import RunFolder, run_key
 from edp.training.averages import AVERAGES
 from edp.training.checkpoint import FILE
 from edp.training.fit import fit
@@ -148,7 +148,7 @@ def test_a_finished_training_is_not_done_again(tmp_path, tiny, tiny_model, tiny_
 KILLED = """
 import os, runpy, signal, sys
 tiny = runpy.run_path(sys.argv[1])
-from edp.runs import RunFolder
+from edp.storage.runs import RunFolder
 from edp.training.fit import fit
 fsync, writes = os.fsync, []
 def die(handle):

@@ -5,14 +5,21 @@ import json
 import numpy as np
 import pytest
 
-from edp.config import FeatureSettings, load_experiment
+from edp.config.experiment import FeatureSettings, load_experiment
 from edp.data.features import Derived
 from edp.errors import ConfigError
 from edp.logs import write_recording
+from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.sources import DataSource
-from edp.trials import Difference, TrialSpec, _difference, _drawn, try_feature_sets, with_differences
+from edp.workflows.feature_selection.trials import (
+    PairedDifference,
+    TrialSpec,
+    _difference,
+    _drawn,
+    try_feature_sets,
+    with_differences,
+)
 
 CHANNELS = (
     Channel("v", Kind.VELOCITY),
@@ -121,7 +128,7 @@ def test_trials_are_kept(trials, source, experiment, folder):
 
 def test_differences_are_paired():
     gap = _difference({"a": 3.0, "b": 6.0, "c": 9.0}, {"a": 2.0, "b": 5.0, "c": 8.0})
-    assert gap == Difference(1.0, 1.0, 1.0)
+    assert gap == PairedDifference(1.0, 1.0, 1.0)
     assert _difference({"a": 1.0, "b": 3.0}, {"a": 1.0, "b": 1.0}).low < 0
 
 

@@ -6,16 +6,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.compress import FORMATS, VARIANTS, Bench, Candidate, Order, deploy, matrices_of, taken, weight_levels
-from edp.compress.bench import tuning
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import ConfigError
 from edp.evaluation.controller import Budget
-from edp.models.backbones import HybridSpec
-from edp.models.heads import MlpHead
-from edp.models.predictor import ModelSpec, build_model
-from edp.models.running import stream_predictions
+from edp.networks.backbones import HybridSpec
+from edp.networks.heads import MlpHead
+from edp.networks.matrices import matrices_of
+from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.running import stream_predictions
 from edp.training.bundle import blank_scaler
+from edp.workflows.compression import (
+    FORMATS,
+    VARIANTS,
+    Bench,
+    CompressedCandidate,
+    CompressionRequest,
+    deploy,
+    taken,
+    weight_levels,
+)
+from edp.workflows.compression.bench import tuning
 
 THESIS = Path(__file__).parents[2] / "examples" / "thesis"
 WIDE = ModelSpec(backbone=HybridSpec(channels=(64, 8), kernel=2, units=64), head=MlpHead(hidden=16), window=10)
@@ -35,7 +45,7 @@ def test_the_names_are_those_of_the_thesis_and_ours():
 @pytest.mark.parametrize("name", list(VARIANTS))
 def test_each_variant_is_a_network_that_runs_in_its_format(tiny, bench, name):
     found = VARIANTS[name](bench)
-    assert isinstance(found, Candidate)
+    assert isinstance(found, CompressedCandidate)
     assert found.name == name
     assert found.network.spec == found.order.model(bench.teacher.spec)
     assert found.network.number_format == "float32"
@@ -83,5 +93,5 @@ def test_what_is_over_budget_is_named(bench):
     found = taken(bench.teacher, "float32", Budget(cycles=1000, parameter_bytes=100))
     assert set(found.over(Budget(cycles=1000, parameter_bytes=100))) == {"cycles", "parameter_bytes"}
     assert taken(bench.teacher, "w8a16", Budget()).over(Budget()) == {}
-    orders = Order(name="a", units=8), Order(name="a", units=8)
+    orders = CompressionRequest(name="a", units=8), CompressionRequest(name="a", units=8)
     assert orders[0] == orders[1]

@@ -11,17 +11,17 @@ import torch
 from edp.cli import app
 from edp.cli.console import run_app
 from edp.cli.evaluate import score_table
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.logs import open_log, read_recording, write_recording
 from edp.logs.repair import Repair
-from edp.models.running import stream_intervals
+from edp.networks.running import stream_intervals
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, TABLE_A1, Channel, Kind, SignalMap
 from edp.training import Diverged, load_bundle
 from edp.training.objective import Objective
-from edp.workflow import (
+from edp.workflows.train_evaluate import (
     DataSource,
     SimulationOrder,
     build_report,

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.blocks import LinearBypass
 from edp.data.features import FeatureSet
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
+from edp.evaluation.channel_importance import WorthSpec, _donors, channel_worths
 from edp.evaluation.conditional import OthersModel, collinear
-from edp.evaluation.worth import WorthSpec, _donors, channel_worths
+from edp.networks.blocks import LinearBypass
 from edp.signals import Channel, Kind
 from edp.training import fit
 

@@ -30,8 +30,8 @@ def adapt(
 
     Example: `edp adapt runs/first --out runs/first_adapted`
     """
-    from edp.adaptation import adapt as make
-    from edp.onboard import AdaptationSpec
+    from edp.ir.rls import AdaptationSpec
+    from edp.workflows.adaptation import adapt as make
 
     spec = AdaptationSpec(
         rank=rank,
@@ -69,7 +69,7 @@ def replay(
 
     Example: `edp replay runs/first_adapted logs/monday --carry`
     """
-    from edp.adaptation import replay_run
+    from edp.workflows.adaptation import replay_run
 
     with progress(as_json) as shown:
         on_recording = counted(shown, Steps(as_json), "replay", "done")

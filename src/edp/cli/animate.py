@@ -34,8 +34,8 @@ def animate(
 
     Example: `edp animate data/m22/m22_000_combined.parquet`
     """
-    from edp.report.animation import scene_of, write_animation
-    from edp.report.film import FILMS, write_film
+    from edp.report.animation.film import FILMS, write_film
+    from edp.report.animation.page import scene_of, write_animation
 
     target = output or log.with_name(f"{log.stem}.html")
     scene = scene_of(_read(log, signal_map), machine, start, seconds)
@@ -54,7 +54,7 @@ def animate(
 def _read(log: Path, signal_map: Path | None) -> Recording:
     """One recording, with the truth that lies in or beside its log."""
     from edp.logs import known_suffixes, read_truth
-    from edp.sources import DataSource
+    from edp.logs.source import DataSource
 
     found = DataSource.of(log, signal_map).read()
     if len(found) != 1:

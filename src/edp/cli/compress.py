@@ -11,7 +11,7 @@ from edp.cli.console import JsonFlag, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 
 if TYPE_CHECKING:
-    from edp.training import Event
+    from edp.training import TrainingProgress
 
 
 def compress(
@@ -43,11 +43,11 @@ def compress(
 
     Example: `edp compress runs/first --budget examples/budgets/small_controller.toml --out runs/small`
     """
-    from edp.downsizing import SearchSpec, Watchers, search
     from edp.evaluation.controller import Budget, load_budget
     from edp.report import read_compression, write_compression_page
+    from edp.workflows.compression import CompressionCallbacks, CompressionSearchSpec, search
 
-    spec = SearchSpec(
+    spec = CompressionSearchSpec(
         budget=Budget() if budget is None else load_budget(budget),
         units=tuple(units),
         formats=tuple(formats),
@@ -59,11 +59,11 @@ def compress(
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "compress", "network")
 
-        def on_training(name: str, done: int, count: int, event: Event) -> None:
+        def on_training(name: str, done: int, count: int, event: TrainingProgress) -> None:
             display.done, display.count = done, max(1, count)
             display.on_training(name, event)
 
-        found = search(bundle, spec, folder, source, Watchers(display.on_note, on_training))
+        found = search(bundle, spec, folder, source, CompressionCallbacks(display.on_note, on_training))
     page = write_compression_page(folder)
     facts = read_compression(folder)
     best = found.best
@@ -80,7 +80,7 @@ def compress(
 
 
 def _tables(facts: Any) -> None:
-    from edp.report import compression_facts as words
+    from edp.report.compression import facts as words
 
     for horizon in facts.horizons:
         sheet = words.table_sheet(facts, horizon)

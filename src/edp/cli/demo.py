@@ -26,8 +26,8 @@ def demo(
 
     Example: `edp demo --out demo`
     """
-    from edp.data_sets import SimulationOrder
     from edp.report import build_report, headline, read_facts
+    from edp.sim.data_set import SimulationOrder
 
     began = time.monotonic()
     data, run = folder / f"data_{seed}", folder / f"run_{seed}"

@@ -39,11 +39,10 @@ def distil(
 
     Example: `edp distil runs/first --units 32 --out runs/small`
     """
-    from edp.compress import DistillationSpec
-    from edp.downsizing import DistilSpec
-    from edp.downsizing import distil as make
     from edp.evaluation.footprint import footprint
     from edp.training import load_bundle
+    from edp.workflows.compression import DistillationSpec, DistilSpec
+    from edp.workflows.compression import distil as make
 
     spec = DistilSpec(
         units=units,

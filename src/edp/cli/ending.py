@@ -6,7 +6,7 @@ import signal
 import sys
 from types import FrameType
 
-from edp.limits import free_bytes
+from edp.storage.memory import free_bytes
 
 _stopped_by: list[int] = []
 """Signals that asked this process to end."""

@@ -12,8 +12,8 @@ from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progr
 from edp.cli.train import MapOption, RepairOption, source_of
 
 if TYPE_CHECKING:
-    from edp.evaluation.worth import Worths
-    from edp.sources import DataSource
+    from edp.evaluation.channel_importance import Worths
+    from edp.logs.source import DataSource
 
 
 def evaluate(
@@ -54,7 +54,7 @@ def run_evaluation(
 ) -> tuple[Path, dict[str, Any]]:
     """Judge with a progress display; returns the folder of the scores and the scores."""
     from edp.storage import read_object
-    from edp.workflow import evaluate as judge_run
+    from edp.workflows.train_evaluate import evaluate as judge_run
 
     steps, began = Steps(quiet, every_s=0.0), time.monotonic()
     with progress(quiet) as shown:
@@ -70,7 +70,7 @@ def run_evaluation(
 
 def run_worths(run: Path, source: DataSource | None = None, quiet: bool = False) -> Worths:
     """Take channels away with a progress display."""
-    from edp.workflow import channel_worths
+    from edp.workflows.train_evaluate import channel_worths
 
     with progress(quiet) as shown:
         on_group = counted(shown, Steps(quiet), "worth", "taken away")

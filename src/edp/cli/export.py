@@ -25,7 +25,7 @@ def export(
 
     Example: `edp export runs/first --to c --out firmware/predictor`
     """
-    from edp.workflow import export_bundle, unheld_adaptation
+    from edp.workflows.train_evaluate import export_bundle, unheld_adaptation
 
     files = export_bundle(bundle, to, folder, name, dict(map(_option, changes or [])))
 

@@ -12,7 +12,7 @@ from edp.cli.console import JsonFlag, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 
 if TYPE_CHECKING:
-    from edp.report.transfer_facts import Transfer
+    from edp.report.transfer.facts import Transfer
 
 
 def finetune(
@@ -61,16 +61,16 @@ def finetune(
     Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --rivals all`
     """
     from edp.report import read_transfer, write_transfer_page
-    from edp.transfer import METHODS, FinetuneSpec, Order, Watchers
-    from edp.transfer import finetune as make
+    from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec
+    from edp.workflows.transfer import finetune as make
 
     named = [field.name for field in fields(FinetuneSpec) if field.name in context.params]
     spec = FinetuneSpec(**{name: context.params[name] for name in named}, check_signs=not any_sign)
-    order = Order(spec=spec, method=method, rivals=_named(rivals, tuple(METHODS)), changes=tuple(changes))
+    order = FinetuneRequest(spec=spec, method=method, rivals=_named(rivals, tuple(METHODS)), changes=tuple(changes))
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "finetune", "method")
-        watchers = Watchers(display.on_note, display.on_training, display.on_next)
+        watchers = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
         found = make(bundle, source, order, folder, watchers)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
@@ -90,7 +90,7 @@ def _named(rivals: str, every: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _tables(facts: Transfer) -> None:
-    from edp.report import transfer_facts as words
+    from edp.report.transfer import facts as words
 
     for horizon in facts.horizons:
         for sheet in words.sheets_of(facts, horizon):

@@ -14,7 +14,7 @@ from edp.errors import EdpError
 
 if TYPE_CHECKING:
     from edp.data.coverage import Coverage
-    from edp.sources import DataSource
+    from edp.logs.source import DataSource
 
 FAULTY = 3
 
@@ -38,7 +38,7 @@ def inspect(
 
     Example: `edp inspect logs/ --map mine.toml --page coverage.html`
     """
-    from edp.sources import DataSource
+    from edp.logs.source import DataSource
 
     source = DataSource.of(data, signal_map)
     with progress(as_json) as shown:
@@ -70,7 +70,7 @@ def inspect(
 
     covers = None
     if found is not None:
-        from edp.data.wanted import wanted
+        from edp.data.coverage_targets import wanted
 
         covers = {**found.to_json(), "wanted": [figure.to_json() for figure in wanted(found)]}
     emit(as_json, {**quality.to_json(), "coverage": covers, "coverage_absent": why}, show)
@@ -81,7 +81,7 @@ def inspect(
 
 def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bool) -> tuple[Coverage | None, str]:
     """Coverage of a source, or why there is none; a question of its own that cannot be answered is an error."""
-    from edp.workflow import coverage
+    from edp.workflows.train_evaluate import coverage
 
     try:
         return coverage(source, inputs, split), ""
@@ -93,7 +93,7 @@ def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bo
 
 def show_coverage(found: Coverage) -> None:
     """Print what a data set covers."""
-    from edp.data.wanted import wanted
+    from edp.data.coverage_targets import wanted
 
     rows: list[tuple[Any, ...]] = []
     if found.singular:

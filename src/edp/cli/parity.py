@@ -13,7 +13,7 @@ from edp.cli.train import MapOption, RepairOption, source_of
 from edp.errors import ConfigError
 
 if TYPE_CHECKING:
-    from edp.parity import Row
+    from edp.workflows.parity import Row
 
 
 def parity(
@@ -44,8 +44,8 @@ def parity(
 
     Example: `edp parity runs/first`
     """
-    from edp.parity import compare, from_own_run, golden_case, recorded_case
     from edp.training import load_bundle
+    from edp.workflows.parity import compare, from_own_run, golden_case, recorded_case
 
     if not (yes or from_own_run(bundle)):
         _ask(bundle)
@@ -73,7 +73,7 @@ def _ask(bundle: Path) -> None:
     Raises:
         ConfigError: there is no terminal, or the answer is no.
     """
-    from edp.parity import WHAT
+    from edp.workflows.parity import WHAT
 
     why = f"'{bundle}' is not the folder of a run of yours. {WHAT}"
     if not (sys.stdin.isatty() and sys.stderr.isatty()):

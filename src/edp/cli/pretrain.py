@@ -39,9 +39,9 @@ def pretrain(
     Example: `edp simulate data/many --scenario examples/scenarios/many_machines.toml`, then
     `edp pretrain data/many --out runs/foundation --set split.test_masses=[12,17]`
     """
-    from edp.config import load_experiment
-    from edp.pretraining import MetaSpec, Pretrain
-    from edp.pretraining import pretrain as make
+    from edp.config.experiment import load_experiment
+    from edp.workflows.pretraining import MetaSpec, Pretrain
+    from edp.workflows.pretraining import pretrain as make
 
     meta = MetaSpec(inner_rate=inner_rate, inner_steps=inner_steps, shots=shots, head_only=head_only)
     order = Pretrain(method=method, meta=meta, start=start)
@@ -67,7 +67,7 @@ def pretrain(
 
 def _tables(found: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
-    from edp.report.foundation import contexts_sheet, parts_sheet
+    from edp.report.run.foundation import contexts_sheet, parts_sheet
 
     for sheet in (parts_sheet(found), contexts_sheet(found)):
         table(sheet.caption, sheet.heads(), sheet.texts())

@@ -22,7 +22,7 @@ def quantise(
 
     Example: `edp quantise runs/first --out runs/first_w8a16`
     """
-    from edp.downsizing.quantise import quantise as make
+    from edp.workflows.compression.quantise import quantise as make
 
     found = make(run, folder, ticks)
 

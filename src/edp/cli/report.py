@@ -24,8 +24,8 @@ def report(
     Example: `edp report runs/first`
     """
     from edp.report import build_report, headline, read_facts
-    from edp.report.facts import main_horizon
-    from edp.report.limit import limit_line
+    from edp.report.run.facts import main_horizon
+    from edp.report.run.predictability import limit_line
 
     page = build_report(run, output, title, limit)
     facts = read_facts(run, limit)

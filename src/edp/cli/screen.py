@@ -16,8 +16,8 @@ from edp.cli.train import MapOption, RepairOption, source_of
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from edp.selection import Selection, SelectionOrder
-    from edp.training import Event
+    from edp.training import TrainingProgress
+    from edp.workflows.feature_selection.select import Selection, SelectionOrder
 
 SHOWN = 40
 SHOWN_FLAGS = 20
@@ -78,7 +78,7 @@ def screen(
 
 def run_screening(source: Any, folder: Path, order: SelectionOrder, quiet: bool = False) -> Selection:
     """Screen with a progress display."""
-    from edp.selection import Listeners, select_features
+    from edp.workflows.feature_selection.select import Listeners, select_features
 
     with progress(quiet) as shown:
         display = ScreeningDisplay(shown, Steps(quiet))
@@ -101,7 +101,7 @@ class ScreeningDisplay:
         """Show a stage."""
         self._show("screen", share, stage)
 
-    def on_trial(self, name: str, done: int, total: int, event: Event | None) -> None:
+    def on_trial(self, name: str, done: int, total: int, event: TrainingProgress | None) -> None:
         """Show a training."""
         part, note = 0.0, f"{name}, training {done + 1} of {total}"
         if event is not None:
@@ -151,7 +151,7 @@ def show_selection(made: Selection) -> None:
 
 
 def _show_lags(made: Selection) -> None:
-    from edp.report.screening_views import lag_ranges
+    from edp.report.screening.views import lag_ranges
 
     rows = [
         (row.group, "-" if row.low is None else f"{row.low} to {row.high}", f"{row.certain} of {row.curves}")
@@ -212,9 +212,9 @@ def _order(
     given: dict[str, Any], changes: Sequence[str], others: tuple[list[str], bool, bool], trials: dict[str, Any]
 ) -> SelectionOrder:
     """What the options ask for."""
-    from edp.config import build, merged, override
-    from edp.screening import ScreeningSpec
-    from edp.selection import SelectionOrder
+    from edp.config.experiment import build, merged, override
+    from edp.data.screening import ScreeningSpec
+    from edp.workflows.feature_selection.select import SelectionOrder
 
     options = given
     for text in changes:
@@ -226,9 +226,9 @@ def _order(
 
 def _trials(config: Path | None, preset: str, own: Sequence[Path], random: int) -> dict[str, Any]:
     """What the trials are made with."""
-    from edp.config import FeatureSettings, build, load_experiment
+    from edp.config.experiment import FeatureSettings, build, load_experiment
     from edp.data.feature_files import read_set_table
-    from edp.trials import TrialSpec
+    from edp.workflows.feature_selection.trials import TrialSpec
 
     sets = {}
     for path in own:

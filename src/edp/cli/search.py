@@ -16,9 +16,9 @@ from edp.cli.train import MapOption, RepairOption, source_of
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from edp.search.diary import Diary
-    from edp.search.ground import Decision
-    from edp.search.runner import Found
+    from edp.workflows.search.context import Decision
+    from edp.workflows.search.runner import SearchResult
+    from edp.workflows.search.study_log import StudyLog
 
 StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study: what edp search --study was given.")]
 DEFAULT = "run"
@@ -83,13 +83,13 @@ def run(
 
     Example: `edp search logs/ --study studies/first --phase screening --set search.features='["FG2", "own.toml"]'`
     """
-    from edp.search.plan import load_plan
-    from edp.search.runner import Crew, Watchers, run_search
+    from edp.workflows.search.plan import load_plan
+    from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 
     changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
-    crew = Crew(
+    crew = Resources(
         workers=workers,
         threads=threads,
         seconds=seconds,
@@ -100,7 +100,7 @@ def run(
     source = source_of(data, signal_map, repair)
     with progress(as_json) as shown:
         display = SearchDisplay(shown, Steps(as_json), as_json)
-        watchers = Watchers(
+        watchers = SearchCallbacks(
             on_note=display.on_note,
             on_phase=display.on_phase,
             on_progress=display.on_progress,
@@ -117,7 +117,7 @@ def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
 
     Example: `edp search status studies/first`
     """
-    from edp.search.diary import look_at
+    from edp.workflows.search.study_log import look_at
 
     held = look_at(study)
     emit(as_json, held, lambda: _show_status(held))
@@ -150,7 +150,7 @@ def export(
 
     Example: `edp search export studies/first && optuna-dashboard studies/first/optuna.journal`
     """
-    from edp.search.export import export_study
+    from edp.workflows.search.export import export_study
 
     file, names = export_study(study, output)
     facts = {"journal": str(file), "studies": names}
@@ -175,14 +175,14 @@ class SearchDisplay:
         if not self.quiet:
             out.print(text)
 
-    def on_phase(self, name: str, diary: Diary) -> None:
+    def on_phase(self, name: str, diary: StudyLog) -> None:
         """A phase begins."""
-        from edp.search.phases import PHASES
+        from edp.workflows.search.phases import PHASES
 
         self.title = f"phase {list(PHASES).index(name) + 1} of {len(PHASES)}, {PHASES[name].title}"
         self.on_progress(diary)
 
-    def on_progress(self, diary: Diary) -> None:
+    def on_progress(self, diary: StudyLog) -> None:
         """Show how far it is."""
         counts, left = diary.counts(), diary.seconds_left()
         running = min(diary.workers, counts["asked"] - counts["done"])
@@ -192,7 +192,7 @@ class SearchDisplay:
 
     def on_decision(self, decision: Decision) -> None:
         """Print what was decided, and why."""
-        from edp.search.phases import PHASES
+        from edp.workflows.search.phases import PHASES
 
         if not self.quiet:
             out.print(PHASES[decision.phase].title, style="bold")
@@ -206,7 +206,7 @@ def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
     return write_study_page(read_study(study), study if output is None else output, pictures).page
 
 
-def _facts(found: Found) -> dict[str, Any]:
+def _facts(found: SearchResult) -> dict[str, Any]:
     return {
         "study": str(found.folder),
         "state": found.state,
@@ -219,7 +219,7 @@ def _facts(found: Found) -> dict[str, Any]:
     }
 
 
-def _show(found: Found, data: Path, page: Path) -> None:
+def _show(found: SearchResult, data: Path, page: Path) -> None:
     out.print(f"study: {found.folder}, {found.state}; {found.trained} trainings now")
     out.print(f"report: {page}")
     if found.teacher is None:
@@ -233,7 +233,7 @@ def _show(found: Found, data: Path, page: Path) -> None:
     )
 
 
-def _deploying(found: Found) -> str:
+def _deploying(found: SearchResult) -> str:
     """The command that goes on with the network that phase 6 chose."""
     facts = found.ground.decided["compression"].facts
     run = found.networks.get("chosen", found.networks.get("teacher"))

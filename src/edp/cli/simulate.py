@@ -11,9 +11,9 @@ import typer
 from edp.cli.console import JsonFlag, Steps, duration, emit, err, out, progress, table
 
 if TYPE_CHECKING:
-    from edp.data_sets import SimulationOrder
     from edp.recording import Recording
-    from edp.sim.limit import LimitSpec
+    from edp.sim.data_set import SimulationOrder
+    from edp.sim.predictability import LimitSpec
 
 
 def simulate(
@@ -63,7 +63,7 @@ def simulate(
     later velocity the least mean absolute error follows that any predictor could reach: one that knows the true state
     and all laws, but neither the operator's future choices nor, in the second column, anything but them.
     """
-    from edp.data_sets import SimulationOrder, suffix_of
+    from edp.sim.data_set import SimulationOrder, suffix_of
 
     given = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
     given["scatter"] = scatter
@@ -91,7 +91,7 @@ def simulate(
 
 def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = False) -> list[Path]:
     """Simulate with a progress display."""
-    from edp.data_sets import simulate_data_set
+    from edp.sim.data_set import simulate_data_set
 
     began, steps, made = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
     with progress(quiet) as shown:
@@ -112,7 +112,7 @@ def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = Fa
 
 def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: int, quiet: bool) -> dict[str, Any]:
     """Find the limit of predictability with a progress display."""
-    from edp.data_sets import find_data_set_limit
+    from edp.sim.data_set import find_data_set_limit
 
     began, steps = time.monotonic(), Steps(quiet)
     with progress(quiet) as shown:
@@ -161,7 +161,7 @@ def _range(text: str) -> tuple[float, float]:
 
 def _limit_spec(moments: int, branches: int, horizons: str) -> LimitSpec:
     from edp.errors import ConfigError
-    from edp.sim.limit import LimitSpec
+    from edp.sim.predictability import LimitSpec
 
     try:
         ahead = tuple(int(part) for part in horizons.split(",") if part.strip())

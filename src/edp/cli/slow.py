@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 from edp.cli.console import err
-from edp.limits import readable
 from edp.sandbox import sandbox
+from edp.storage.memory import readable
 
 _AGAIN = 2.0
 """Times as long until the next line: after 5, 10, 20, 40 s and so on."""

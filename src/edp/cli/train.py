@@ -13,8 +13,8 @@ from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from edp.sources import DataSource
-    from edp.training import Bundle, Event
+    from edp.logs.source import DataSource
+    from edp.training import Bundle, TrainingProgress
 
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
@@ -65,9 +65,9 @@ def run(
     quiet: bool = False,
 ) -> tuple[Bundle, float | None]:
     """Train with a progress display; returns the bundle and the best validation error."""
-    from edp.config import load_experiment
-    from edp.sources import DataSource
-    from edp.workflow import train as run_training
+    from edp.config.experiment import load_experiment
+    from edp.logs.source import DataSource
+    from edp.workflows.train_evaluate import train as run_training
 
     experiment = load_experiment(config, preset, changes)
     with progress(quiet) as shown:
@@ -78,10 +78,10 @@ def run(
 
 def source_of(data: Path, signal_map: Path | None, repair: list[str]) -> DataSource:
     """A data source from command-line options."""
-    from edp.config import build
+    from edp.config.experiment import build
     from edp.errors import ConfigError
     from edp.logs.repair import Repair
-    from edp.sources import DataSource
+    from edp.logs.source import DataSource
 
     table: dict[str, str] = {}
     for text in repair:
@@ -100,7 +100,7 @@ class TrainingDisplay:
         self.bar = shown.add_task("train", total=1.0, note="")
         self.best: float | None = None
 
-    def on_event(self, event: Event) -> None:
+    def on_event(self, event: TrainingProgress) -> None:
         """Show one event."""
         if event.row is not None and event.row["best"]:
             self.best = event.row["validation_mae"]
@@ -138,7 +138,7 @@ class SeriesDisplay:
         self.shown.update(self.bar, completed=min(1.0, done / self.count), note=name)
         self.steps.say(f"{self.command}: {self.each} {done + 1} of {count}, {name}", force=True)
 
-    def on_training(self, name: str, event: Event) -> None:
+    def on_training(self, name: str, event: TrainingProgress) -> None:
         """Show an event of the training that is at work."""
         note = f"{name}, {self.each} {self.done + 1} of {self.count}, epoch {event.epoch}/{event.epochs}"
         self.shown.update(self.bar, completed=min(1.0, (self.done + event.share) / self.count), note=note)

@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.bounds import MOST_TICKS, above, check_bounds, whole
 from edp.data.series import Series
 from edp.registry import Registry
+from edp.settings.bounds import MOST_TICKS, above, check_bounds, whole
 
 
 class AugmentationSpec(Protocol):
@@ -117,8 +117,8 @@ class TimeWarp:
         def read(values: NDArray[np.float32]) -> NDArray[np.float32]:
             return values[below] + share * (values[below + 1] - values[below])
 
-        taught = None if part.taught is None else read(part.taught)
-        return replace(part, inputs=read(part.inputs), targets=read(part.targets), taught=taught)
+        teacher_targets = None if part.teacher_targets is None else read(part.teacher_targets)
+        return replace(part, inputs=read(part.inputs), targets=read(part.targets), teacher_targets=teacher_targets)
 
 
 def input_deviation(series: list[Series]) -> NDArray[np.float32]:

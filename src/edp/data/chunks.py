@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.bounds import MOST_BATCH, MOST_TICKS, check_bounds, whole
 from edp.data.augment import AugmentationSpec, input_deviation
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
+from edp.settings.bounds import MOST_BATCH, MOST_TICKS, check_bounds, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,14 +84,14 @@ class Batch:
         future: ``(batch, time, horizon, target)``: the target channels at t + k, SI units.
         valid: ``(batch, time)``: where a loss is taken.
         reset: ``(batch,)``: streams that start anew with this chunk.
-        taught: ``(batch, time, column)``: what a lesson says of each tick; None without one.
+        teacher_targets: ``(batch, time, column)``: what a lesson says of each tick; None without one.
     """
 
     inputs: NDArray[np.float32]
     future: NDArray[np.float32]
     valid: NDArray[np.bool_]
     reset: NDArray[np.bool_]
-    taught: NDArray[np.float32] | None = None
+    teacher_targets: NDArray[np.float32] | None = None
 
     @property
     def targets_seen(self) -> int:
@@ -243,8 +243,10 @@ class ChunkSampler:
         if rng is None or self.deviation is None:
             return part, 0
         stop = min(stop + max(self.horizons), part.samples)
-        taught = None if part.taught is None else part.taught[start:stop]
-        part = replace(part, inputs=part.inputs[start:stop], targets=part.targets[start:stop], taught=taught)
+        teacher_targets = None if part.teacher_targets is None else part.teacher_targets[start:stop]
+        part = replace(
+            part, inputs=part.inputs[start:stop], targets=part.targets[start:stop], teacher_targets=teacher_targets
+        )
         for augmentation in self.augmentations:
             part = augmentation.apply(part, self.deviation, rng)
         return part, start
@@ -268,14 +270,14 @@ def cut(part: Series, ticks: range, horizons: tuple[int, ...], silent: int) -> P
     valid = (rows - at >= silent) & (rows + max(horizons) < part.samples)
     if inside:
         future = np.stack([part.targets[at + k : at + k + length] for k in horizons], axis=1)
-        return part.inputs[at : at + length], future, valid, _rows(part.taught, rows)
+        return part.inputs[at : at + length], future, valid, _rows(part.teacher_targets, rows)
     last = part.samples - 1
     future = np.stack([part.targets[np.minimum(rows + k, last)] for k in horizons], axis=1)
-    return part.inputs[np.minimum(rows, last)], future, valid, _rows(part.taught, np.minimum(rows, last))
+    return part.inputs[np.minimum(rows, last)], future, valid, _rows(part.teacher_targets, np.minimum(rows, last))
 
 
-def _rows(taught: NDArray[np.float32] | None, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
-    return None if taught is None else taught[rows]
+def _rows(teacher_targets: NDArray[np.float32] | None, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
+    return None if teacher_targets is None else teacher_targets[rows]
 
 
 def _ticks(lane: list[tuple[int, int, int]]) -> int:
@@ -284,6 +286,8 @@ def _ticks(lane: list[tuple[int, int, int]]) -> int:
 
 def stack(rows: list[Piece], resets: list[bool]) -> Batch:
     """Pieces side by side."""
-    *columns, taught = zip(*rows, strict=True)
+    *columns, teacher_targets = zip(*rows, strict=True)
     inputs, future, valid = (np.stack(parts) for parts in columns)
-    return Batch(inputs, future, valid, np.array(resets), None if taught[0] is None else np.stack(taught))
+    return Batch(
+        inputs, future, valid, np.array(resets), None if teacher_targets[0] is None else np.stack(teacher_targets)
+    )

@@ -81,7 +81,7 @@ class Occupancy:
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
+class JointHistogram:
     """Joint histogram of two signals in report units: `counts` has shape ``(x bin, y bin)``.
 
     Attributes:
@@ -123,10 +123,10 @@ class Coverage:
     constant: tuple[str, ...]
     spectrum: Spectrum | None
     occupancy: Occupancy | None
-    joints: tuple[Joint, ...]
+    joints: tuple[JointHistogram, ...]
     activity: tuple[events.Activity, ...]
     together: dict[str, float]
-    events: tuple[events.Event, ...]
+    events: tuple[events.RareEvent, ...]
     distance: Distance | None
     absent: tuple[str, ...] = field(default=())
 
@@ -262,7 +262,7 @@ def _counted(cells: Sequence[NDArray[np.intp]], shape: tuple[int, ...]) -> NDArr
     return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape)
 
 
-def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> list[Joint]:
+def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> list[JointHistogram]:
     """Histograms of command, pressures and velocity of each axis, and of velocities with each other."""
     made = [_joint(recordings, "command", a.command, (a.velocity,)) for a in axes if a.command and a.velocity]
     for side, title in enumerate(("head pressure", "rod pressure")):
@@ -277,7 +277,7 @@ def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[
     return made
 
 
-def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: tuple[str, ...]) -> Joint:
+def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: tuple[str, ...]) -> JointHistogram:
     (x_values, x_unit), (y_values, y_unit) = _values(recordings, x), _values(recordings, y)
     (x_low, x_high), (y_low, y_high) = _range(x_values), _range(y_values)
     inside = (x_values >= x_low) & (x_values <= x_high) & (y_values >= y_low) & (y_values <= y_high)
@@ -286,7 +286,7 @@ def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: t
     with np.errstate(invalid="ignore"):
         alike = x_values.std() > 0 and y_values.std() > 0
         correlation = float(np.corrcoef(x_values, y_values)[0, 1]) if alike else 0.0
-    return Joint(
+    return JointHistogram(
         group,
         " - ".join(x),
         " - ".join(y),

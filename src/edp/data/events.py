@@ -41,7 +41,7 @@ class Activity:
 
 
 @dataclass(frozen=True)
-class Event:
+class RareEvent:
     """A thing that happens now and then; `count` and `share` of the time are None where it is not recorded."""
 
     name: str
@@ -105,7 +105,7 @@ def together(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: f
     return shares
 
 
-def events_of(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, float]] | None) -> tuple[Event, ...]:
+def events_of(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, float]] | None) -> tuple[RareEvent, ...]:
     """Contacts with the ends of the strokes and recorded events.
 
     Args:
@@ -115,18 +115,18 @@ def events_of(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, f
     made = [_contacts(recordings, ends)]
     for name, channel in RECORDED.items():
         if channel not in recordings[0].channel_names:
-            made.append(Event(name, None, None, "not recorded"))
+            made.append(RareEvent(name, None, None, "not recorded"))
             continue
         flags = [r.column(channel) > 0.5 for r in recordings]
-        made.append(Event(name, sum(rises(on) for on in flags), float(np.concatenate(flags).mean())))
+        made.append(RareEvent(name, sum(rises(on) for on in flags), float(np.concatenate(flags).mean())))
     return tuple(made)
 
 
-def _contacts(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, float]] | None) -> Event:
+def _contacts(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, float]] | None) -> RareEvent:
     if not ends:
-        return Event("end contact", None, None, "needs the strokes and their full lengths")
+        return RareEvent("end contact", None, None, "needs the strokes and their full lengths")
     low, high = (np.array([span[side] for span in ends.values()]) for side in (0, 1))
     strokes = [r.select(list(ends)) for r in recordings]
     touched = [(x < low + CONTACT) | (x > high - CONTACT) for x in strokes]
     count = sum(rises(flags[:, i]) for flags in touched for i in range(flags.shape[1]))
-    return Event("end contact", count, float(np.concatenate(touched).any(axis=1).mean()))
+    return RareEvent("end contact", count, float(np.concatenate(touched).any(axis=1).mean()))

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from edp.bounds import MOST_NAMES, MOST_TICKS, check_bounds, check_count, whole
 from edp.errors import ConfigError, DataError
 from edp.recording import FloatArray, Recording
 from edp.registry import Registry
+from edp.settings.bounds import MOST_NAMES, MOST_TICKS, check_bounds, check_count, whole
 from edp.signals import TABLE_A1, VOCABULARY, Kind
 
 STARTING = "starting"

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from edp.bounds import SEED, check_bounds, shown
 from edp.data.splits import PART, SPLITS, ByRecording, Split, SplitSpec, Stretch
 from edp.errors import ConfigError, DataError, StorageError
 from edp.recording import Recording
+from edp.settings.bounds import SEED, check_bounds, shown
 
 SECOND_BOX = "second test sessions"
 """What ledgers call the second lock-box of a search."""

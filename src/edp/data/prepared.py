@@ -57,7 +57,7 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
         DataError: a channel is missing, a value is not finite, rates differ, or a part would be empty.
     """
     first = recordings[0]
-    parts = split.split(recordings, window + task.reach)
+    parts = split.split(recordings, window + task.max_horizon)
     state = hashlib.blake2b(digest_size=16)
     for recording in recordings:
         state.update(recording.digest.encode())

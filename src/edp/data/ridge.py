@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from edp.data.lags import DoubleArray, LagTask, origins, target_means
-from edp.data.ridge_moments import Moments, Standard, moments_of, standard_of
+from edp.data.ridge_moments import RidgeMoments, Standard, moments_of, standard_of
 from edp.data.series import Series
 from edp.errors import ConfigError
 from edp.recording import FloatArray
@@ -167,11 +167,11 @@ def _folds(parts: Sequence[Series], task: LagTask, folds: int) -> list[list[Seri
     return pieces
 
 
-def _sum(parts: Sequence[Moments]) -> Moments:
-    return Moments(*(sum(getattr(part, entry.name) for part in parts) for entry in fields(Moments)))
+def _sum(parts: Sequence[RidgeMoments]) -> RidgeMoments:
+    return RidgeMoments(*(sum(getattr(part, entry.name) for part in parts) for entry in fields(RidgeMoments)))
 
 
-def _solve(fitted: Moments, size: int, relative: float) -> DoubleArray:
+def _solve(fitted: RidgeMoments, size: int, relative: float) -> DoubleArray:
     """Weights ``(size, output)`` on the first `size` standardised features, with an unpenalised intercept."""
     x, y = fitted.x[:size] / fitted.rows, fitted.y / fitted.rows
     covariance = fitted.xx[:size, :size] / fitted.rows - np.outer(x, x)
@@ -187,7 +187,7 @@ def _solve(fitted: Moments, size: int, relative: float) -> DoubleArray:
     return np.asarray(linalg.cho_solve(factor, cross, check_finite=False))
 
 
-def _squared_error(held_out: Moments, fitted: Moments, weights: DoubleArray) -> DoubleArray:
+def _squared_error(held_out: RidgeMoments, fitted: RidgeMoments, weights: DoubleArray) -> DoubleArray:
     """Mean squared validation error per output, from the moments; zero when there is no validation row."""
     if held_out.rows == 0:
         return np.zeros(weights.shape[1])
@@ -201,7 +201,7 @@ def _squared_error(held_out: Moments, fitted: Moments, weights: DoubleArray) -> 
 
 def _physical(
     weights: DoubleArray,
-    fitted: Moments,
+    fitted: RidgeMoments,
     standard: Standard,
     task: LagTask,
     chosen: tuple[DoubleArray, NDArray[np.int64]],

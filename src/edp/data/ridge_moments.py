@@ -14,7 +14,7 @@ import numpy as np
 
 from edp.data.lags import DoubleArray, LagTask, anchors, future, origins
 from edp.data.series import Series
-from edp.limits import check_setting
+from edp.storage.memory import check_setting
 
 BLOCK_ROWS = 8_192
 
@@ -35,7 +35,7 @@ class Standard:
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class RidgeMoments:
     """Sums over all rows of standardised lagged inputs x and changes y (future minus anchor, SI units).
 
     Attributes:
@@ -66,7 +66,7 @@ def standard_of(train: Sequence[Series], means: DoubleArray) -> Standard:
     return Standard(np.asarray(centre), np.where(still, 1.0, scale), means)
 
 
-def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> Moments:
+def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> RidgeMoments:
     """Moments over all ticks with a full history and a known future (see `origins`), for ``task.history`` lags."""
     lags, inputs = task.history, len(standard.centre)
     check_setting(
@@ -98,7 +98,7 @@ def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> M
             edges += np.outer(head, head) - np.outer(tail, tail)
     gram = _gram(first[:, :inputs, :], edges)
     xy = first[:, inputs:, :].transpose(0, 2, 1).reshape(lags * inputs, task.outputs)
-    return Moments(rows, x.ravel(), y, gram, xy, yy)
+    return RidgeMoments(rows, x.ravel(), y, gram, xy, yy)
 
 
 def _blocks(train: Sequence[Series]) -> Iterator[DoubleArray]:

@@ -15,14 +15,14 @@ class Series:
         name: the recording it comes from (with the row range when it is a part of one).
         inputs: float32 ``(time, input)``; row t is what is known at tick t.
         targets: float32 ``(time, target)``; row t is the target channel *at* t (a horizon k asks for row t + k).
-        taught: float32 ``(time, column)``, what a lesson says of tick t; None without one.
+        teacher_targets: float32 ``(time, column)``, what a lesson says of tick t; None without one.
         machine: which machine it was recorded on; empty where that is not known.
     """
 
     name: str
     inputs: FloatArray
     targets: FloatArray
-    taught: FloatArray | None = None
+    teacher_targets: FloatArray | None = None
     machine: str = ""
 
     @property

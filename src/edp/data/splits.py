@@ -10,10 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
-from edp.bounds import MOST_NAMES, SEED, above, below, check_bounds, shown, span, whole
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
 from edp.registry import Registry
+from edp.settings.bounds import MOST_NAMES, SEED, above, below, check_bounds, shown, span, whole
 
 PARTS = ("train", "validation", "test")
 PART = below(0.0, 1.0)

@@ -9,11 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-from edp.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, whole
 from edp.data.features import Derived, FeatureSet, column, kind_of
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
+from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, whole
 from edp.signals import Kind
 
 
@@ -128,7 +128,7 @@ class Task:
         return self.features.derived + self.derived_targets
 
     @property
-    def reach(self) -> int:
+    def max_horizon(self) -> int:
         """The largest horizon in samples."""
         return max(self.horizons)
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
-from edp.models.predictor import Predictor
-from edp.models.running import stream_predictions
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 
 CONTEXTS_S = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
@@ -92,7 +92,7 @@ def context_errors(
     wanted = sorted(set(seconds))
     if not wanted or wanted[0] <= 0:
         raise ConfigError(f"contexts of {list(seconds)} s; at least one, all positive, must hold")
-    block, step, reach = round(BLOCK_S * rate), round(EVERY_S * rate), predictor.task.reach
+    block, step, reach = round(BLOCK_S * rate), round(EVERY_S * rate), predictor.task.max_horizon
     longest = max((part.samples for part in series), default=0) - block - reach
     kept = [s for s in wanted if round(s * rate) <= longest]
     if not kept:
@@ -125,7 +125,7 @@ def _block_errors(
             part,
             inputs=part.inputs[at - context : at + size],
             targets=part.targets[at - context : at + size],
-            taught=None,
+            teacher_targets=None,
         )
         for part, at in blocks
     ]

@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from edp.bounds import check_bounds, whole
 from edp.errors import ConfigError, closest
 from edp.export.c.sizes import Sizes
+from edp.networks.streaming import Cost
+from edp.settings.bounds import check_bounds, whole
 from edp.storage import read_toml
-from edp.streaming import Cost
 
 STACK_BYTES = 1_024  # an allowance: a tick was seen to take 340 (``benchmarks/controller_memory.py``)
 # Published boards against zero-wait memory (flash wait states): the best, and the slowest, which decides.
@@ -48,7 +48,7 @@ FORMATS = {
 
 
 @dataclass(frozen=True)
-class Core:
+class ProcessorCore:
     """A processor core, by its cycles against those of a Cortex-M4F.
 
     Attributes:
@@ -65,9 +65,9 @@ class Core:
 # The M33 has the instructions of the M4F. The M7 can issue two at a time: half the cycles at best; as a rule the ratio
 # of the CoreMark figures 3.40 and 5.01 per MHz. In the high estimate no core is faster than an M4F.
 CORES = {
-    "cortex_m4f": Core("Cortex-M4F", 1.0, 1.0),
-    "cortex_m7": Core("Cortex-M7", 0.5, 0.68),
-    "cortex_m33": Core("Cortex-M33", 1.0, 1.0),
+    "cortex_m4f": ProcessorCore("Cortex-M4F", 1.0, 1.0),
+    "cortex_m7": ProcessorCore("Cortex-M7", 0.5, 0.68),
+    "cortex_m33": ProcessorCore("Cortex-M33", 1.0, 1.0),
 }
 
 

@@ -11,11 +11,11 @@ import torch
 from edp.errors import ConfigError, ExportError
 from edp.evaluation.controller import CORES, Budget, Estimate, estimate
 from edp.export.c.sizes import Sizes, sizes_of
-from edp.graph import Graph
-from edp.integer.quantise import outline
-from edp.models.predictor import Predictor
-from edp.onboard import Adaptation
-from edp.streaming import Cost, state_numbers
+from edp.ir import Graph
+from edp.ir.rls import Adaptation
+from edp.ir.w8a16.quantise import outline
+from edp.networks.predictor import Predictor
+from edp.networks.streaming import Cost, state_numbers
 
 GRAPHS: dict[str, Callable[[Predictor], Graph]] = {
     "float32": lambda predictor: predictor.graph(),

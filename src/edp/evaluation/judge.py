@@ -10,17 +10,17 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, whole
 from edp.data.prepared import Prepared
 from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
-from edp.limits import check_setting
-from edp.metrics import Scores, interval_scores, mean_scores, score, spread
-from edp.models.predictor import Predictor
-from edp.models.running import stream_intervals, stream_predictions
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_intervals, stream_predictions
+from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, whole
 from edp.signals import KINDS
+from edp.stats.metrics import Scores, interval_scores, mean_scores, score, spread
+from edp.storage.memory import check_setting
 
 Predictions = list[NDArray[np.float32]]
 B = TypeVar("B", bound=Baseline)
@@ -150,7 +150,7 @@ def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     """The baselines' task: present values only where an input measures them, or a feature derived from one."""
     inputs = (*_lasting(data), *_derived_targets(data))
     present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
-    longest = min(series.samples for series in [*data.train, *data.test]) - data.task.reach - 1
+    longest = min(series.samples for series in [*data.train, *data.test]) - data.task.max_horizon - 1
     history = max(1, min(spec.history, longest // 2))
     return BaselineTask(horizons=data.task.horizons, present=present, history=history, seed=spec.seed)
 
@@ -190,7 +190,7 @@ class _Ruler:
         facts = [KINDS[kind] for kind in data.target_kinds]
         self.units = [fact.report_unit for fact in facts]
         self.factors = np.array([fact.report_factor for fact in facts])
-        reach = self.task.reach
+        reach = self.task.max_horizon
         self.truth = []
         for series in data.test:
             ticks = max(0, series.samples - reach)

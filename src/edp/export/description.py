@@ -15,10 +15,10 @@ from edp import __version__
 from edp.errors import ExportError
 from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
 from edp.export.hashes import model_hash, scale_hash
-from edp.graph import Graph
-from edp.models.integer import IntegerPredictor
-from edp.models.predictor import Predictor
-from edp.models.predictor import describe as describe_network
+from edp.ir import Graph
+from edp.networks.integer import IntegerPredictor
+from edp.networks.predictor import Predictor
+from edp.networks.predictor import describe as describe_network
 from edp.signals import KINDS
 from edp.training.bundle import Bundle
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edp.models.input_range import usual_range
-from edp.models.integer import IntegerPredictor
-from edp.models.predictor import Predictor
+from edp.networks.input_range import usual_range
+from edp.networks.integer import IntegerPredictor
+from edp.networks.predictor import Predictor
 
 GOLDEN_TICKS = 200
 SHARE = 1e-5

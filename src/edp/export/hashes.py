@@ -8,8 +8,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from edp.graph import Graph
-from edp.models.predictor import Predictor
+from edp.ir import Graph
+from edp.networks.predictor import Predictor
 
 
 def model_hash(graph: Graph) -> str:

@@ -1,13 +1,14 @@
 """Recordings in and out: readers and writers, units, time stamps, repairs and quality reports."""
 
-from edp.logs import csv, mat, mdf, parquet, rosbag
-from edp.logs.between import DataQuality, compare
-from edp.logs.checks import Finding
 from edp.logs.detect import format_for, known_suffixes, open_log
-from edp.logs.inspection import inspect_log, look_into
-from edp.logs.mat_layouts import LAYOUTS
-from edp.logs.quality import ChannelFacts, ClockFacts, QualityReport, inspect
-from edp.logs.raw import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
+from edp.logs.formats import csv, mat, mdf, parquet, rosbag
+from edp.logs.formats.base import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
+from edp.logs.formats.mat_layouts import LAYOUTS
+from edp.logs.quality.checks import Finding
+from edp.logs.quality.cross_recording import DataQuality, compare
+from edp.logs.quality.inspection import inspect_log, look_into
+from edp.logs.quality.quality import ChannelFacts, ClockFacts, QualityReport, inspect
+from edp.logs.quality.repeats import Repeat, Sketch, find_repeats, sketch
 from edp.logs.read import (
     common_channels,
     find_recordings,
@@ -18,7 +19,6 @@ from edp.logs.read import (
     unique_names,
 )
 from edp.logs.repair import Repair, split_at_gaps
-from edp.logs.repeats import Repeat, Sketch, find_repeats, sketch
 from edp.logs.write import truth_path, write_recording
 
 __all__ = [

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError
-from edp.limits import check_memory
-from edp.logs.names import name_of_file
-from edp.logs.raw import RawLog, RawSignal, Table
+from edp.logs.formats.base import ColumnTable, RawLog, RawSignal
+from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Mask, Repair, mend_gaps, mend_stamps, mend_values
-from edp.logs.resolve import Wanted
+from edp.logs.resolve import ChannelSource
 from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
 from edp.recording import FloatArray, Recording
 from edp.signals import SignalMap
+from edp.storage.memory import check_memory
 
 _CACHED_ROWS = 4096
 _TICK_BYTES = 25
@@ -51,7 +51,7 @@ class Assembly:
     """
 
     raw: RawLog
-    wanted: Sequence[Wanted]
+    wanted: Sequence[ChannelSource]
     repair: Repair
     lines: dict[int, _Timeline]
     rate_hz: float
@@ -124,7 +124,7 @@ class Assembly:
             "read some rows, fewer channels, or in parts (edp.logs.read_parts)",
         )
         values = np.empty((last - first, len(self.wanted)), dtype=np.float32)
-        tables: dict[tuple[int, int], tuple[Table, list[int]]] = {}
+        tables: dict[tuple[int, int], tuple[ColumnTable, list[int]]] = {}
         for place, entry in enumerate(self.wanted):
             if entry.signal is None:
                 values[:, place] = entry.constant
@@ -142,7 +142,7 @@ class Assembly:
             self._fill(values, table, places, first)
         return values
 
-    def _fill(self, values: FloatArray, table: Table, places: list[int], first: int) -> None:
+    def _fill(self, values: FloatArray, table: ColumnTable, places: list[int], first: int) -> None:
         """Columns of one table and one clock, piece by piece."""
         chosen = [(place, entry, entry.signal) for place in places if (entry := self.wanted[place]).signal is not None]
         keys = [signal.key for _, _, signal in chosen]
@@ -177,7 +177,7 @@ def _interleave(values: FloatArray, places: list[int], columns: list[FloatArray]
 
 def prepare(
     raw: RawLog,
-    wanted: Sequence[Wanted],
+    wanted: Sequence[ChannelSource],
     signal_map: SignalMap,
     repair: Repair,
     rows: tuple[int, int | None] | None = None,
@@ -205,7 +205,7 @@ def prepare(
 
 def assemble(
     raw: RawLog,
-    wanted: Sequence[Wanted],
+    wanted: Sequence[ChannelSource],
     signal_map: SignalMap,
     repair: Repair,
     naming: tuple[str | None, tuple[int, int | None] | None] = (None, None),
@@ -246,7 +246,7 @@ def _clock_key(signal: RawSignal) -> int:
 
 
 def _timelines(
-    raw: RawLog, wanted: Sequence[Wanted], signal_map: SignalMap, repair: Repair
+    raw: RawLog, wanted: Sequence[ChannelSource], signal_map: SignalMap, repair: Repair
 ) -> tuple[dict[int, _Timeline], Grid, list[dict[str, Any]]]:
     if signal_map.rate_hz is not None and not 0 < signal_map.rate_hz < np.inf:
         raise DataError(f"signal map: rate_hz is {signal_map.rate_hz}; it must be a positive number")

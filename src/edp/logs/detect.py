@@ -7,7 +7,7 @@ import stat
 from pathlib import Path
 
 from edp.errors import DataError, closest
-from edp.logs.raw import FORMATS, LogFormat, RawLog
+from edp.logs.formats.base import FORMATS, LogFormat, RawLog
 from edp.logs.sandboxed import read_apart
 from edp.signals import SignalMap
 

@@ -11,10 +11,10 @@ import numpy as np
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
 from edp.logs.detect import BAG_MARK, format_for, known_suffixes, open_log
-from edp.logs.names import name_of_file
-from edp.logs.raw import TRUTH, RawLog, is_truth
+from edp.logs.formats.base import TRUTH, RawLog, is_truth
+from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
-from edp.logs.resolve import Wanted, resolve
+from edp.logs.resolve import ChannelSource, resolve
 from edp.logs.write import truth_path
 from edp.recording import Recording
 from edp.signals import SignalMap
@@ -80,7 +80,7 @@ def read_parts(
     yield from parts(prepare(raw, wanted, signal_map, repair), samples, raw.name or name_of_file(raw.path))
 
 
-def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[Wanted]]:
+def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[ChannelSource]]:
     """The file and the wanted channels, all of which it has."""
     raw = open_log(path, signal_map)
     wanted, problems = resolve(raw, signal_map)

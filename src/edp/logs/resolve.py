@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, EdpError, closest
-from edp.logs.raw import RawLog, RawSignal
+from edp.logs.formats.base import RawLog, RawSignal
 from edp.logs.units import normalise_unit, unit_for
 from edp.signals import UNITS, VOCABULARY, Channel, ChannelMap, Kind, SignalMap, Unit
 
@@ -17,7 +17,7 @@ _LOOKED_ROWS = 1000
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ChannelSource:
     """One channel and where its values come from: a column with its conversion, or a constant in SI."""
 
     channel: Channel
@@ -42,9 +42,9 @@ class Wanted:
             return values.astype(np.float32)
 
 
-def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[Wanted], list[EdpError]]:
+def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[ChannelSource], list[EdpError]]:
     """The wanted channels in order, and what is wrong with the map or the file for those that cannot be had."""
-    wanted: list[Wanted] = []
+    wanted: list[ChannelSource] = []
     problems: list[EdpError] = []
     if not signal_map.channels and not signal_map.others:
         entries = _vocabulary_entries(raw)
@@ -109,15 +109,15 @@ def _nothing_known(raw: RawLog) -> DataError:
     return DataError(f"'{raw.path}' has the columns {shown}: {text}; rename columns or give a signal map")
 
 
-def _one(raw: RawLog, entry: ChannelMap) -> Wanted:
+def _one(raw: RawLog, entry: ChannelMap) -> ChannelSource:
     channel = entry.channel()
     where = f"'{raw.path}', column '{entry.column}'"
     present = entry.column in raw
     if not present and entry.column in raw.scalars:
         unit = unit_for(entry.unit, channel.kind, where)
         value = raw.scalars[entry.column] * entry.scale * unit.factor + unit.offset
-        return Wanted(channel, None, unit, constant=value)
+        return ChannelSource(channel, None, unit, constant=value)
     if not present and entry.constant is not None:
-        return Wanted(channel, None, Unit((channel.kind,), 1.0), constant=entry.constant)
+        return ChannelSource(channel, None, Unit((channel.kind,), 1.0), constant=entry.constant)
     signal = raw.signal(entry.column)
-    return Wanted(channel, signal, unit_for(entry.unit or signal.unit, channel.kind, where), entry.scale)
+    return ChannelSource(channel, signal, unit_for(entry.unit or signal.unit, channel.kind, where), entry.scale)

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, DataError, EdpError, StorageError, brief
-from edp.limits import check_memory
-from edp.logs.raw import FORMATS, Column, LogFormat, RawLog, RawSignal, load_column
-from edp.sandbox import Channel, open_channel
+from edp.logs.formats.base import FORMATS, Column, LogFormat, RawLog, RawSignal, load_column
+from edp.sandbox import WorkerConnection, open_channel
 from edp.sandbox.protocol import Header
 from edp.sandbox.sandbox import SMALL_BYTES
 from edp.signals import Kind, SignalMap
+from edp.storage.memory import check_memory
 
 WORKER = "edp.logs.sandbox_worker"
 AHEAD = 2
@@ -125,7 +125,7 @@ class _Stream:
 class _Log:
     """The process that has the log. Requests of several threads and streams take turns; answers come in their order."""
 
-    def __init__(self, path: Path, channel: Channel) -> None:
+    def __init__(self, path: Path, channel: WorkerConnection) -> None:
         self.path = path
         self.channel = channel
         self.lock = threading.RLock()
@@ -228,7 +228,7 @@ class _Table:
         self.number = number
 
     def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
-        """See `edp.logs.raw.Table`."""
+        """See `edp.logs.formats.base.ColumnTable`."""
         stream = self.log.open(self.number, names, start, stop)
         try:
             while (columns := self.log.next(stream)) is not None:

@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, EdpError, brief
-from edp.limits import announce
-from edp.logs.raw import FORMATS, Column, LogFormat, RawLog, RawSignal, Table
+from edp.logs.formats.base import FORMATS, Column, ColumnTable, LogFormat, RawLog, RawSignal
 from edp.sandbox import lock_down
 from edp.sandbox.allowance import Allowance, is_exhausted
 from edp.sandbox.protocol import Header, is_plain, reader, receive, send, writer
 from edp.signals import ChannelMap, Kind, SignalMap
+from edp.storage.memory import announce
 
 MESSAGE_BYTES = 1 << 24
 """Of the numbers of one message; larger pieces are sent in parts."""
@@ -133,7 +133,7 @@ class _Served:
 
     raw: RawLog
     times: list[Column | Callable[[], Column]] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
+    tables: list[ColumnTable] = field(default_factory=list)
     streams: dict[int, _Stream] = field(default_factory=dict)
 
     def facts(self) -> Header:
@@ -239,7 +239,7 @@ def check_plain(path: Path, arrays: Sequence[NDArray[Any]]) -> None:
         raise DataError(f"'{path}' holds a column of no plain numbers; map another")
 
 
-def _parts(table: Table, keys: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+def _parts(table: ColumnTable, keys: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
     """Pieces, cut where a message would be too long."""
     for columns in table.pieces(keys, start, stop):
         row = sum(column.itemsize for column in columns)

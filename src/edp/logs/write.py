@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.detect import format_for
-from edp.logs.raw import TRUTH, LogFormat, WriteOptions, parted
+from edp.logs.formats.base import TRUTH, LogFormat, WriteOptions, parted
 from edp.recording import Recording
 from edp.storage import replacing
 

@@ -1,19 +1,19 @@
 """The report of a run: `facts` reads, `figures` computes, `plots` draws, `page` writes one offline HTML file."""
 
-from edp.report.compression_facts import Compression, read_compression
-from edp.report.compression_page import write_compression_page
-from edp.report.coverage_page import build_coverage_page
-from edp.report.facts import Facts, comparison_rows, headline, read_facts
-from edp.report.page import build_report
-from edp.report.pictures import write_pictures
-from edp.report.screening_page import build_screening_page
-from edp.report.study_facts import read_study
-from edp.report.study_page import StudyReport, write_study_page
-from edp.report.transfer_facts import Transfer, read_transfer
-from edp.report.transfer_page import write_transfer_page
+from edp.report.compression.facts import CompressionFacts, read_compression
+from edp.report.compression.page import write_compression_page
+from edp.report.coverage.page import build_coverage_page
+from edp.report.run.facts import Facts, comparison_rows, headline, read_facts
+from edp.report.run.page import build_report
+from edp.report.screening.page import build_screening_page
+from edp.report.screening.pictures import write_pictures
+from edp.report.search.facts import read_study
+from edp.report.search.page import StudyReport, write_study_page
+from edp.report.transfer.facts import Transfer, read_transfer
+from edp.report.transfer.page import write_transfer_page
 
 __all__ = [
-    "Compression",
+    "CompressionFacts",
     "Facts",
     "StudyReport",
     "Transfer",

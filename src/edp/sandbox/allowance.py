@@ -1,7 +1,8 @@
 """How much memory and processor time the reader of one log may take, as functions of the file and its headers.
 
 Memory beyond what the process has when it begins: `START_BYTES` + `COPIES` x the file's size + the largest need that
-its checked headers announced (`edp.limits.announce`), and never more than the machine has free. Processor time of one
+its checked headers announced (`edp.storage.memory.announce`), and never more than the machine has free. Processor time
+of one
 request: `START_S` + what the size, the announced work and the wanted values take at speeds well below those of a slow
 computer.
 """
@@ -15,9 +16,9 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-from edp import limits
 from edp.errors import DataError
-from edp.limits import gigabytes
+from edp.storage import memory as limits
+from edp.storage.memory import gigabytes
 
 try:
     import resource
@@ -60,7 +61,7 @@ class Allowance:
         limits.listen(self.announce)
 
     def announce(self, memory: int, work: int, parts: int) -> None:
-        """What checked headers promise; see `edp.limits.announce`."""
+        """What checked headers promise; see `edp.storage.memory.announce`."""
         self.work_s += work / WORK_PER_S + parts * PART_S
         if memory > self.memory:
             self.memory = memory

@@ -35,7 +35,7 @@ def restrict(readable: Iterable[Path]) -> None:
 def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
     """What is called with every event; raises PermissionError for those refused."""
     places = tuple(os.path.realpath(path) for path in readable)
-    below = tuple(os.path.join(place, "") for place in places)
+    below = tuple(os.path.join(folder, "") for folder in places)
 
     def judge(event: str, arguments: tuple[Any, ...]) -> None:
         if event in _OPENERS:

@@ -43,15 +43,15 @@ def note_libraries() -> None:
     """
     places = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
     places |= {os.path.join(prefix, "lib") for prefix in (sys.prefix, sys.base_prefix)}
-    places |= {place for place in sys.path if Path(place).name in _LIBRARIES or place.endswith(".zip")}
+    places |= {entry for entry in sys.path if Path(entry).name in _LIBRARIES or entry.endswith(".zip")}
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if "." not in name and isinstance(file, str):
             places.add(os.path.dirname(file) if os.path.basename(file).startswith("__init__.") else file)
     _folders.clear()
-    for place in sorted(os.path.realpath(place) for place in places if place):
-        if os.path.exists(place) and not any(Path(place).is_relative_to(folder) for folder in _folders):
-            _folders.append(Path(place))
+    for entry in sorted(os.path.realpath(entry) for entry in places if entry):
+        if os.path.exists(entry) and not any(Path(entry).is_relative_to(folder) for folder in _folders):
+            _folders.append(Path(entry))
 
 
 def lock_down(readable: Iterable[Path]) -> list[str]:

@@ -42,7 +42,7 @@ _TRIES = 2
 Watcher = Callable[[Path, float, int], None]
 _lock = threading.RLock()
 _workers: dict[str, _Worker] = {}
-_channels: weakref.WeakSet[Channel] = weakref.WeakSet()
+_channels: weakref.WeakSet[WorkerConnection] = weakref.WeakSet()
 _watcher: Watcher | None = None
 
 
@@ -63,7 +63,7 @@ def end() -> None:
             _drop(name)
 
 
-def open_channel(worker: str, modules: Sequence[str], path: Path, libraries: Sequence[str] = ()) -> Channel:
+def open_channel(worker: str, modules: Sequence[str], path: Path, libraries: Sequence[str] = ()) -> WorkerConnection:
     """Start a process that serves one log.
 
     Args:
@@ -80,17 +80,17 @@ def open_channel(worker: str, modules: Sequence[str], path: Path, libraries: Seq
     order = {"modules": list(modules), "libraries": list(libraries)}
     for attempt in range(_TRIES):
         with _lock:
-            kept = _workers.get(worker)
-            if kept is None or kept.process.poll() is not None:
+            running_worker = _workers.get(worker)
+            if running_worker is None or running_worker.process.poll() is not None:
                 _drop(worker)
-                kept = _workers[worker] = _Worker(worker)
+                running_worker = _workers[worker] = _Worker(worker)
             try:
-                return kept.open(order, path)
+                return running_worker.open(order, path)
             except OSError as error:
-                code, said = kept.last_words()
+                code, last_words = running_worker.last_words()
                 _drop(worker)
                 if attempt == _TRIES - 1:
-                    raise DataError(_failed(path, said or str(error) or f"exit code {code}")) from error
+                    raise DataError(_failed(path, last_words or str(error) or f"exit code {code}")) from error
     raise RuntimeError("unreachable")
 
 
@@ -119,7 +119,7 @@ def _forget() -> None:
 
 
 def _environment() -> dict[str, str]:
-    places = os.pathsep.join(place for place in sys.path if place)
+    places = os.pathsep.join(entry for entry in sys.path if entry)
     return os.environ | dict.fromkeys(_THREADS, "1") | _SMALL_POOL | {"PYTHONPATH": places}
 
 
@@ -142,7 +142,7 @@ class _Worker:
         with theirs:
             self.process = _start(module, (), stdin=theirs, stdout=subprocess.DEVNULL, stderr=self.output)
 
-    def open(self, order: Header, path: Path) -> Channel:
+    def open(self, order: Header, path: Path) -> WorkerConnection:
         """Have a process forked.
 
         Raises:
@@ -165,7 +165,7 @@ class _Worker:
             import fcntl
 
             fcntl.fcntl(answers, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        return Channel(requests, answers, path, lambda: self.ended(number))
+        return WorkerConnection(requests, answers, path, lambda: self.ended(number))
 
     def ended(self, number: int) -> tuple[int | None, str]:
         """How a forked process ended: its exit code, negative for a signal, and what the worker said."""
@@ -206,7 +206,7 @@ class _Worker:
         self.output.close()
 
 
-def _alone(worker: str, path: Path) -> Channel:
+def _alone(worker: str, path: Path) -> WorkerConnection:
     """Where processes cannot be forked: a worker for this one log."""
     output = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
     process = _start(worker, ("--alone",), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=output)
@@ -222,7 +222,7 @@ def _alone(worker: str, path: Path) -> Channel:
         output.seek(0)
         return process.returncode, output.read().decode(errors="replace").strip()
 
-    channel = Channel(requests, answers, path, ended)
+    channel = WorkerConnection(requests, answers, path, ended)
     weakref.finalize(channel, _reap, process, output)
     return channel
 
@@ -233,7 +233,7 @@ def _reap(process: subprocess.Popen[bytes], output: Any) -> None:
     output.close()
 
 
-class Channel:
+class WorkerConnection:
     """The pipes to the process that serves one log; closed when it is no longer referred to."""
 
     def __init__(self, requests: int, answers: int, path: Path, ended: Callable[[], tuple[int | None, str]]) -> None:
@@ -319,16 +319,16 @@ class Channel:
 
     def lost(self) -> DataError:
         """What to say about a process that ended."""
-        code, said = self._ended()
-        error = DataError(_died(self.path, code, said))
+        code, last_words = self._ended()
+        error = DataError(_died(self.path, code, last_words))
         self.close("reading it failed before; open it again")
         return error
 
 
-def _died(path: Path, code: int | None, said: str) -> str:
+def _died(path: Path, code: int | None, last_words: str) -> str:
     advice = "it may be damaged: copy or export it again"
     if code is None or code >= 0:
-        return _failed(path, said or f"exit code {code}")
+        return _failed(path, last_words or f"exit code {code}")
     number = -code
     if number in [int(getattr(signal, name, -1)) for name in ("SIGPROF", "SIGALRM", "SIGXCPU")]:
         return (

@@ -21,8 +21,8 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from edp.processes import die_with_parent
 from edp.sandbox.lockdown import note_libraries
+from edp.sandbox.processes import die_with_parent
 
 IDLE_S = 60.0
 """After so long without a log the process ends; the next log starts another."""
@@ -47,8 +47,8 @@ class _Forks:
         """Take note of ended forks; returns their pipes."""
         closed = []
         for number, pid in list(self.pids.items()):
-            found, status = os.waitpid(pid, os.WNOHANG)
-            if found:
+            ended_pid, status = os.waitpid(pid, os.WNOHANG)
+            if ended_pid:
                 closed.append(self.ended(number, os.waitstatus_to_exitcode(status)))
         return closed
 
@@ -63,14 +63,14 @@ class _Forks:
         """How a fork ended whose pipes are closed; None for one that never ran."""
         if number in self.pids:
             pid, until = self.pids[number], time.monotonic() + END_S
-            found, status = os.waitpid(pid, os.WNOHANG)
-            while not found:
+            ended_pid, status = os.waitpid(pid, os.WNOHANG)
+            while not ended_pid:
                 if time.monotonic() > until:
                     os.kill(pid, signal.SIGKILL)
-                    found, status = os.waitpid(pid, 0)
+                    ended_pid, status = os.waitpid(pid, 0)
                 else:
                     time.sleep(0.005)
-                    found, status = os.waitpid(pid, os.WNOHANG)
+                    ended_pid, status = os.waitpid(pid, os.WNOHANG)
             os.close(self.ended(number, os.waitstatus_to_exitcode(status)))
         return self.codes.pop(number, None)
 

@@ -16,12 +16,12 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from edp.errors import ConfigError
-from edp.processes import begin_helper
 from edp.recording import Recording
-from edp.sim import soil
+from edp.sandbox.processes import begin_helper
 from edp.sim.excitation import EXCITATIONS
-from edp.sim.family import MASSES_T, WIDEST, member_mass, member_name
-from edp.sim.machine_files import load_machine
+from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
+from edp.sim.machine.machine_files import load_machine
+from edp.sim.physics import soil
 from edp.sim.scenario import START_STROKES, Scenario, SimulationError
 from edp.sim.simulate import simulate
 

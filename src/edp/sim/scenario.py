@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from edp.errors import ConfigError, EdpError, closest
-from edp.sim import soil
 from edp.sim.excitation import EXCITATIONS
-from edp.sim.machine import Machine, Sensors
-from edp.sim.machine_checks import check_machine
-from edp.sim.machine_files import load_machine
-from edp.sim.plant import steps_per_sample
+from edp.sim.machine.machine import Machine, Sensors
+from edp.sim.machine.machine_checks import check_machine
+from edp.sim.machine.machine_files import load_machine
+from edp.sim.physics import soil
+from edp.sim.physics.plant import steps_per_sample
 
 START_STROKES = (0.3, 0.7)
 LARGEST_STEP_S = 2.5e-3

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import ConfigError, closest
-from edp.sim.family import WIDEST
+from edp.sim.machine.family import WIDEST
 from edp.sim.plan import MOST_MACHINES, MOST_MINUTES, MOST_RECORDINGS, MOST_SEED, DataSetSpec
 from edp.storage import read_toml
 

@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
-from edp.sim import layout as at
-from edp.sim import pose, sensors, soil
 from edp.sim.excitation import EXCITATIONS
-from edp.sim.jit import rehearsal
-from edp.sim.machine import Machine
-from edp.sim.machine_files import known_mass
-from edp.sim.parameters import pack
-from edp.sim.plant import Plant
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_files import known_mass
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import pose, soil
+from edp.sim.physics.jit import rehearsal
+from edp.sim.physics.plant import Plant
+from edp.sim.physics.snapshot import Snapshot, capture, restored
 from edp.sim.scenario import Scenario, SimulationError, plain
-from edp.sim.snapshot import Snapshot, capture, restored
+from edp.sim.sensors import sensors
 from edp.sim.view import view_of
 
 Array = NDArray[np.float64]

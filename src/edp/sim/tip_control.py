@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim import layout as at
-from edp.sim import pose
-from edp.sim.jit import compiled
+from edp.sim.machine import layout as at
+from edp.sim.physics import pose
+from edp.sim.physics.jit import compiled
 
 Array = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim import pose
-from edp.sim.plant import Plant
+from edp.sim.physics import pose
+from edp.sim.physics.plant import Plant
 
 Array = NDArray[np.float64]
 
 
 class View(NamedTuple):
-    """The plant at one instant; frame and attitude as in `edp.sim.pose`.
+    """The plant at one instant; frame and attitude as in `edp.sim.physics.pose`.
 
     Attributes:
         strokes: shares of each cylinder's stroke, shape (3,).

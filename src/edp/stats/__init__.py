@@ -5,7 +5,7 @@ Nothing here trains, stores or draws without a seed.
 """
 
 from edp.stats.clustered import MeanTest, clustered_t
-from edp.stats.confirm import Evidence, Rule, confirm
+from edp.stats.confirm import ModuleEvidence, Rule, confirm
 from edp.stats.effects import (
     Concordance,
     EffectSize,
@@ -15,14 +15,14 @@ from edp.stats.effects import (
     kendalls_w,
     rank_stability,
 )
-from edp.stats.efficiency import Candidate, most_efficient
+from edp.stats.efficiency import SizeScore, most_efficient
 from edp.stats.factorial import Factorial, two_level_design
 from edp.stats.folds import repeated_folds, repeated_splits
 from edp.stats.importance import MainEffect, main_effects
 from edp.stats.mixed import MixedModel, mixed_model
 from edp.stats.multiple import adjust_registered, benjamini_hochberg, holm
 from edp.stats.paired import fill_worst, paired, run_means
-from edp.stats.power import Plan, plan_runs, power, simulate_differences, simulated_power
+from edp.stats.power import ConfirmationPlan, plan_runs, power, simulate_differences, simulated_power
 from edp.stats.race import LOOKS, Look, RaceRates, RaceResult, race, race_rates
 from edp.stats.resampled import paired_t, printed_p, resampled_t
 from edp.stats.thesis_confirm import ThesisEvidence, thesis_confirm
@@ -38,20 +38,20 @@ from edp.stats.variance import (
 
 __all__ = [
     "LOOKS",
-    "Candidate",
     "Concordance",
+    "ConfirmationPlan",
     "EffectSize",
-    "Evidence",
     "Factorial",
     "Look",
     "MainEffect",
     "MeanTest",
     "MixedModel",
+    "ModuleEvidence",
     "PairedVariance",
-    "Plan",
     "RaceRates",
     "RaceResult",
     "Rule",
+    "SizeScore",
     "SplitVariance",
     "ThesisEvidence",
     "ThesisPlan",

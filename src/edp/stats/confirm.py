@@ -44,7 +44,7 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ModuleEvidence:
     """What a confirmation found on one module. Negative differences are improvements.
 
     Attributes:
@@ -87,7 +87,7 @@ def confirm(
     tested: ArrayLike | None = None,
     rule: Rule | None = None,
     worst: ArrayLike | None = None,
-) -> tuple[Evidence, ...]:
+) -> tuple[ModuleEvidence, ...]:
     """Decide on every registered module from scores on one primary metric.
 
     Args:
@@ -115,18 +115,18 @@ def confirm(
     differences = filled[1:] - filled[0]
     raced = race(differences, mask, rule.looks)
     adjusted = adjust_registered({name: float(p) for name, p in zip(modules, raced.p)}, registered)
-    found = {}
-    for place, name in enumerate(modules):
-        runs, dropped = int(raced.runs[place]), int(raced.dropped_after[place])
+    evidence = {}
+    for index, name in enumerate(modules):
+        runs, dropped = int(raced.runs[index]), int(raced.dropped_after[index])
         part = mask[:runs]
         seen = part.any(axis=0)
-        cells = (filled[1 + place, :runs][:, seen], filled[0, :runs][:, seen], part[:, seen])
-        found[name] = _evidence(name, cells, dropped, adjusted[name], rule)
+        cells = (filled[1 + index, :runs][:, seen], filled[0, :runs][:, seen], part[:, seen])
+        evidence[name] = _evidence(name, cells, dropped, adjusted[name], rule)
     absent = "stopped by the screening, counted with p = 1"
-    return tuple(found.get(name, Evidence(name, False, absent)) for name in registered)
+    return tuple(evidence.get(name, ModuleEvidence(name, False, absent)) for name in registered)
 
 
-def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjusted: float, rule: Rule) -> Evidence:
+def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjusted: float, rule: Rule) -> ModuleEvidence:
     """All figures on one module from its scores, the baseline's and the cells that exist."""
     module, baseline, mask = cells
     difference = module - baseline
@@ -149,7 +149,7 @@ def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjuste
             f"; the corrected resampled t-test does not agree (p {resampled:.2g}): if the module depends on what all "
             "training sets share, more sessions are needed"
         )
-    return Evidence(
+    return ModuleEvidence(
         module=name,
         confirmed=confirmed,
         reason=reason,

@@ -15,7 +15,7 @@ parameters (4.2.2), 3.3 % a doubling; this is the next rounder figure above it."
 
 
 @dataclass(frozen=True)
-class Candidate:
+class SizeScore:
     """Best score that was reached with one size of network.
 
     Attributes:
@@ -31,7 +31,7 @@ class Candidate:
     error: float = 0.0
 
 
-def most_efficient(candidates: Sequence[Candidate], gain: float = GAIN_PER_DOUBLING) -> Candidate:
+def most_efficient(candidates: Sequence[SizeScore], gain: float = GAIN_PER_DOUBLING) -> SizeScore:
     """The smallest candidate that no larger one repays.
 
     Candidate c' repays its size over c where ``(S(c) - S(c')) / S(c) > gain * log2(P(c') / P(c))`` and the difference
@@ -53,13 +53,13 @@ def most_efficient(candidates: Sequence[Candidate], gain: float = GAIN_PER_DOUBL
     for small, large in pairwise(ordered):
         if small.parameters == large.parameters:
             raise DataError(f"'{small.name}' and '{large.name}' have one size; give the best of each size only")
-    for place, small in enumerate(ordered):
-        if not any(_repays(small, large, gain) for large in ordered[place + 1 :]):
+    for index, small in enumerate(ordered):
+        if not any(_repays(small, large, gain) for large in ordered[index + 1 :]):
             return small
     return ordered[-1]
 
 
-def _repays(small: Candidate, large: Candidate, gain: float) -> bool:
+def _repays(small: SizeScore, large: SizeScore, gain: float) -> bool:
     better = small.score - large.score
     asked = gain * small.score * math.log2(large.parameters / small.parameters)
     return better > asked and better > math.hypot(small.error, large.error)

@@ -59,14 +59,14 @@ def two_level_design(
     """
     names = tuple(factors)
     groups = tuple(tuple(group) for group in exclusive)
-    wanted = _checked_runs(names, runs)
+    run_count = _checked_runs(names, runs)
     for group in groups:
         for name in group:
             if name not in names:
                 raise ConfigError(f"exclusive factor '{name}' is not among the factors{closest(name, names)}")
         if len(set(group)) != len(group) or len(group) < 2:
             raise ConfigError(f"exclusive group {list(group)} needs at least two different factors")
-    levels = _regular(len(names), wanted)
+    levels = _regular(len(names), run_count)
     if groups:
         indices = [tuple(names.index(name) for name in group) for group in groups]
         levels = _exchanged(_repaired(levels, indices), indices)
@@ -96,7 +96,7 @@ def _checked_runs(names: tuple[str, ...], runs: int | None) -> int:
 def _regular(factors: int, runs: int) -> Mask:
     """Columns of odd weight; greedily the one that adds the fewest words of four letters."""
     words = [word for word in range(1, runs) if word.bit_count() % 2]
-    basic = [1 << place for place in range(runs.bit_length() - 1)]
+    basic = [1 << bit for bit in range(runs.bit_length() - 1)]
     chosen = basic[:factors]
     while len(chosen) < factors:
         triples = [a ^ b ^ c for a, b, c in combinations(chosen, 3)]
@@ -109,12 +109,12 @@ def _repaired(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
     """Where several of a group are on keep one, the one kept least often so far."""
     fixed = levels.copy()
     for group in groups:
-        kept = dict.fromkeys(group, 0)
+        repairs = dict.fromkeys(group, 0)
         for row in fixed:
             on = [factor for factor in group if row[factor]]
             if len(on) > 1:
-                stays = min(on, key=lambda factor: (kept[factor], factor))
-                kept[stays] += 1
+                stays = min(on, key=lambda factor: (repairs[factor], factor))
+                repairs[stays] += 1
                 row[[factor for factor in on if factor != stays]] = False
     return fixed
 
@@ -133,9 +133,9 @@ def _exchanged(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
             counts = np.stack([trials[:, run, list(group)].sum(axis=1) for group in groups])
             trials = trials[(counts <= 1).all(axis=0)]
             costs = _quality(trials, groups)[0]
-            place = int(np.argmin(costs))
-            if costs[place] < cost - 1e-9:
-                best, cost = trials[place], float(costs[place])
+            cheapest = int(np.argmin(costs))
+            if costs[cheapest] < cost - 1e-9:
+                best, cost = trials[cheapest], float(costs[cheapest])
         if cost == before:
             break
     return best

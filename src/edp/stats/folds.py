@@ -27,8 +27,8 @@ def repeated_folds(sessions: int, folds: int = 5, repeats: int = 1, seed: int = 
     for repeat in range(repeats):
         # The fold of extra sessions moves with the repeat, so that no fold is always the larger one.
         order = np.random.default_rng([seed, repeat]).permutation(sessions)
-        for place, session in enumerate(order):
-            tested[repeat * folds + (place + repeat) % folds, session] = True
+        for index, session in enumerate(order):
+            tested[repeat * folds + (index + repeat) % folds, session] = True
     return tested
 
 

@@ -83,10 +83,10 @@ def main_effects(
             "some factors or covariates cannot be told apart; every factor must change, each in its own way"
         )
     inverse = np.linalg.inv(design.T @ design)
-    found = inverse @ (design.T @ y)
-    noise = float(np.square(y - design @ found).sum()) / free
+    coefficients = inverse @ (design.T @ y)
+    noise = float(np.square(y - design @ coefficients).sum()) / free
     chosen = slice(1, 1 + len(factors))
-    effect, spread = found[chosen], np.diag(inverse)[chosen]
+    effect, spread = coefficients[chosen], np.diag(inverse)[chosen]
     error = np.sqrt(noise * spread)
     explained = np.square(effect) / spread
     total = float(explained.sum())

@@ -31,8 +31,8 @@ def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayL
     if array.ndim != 3:
         raise DataError(f"the scores have shape {array.shape}; give (arm, run, session)")
     mask = tested_mask(tested, array.shape)
-    known = np.isfinite(array) & mask
-    seen = np.where(known, array, -np.inf).max(axis=(0, 1))
+    finite = np.isfinite(array) & mask
+    seen = np.where(finite, array, -np.inf).max(axis=(0, 1))
     if worst is not None:
         floor = np.asarray(worst, dtype=np.float64)
         if floor.shape != seen.shape or not np.isfinite(floor).all():
@@ -44,7 +44,7 @@ def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayL
             f"no arm has a score on sessions {np.flatnonzero(empty).tolist()}; repeat the runs there or "
             "leave these sessions out of the study"
         )
-    return np.where(known, array, np.where(mask, seen, 0.0))
+    return np.where(finite, array, np.where(mask, seen, 0.0))
 
 
 def paired(

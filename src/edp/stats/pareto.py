@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 def pareto(points: Sequence[Sequence[float]]) -> list[int]:
     """Places of the points that no other one betters in one value without being worse in another, in order."""
-    kept = []
-    for place, point in enumerate(points):
+    optimal = []
+    for index, point in enumerate(points):
         better = (
             all(a <= b for a, b in zip(other, point, strict=True))
             and any(a < b for a, b in zip(other, point, strict=True))
             for other in points
         )
         if not any(better):
-            kept.append(place)
-    return kept
+            optimal.append(index)
+    return optimal

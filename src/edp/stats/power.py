@@ -16,7 +16,7 @@ from edp.stats.variance import PairedVariance
 
 
 @dataclass(frozen=True)
-class Plan:
+class ConfirmationPlan:
     """How long a confirmation must be.
 
     Attributes:
@@ -62,7 +62,7 @@ def plan_runs(
     alpha: float = 0.05,
     target: float = 0.80,
     most: int = 200,
-) -> Plan:
+) -> ConfirmationPlan:
     """Smallest number of runs, in whole repeats of the folds, that reaches the target power.
 
     With several modules give ``alpha / modules``: the first step of Benjamini-Hochberg, which a single true module
@@ -92,15 +92,17 @@ def plan_runs(
             f"no number of runs suffices: with {sessions} sessions the power cannot exceed {limit:.2f}, since the "
             f"module's effect differs between sessions (sd {math.sqrt(variance.session):.3g}); {text}"
         )
-        return Plan(None, limit, limit, needed, reason)
+        return ConfirmationPlan(None, limit, limit, needed, reason)
     for runs in range(folds, most + 1, folds):
         reached = power(delta, variance, sessions, runs, folds, alpha)
         if reached >= target:
-            return Plan(runs, reached, limit, None, f"{runs} runs of each arm give a power of {reached:.2f}")
+            return ConfirmationPlan(
+                runs, reached, limit, None, f"{runs} runs of each arm give a power of {reached:.2f}"
+            )
     most -= most % folds
     reached = power(delta, variance, sessions, most, folds, alpha) if most else 0.0
     reason = f"{most} runs, the most allowed, give a power of {reached:.2f}; allow more, or look for a larger effect"
-    return Plan(None, reached, limit, None, reason)
+    return ConfirmationPlan(None, reached, limit, None, reason)
 
 
 def _sessions_needed(delta: float, variance: PairedVariance, folds: int, alpha: float, target: float) -> int | None:

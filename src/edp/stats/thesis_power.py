@@ -96,5 +96,5 @@ def thesis_plan(
         ),
         None,
     )
-    wanted = MOST_SPLITS if simulated is None else max(simulated, math.ceil(analytical))
-    return ThesisPlan(min(wanted, MOST_SPLITS), simulated, analytical)
+    split_count = MOST_SPLITS if simulated is None else max(simulated, math.ceil(analytical))
+    return ThesisPlan(min(split_count, MOST_SPLITS), simulated, analytical)

@@ -2,13 +2,13 @@
 
 from edp.training.bundle import Bundle, load_bundle, make_bundle, save_bundle, upgrade_bundle
 from edp.training.fit import TrainingSpec, fit
-from edp.training.outcome import Diverged, Event, Fitted
+from edp.training.outcome import Diverged, Fitted, TrainingProgress
 
 __all__ = [
     "Bundle",
     "Diverged",
-    "Event",
     "Fitted",
+    "TrainingProgress",
     "TrainingSpec",
     "fit",
     "load_bundle",

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from edp.models.predictor import Predictor
-from edp.streaming import State
+from edp.networks.predictor import Predictor
+from edp.networks.streaming import State
 from edp.training.objective import Objective
 
 Weights = dict[str, Tensor]
@@ -26,7 +26,7 @@ class _Exposed(nn.Module):
         self.net = net
 
     def forward(self, x: Tensor, state: State) -> tuple[Any, Tensor, Tensor, State]:
-        return self.net.expose(x, state)
+        return self.net.forward_features(x, state)
 
 
 def loss_with(net: Predictor, weights: Mapping[str, Tensor], objective: Objective, pieces: Pieces) -> Tensor:

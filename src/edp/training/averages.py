@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from edp.bounds import SHARE, above, between, check_bounds
 from edp.errors import ConfigError
 from edp.registry import Registry
+from edp.settings.bounds import SHARE, above, between, check_bounds
 
 
 class AverageSpec(Protocol):

@@ -24,12 +24,12 @@ from edp.data.prepared import Prepared
 from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import BundleError, EdpError, brief
-from edp.integer import Formats
-from edp.integer.quantise import weights_of
-from edp.models.integer import IntegerPredictor
-from edp.models.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain
-from edp.models.predictor import Predictor
-from edp.onboard import Adaptation
+from edp.ir.rls import Adaptation
+from edp.ir.w8a16 import Formats
+from edp.ir.w8a16.quantise import weights_of
+from edp.networks.integer import IntegerPredictor
+from edp.networks.plain import model_from_plain, model_to_plain, task_from_plain, task_to_plain
+from edp.networks.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, read_json, write_bytes, write_json
 

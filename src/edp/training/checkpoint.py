@@ -16,8 +16,8 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from edp.errors import StorageError
+from edp.networks.streaming import State
 from edp.storage import parse_json, read_bytes, write_bytes
-from edp.streaming import State
 from edp.training.schedules import ScheduleState
 
 CHECKPOINT_BYTES = 16 * 2**30

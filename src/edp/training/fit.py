@@ -17,16 +17,16 @@ from edp.data.chunks import Batch, ChunkSampler, Sampler
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
-from edp.models.predictor import ModelSpec, build_model, trainable
-from edp.runs import RunFolder
-from edp.streaming import State, detach_state, reset_where
+from edp.networks.predictor import ModelSpec, build_model, trainable
+from edp.networks.streaming import State, detach_state, reset_where
+from edp.storage.runs import RunFolder
 from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, damaged, load_checkpoint, save_checkpoint
-from edp.training.lesson import Episodic, Lesson, Moment
 from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
-from edp.training.outcome import Diverged, Event, Fitted, TrainingError
+from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
 from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, check_training
+from edp.training.strategy import BatchContext, EpisodicStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
 
 
@@ -35,8 +35,8 @@ def fit(
     model: ModelSpec,
     spec: TrainingSpec,
     run: tuple[RunFolder, str] | None = None,
-    on_event: Callable[[Event], None] | None = None,
-    lesson: Lesson | None = None,
+    on_event: Callable[[TrainingProgress], None] | None = None,
+    lesson: TrainingStrategy | None = None,
 ) -> Fitted:
     """Train on ``data.train``, choose by ``data.validation``; ``data.test`` is not touched.
 
@@ -93,7 +93,7 @@ class Loop:
         model: ModelSpec,
         spec: TrainingSpec,
         run: tuple[RunFolder, str] | None,
-        lesson: Lesson | None = None,
+        lesson: TrainingStrategy | None = None,
         refitted: list[dict[str, Any]] | None = None,
         windowed: bool = False,
     ) -> None:
@@ -108,10 +108,10 @@ class Loop:
         lessons = known if lesson is None else lesson.series(data.task, known)
         self.sampler = self._sampler(lessons)
         for part in data.validation:
-            if part.samples <= spec.chunks.burn_in + data.task.reach:
+            if part.samples <= spec.chunks.burn_in + data.task.max_horizon:
                 raise DataError(
                     f"validation recording '{part.name}' has {part.samples} samples, no more than the burn-in of "
-                    f"{spec.chunks.burn_in} plus the horizon of {data.task.reach}; give a longer one"
+                    f"{spec.chunks.burn_in} plus the horizon of {data.task.max_horizon}; give a longer one"
                 )
         if self.net.physics is not None:
             self.net.physics.settle([torch.from_numpy(part.inputs) for part in data.train])
@@ -139,16 +139,16 @@ class Loop:
     def _sampler(self, series: Sequence[Series]) -> Sampler:
         """Where batches come from: carried chunks or windows, or what the lesson deals out."""
         task, spec = self.data.task, self.spec
-        if isinstance(self.lesson, Episodic):
+        if isinstance(self.lesson, EpisodicStrategy):
             return self.lesson.sampler(series, task, spec)
         return ChunkSampler(series, task.horizons, spec.chunks, spec.seed, spec.augmentations)
 
-    def fit(self, on_event: Callable[[Event], None]) -> Fitted:
+    def fit(self, on_event: Callable[[TrainingProgress], None]) -> Fitted:
         self._resume()
         self.go_on(on_event)
         return self.finish()
 
-    def go_on(self, on_event: Callable[[Event], None]) -> None:
+    def go_on(self, on_event: Callable[[TrainingProgress], None]) -> None:
         """Train to the last epoch, or until the early stop."""
         self.resumed_at, self.rate = self.progress.epoch, 0.0
         seen, busy = 0, 0.0
@@ -231,7 +231,7 @@ class Loop:
                     return
             passes += 1
 
-    def advance(self, until: int, on_event: Callable[[Event], None]) -> int:
+    def advance(self, until: int, on_event: Callable[[TrainingProgress], None]) -> int:
         """Go on to an update of this epoch; ticks with a loss that were seen on the way."""
         within = self.within
         if not within.given:
@@ -267,16 +267,16 @@ class Loop:
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * self._factor()
         future, valid = (torch.from_numpy(part).to(self.device) for part in (batch.future, batch.valid))
-        if isinstance(self.lesson, Episodic):
+        if isinstance(self.lesson, EpisodicStrategy):
             loss = self.lesson.episode(self.net, self.objective, (x, future, valid))
         else:
-            answer, features, hidden, state = self.net.expose(x, state)
-            if self.lesson is None or batch.taught is None:
+            answer, features, hidden, state = self.net.forward_features(x, state)
+            if self.lesson is None or batch.teacher_targets is None:
                 loss = self.objective.evaluate(answer, future, features, valid)
             else:
-                taught = torch.from_numpy(batch.taught).to(self.device)
+                teacher_targets = torch.from_numpy(batch.teacher_targets).to(self.device)
                 done = self.progress.updates / (self.updates * self.spec.epochs)
-                moment = Moment(answer, future, features, hidden, valid, taught, done)
+                moment = BatchContext(answer, future, features, hidden, valid, teacher_targets, done)
                 loss = self.lesson.loss(self.objective, moment)
         self.progress.updates += 1
         value = float(loss.detach())
@@ -357,7 +357,7 @@ class Loop:
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.average[name])
         try:
-            if isinstance(self.lesson, Episodic):
+            if isinstance(self.lesson, EpisodicStrategy):
                 return self.lesson.judge(self.net, self.objective, self.data)
             return validation_scores(self.net, self.data.validation, self.spec, self.data, self.windowed)
         finally:
@@ -365,10 +365,12 @@ class Loop:
                 for name, parameter in self.net.named_parameters():
                     parameter.copy_(held[name])
 
-    def _event(self, epoch: int, update: int, rate: float, seconds: float, row: dict[str, Any] | None) -> Event:
+    def _event(
+        self, epoch: int, update: int, rate: float, seconds: float, row: dict[str, Any] | None
+    ) -> TrainingProgress:
         done = (epoch - 1) * self.updates + update
         left = max(0, self.epochs * self.updates - done)
-        return Event(
+        return TrainingProgress(
             epoch,
             self.epochs,
             update,
@@ -386,4 +388,13 @@ def _device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-__all__ = ["Diverged", "Event", "Fitted", "TrainingError", "TrainingSpec", "fit", "thread_count", "validation_scores"]
+__all__ = [
+    "Diverged",
+    "Fitted",
+    "TrainingError",
+    "TrainingProgress",
+    "TrainingSpec",
+    "fit",
+    "thread_count",
+    "validation_scores",
+]

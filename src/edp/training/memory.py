@@ -7,9 +7,9 @@ import math
 import torch
 
 from edp.data.prepared import Prepared
-from edp.limits import check_setting
-from edp.models.initial import state_numbers
-from edp.models.predictor import Predictor
+from edp.networks.initial import state_numbers
+from edp.networks.predictor import Predictor
+from edp.storage.memory import check_setting
 from edp.training.spec import TrainingSpec
 
 FLOAT, DOUBLE = 4, 8
@@ -105,7 +105,7 @@ def _saved(net: Predictor, ticks: int) -> int:
     net.train()
     try:
         with torch.random.fork_rng(devices=[]), torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-            net.expose(x, net.initial_state(1, x))
+            net.forward_features(x, net.initial_state(1, x))
     finally:
         net.train(was_training)
     return total

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from edp.losses import Answer, Course, horizon_weights, masked_loss, output_weights
-from edp.models.frontend import TargetCode
+from edp.networks.frontend import TargetTransform
+from edp.networks.losses import Course, Prediction, horizon_weights, masked_loss, output_weights
 from edp.training.spec import TrainingSpec
 
 
@@ -21,13 +21,13 @@ class Objective:
         running: mean absolute error ``(horizon, output)`` in standard deviations, led on by `follow`.
     """
 
-    def __init__(self, spec: TrainingSpec, code: TargetCode) -> None:
+    def __init__(self, spec: TrainingSpec, code: TargetTransform) -> None:
         self.spec, self.code = spec, code
         self.weights = output_weights(code.width, spec.weight_power)
         self.weights = self.weights * horizon_weights(len(self.weights), spec.horizon_decay).to(self.weights)
         self.running = torch.ones_like(self.weights)
 
-    def evaluate(self, answer: Answer, future: Tensor, features: Tensor, valid: Tensor) -> Tensor:
+    def evaluate(self, answer: Prediction, future: Tensor, features: Tensor, valid: Tensor) -> Tensor:
         """The loss of a batch.
 
         Args:

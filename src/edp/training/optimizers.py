@@ -10,9 +10,9 @@ from typing import Protocol
 import torch
 from torch import nn
 
-from edp.bounds import DECAY, MOST_NAMES, MOST_UPDATES, RATE, below, check_bounds, check_count, shown, whole
 from edp.errors import ConfigError
 from edp.registry import Registry
+from edp.settings.bounds import DECAY, MOST_NAMES, MOST_UPDATES, RATE, below, check_bounds, check_count, shown, whole
 
 
 class OptimizerSpec(Protocol):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from edp.errors import EdpError, NotFiniteError
-from edp.models.predictor import Predictor
+from edp.networks.predictor import Predictor
 
 
 class TrainingError(EdpError):
@@ -14,7 +14,7 @@ class TrainingError(EdpError):
 
 
 @dataclass(frozen=True)
-class Event:
+class TrainingProgress:
     """Progress of a training, for displays: after every few updates and after each epoch."""
 
     epoch: int

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from edp.data.prepared import Prepared
 from edp.errors import ConfigError
-from edp.models.predictor import ModelSpec
+from edp.networks.predictor import ModelSpec
 from edp.training.checkpoint import Progress, optimizer_state, pack, unpack
 from edp.training.fit import Loop, thread_count
 from edp.training.outcome import Fitted

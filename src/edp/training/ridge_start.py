@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from edp.blocks.linear_bypass import Bypass
 from edp.data.lags import LagTask, origins
 from edp.data.ridge import crossed_solution, ridge_solution
 from edp.data.scaling import feature_matrix
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import DataError
-from edp.models.predictor import Predictor
+from edp.networks.blocks.linear_bypass import Bypass
+from edp.networks.predictor import Predictor
 
 
 def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequence[Series]) -> bool:
@@ -48,7 +48,8 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
     if not any(len(origins(part, lags)) for part in known[0]):
         raise DataError(
             f"linear_bypass: the longest training stretch has {max(part.samples for part in train)} samples, fewer "
-            f"than its {bypass.spec.taps} taps plus the horizon of {task.reach}; give longer recordings or fewer taps"
+            f"than its {bypass.spec.taps} taps plus the horizon of {task.max_horizon}; give longer recordings "
+            "or fewer taps"
         )
     crossed = bypass.spec.start == "crossed"
     solution = crossed_solution(known[0] + known[1], lags) if crossed else ridge_solution(known[0], lags, known[1])

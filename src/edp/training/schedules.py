@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from edp.bounds import MOST_EPOCHS, SHARE, below, check_bounds, whole
 from edp.registry import Registry
+from edp.settings.bounds import MOST_EPOCHS, SHARE, below, check_bounds, whole
 
 
 @dataclass

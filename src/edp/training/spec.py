@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from edp.bounds import (
+from edp.data.augment import AugmentationSpec
+from edp.data.chunks import ChunkSpec
+from edp.data.task import Task
+from edp.errors import ConfigError
+from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights, Huber, LossSpec, TermSpec
+from edp.networks.outputs import OUTPUTS
+from edp.networks.predictor import ModelSpec
+from edp.settings.bounds import (
     MOST_EPOCHS,
     MOST_THREADS,
     MOST_UPDATES,
@@ -16,13 +23,6 @@ from edp.bounds import (
     span,
     whole,
 )
-from edp.data.augment import AugmentationSpec
-from edp.data.chunks import ChunkSpec
-from edp.data.task import Task
-from edp.errors import ConfigError
-from edp.losses import LOSSES, TERMS, AdaptiveWeights, Huber, LossSpec, TermSpec
-from edp.models.outputs import OUTPUTS
-from edp.models.predictor import ModelSpec
 from edp.training.averages import AverageSpec, Exponential
 from edp.training.optimizers import AdamW, OptimizerSpec
 from edp.training.schedules import Cosine, ScheduleSpec

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from edp.data.prepared import Prepared
 from edp.data.series import Series
-from edp.losses import Answer
-from edp.models.predictor import Predictor
-from edp.models.running import stream_answers
+from edp.networks.losses import Prediction
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_answers
 from edp.signals import KINDS
 from edp.training.spec import TrainingSpec
 
@@ -50,7 +50,7 @@ def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> N
 
 def _answers(
     net: Predictor, series: Sequence[Series], spec: TrainingSpec, windowed: bool = False
-) -> Iterator[tuple[Answer, Tensor]]:
+) -> Iterator[tuple[Prediction, Tensor]]:
     """What the network says of each series after start-up, and the standardised targets; batches of one."""
     skip = spec.chunks.burn_in if spec.chunks.regime == "chunk" else net.spec.window - 1
     for part, said in zip(series, stream_answers(net, series, windowed=windowed), strict=True):
@@ -64,7 +64,7 @@ def standard_targets(net: Predictor, part: Series) -> Tensor:
 
     Ticks whose targets lie beyond the end are left out.
     """
-    ticks = part.samples - net.task.reach
+    ticks = part.samples - net.task.max_horizon
     future = np.stack([part.targets[k : k + ticks] for k in net.task.horizons], axis=1)
     like = next(net.parameters())
     x = torch.from_numpy(part.inputs[:ticks]).unsqueeze(0).to(like)

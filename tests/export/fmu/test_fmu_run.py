@@ -12,7 +12,7 @@ import torch
 
 from edp.export.c.model import HOLD_TICKS
 from edp.export.golden import random_inputs
-from edp.models.input_range import usual_range
+from edp.networks.input_range import usual_range
 
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy: pip install 'excavator-dynamics-predictor[dev]'")
 from fmpy.fmi1 import FMICallException  # noqa: E402

@@ -98,8 +98,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory, recording_of: Callable[..., R
 
 @pytest.fixture(scope="session")
 def _trained(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
-    from edp.config import load_experiment
-    from edp.workflow import DataSource, evaluate, train
+    from edp.config.experiment import load_experiment
+    from edp.workflows.train_evaluate import DataSource, evaluate, train
 
     run = tmp_path_factory.mktemp("trained") / "run"
     train(DataSource.of(logs), load_experiment(preset="quick", overrides=SMALL), run)

@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 
-from edp.models import Stream
-from edp.models.integer import IntegerPredictor
+from edp.networks import Stream
+from edp.networks.integer import IntegerPredictor
 from edp.training import load_bundle
 
 

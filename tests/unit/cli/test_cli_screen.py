@@ -10,9 +10,9 @@ import pytest
 
 from edp.cli.console import Steps
 from edp.cli.screen import ScreeningDisplay
-from edp.config import load_experiment
-from edp.sources import load_signal_map
-from edp.training import Event
+from edp.config.experiment import load_experiment
+from edp.logs.source import load_signal_map
+from edp.training import TrainingProgress
 
 QUICK = [
     word
@@ -89,7 +89,9 @@ def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
 
 def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr("edp.selection.write_pictures", lambda found, folder: drawn.append(folder))
+    monkeypatch.setattr(
+        "edp.workflows.feature_selection.select.write_pictures", lambda found, folder: drawn.append(folder)
+    )
     (tmp_path / "mine.toml").write_text('channels = ["speed", "dice"]')
     (tmp_path / "tiny.toml").write_text(
         "[training]\nepochs = 1\nupdates = 3\n"
@@ -165,10 +167,10 @@ def test_time_left_is_told_once_there_is_something_to_judge_it_by(monkeypatch):
 
     tell(0, "kept", 0)
     tell(0.1, "proposed", 1)
-    tell(30, "proposed", 1, Event(1, 2, 0, 10, 0.0, 0.0))
-    tell(30, "proposed", 1, Event(1, 2, 10, 10, 0.0, 0.0))
-    tell(60, "proposed", 1, Event(2, 2, 10, 10, 0.0, 0.0))
-    tell(0, "proposed", 1, Event(1, 2, 5, 10, 0.0, 0.0, refit=True))
+    tell(30, "proposed", 1, TrainingProgress(1, 2, 0, 10, 0.0, 0.0))
+    tell(30, "proposed", 1, TrainingProgress(1, 2, 10, 10, 0.0, 0.0))
+    tell(60, "proposed", 1, TrainingProgress(2, 2, 10, 10, 0.0, 0.0))
+    tell(0, "proposed", 1, TrainingProgress(1, 2, 5, 10, 0.0, 0.0, refit=True))
     tell(60, "random 1", 2)
     assert said.lines == [
         "trials: kept, training 1 of 4, 0 %",

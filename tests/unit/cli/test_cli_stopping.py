@@ -5,7 +5,7 @@ import signal
 
 from safetensors.numpy import load_file
 
-from edp.runs import RunFolder
+from edp.storage.runs import RunFolder
 
 
 def weights_of(run):

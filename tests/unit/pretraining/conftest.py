@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.config import Experiment, load_experiment
+from edp.config.experiment import Experiment, load_experiment
 from edp.data.prepared import Prepared
 from edp.logs import write_recording
+from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.sources import DataSource
-from edp.workflow import prepare_data
+from edp.workflows.train_evaluate import prepare_data
 
 CHANNELS = (Channel("lever", Kind.PILOT_PRESSURE), Channel("speed", Kind.VELOCITY, "Speed"))
 SETTINGS = (

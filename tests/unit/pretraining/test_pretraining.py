@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import torch
 
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.chunks import stack
 from edp.data.episodes import EpisodeSampler
 from edp.errors import BundleError, ConfigError, DataError, StorageError
-from edp.models.decomposition import decompose
-from edp.models.predictor import build_model
-from edp.pretraining import PRETRAININGS, MetaSpec, Pretrain, pretrain
+from edp.networks.decomposition import decompose
+from edp.networks.predictor import build_model
 from edp.report import build_report
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.adaptation import adapt, loss_with
-from edp.training.lesson import Episodic
 from edp.training.objective import Objective
+from edp.training.strategy import EpisodicStrategy
 from edp.training.validation import validation_scores
-from edp.transfer import FinetuneSpec, Order, finetune
-from edp.workflow import evaluate
+from edp.workflows.pretraining import PRETRAININGS, MetaSpec, Pretrain, pretrain
+from edp.workflows.train_evaluate import evaluate
+from edp.workflows.transfer import FinetuneRequest, FinetuneSpec, finetune
 
 META = MetaSpec(inner_rate=0.1, inner_steps=2, shots=2)
 
@@ -117,7 +117,7 @@ def test_few_steps_take_rate_and_head_of_the_meta_learning(machines, experiment,
     meta = dataclasses.replace(META, inner_rate=0.07, head_only=True)
     pretrain(machines, experiment, Pretrain(method="fomaml", meta=meta), tmp_path / "meta")
     spec = FinetuneSpec(inner_steps=3, batch=4, check_signs=False)
-    finetune(tmp_path / "meta", machines, Order(spec=spec, method="few_steps"), tmp_path / "tuned")
+    finetune(tmp_path / "meta", machines, FinetuneRequest(spec=spec, method="few_steps"), tmp_path / "tuned")
     tuned = load_bundle(tmp_path / "tuned").predictor
     before = dict(load_bundle(tmp_path / "meta").predictor.named_parameters())
     settings = load_experiment(tmp_path / "tuned" / "config.toml", preset=None)
@@ -156,7 +156,7 @@ def by_hand(net, objective, pieces, steps):
     kept = {name: p.detach().clone() for name, p in net.named_parameters()}
     for piece, rate in zip(pieces, steps, strict=True):
         net.zero_grad()
-        answer, features, _, _ = net.expose(piece[0], net.initial_state(len(piece[0]), piece[0]))
+        answer, features, _, _ = net.forward_features(piece[0], net.initial_state(len(piece[0]), piece[0]))
         objective.evaluate(answer, piece[1], features, piece[2]).backward()
         with torch.no_grad():
             for parameter in net.parameters():
@@ -177,7 +177,7 @@ def test_first_order_gradient_is_the_querys_at_the_adapted_weights(episode, expe
     cost, found = gradient(lesson_of("fomaml", net, experiment), episode)
     kept, came = by_hand(net, objective, [support, support], META.steps)
     put(net, came)
-    answer, features, _, _ = net.expose(query[0], net.initial_state(2, query[0]))
+    answer, features, _, _ = net.forward_features(query[0], net.initial_state(2, query[0]))
     loss = objective.evaluate(answer, query[1], features, query[2])
     loss.backward()
     assert cost == pytest.approx(loss.item(), rel=1e-12)
@@ -217,7 +217,7 @@ def test_an_epoch_is_chosen_by_the_error_after_adaptation(prepared_machines, exp
     net = build_model(prepared_machines.task, experiment.model, prepared_machines.scaler(), 3).eval()
     objective = Objective(experiment.training, net.code)
     lesson = lesson_of("fomaml", net, experiment)
-    assert isinstance(lesson, Episodic)
+    assert isinstance(lesson, EpisodicStrategy)
     before = {name: p.detach().clone() for name, p in net.named_parameters()}
     found = lesson.judge(net, objective, prepared_machines)
     assert all(torch.equal(before[name], p) for name, p in net.named_parameters())
@@ -296,4 +296,4 @@ def test_episodes_are_of_one_machine_each_and_share_no_tick(prepared_machines, e
     assert len(owners) == 2 * sampler.updates()
     again = [batch.inputs for batch in EpisodeSampler(parts, (2,), experiment.training.chunks, 2, 4).epoch(3)]
     assert all(np.array_equal(one, batch.inputs) for one, batch in zip(again, sampler.epoch(3), strict=True))
-    assert stack([(p.inputs, p.targets, p.targets, None) for p in parts[:1]], [True]).taught is None
+    assert stack([(p.inputs, p.targets, p.targets, None) for p in parts[:1]], [True]).teacher_targets is None

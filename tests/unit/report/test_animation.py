@@ -14,9 +14,9 @@ from edp.cli import app
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs import write_recording
 from edp.recording import Recording
-from edp.report import film
-from edp.report.animation import scene_of, write_animation
-from edp.report.raster import Image
+from edp.report.animation import film
+from edp.report.animation.page import scene_of, write_animation
+from edp.report.animation.raster import Image
 from edp.sim import Scenario, simulate
 
 

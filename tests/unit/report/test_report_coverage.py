@@ -9,8 +9,8 @@ from edp.data.coverage import cover
 from edp.data.splits import ByTime
 from edp.recording import Recording
 from edp.report import build_coverage_page
-from edp.report.coverage_page import headline, render_coverage, verdict
-from edp.report.coverage_plots import coverage_plots
+from edp.report.coverage.page import headline, render_coverage, verdict
+from edp.report.coverage.plots import coverage_plots
 from edp.signals import EXTRA_CHANNELS, TABLE_A1, VOCABULARY, Channel, Kind
 
 

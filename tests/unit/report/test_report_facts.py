@@ -3,7 +3,8 @@ import json
 import pytest
 
 from edp.errors import DataError, StorageError
-from edp.report.facts import (
+from edp.report.common.wording import decimals_for, duration, listed, number, percent, unbroken
+from edp.report.run.facts import (
     NETWORK,
     comparison_rows,
     headline,
@@ -13,7 +14,6 @@ from edp.report.facts import (
     spread_text,
     verdict_lines,
 )
-from edp.report.wording import decimals_for, duration, listed, number, percent, unbroken
 
 
 def edit_scores(folder, change):

@@ -3,10 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from edp.report import figures
-from edp.report.facts import NETWORK, TRUTH, read_facts
-from edp.report.plots import plots_of
-from edp.report.style import BLUE, GREY
+from edp.report.common.style import BLUE, GREY
+from edp.report.run import figures
+from edp.report.run.facts import NETWORK, TRUTH, read_facts
+from edp.report.run.plots import plots_of
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import pytest
 
 from edp.errors import StorageError
 from edp.report import build_report
-from edp.report.facts import MAKERS, read_facts
-from edp.report.page import context, render
+from edp.report.run.facts import MAKERS, read_facts
+from edp.report.run.page import context, render
 
 LOADS = {"src", "href", "srcset", "data", "poster", "action", "formaction", "background"}
 

@@ -7,24 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.report import build_screening_page, pictures, write_pictures
-from edp.report.drawing import write_drawings
-from edp.report.screening_page import headline, render_screening, sentence, verdict
-from edp.report.screening_plots import screening_plots
-from edp.report.screening_views import lag_ranges, lag_views, matrix_views, stability_views
-from edp.screening import (
-    Choice,
+from edp.data.screening import (
+    ChannelVerdict,
     Cluster,
     Flag,
     FlagKind,
-    Importance,
+    GroupImportance,
     LagCurve,
     Matrices,
     Proposal,
-    Screening,
+    ScreeningResult,
     Stability,
     Value,
 )
+from edp.report import build_screening_page, write_pictures
+from edp.report.common.drawing import write_drawings
+from edp.report.screening import pictures
+from edp.report.screening.page import headline, render_screening, sentence, verdict
+from edp.report.screening.plots import screening_plots
+from edp.report.screening.views import lag_ranges, lag_views, matrix_views, stability_views
 
 NAMES = ("v", "u<b>", "late", "noise")
 LAGS = np.arange(-20, 21)
@@ -52,7 +53,7 @@ def screening(names=NAMES):
         for i, name in enumerate(names)
     )
     importance = tuple(
-        Importance((name,), target, 0.3 - 0.1 * (i % 4), 0.1 - 0.1 * (i % 4), 0.4, 0.25)
+        GroupImportance((name,), target, 0.3 - 0.1 * (i % 4), 0.1 - 0.1 * (i % 4), 0.4, 0.25)
         for target in ("all", "v")
         for i, name in enumerate(names)
     )
@@ -62,11 +63,11 @@ def screening(names=NAMES):
         Flag(names[3], FlagKind.NOISE, evidence="correlation at most 0.01"),
     )
     choices = tuple(
-        Choice(name, i < 2, i + 1, 1.0 - i / count, f"reason {i}", tuple(f for f in flags if f.channel == name))
+        ChannelVerdict(name, i < 2, i + 1, 1.0 - i / count, f"reason {i}", tuple(f for f in flags if f.channel == name))
         for i, name in enumerate(names)
     )
     proposal = Proposal(choices, 30, "the longest lead is 12 samples", ("one leak",))
-    return Screening(
+    return ScreeningResult(
         ("r1", "r2"), ("p1", "p2"), 360_000, 100.0, tuple(names), ("group",) * count, ("v",), 10, matrices,
         tuple(curves), stable, importance, values, (Cluster(tuple(names[:2]), names[0], 0.93),), flags, proposal,
         {"horizon": 10}, {"reading": 0.5, "forest": 61.0},

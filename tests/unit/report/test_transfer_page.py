@@ -7,8 +7,9 @@ import pytest
 from safetensors.numpy import save_file
 
 from edp.errors import StorageError
-from edp.report import read_transfer, transfer_facts, write_transfer_page
-from edp.report.transfer_page import render
+from edp.report import read_transfer, write_transfer_page
+from edp.report.transfer import facts as transfer_facts
+from edp.report.transfer.page import render
 
 EVIL = "</script><script>alert(1)</script><b>&"
 PRINTED = {

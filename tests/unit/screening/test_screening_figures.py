@@ -7,16 +7,16 @@ from scipy.stats import kendalltau, pearsonr, spearmanr
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.feature_selection import mutual_info_regression
 
-from edp.screening.clusters import clusters_of
-from edp.screening.copies import find_copies, rest_related
-from edp.screening.forest import Permuted, Rows
-from edp.screening.information import Information
-from edp.screening.lagged import lagged_covariances
-from edp.screening.linear import RIDGE, gram, peaks, unexplained
-from edp.screening.ranks import Kendall, correlation, rank_columns
-from edp.screening.spec import ScreeningSpec
-from edp.screening.table import Piece, Table, build_table
-from edp.screening.values import _correlations, _Model
+from edp.data.screening.clusters import clusters_of
+from edp.data.screening.copies import find_copies, rest_related
+from edp.data.screening.forest import Permuted, Rows
+from edp.data.screening.information import Information
+from edp.data.screening.lagged import lagged_covariances
+from edp.data.screening.linear import RIDGE, gram, peaks, unexplained
+from edp.data.screening.ranks import Kendall, correlation, rank_columns
+from edp.data.screening.spec import ScreeningSpec
+from edp.data.screening.table import CandidateTable, Piece, build_table
+from edp.data.screening.values import _correlations, _Model
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +65,10 @@ def test_mutual_information_of_a_gaussian_is_what_theory_says() -> None:
     assert Information(x.astype(np.float32), 3).of(0, 1) == pytest.approx(-0.5 * np.log(1 - 0.64), abs=0.04)
 
 
-def table_of(parts: list[list[np.ndarray]]) -> Table:
+def table_of(parts: list[list[np.ndarray]]) -> CandidateTable:
     pieces = tuple(Piece(f"p{i}", tuple(part)) for i, part in enumerate(parts))
     width = parts[0][0].shape[1]
-    return Table(tuple("abcdefgh"[:width]), ("generic",) * width, (0, 1), pieces, 100.0, {})
+    return CandidateTable(tuple("abcdefgh"[:width]), ("generic",) * width, (0, 1), pieces, 100.0, {})
 
 
 def test_lagged_sums_equal_scipys_correlate_over_stretches_of_any_length() -> None:

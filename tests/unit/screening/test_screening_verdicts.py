@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edp.data.screening import FlagKind, ForestSpec, ScreeningResult, ScreeningSpec, screen
 from edp.errors import ConfigError, DataError
 from edp.recording import Recording
-from edp.screening import FlagKind, ForestSpec, Screening, ScreeningSpec, screen
 
 SPEC = ScreeningSpec(
     trusted=("lever_a", "lever_b", "pressure"),
@@ -21,22 +21,22 @@ SPEC = ScreeningSpec(
 
 
 @pytest.fixture(scope="module")
-def found(sessions: list[Recording]) -> Screening:
+def found(sessions: list[Recording]) -> ScreeningResult:
     return screen(sessions, SPEC)
 
 
-def flags(found: Screening) -> dict[str, tuple[FlagKind, str, int]]:
+def flags(found: ScreeningResult) -> dict[str, tuple[FlagKind, str, int]]:
     return {flag.channel: (flag.kind, flag.source, flag.lag) for flag in found.flags}
 
 
-def test_real_channels_are_kept_and_false_ones_dropped(found: Screening) -> None:
+def test_real_channels_are_kept_and_false_ones_dropped(found: ScreeningResult) -> None:
     assert set(found.proposal.kept) == {"v_a", "v_b", "lever_a", "lever_b", "pressure"}
     assert [choice.rank for choice in found.proposal.choices] == list(range(1, 15))
     assert all(choice.reason and 0 <= choice.score <= 1 for choice in found.proposal.choices)
     assert found.targets == ("v_a", "v_b")
 
 
-def test_each_false_channel_is_flagged_for_what_it_is(found: Screening) -> None:
+def test_each_false_channel_is_flagged_for_what_it_is(found: ScreeningResult) -> None:
     told = flags(found)
     assert told["aux_ahead"] == (FlagKind.LEAK, "v_b", -15)
     assert told["aux_smooth"][:2] == (FlagKind.LEAK, "v_a")
@@ -48,7 +48,7 @@ def test_each_false_channel_is_flagged_for_what_it_is(found: Screening) -> None:
     assert len(told) == 9
 
 
-def test_lags_have_the_sign_of_table_4_2(found: Screening) -> None:
+def test_lags_have_the_sign_of_table_4_2(found: ScreeningResult) -> None:
     curve = found.curve("lever_b", "v_b")
     assert -14 <= curve.best <= -4
     assert curve.low <= curve.best <= curve.high
@@ -70,7 +70,7 @@ def test_without_trust_a_lever_may_stay_and_leaks_of_targets_go(sessions: list[R
     assert "lever_b" not in told
 
 
-def test_results_are_plain_json_and_the_same_twice(found: Screening, sessions: list[Recording]) -> None:
+def test_results_are_plain_json_and_the_same_twice(found: ScreeningResult, sessions: list[Recording]) -> None:
     heard: list[tuple[str, float]] = []
     again = screen(sessions, SPEC, lambda stage, share: heard.append((stage, share)))
     plain = found.to_json() | {"seconds": 0}
@@ -82,7 +82,7 @@ def test_results_are_plain_json_and_the_same_twice(found: Screening, sessions: l
     assert list(dict.fromkeys(stage for stage, _ in heard)) == list(found.seconds)
 
 
-def test_matrices_and_tables_are_complete(found: Screening) -> None:
+def test_matrices_and_tables_are_complete(found: ScreeningResult) -> None:
     count = len(found.channels)
     dead = [found.channels.index(name) for name in ("aux_dead", "aux_session")]
     for matrix in (found.matrices.pearson, found.matrices.spearman, found.matrices.kendall, found.matrices.information):

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from edp.ledger import Identity
-from edp.search.executor import Job
+from edp.storage.ledger import TrainingIdentity
+from edp.workflows.search.executor import Job
 
 
 @pytest.fixture
@@ -13,7 +13,7 @@ def identity_of():
     def make(seed=0, job="train", **config):
         name = f"trainings_of_tests:{job}"
         facts = {"code": "c", "data": "d", "environment": {"threads": "1"}}
-        return Identity(name, config, {"fold": 0}, seed, 1, **facts)
+        return TrainingIdentity(name, config, {"fold": 0}, seed, 1, **facts)
 
     return make
 

@@ -17,15 +17,15 @@ from types import SimpleNamespace
 
 import pytest
 
-import edp.search.cluster
+import edp.workflows.search.cluster
 from edp.errors import ConfigError
-from edp.ledger import Ledger, Status, read_state
-from edp.search.batch import complete
-from edp.search.cluster import RayPool
-from edp.search.executor import START
-from edp.search.local import LocalPool
-from edp.search.plan import load_plan
-from edp.search.runner import Crew, Watchers, run_search
+from edp.storage.ledger import Ledger, TrainingStatus, read_state
+from edp.workflows.search.batch import complete
+from edp.workflows.search.cluster import RayPool
+from edp.workflows.search.executor import START
+from edp.workflows.search.local import LocalPool
+from edp.workflows.search.plan import load_plan
+from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 
 TOKEN = secrets.token_hex(16)
 RAY = Path(sys.executable).with_name("ray")
@@ -116,10 +116,12 @@ def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_fi
             done.append(diary.workers)
             cluster.kill(2)
 
-    crew = Crew(cluster=cluster.address)
-    there = run_search(six_sessions, plan, tmp_path / "there", crew, "calibration", Watchers(on_progress=kill_one))
+    crew = Resources(cluster=cluster.address)
+    there = run_search(
+        six_sessions, plan, tmp_path / "there", crew, "calibration", SearchCallbacks(on_progress=kill_one)
+    )
     assert done == [3]
-    here = run_search(six_sessions, plan, tmp_path / "here", Crew(workers=1), "calibration")
+    here = run_search(six_sessions, plan, tmp_path / "here", Resources(workers=1), "calibration")
     assert there.digest == here.digest
     assert there.trained == here.trained == 11
     assert there.ground.decided == here.ground.decided
@@ -134,32 +136,32 @@ def test_caps_failures_and_cancelling_are_those_of_the_local_pool(cluster, job_o
     jobs = [job_of(0), job_of(1, "raises", how="error"), job_of(2, seconds=1.0, sleep=60)]
     with RayPool(cluster.address) as pool, Ledger(tmp_path / "ledger") as ledger:
         found = [str(record.status) for record in complete(ledger, pool, jobs).values()]
-        assert found == [Status.DONE, Status.FAILED, Status.TIMEOUT]
+        assert found == [TrainingStatus.DONE, TrainingStatus.FAILED, TrainingStatus.TIMEOUT]
         pool.submit(job_of(3, sleep=600))
         with pytest.raises(ConfigError, match="submitted twice"):
             pool.submit(job_of(3, sleep=600))
         pool.cancel(job_of(3, sleep=600).key)
         assert pool.wait_any(0.1) is None
         pool.submit(job_of(4))
-        assert pool.wait_any().status is Status.DONE  # the cancelled one holds no core
+        assert pool.wait_any().status is TrainingStatus.DONE  # the cancelled one holds no core
 
 
 @needs_ray
 def test_no_cluster_at_an_address_is_told_at_once():
     with pytest.raises(ConfigError, match=r"nothing answers at '127\.0\.0\.1:9'.*ray start --head"):
-        Crew(cluster="127.0.0.1:9").gather()
+        Resources(cluster="127.0.0.1:9").gather()
 
 
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"\[cluster\]"):
-        Crew(cluster="auto", open_cluster=True).gather()
+        Resources(cluster="auto", open_cluster=True).gather()
 
 
 def test_workers_of_two_kinds_are_refused():
     with pytest.raises(ConfigError, match="give one of the two"):
-        Crew(cluster="auto", workers=2)
-    assert isinstance(Crew(workers=1).gather(), LocalPool)
+        Resources(cluster="auto", workers=2)
+    assert isinstance(Resources(workers=1).gather(), LocalPool)
 
 
 class OneNode:
@@ -195,16 +197,16 @@ class OneNode:
         self.results.pop(reference, None)
 
     def shutdown(self):
-        for pool in edp.search.cluster._pool.values():
+        for pool in edp.workflows.search.cluster._pool.values():
             pool.close()
-        edp.search.cluster._pool.clear()
+        edp.workflows.search.cluster._pool.clear()
 
 
 @pytest.fixture
 def node(monkeypatch):
     one = OneNode()
-    monkeypatch.setattr(edp.search.cluster, "_ray", lambda: one)
-    monkeypatch.setattr(edp.search.cluster, "_reach", lambda ray, address: None)
+    monkeypatch.setattr(edp.workflows.search.cluster, "_ray", lambda: one)
+    monkeypatch.setattr(edp.workflows.search.cluster, "_reach", lambda ray, address: None)
     monkeypatch.setattr(RayPool, "_check_nodes", lambda self: None)
     return one
 

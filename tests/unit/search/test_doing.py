@@ -2,14 +2,14 @@
 
 import pytest
 
-from edp.config import load_experiment
-from edp.ledger import Ledger, Status
-from edp.search.conduct import conduct
-from edp.search.doing import Doing
-from edp.search.ground import Ground
-from edp.search.local import LocalPool
-from edp.search.settings import SearchSpec
-from edp.search.trainings import settings_of
+from edp.config.experiment import load_experiment
+from edp.storage.ledger import Ledger, TrainingStatus
+from edp.workflows.search.context import SearchContext
+from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.local import LocalPool
+from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.trainings import settings_of
 
 CHANGES = (
     'task.targets=["speed"]',
@@ -32,7 +32,7 @@ class Stop(Exception):
 def ground(lever_sessions):
     base = settings_of(load_experiment(None, "quick", CHANGES))
     names = tuple(f"s{number}" for number in range(5))
-    return Ground(SPEC, base, lever_sessions.to_plain(), names[:4], names[4:], ("lever", "speed"))
+    return SearchContext(SPEC, base, lever_sessions.to_plain(), names[:4], names[4:], ("lever", "speed"))
 
 
 def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(ground, tmp_path):
@@ -40,8 +40,8 @@ def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(groun
 
     def search(on_record):
         with Ledger(tmp_path / "ledger") as ledger, LocalPool(1) as pool:
-            do = Doing(ledger, pool, "data", on_record=on_record)
-            return conduct(ground, do, until="isolation").decided["isolation"]
+            do = Dispatcher(ledger, pool, "data", on_record=on_record)
+            return run_phases(ground, do, until="isolation").decided["isolation"]
 
     def stop_after_three(record, now):
         trained.append(record.key)
@@ -55,7 +55,7 @@ def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(groun
     decision = search(lambda record, now: seen.append((record.key, now, record.status)))
     assert sum(not now for _, now, _ in seen) >= 3
     assert len({key for key, _, _ in seen}) == len(seen) == 8
-    assert {status for *_, status in seen} == {Status.DONE}
+    assert {status for *_, status in seen} == {TrainingStatus.DONE}
     seen.clear()
     again = search(lambda record, now: seen.append(now))
     assert not any(seen)

@@ -9,9 +9,9 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from edp.errors import ConfigError, StorageError
-from edp.search.export import export_study
-from edp.search.plan import space_of
-from edp.search.space import Choice, Real
+from edp.workflows.search.export import export_study
+from edp.workflows.search.plan import space_of
+from edp.workflows.search.space import Choice, Real
 
 SPACE = {"learning_rate": {"low": 1e-4, "high": 5e-3, "log": True}, "units": [8, 16]}
 RATES = ({"learning_rate": 1e-3, "units": 8}, {"learning_rate": 2e-3, "units": 16})

@@ -7,30 +7,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.compress import taken
-from edp.config import load_experiment, plain_tree
+from edp.config.experiment import load_experiment, plain_tree
 from edp.data.frozen import SECOND_BOX, ByFrozen, Session
-from edp.downsizing import DistilSpec, SearchSpec, distil, search
-from edp.downsizing.quantise import quantise
 from edp.errors import ConfigError, DataError
 from edp.evaluation.controller import Budget
-from edp.ledger import Ledger
 from edp.logs import read_recording, write_recording
-from edp.search.diary import look_at
-from edp.search.phases.compression import order_of, recipe_of, teacher_settings
-from edp.search.plan import load_plan
-from edp.search.runner import Crew, Watchers, run_search
-from edp.search.smaller import Recipe, before, make_smaller
-from edp.search.trainings import experiment_of
-from edp.search.worker import perform
-from edp.sources import DataSource
+from edp.logs.source import DataSource
 from edp.storage import read_json
+from edp.storage.ledger import Ledger
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.fit import Loop
-from edp.transfer.finetune import Order, finetune
-from edp.transfer.spec import FinetuneSpec
-from edp.workflow import evaluate, prepare_data, train, trained_run
+from edp.workflows.compression import CompressionSearchSpec, DistilSpec, distil, search, taken
+from edp.workflows.compression.quantise import quantise
+from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_settings
+from edp.workflows.search.plan import load_plan
+from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.smaller import Recipe, before, make_smaller
+from edp.workflows.search.study_log import look_at
+from edp.workflows.search.trainings import experiment_of
+from edp.workflows.search.worker import perform
+from edp.workflows.train_evaluate import evaluate, prepare_data, train, trained_run
+from edp.workflows.transfer.finetune import FinetuneRequest, finetune
+from edp.workflows.transfer.spec import FinetuneSpec
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
@@ -76,7 +75,7 @@ class Inline:
         self.close()
 
 
-class Here(Crew):
+class Here(Resources):
     def gather(self):
         return Inline()
 
@@ -169,7 +168,7 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
         assert [one.box for one in ledger.openings()] == ["test sessions", SECOND_BOX]
     need = taken(load_bundle(run).predictor, "float32", Budget())
     budget = Budget(name="tight", parameter_bytes=need.parameter_bytes - 1)
-    spec = SearchSpec(budget=budget, units=(2,), formats=("float32",), again=True)
+    spec = CompressionSearchSpec(budget=budget, units=(2,), formats=("float32",), again=True)
     with watching(seen):
         found = search(run, spec, tmp_path / "small")
         distil(run, DistilSpec(units=2), tmp_path / "student")
@@ -212,7 +211,7 @@ def test_a_frozen_session_under_another_name_is_still_frozen(study, run, six_ses
     opened = prepare_data(source, replaced(study, lambda split: split.opened()))
     assert [series.name for series in opened.test] == ["b_new_day"]
     with pytest.raises(DataError, match=f"'a_new_day' .* is the frozen session '{test}'"):
-        finetune(run, source, Order(spec=FinetuneSpec()), tmp_path / "fine")
+        finetune(run, source, FinetuneRequest(spec=FinetuneSpec()), tmp_path / "fine")
     with pytest.raises(DataError, match=f"is the frozen session '{test}'.*learn from it"):
         distil(run, DistilSpec(units=2, further=source), tmp_path / "student")
     assert not (tmp_path / "student").exists()
@@ -267,7 +266,7 @@ def test_phase_6_killed_after_each_training_comes_to_the_same(
 
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, folder, Here(workers=1), watchers=Watchers(on_progress=kill))
+            found = run_search(six_sessions, plan, folder, Here(workers=1), watchers=SearchCallbacks(on_progress=kill))
         except Killed:
             sittings += 1
             if harm != "none":

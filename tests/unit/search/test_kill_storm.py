@@ -8,14 +8,14 @@ import sys
 import time
 from pathlib import Path
 
-from edp.ledger import Ledger, read_records
+from edp.storage.ledger import Ledger, read_records
 
 STUDY = """
 import sys
-from edp.ledger import Identity, Ledger
-from edp.search.batch import complete
-from edp.search.executor import Job
-from edp.search.local import LocalPool
+from edp.storage.ledger import Identity, Ledger
+from edp.workflows.search.batch import complete
+from edp.workflows.search.executor import Job
+from edp.workflows.search.local import LocalPool
 
 def identity(seed):
     facts = {"code": "c", "data": "d", "environment": {"threads": "1"}}

@@ -15,11 +15,11 @@ import pytest
 
 import edp.storage
 from edp.errors import BusyError, ConfigError, NotFiniteError, StorageError
-from edp.ledger import (
-    Identity,
+from edp.storage.ledger import (
     Ledger,
     Record,
-    Status,
+    TrainingIdentity,
+    TrainingStatus,
     canonical,
     claim,
     code_version,
@@ -27,7 +27,7 @@ from edp.ledger import (
     leave_arrival,
     read_records,
 )
-from edp.runs import environment
+from edp.storage.runs import environment
 
 
 class Mode(StrEnum):
@@ -37,7 +37,7 @@ class Mode(StrEnum):
 def test_equal_content_gives_one_key_and_other_content_another(identity_of):
     one = identity_of(lr=1e-3, blocks=("a", "b"), mode=Mode.DELTA)
     assert one.key == identity_of(mode="delta", blocks=["a", "b"], lr=0.001).key
-    assert Identity(**json.loads(json.dumps(one.to_json()))).key == one.key
+    assert TrainingIdentity(**json.loads(json.dumps(one.to_json()))).key == one.key
     others = [
         replace(one, code="c2"),
         replace(one, data="d2"),
@@ -76,7 +76,7 @@ def test_the_code_and_threads_are_parts_of_a_key(tmp_path):
     shutil.copytree(Path(edp.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
 
     def told():
-        command = "from edp.ledger import code_version; print(code_version())"
+        command = "from edp.storage.ledger import code_version; print(code_version())"
         return subprocess.check_output([sys.executable, "-P", "-c", command], env=os.environ | {"PYTHONPATH": tmp_path})
 
     before = told()
@@ -92,15 +92,17 @@ def test_the_code_and_threads_are_parts_of_a_key(tmp_path):
 
 
 def test_a_record_comes_back_as_it_was(identity_of, tmp_path):
-    done = Record(identity_of(lr=0.1), Status.DONE, {"score": 0.1 + 0.2, "n": 3, "none": None}, "", {"seconds": 1.5})
-    lost = Record(identity_of(1), Status.LOST, None, "killed")
+    done = Record(
+        identity_of(lr=0.1), TrainingStatus.DONE, {"score": 0.1 + 0.2, "n": 3, "none": None}, "", {"seconds": 1.5}
+    )
+    lost = Record(identity_of(1), TrainingStatus.LOST, None, "killed")
     with Ledger(tmp_path) as ledger:
         assert ledger.finished(done.key) is None
         ledger.put(done)
         ledger.put(done)
         ledger.put(lost)
         with pytest.raises(StorageError, match="came again, diverged, with another result"):
-            ledger.put(replace(done, status=Status.DIVERGED, result=None))
+            ledger.put(replace(done, status=TrainingStatus.DIVERGED, result=None))
     with Ledger(tmp_path) as ledger:
         assert len(ledger) == 2
         held = ledger.finished(done.key)
@@ -108,16 +110,16 @@ def test_a_record_comes_back_as_it_was(identity_of, tmp_path):
         assert held.result["score"] == 0.1 + 0.2
         assert ledger.finished(lost.key) is None
         assert ledger.get(lost.key) == lost
-        ledger.put(Record(lost.identity, Status.DONE, {"score": 1.0}))
+        ledger.put(Record(lost.identity, TrainingStatus.DONE, {"score": 1.0}))
         assert ledger.finished(lost.key).result == {"score": 1.0}
-    assert read_records(tmp_path)[0][lost.key].status is Status.DONE
+    assert read_records(tmp_path)[0][lost.key].status is TrainingStatus.DONE
 
 
 def test_the_hash_leaves_out_what_is_measured(identity_of, tmp_path):
     def hashed(name, seeds, **changed):
         with Ledger(tmp_path / name) as ledger:
             for seed in seeds:
-                record = Record(identity_of(seed), Status.DONE, {"score": seed}, "", {"seconds": len(name)})
+                record = Record(identity_of(seed), TrainingStatus.DONE, {"score": seed}, "", {"seconds": len(name)})
                 ledger.put(replace(record, **changed))
             return ledger.digest()
 
@@ -138,7 +140,7 @@ def test_the_hash_leaves_out_what_is_measured(identity_of, tmp_path):
     ],
 )
 def test_a_damaged_record_is_set_apart_and_its_training_is_not_done(identity_of, tmp_path, damage):
-    records = [Record(identity_of(seed), Status.DONE, {"score": 0.25}) for seed in range(3)]
+    records = [Record(identity_of(seed), TrainingStatus.DONE, {"score": 0.25}) for seed in range(3)]
     with Ledger(tmp_path) as ledger:
         for record in records:
             ledger.put(record)
@@ -162,7 +164,7 @@ def test_a_damaged_record_is_set_apart_and_its_training_is_not_done(identity_of,
 
 
 def test_a_record_under_another_name_or_of_a_later_version(identity_of, tmp_path):
-    record = Record(identity_of(), Status.DONE, {"score": 1.0})
+    record = Record(identity_of(), TrainingStatus.DONE, {"score": 1.0})
     with Ledger(tmp_path) as ledger:
         ledger.put(record)
     file = tmp_path / "records" / f"{record.key}.json"
@@ -171,7 +173,7 @@ def test_a_record_under_another_name_or_of_a_later_version(identity_of, tmp_path
         assert len(ledger) == 1
         assert "record of another training" in ledger.damaged[0].why
     body = canonical({"schema": 2})
-    file.write_text(f'{{"checksum":"{edp.ledger.record._checksum(body.encode())}","record":{body}}}\n')
+    file.write_text(f'{{"checksum":"{edp.storage.ledger.record._checksum(body.encode())}","record":{body}}}\n')
     with pytest.raises(StorageError, match="later version"):
         Ledger(tmp_path)
     assert file.exists()
@@ -181,7 +183,7 @@ def test_a_record_under_another_name_or_of_a_later_version(identity_of, tmp_path
 
 FULL = """
 import sys
-from edp.ledger import *
+from edp.storage.ledger import *
 from edp.errors import StorageError
 def record(seed, size):
     identity = Identity("m:f", {}, {}, seed, 1, "c", "d", {})
@@ -223,10 +225,10 @@ def test_an_error_while_writing_leaves_no_temporary_file(identity_of, tmp_path, 
         with monkeypatch.context() as patch:
             patch.setattr(edp.storage.writing.os, "fsync", full)
             with pytest.raises(StorageError, match="No space left"):
-                ledger.put(Record(identity_of(), Status.DONE, {"score": 1.0}))
+                ledger.put(Record(identity_of(), TrainingStatus.DONE, {"score": 1.0}))
         assert list((tmp_path / "records").iterdir()) == []
         assert len(ledger) == 0
-        ledger.put(Record(identity_of(), Status.DONE, {"score": 1.0}))
+        ledger.put(Record(identity_of(), TrainingStatus.DONE, {"score": 1.0}))
     (tmp_path / "records" / ".x.json.1.tmp").write_text("of a process that was killed while it wrote")
     with Ledger(tmp_path) as ledger:
         assert len(os.listdir(tmp_path / "records")) == len(ledger) == 1
@@ -235,7 +237,7 @@ def test_an_error_while_writing_leaves_no_temporary_file(identity_of, tmp_path, 
 SECOND = """
 import sys
 from edp.errors import EdpError
-from edp.ledger import Ledger, claim
+from edp.storage.ledger import Ledger, claim
 try:
     Ledger(sys.argv[1]) if len(sys.argv) == 2 else claim(*sys.argv[1:])
 except EdpError as error:
@@ -246,7 +248,7 @@ except EdpError as error:
 
 FIRST = """
 import sys, time
-from edp.ledger import claim
+from edp.storage.ledger import claim
 held = claim(sys.argv[1], "k")
 print("held", flush=True)
 time.sleep(60)
@@ -289,7 +291,7 @@ def test_a_claim_is_refused_to_a_second_and_freed_when_the_first_dies(tmp_path):
 
 
 def test_what_a_worker_left_is_entered_and_damaged_leavings_are_not(identity_of, tmp_path):
-    done, other = (Record(identity_of(seed), Status.DONE, {"score": float(seed)}) for seed in range(2))
+    done, other = (Record(identity_of(seed), TrainingStatus.DONE, {"score": float(seed)}) for seed in range(2))
     leave_arrival(tmp_path, done)
     (tmp_path / "arrived" / f"{other.key}.json").write_bytes(other.to_bytes()[:-5])
     with Ledger(tmp_path) as ledger:
@@ -303,9 +305,9 @@ def test_what_a_worker_left_is_entered_and_damaged_leavings_are_not(identity_of,
 
 def test_capped_trainings_are_tried_again_when_asked(identity_of, tmp_path):
     with Ledger(tmp_path) as ledger:
-        for seed, status in enumerate([Status.DONE, Status.TIMEOUT, Status.OOM]):
+        for seed, status in enumerate([TrainingStatus.DONE, TrainingStatus.TIMEOUT, TrainingStatus.OOM]):
             ledger.put(Record(identity_of(seed), status))
-        assert ledger.set_aside({Status.TIMEOUT}) == 1
+        assert ledger.set_aside({TrainingStatus.TIMEOUT}) == 1
         assert [ledger.finished(identity_of(seed).key) is None for seed in range(3)] == [False, True, False]
     with Ledger(tmp_path) as ledger:
         assert len(ledger) == 2

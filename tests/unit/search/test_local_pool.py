@@ -8,10 +8,10 @@ import time
 import pytest
 
 from edp.errors import ConfigError, StorageError
-from edp.ledger import Ledger, Status, claim, leave_arrival
-from edp.search import worker
-from edp.search.batch import complete
-from edp.search.local import LocalPool
+from edp.storage.ledger import Ledger, TrainingStatus, claim, leave_arrival
+from edp.workflows.search import worker
+from edp.workflows.search.batch import complete
+from edp.workflows.search.local import LocalPool
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def alive(pid):
 def test_jobs_come_back_with_result_and_measures(pool, job_of, log):
     found = collect(pool, [job_of(seed) for seed in range(5)])
     assert sorted(found) == list(range(5))
-    assert all(record.status is Status.DONE for record in found.values())
+    assert all(record.status is TrainingStatus.DONE for record in found.values())
     assert {seed: record.result["score"] for seed, record in found.items()} == {s: 1 / (1 + s) for s in range(5)}
     assert found[0].result["threads"] == "1"
     assert {"seconds", "peak_mb", "host", "attempts", "finished"} <= set(found[0].measured)
@@ -57,14 +57,14 @@ def test_jobs_come_back_with_result_and_measures(pool, job_of, log):
 @pytest.mark.parametrize(
     ("how", "status", "message"),
     [
-        ("error", Status.FAILED, "ValueError: no such optimiser"),
-        ("user", Status.FAILED, "give at least 1 epoch"),
-        ("exit", Status.FAILED, "SystemExit: 3"),
-        ("list", Status.FAILED, "returned list"),
-        ("diverged", Status.DIVERGED, "the loss is nan in epoch 3"),
-        ("nan", Status.DIVERGED, "'score' is nan"),
-        ("inf", Status.DIVERGED, r"'scores\[1\]' is -inf"),
-        ("memory", Status.OOM, "MemoryError: 512 GB"),
+        ("error", TrainingStatus.FAILED, "ValueError: no such optimiser"),
+        ("user", TrainingStatus.FAILED, "give at least 1 epoch"),
+        ("exit", TrainingStatus.FAILED, "SystemExit: 3"),
+        ("list", TrainingStatus.FAILED, "returned list"),
+        ("diverged", TrainingStatus.DIVERGED, "the loss is nan in epoch 3"),
+        ("nan", TrainingStatus.DIVERGED, "'score' is nan"),
+        ("inf", TrainingStatus.DIVERGED, r"'scores\[1\]' is -inf"),
+        ("memory", TrainingStatus.OOM, "MemoryError: 512 GB"),
     ],
 )
 def test_how_a_training_ends_is_typed_and_not_tried_again(pool, job_of, log, tmp_path, how, status, message):
@@ -81,7 +81,7 @@ def test_how_a_training_ends_is_typed_and_not_tried_again(pool, job_of, log, tmp
 
 def test_a_job_that_does_not_exist(pool, job_of):
     found = collect(pool, [job_of(1, "nothing")])
-    assert found[1].status is Status.FAILED
+    assert found[1].status is TrainingStatus.FAILED
     assert "there is no job 'trainings_of_tests:nothing'" in found[1].message
 
 
@@ -89,41 +89,41 @@ def test_an_equal_job_is_refused_while_one_is_under_way(pool, job_of):
     pool.submit(job_of(1))
     with pytest.raises(ConfigError, match="submitted twice"):
         pool.submit(job_of(1))
-    assert pool.wait_any().status is Status.DONE
+    assert pool.wait_any().status is TrainingStatus.DONE
     pool.submit(job_of(1))
-    assert pool.wait_any().status is Status.DONE
+    assert pool.wait_any().status is TrainingStatus.DONE
 
 
 def test_waiting_has_an_end(pool, job_of):
     pool.submit(job_of(1, sleep=0.5))
     assert pool.wait_any(0.05) is None
     assert pool.running() == [job_of(1, sleep=0.5).key]
-    assert pool.wait_any().status is Status.DONE
+    assert pool.wait_any().status is TrainingStatus.DONE
 
 
 def test_a_killed_worker_is_replaced_and_only_its_training_starts_again(job_of, log):
     with LocalPool(2) as pool:
         found = collect(pool, [job_of(0, "killed", times=2), *(job_of(seed) for seed in range(1, 5))])
-        assert all(record.status is Status.DONE for record in found.values())
+        assert all(record.status is TrainingStatus.DONE for record in found.values())
         assert [found[seed].measured["attempts"] for seed in range(5)] == [3, 1, 1, 1, 1]
         assert log("start 0") == 3
         assert log("end") == 4
         for pid in pool.processes():  # idle ones, too, are replaced, at no cost to a training
             os.kill(pid, signal.SIGKILL)
         found = collect(pool, [job_of(seed) for seed in range(5, 8)])
-        assert [record.status for record in found.values()] == [Status.DONE] * 3
+        assert [record.status for record in found.values()] == [TrainingStatus.DONE] * 3
 
 
 def test_killed_three_times_is_lost_and_tried_again_by_the_next_search(job_of, log, tmp_path):
     jobs = [job_of(0, "killed", times=3), job_of(1)]
     with LocalPool(1) as pool, Ledger(tmp_path / "study") as ledger:
         lost, done = complete(ledger, pool, jobs).values()
-        assert lost.status is Status.LOST
+        assert lost.status is TrainingStatus.LOST
         assert "its process ended 3 times, last by signal 9: last words" in lost.message
-        assert done.status is Status.DONE
+        assert done.status is TrainingStatus.DONE
         assert log("start 0") == 3
         again, _ = complete(ledger, pool, jobs).values()
-        assert again.status is Status.DONE
+        assert again.status is TrainingStatus.DONE
         assert log("start 1") == 1
 
 
@@ -132,20 +132,20 @@ def test_time_and_memory_over_the_cap(job_of, log):
         pool.submit(job_of(0, seconds=0.3, sleep=30.0))
         pool.submit(job_of(1, "hog", memory_mb=120, mb=400))
         found = {record.identity.seed: record for record in iter(pool.wait_any, None)}
-        assert found[0].status is Status.TIMEOUT
+        assert found[0].status is TrainingStatus.TIMEOUT
         assert found[0].message == "it took longer than 0.3 s"
-        assert found[1].status is Status.OOM
+        assert found[1].status is TrainingStatus.OOM
         assert found[1].message == "it took more than 120 MB of memory"
         assert log("start") == 2
         assert pool.processes() == []
-        assert collect(pool, [job_of(3)])[3].status is Status.DONE
+        assert collect(pool, [job_of(3)])[3].status is TrainingStatus.DONE
 
 
 def test_a_process_that_did_other_trainings_does_not_decide_on_memory(job_of, log):
     with LocalPool(1) as pool:
         collect(pool, [job_of(0)])
         found = collect(pool, [job_of(1, "hog", memory_mb=120, mb=400)])
-        assert found[1].status is Status.OOM
+        assert found[1].status is TrainingStatus.OOM
         assert log("start 1") == 2
         assert found[1].measured["attempts"] == 1
 
@@ -197,11 +197,11 @@ def test_a_training_that_someone_else_does_is_not_done_twice(pool, job_of, log, 
     monkeypatch.setattr(worker, "CLAIM_WAIT_S", 0.2)
     with claim(tmp_path, job.key):
         record = worker.perform(job.identity, job.where, str(tmp_path), lambda: None)
-    assert record.status is Status.LOST
+    assert record.status is TrainingStatus.LOST
     assert f"claimed by process {os.getpid()}" in record.message
     assert log("start") == 0
     first = worker.perform(job.identity, job.where, str(tmp_path), lambda: None)
-    assert first.status is Status.DONE
+    assert first.status is TrainingStatus.DONE
     assert worker.perform(job.identity, job.where, str(tmp_path), lambda: None) == first
     assert log("start") == 1
 
@@ -225,7 +225,7 @@ def test_a_full_disk_stops_the_search_and_it_goes_on(pool, job_of, log, tmp_path
     with Ledger(tmp_path / "study") as ledger:
         told = []
         found = complete(ledger, pool, jobs, lambda record, trained: told.append(trained))
-        assert [record.status for record in found.values()] == [Status.DONE] * 3
+        assert [record.status for record in found.values()] == [TrainingStatus.DONE] * 3
         assert list(found) == [job.key for job in jobs]
         assert log("end") == 3
         assert set(told) <= {True, False}
@@ -238,7 +238,7 @@ def test_a_pool_of_nothing(wrong):
 
 
 def test_memory_caps_are_refused_where_they_cannot_be_held(pool, job_of, monkeypatch):
-    monkeypatch.setattr("edp.search.local.sys.platform", "darwin")
+    monkeypatch.setattr("edp.workflows.search.local.sys.platform", "darwin")
     with pytest.raises(ConfigError, match="needs Linux"):
         pool.submit(job_of(0, memory_mb=1))
 

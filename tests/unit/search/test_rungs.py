@@ -9,19 +9,28 @@ import time
 import pytest
 
 import edp.storage
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import LostError, StorageError
-from edp.ledger import Ledger, Record, Status, WithState, leave_arrival, leave_state, left_state, read_state
 from edp.report import read_study, write_study_page
-from edp.search.diary import look_at
-from edp.search.doing import Doing
-from edp.search.export import export_study
-from edp.search.jobs import job_of as job_of_order
-from edp.search.local import LocalPool
-from edp.search.plan import load_plan
-from edp.search.runner import Crew, Watchers, run_search
-from edp.search.trainings import Order, settings_of
-from edp.search.worker import perform
+from edp.storage.ledger import (
+    Ledger,
+    Record,
+    TrainingStatus,
+    WithState,
+    leave_arrival,
+    leave_state,
+    left_state,
+    read_state,
+)
+from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.export import export_study
+from edp.workflows.search.jobs import job_of as job_of_order
+from edp.workflows.search.local import LocalPool
+from edp.workflows.search.plan import load_plan
+from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.study_log import look_at
+from edp.workflows.search.trainings import TrainingRequest, settings_of
+from edp.workflows.search.worker import perform
 
 TINY = (
     'task={targets=["speed"], horizons=[1]}',
@@ -68,7 +77,7 @@ class Inline:
         self.close()
 
 
-class Here(Crew):
+class Here(Resources):
     def gather(self):
         return Inline()
 
@@ -83,7 +92,7 @@ CREW = Here(workers=1)
 @pytest.fixture(scope="module")
 def order(lever_sessions):
     settings = settings_of(load_experiment(None, "quick", [*TINY, 'task.features="all"']))
-    return Order(settings, lever_sessions.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
+    return TrainingRequest(settings, lever_sessions.to_plain(), ("s0", "s1", "s2"), ("s3", "s4"), seed=1, updates=12)
 
 
 def parts_of(order, stops=(3, 6)):
@@ -100,14 +109,14 @@ def test_a_training_over_rungs_is_the_training_without_them(order, tmp_path):
     assert job_of_order(second, "d").key == job_of_order(dataclasses.replace(second, stops=()), "d").key
     executor = Inline()
     with Ledger(tmp_path / "rungs") as ledger:
-        do = Doing(ledger, executor, "d")
+        do = Dispatcher(ledger, executor, "d")
         judged = [do([part])[0] for part in (first, second)]
         assert len(os.listdir(tmp_path / "rungs/states")) == 1  # that of the second, the first being of no use any more
         over_rungs = do([last])[0]
         assert os.listdir(tmp_path / "rungs/states") == []
     assert [begun for _, begun in executor.heard] == [False, True, True]
     with Ledger(tmp_path / "whole") as ledger:
-        whole = Doing(ledger, Inline(), "d")([order])[0]
+        whole = Dispatcher(ledger, Inline(), "d")([order])[0]
     assert over_rungs.result == whole.result
     assert judged[0].result["scores"] != judged[1].result["scores"]
 
@@ -117,7 +126,7 @@ def test_a_state_that_is_damaged_is_set_apart_and_the_rung_before_it_serves(harm
     first, second, last = parts_of(order)
     executor = Inline()
     with Ledger(tmp_path) as ledger:
-        do = Doing(ledger, executor, "d")
+        do = Dispatcher(ledger, executor, "d")
         do([first, dataclasses.replace(first, seed=2)])
         do.ledger.keep_states = lambda keys: None  # both rungs keep theirs
         do([second])
@@ -133,14 +142,14 @@ def test_a_state_that_is_damaged_is_set_apart_and_the_rung_before_it_serves(harm
     assert executor.heard[-1] == (job_of_order(order, "d").key, True)
     assert len(list(tmp_path.glob("quarantine/*.state"))) == (harm != "gone")
     with Ledger(tmp_path / "whole") as ledger:
-        assert harmed.result == Doing(ledger, Inline(), "d")([order])[0].result
+        assert harmed.result == Dispatcher(ledger, Inline(), "d")([order])[0].result
 
 
 def test_a_state_that_goes_while_its_job_waits_costs_time_only(order, tmp_path):
     first, second, _ = parts_of(order)
     with Ledger(tmp_path) as ledger:
         executor = Inline()
-        do = Doing(ledger, executor, "d")
+        do = Dispatcher(ledger, executor, "d")
         do([first])
 
         def lose(job):
@@ -155,7 +164,7 @@ def test_a_state_that_goes_while_its_job_waits_costs_time_only(order, tmp_path):
 def test_a_worker_of_the_pool_hands_states_on_and_is_killed_on_the_way(order, tmp_path):
     first, _, last = parts_of(order)
     with Ledger(tmp_path / "pool") as ledger, LocalPool(1) as pool:
-        do = Doing(ledger, pool, "d")
+        do = Dispatcher(ledger, pool, "d")
         do([first])
         submit = pool.submit
 
@@ -168,14 +177,14 @@ def test_a_worker_of_the_pool_hands_states_on_and_is_killed_on_the_way(order, tm
         pool.submit = kill_then
         found = do([last])[0]
     with Ledger(tmp_path / "whole") as ledger:
-        assert found.result == Doing(ledger, Inline(), "d")([order])[0].result
+        assert found.result == Dispatcher(ledger, Inline(), "d")([order])[0].result
 
 
 def test_a_disk_that_is_full_stops_the_search_and_loses_nothing(order, tmp_path, monkeypatch):
     first, second, _ = parts_of(order)
     written = os.fsync
     with Ledger(tmp_path) as ledger:
-        do = Doing(ledger, Inline(), "d")
+        do = Dispatcher(ledger, Inline(), "d")
         do([first])
 
         def full(handle):
@@ -186,13 +195,13 @@ def test_a_disk_that_is_full_stops_the_search_and_loses_nothing(order, tmp_path,
         with monkeypatch.context() as patch:
             patch.setattr(edp.storage.writing.os, "fsync", full)
             outcome = do([second])[0]
-        assert outcome.status == Status.LOST  # which stops a search, and is tried again by the next
+        assert outcome.status == TrainingStatus.LOST  # which stops a search, and is tried again by the next
         assert "No space left" in outcome.message
         assert not list(tmp_path.rglob("*.tmp"))
         assert ledger.state(job_of_order(first, "d").key)
     with Ledger(tmp_path) as ledger:
         executor = Inline()
-        assert Doing(ledger, executor, "d")([second])[0].status == "done"
+        assert Dispatcher(ledger, executor, "d")([second])[0].status == "done"
         assert executor.heard == [(job_of_order(second, "d").key, True)]
 
 
@@ -201,7 +210,7 @@ def test_what_a_killed_coordinator_left_is_taken_with_its_record_only(tmp_path, 
         pass
     done, cut_short = identity_of(0), identity_of(1)
     leave_state(tmp_path, done.key, b"one")
-    leave_arrival(tmp_path, Record(done, Status.DONE, {"score": 1.0}))
+    leave_arrival(tmp_path, Record(done, TrainingStatus.DONE, {"score": 1.0}))
     leave_state(tmp_path, cut_short.key, b"two")
     with Ledger(tmp_path) as ledger:
         assert read_state(ledger.state(done.key)) == b"one"
@@ -223,10 +232,10 @@ def gives_a_bad_result(identity, where):
 def test_a_worker_leaves_a_state_only_of_what_is_done(tmp_path, identity_of):
     with Ledger(tmp_path):
         pass
-    for function, status in ((gives_a_state, Status.DONE), (gives_a_bad_result, Status.DIVERGED)):
+    for function, status in ((gives_a_state, TrainingStatus.DONE), (gives_a_bad_result, TrainingStatus.DIVERGED)):
         identity = dataclasses.replace(identity_of(0), job=f"{__name__}:{function.__name__}")
         assert perform(identity, {}, str(tmp_path), lambda: None).status == status
-        assert left_state(tmp_path, identity.key).exists() == (status == Status.DONE)
+        assert left_state(tmp_path, identity.key).exists() == (status == TrainingStatus.DONE)
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +298,7 @@ def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same
                 raise Stop
 
         try:
-            again = run_search(six_sessions, plan, tmp_path, CREW, "calibration", Watchers(on_progress=stop))
+            again = run_search(six_sessions, plan, tmp_path, CREW, "calibration", SearchCallbacks(on_progress=stop))
             break
         except Stop:
             stops += 1
@@ -303,7 +312,7 @@ def test_a_search_whose_states_cannot_be_written_is_stopped(six_sessions, plan, 
     def full(folder, key, state):
         raise StorageError("cannot write 'states': No space left on device; free space")
 
-    monkeypatch.setattr("edp.search.worker.leave_state", full)
+    monkeypatch.setattr("edp.workflows.search.worker.leave_state", full)
     with pytest.raises(LostError, match="No space left"):
         run_search(six_sessions, plan, tmp_path, CREW, "calibration")
     monkeypatch.undo()

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import pytest
 
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.errors import BusyError, ConfigError, DataError, LostError, StorageError
-from edp.ledger import Ledger, Status
 from edp.logs import read_recording, write_recording
+from edp.logs.source import DataSource
 from edp.report import read_study
-from edp.search.diary import look_at
-from edp.search.executor import ended
-from edp.search.plan import SearchPlan, load_plan
-from edp.search.runner import Crew, Watchers, run_search
-from edp.search.worker import perform
-from edp.sources import DataSource
+from edp.storage.ledger import Ledger, TrainingStatus
+from edp.workflows.search.executor import ended
+from edp.workflows.search.plan import SearchPlan, load_plan
+from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.study_log import look_at
+from edp.workflows.search.worker import perform
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
@@ -59,7 +59,7 @@ class Inline:
         self.close()
 
 
-class Here(Crew):
+class Here(Resources):
     def gather(self):
         return Inline()
 
@@ -130,7 +130,7 @@ def test_a_search_that_was_stopped_again_and_again_trains_nothing_twice_and_find
     trained = 0
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, tmp_path, CREW, watchers=Watchers(on_progress=stop_every_30))
+            found = run_search(six_sessions, plan, tmp_path, CREW, watchers=SearchCallbacks(on_progress=stop_every_30))
         except Stop:
             study = look_at(tmp_path)
             assert study["state"] == "stopped"
@@ -226,7 +226,7 @@ def test_damaged_records_are_set_apart_and_trained_again(six_sessions, plan, tmp
     records = sorted((tmp_path / "ledger/records").glob("*.json"))
     records[0].write_bytes(records[0].read_bytes()[:-40])
     notes = []
-    again = run_search(six_sessions, plan, tmp_path, CREW, "isolation", Watchers(on_note=notes.append))
+    again = run_search(six_sessions, plan, tmp_path, CREW, "isolation", SearchCallbacks(on_note=notes.append))
     assert "1 damaged records were set apart" in notes[0]
     assert (again.trained, again.digest) == (1, digest)
 
@@ -241,9 +241,11 @@ def test_trainings_that_all_fail_are_told_with_their_reason(six_sessions, plan, 
 def test_a_lost_training_stops_the_search_and_is_tried_again(six_sessions, plan, tmp_path):
     class Killed(Inline):
         def wait_any(self, timeout_s=None):
-            return ended(self.queue.pop(0), Status.LOST, "its process ended 3 times, last by signal 9", attempts=3)
+            return ended(
+                self.queue.pop(0), TrainingStatus.LOST, "its process ended 3 times, last by signal 9", attempts=3
+            )
 
-    class Unlucky(Crew):
+    class Unlucky(Resources):
         def gather(self):
             return Killed()
 

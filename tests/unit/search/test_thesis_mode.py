@@ -5,15 +5,22 @@ import json
 
 import pytest
 
-from edp.config import load_experiment
-from edp.ledger import Ledger
+from edp.config.experiment import load_experiment
 from edp.report import read_study, write_study_page
-from edp.search.doing import Doing
-from edp.search.plan import load_plan
-from edp.search.runner import Crew, Watchers, run_search
-from edp.search.trainings import Order, experiment_of, prepared, settings_of, train_order, train_part
-from edp.search.worker import perform
+from edp.storage.ledger import Ledger
 from edp.training.parts import fit_part
+from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.plan import load_plan
+from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
+from edp.workflows.search.trainings import (
+    TrainingRequest,
+    experiment_of,
+    prepared,
+    settings_of,
+    train_order,
+    train_part,
+)
+from edp.workflows.search.worker import perform
 
 CHANGES = (
     'task={targets=["speed"], horizons=[1]}',
@@ -58,7 +65,7 @@ class Inline:
         self.close()
 
 
-class Here(Crew):
+class Here(Resources):
     def gather(self):
         return Inline()
 
@@ -82,7 +89,7 @@ def order(lever_sessions, plan):
     settings["training"]["schedule"]["patience"] = 0
     source = lever_sessions.to_plain()
     names = ("s0", "s1", "s2"), ("s3", "s4")
-    return Order(settings, source, *names, seed=1, updates=24, epochs=8, patience=3, validation=names[1])
+    return TrainingRequest(settings, source, *names, seed=1, updates=24, epochs=8, patience=3, validation=names[1])
 
 
 def test_a_training_has_epochs_a_schedule_that_acts_and_an_early_stop(order):
@@ -129,7 +136,7 @@ def test_a_training_in_parts_of_epochs_is_the_training_without_them(order, tmp_p
     assert nothing is None
     assert {**found, "seconds": 0} == {**whole, "seconds": 0}
     with Ledger(tmp_path) as ledger:
-        doing = Doing(ledger, Inline(), "data")
+        doing = Dispatcher(ledger, Inline(), "data")
         (first,) = doing([dataclasses.replace(order, until=3)])
         (last,) = doing([dataclasses.replace(order, stops=(3,))])
         assert first.status == last.status == "done"
@@ -187,7 +194,7 @@ def test_stopped_again_and_again_it_comes_to_the_same(six_sessions, plan, finish
     trained = 0
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, tmp_path, CREW, watchers=Watchers(on_progress=stop_every_25))
+            found = run_search(six_sessions, plan, tmp_path, CREW, watchers=SearchCallbacks(on_progress=stop_every_25))
         except Stop:
             trained += 25
             continue

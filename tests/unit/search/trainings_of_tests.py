@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from edp.errors import ConfigError, NotFiniteError
-from edp.ledger import WithState, known, read_state
+from edp.storage.ledger import WithState, known, read_state
 
 
 def _note(where, word, identity):

@@ -8,9 +8,9 @@ import pytest
 from edp.errors import ConfigError, DataError
 from edp.stats import (
     LOOKS,
-    Candidate,
     Look,
     PairedVariance,
+    SizeScore,
     clustered_t,
     most_efficient,
     paired_variance,
@@ -145,16 +145,16 @@ def test_race_spends_no_alpha_and_saves_runs():
 def test_smallest_network_that_a_larger_one_does_not_repay():
     # The thesis at k = 1: 512 units bring 13 % for 15 times the parameters of 128 units, and it takes 128.
     units = {
-        "64": Candidate("64", 110e3, 1.20),
-        "128": Candidate("128", 397e3, 1.00),
-        "256": Candidate("256", 1.5e6, 0.95),
-        "512": Candidate("512", 15 * 397e3, 0.87),
+        "64": SizeScore("64", 110e3, 1.20),
+        "128": SizeScore("128", 397e3, 1.00),
+        "256": SizeScore("256", 1.5e6, 0.95),
+        "512": SizeScore("512", 15 * 397e3, 0.87),
     }
     assert most_efficient(list(units.values())).name == "128"
     assert most_efficient(list(units.values()), gain=0.03).name == "512"
-    noisy = [Candidate("small", 1e5, 1.0, error=0.1), Candidate("large", 2e5, 0.9, error=0.1)]
+    noisy = [SizeScore("small", 1e5, 1.0, error=0.1), SizeScore("large", 2e5, 0.9, error=0.1)]
     assert most_efficient(noisy).name == "small"
-    by_chance_poor = [Candidate("a", 1e5, 1.0), Candidate("b", 2e5, 1.1), Candidate("c", 4e5, 0.8)]
+    by_chance_poor = [SizeScore("a", 1e5, 1.0), SizeScore("b", 2e5, 1.1), SizeScore("c", 4e5, 0.8)]
     assert most_efficient(by_chance_poor).name == "c"
 
 
@@ -174,8 +174,8 @@ def test_smallest_network_that_a_larger_one_does_not_repay():
         (lambda: race(np.zeros((6, 4)), looks=(Look(4, 0.1), Look(3, 0.1))), ConfigError, "ascend"),
         (lambda: race(np.zeros((6, 4)), looks=(Look(4, 1.4),)), ConfigError, "between 0 and 1"),
         (lambda: most_efficient([]), DataError, "no candidate"),
-        (lambda: most_efficient([Candidate("a", 1.0, math.nan)]), DataError, "'a'"),
-        (lambda: most_efficient([Candidate("a", 1.0, 2.0), Candidate("b", 1.0, 3.0)]), DataError, "one size"),
+        (lambda: most_efficient([SizeScore("a", 1.0, math.nan)]), DataError, "'a'"),
+        (lambda: most_efficient([SizeScore("a", 1.0, 2.0), SizeScore("b", 1.0, 3.0)]), DataError, "one size"),
         (lambda: thesis_power(1, 0.1, 0.1, 1), ConfigError, "two splits"),
         (lambda: thesis_splits_analytical(0.1, 0.0, 1), ConfigError, "above zero"),
         (lambda: thesis_plan(1.0, 0.1, 0), ConfigError, "above zero"),

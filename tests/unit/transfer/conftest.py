@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.logs import write_recording
+from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.sources import DataSource
-from edp.transfer import FinetuneSpec
-from edp.workflow import train
+from edp.workflows.train_evaluate import train
+from edp.workflows.transfer import FinetuneSpec
 
 CHANNELS = (
     Channel("lift", Kind.PILOT_PRESSURE),

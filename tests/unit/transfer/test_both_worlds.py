@@ -8,11 +8,11 @@ import torch
 
 from edp.data.chunks import ChunkSampler
 from edp.errors import ConfigError
-from edp.models.predictor import build_model
-from edp.models.running import stream_predictions
+from edp.networks.predictor import build_model
+from edp.networks.running import stream_predictions
 from edp.training.fit import fit
-from edp.transfer.both_worlds import BothSpec, BothWorlds, Classifier, ramp, reverse
-from edp.transfer.methods.replay import share
+from edp.workflows.transfer.both_domains import BothDomains, BothSpec, Classifier, ramp, reverse
+from edp.workflows.transfer.methods.rehearsal import share
 
 
 @pytest.fixture(scope="module")
@@ -25,23 +25,23 @@ def kept(tiny):
 
 
 def test_both_worlds_have_equal_shares_and_the_network_of_the_source_teaches_its_own(tiny, start):
-    lesson = BothWorlds(start, kept(tiny), BothSpec(soft=0.5))
+    lesson = BothDomains(start, kept(tiny), BothSpec(soft=0.5))
     found = lesson.series(tiny.task, tiny.train)
     ticks = {name: sum(p.samples for p in found if p.name.startswith("kept") == name) for name in (True, False)}
     assert max(ticks.values()) <= 1.5 * min(ticks.values())
     for part in found:
-        assert part.taught is not None
-        assert np.all(part.taught[:, 0] == (1.0 if part.name.startswith("kept") else 0.0))
-        assert part.taught.shape == (part.samples, 1 + 2 * 3)
+        assert part.teacher_targets is not None
+        assert np.all(part.teacher_targets[:, 0] == (1.0 if part.name.startswith("kept") else 0.0))
+        assert part.teacher_targets.shape == (part.samples, 1 + 2 * 3)
         if part.name.startswith("kept"):
             said = stream_predictions(start, [part])[0].reshape(part.samples, -1)
-            np.testing.assert_allclose(part.taught[:, 1:], said, atol=1e-6)
+            np.testing.assert_allclose(part.teacher_targets[:, 1:], said, atol=1e-6)
 
 
 def test_worlds_meet_in_a_batch(tiny, start, tiny_training):
-    series = BothWorlds(start, kept(tiny), BothSpec()).series(tiny.task, tiny.train)
+    series = BothDomains(start, kept(tiny), BothSpec()).series(tiny.task, tiny.train)
     sampler = ChunkSampler(series, tiny.task.horizons, dataclasses.replace(tiny_training.chunks, carried=2), 0)
-    shares = [batch.taught[..., 0].mean() for batch in sampler.epoch(0) if batch.taught is not None]
+    shares = [batch.teacher_targets[..., 0].mean() for batch in sampler.epoch(0) if batch.teacher_targets is not None]
     assert 0.2 < np.mean(shares) < 0.8
 
 
@@ -63,7 +63,7 @@ def test_the_classifier_learns_while_the_network_hides(tiny, start):
     """One step: the classifier goes down its loss, the representation up."""
     torch.manual_seed(0)
     classifier, hidden = Classifier(16), torch.randn(8, 20, 16, requires_grad=True)
-    lesson = BothWorlds(start, kept(tiny), BothSpec(reversal=1.0))
+    lesson = BothDomains(start, kept(tiny), BothSpec(reversal=1.0))
     here = torch.zeros(8, 20, dtype=torch.bool)
     here[:4] = True
     plain = lesson._confusion(classifier(hidden), here, ~here)
@@ -78,7 +78,7 @@ def test_the_classifier_learns_while_the_network_hides(tiny, start):
 
 
 def test_the_classifier_is_taken_away_and_the_progress_is_told(tiny, tiny_model, tiny_training, start):
-    lesson = BothWorlds(start, kept(tiny), BothSpec(reversal=0.5))
+    lesson = BothDomains(start, kept(tiny), BothSpec(reversal=0.5))
     seen = []
     inner = lesson.loss
     lesson.loss = lambda objective, moment: seen.append(moment.progress) or inner(objective, moment)  # type: ignore[method-assign]

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from edp.models.activations import ACTIVATIONS
-from edp.models.outputs import OUTPUTS
-from edp.models.predictor import build_model
-from edp.models.running import stream_intervals, stream_predictions
+from edp.networks.activations import ACTIVATIONS
+from edp.networks.outputs import OUTPUTS
+from edp.networks.predictor import build_model
+from edp.networks.running import stream_intervals, stream_predictions
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler
-from edp.transfer import Order, centring, finetune
-from edp.transfer.centring import DEAREST, centre
-from edp.transfer.source import read_source
+from edp.workflows.transfer import FinetuneRequest, centring, finetune
+from edp.workflows.transfer.centring import DEAREST, centre
+from edp.workflows.transfer.source import read_source
 
 
 def errors(net, series):
@@ -97,7 +97,9 @@ def test_a_fine_tuned_network_is_centred_unless_it_is_not_asked_for_or_logs_are_
     for name, center, shortest in (("yes", True, 1.0), ("no", False, 1.0), ("short", True, 1e3)):
         monkeypatch.setattr(centring, "SHORTEST_S", shortest)
         folder = tmp_path / name
-        order = Order(spec=replace(small, center=center), method="full", rivals=(), changes=("training.updates=25",))
+        order = FinetuneRequest(
+            spec=replace(small, center=center), method="full", rivals=(), changes=("training.updates=25",)
+        )
         finetune(run, target, order, folder)
         net = load_bundle(folder / "bundle").predictor
         last[name] = net.heads.biases[-1].detach().clone()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError, DataError
+from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
-from edp.sources import DataSource
-from edp.transfer import Order, finetune
-from edp.transfer.checks import CONVENTION, Pair, check_signs, check_units, correlation
-from edp.transfer.source import read_source
+from edp.workflows.transfer import FinetuneRequest, finetune
+from edp.workflows.transfer.checks import CONVENTION, PilotPair, check_signs, check_units, correlation
+from edp.workflows.transfer.source import read_source
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def refused(run, small, written, tmp_path):
     def message(*recordings, **changes):
         logs = DataSource.of(written(tmp_path / "logs", list(recordings)))
         with pytest.raises((DataError, ConfigError)) as caught:
-            finetune(run, logs, Order(spec=small, **changes), tmp_path / "out")
+            finetune(run, logs, FinetuneRequest(spec=small, **changes), tmp_path / "out")
         assert not (tmp_path / "out").exists()
         return str(caught.value)
 
@@ -91,7 +91,7 @@ def test_another_sign_is_found_by_correlation_with_the_pilot_pressure(refused, m
 def test_logs_of_another_sign_are_taken_where_that_is_asked_for(run, small, made_by, written, tmp_path):
     logs = DataSource.of(written(tmp_path / "logs", [made_by("a", 1, (0.3, 0.2))]))
     spec = dataclasses.replace(small, check_signs=False)
-    found = finetune(run, logs, Order(spec=spec, changes=("training.updates=2",)), tmp_path / "out")
+    found = finetune(run, logs, FinetuneRequest(spec=spec, changes=("training.updates=2",)), tmp_path / "out")
     assert found["notes"] == []
 
 
@@ -120,7 +120,7 @@ def test_without_recordings_of_the_source_the_convention_of_the_names_holds(run)
         made = dataclasses.replace(
             data, task=task, inputs=channels, train=[turned(part, np.float32([sign, 1])) for part in data.train]
         )
-        assert np.sign(correlation(made, made.train, Pair(*names))) == sign
+        assert np.sign(correlation(made, made.train, PilotPair(*names))) == sign
         if sign == 1:
             assert check_signs(made, None) == [
                 "The sign of turn was not checked: no pilot pressure moves with it clearly (correlation of 0.3 or more "

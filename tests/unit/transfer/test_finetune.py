@@ -12,23 +12,24 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from edp.cli import app
-from edp.config import load_experiment
+from edp.config.experiment import load_experiment
 from edp.data.chunks import ChunkSpec
 from edp.errors import BundleError, ConfigError, StorageError
-from edp.losses import Drift, Smoothness
-from edp.models.decomposition import decompose
-from edp.sources import DataSource
+from edp.logs.source import DataSource
+from edp.networks.decomposition import decompose
+from edp.networks.losses import Drift, Smoothness
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.optimizers import Soap
 from edp.training.spec import TrainingSpec
-from edp.transfer import METHODS, FinetuneSpec, Order, Watchers, finetune
-from edp.transfer.both_worlds import BothSpec, BothWorlds
-from edp.transfer.case import tuned as tuning
-from edp.transfer.lessons import GoOn, LowRank
-from edp.transfer.scores import errors_of, measure, skew
-from edp.transfer.source import read_source, target_experiment, task_settings
-from edp.workflow import evaluate, train
+from edp.training.warm_start import WarmStart
+from edp.workflows.train_evaluate import evaluate, train
+from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec, finetune
+from edp.workflows.transfer.both_domains import BothDomains, BothSpec
+from edp.workflows.transfer.case import tuned as tuning
+from edp.workflows.transfer.scores import errors_of, measure, skew
+from edp.workflows.transfer.source import read_source, target_experiment, task_settings
+from edp.workflows.transfer.strategies import LowRank
 
 UPDATES = ("training.updates=25",)
 BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
@@ -37,7 +38,7 @@ BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
 @pytest.fixture(scope="module")
 def tuned(run, target, small, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned") / "run"
-    order = Order(spec=small, method="two_phase", rivals=tuple(METHODS), changes=UPDATES)
+    order = FinetuneRequest(spec=small, method="two_phase", rivals=tuple(METHODS), changes=UPDATES)
     return folder, finetune(run, target, order, folder)
 
 
@@ -120,7 +121,7 @@ def test_low_rank_changes_have_their_rank_and_leave_an_ordinary_network(tuned, r
 
 def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, small, tmp_path):
     whole, _ = tuned
-    order = Order(spec=small, method="two_phase", changes=UPDATES)
+    order = FinetuneRequest(spec=small, method="two_phase", changes=UPDATES)
     for stop in (1, 3):
         seen = []
 
@@ -130,7 +131,7 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_bits(tuned, run, target, smal
                 raise Pulled
 
         with pytest.raises(Pulled):
-            finetune(run, target, order, tmp_path / "run", Watchers(on_training=pull))
+            finetune(run, target, order, tmp_path / "run", FinetuneCallbacks(on_training=pull))
     found = finetune(run, target, order, tmp_path / "run")
     ends = [load_bundle(folder).predictor.state_dict() for folder in (whole, tmp_path / "run")]
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
@@ -147,9 +148,9 @@ def test_a_stopped_adversarial_training_goes_on_to_the_same_bits(tuned, run, tar
         if event.row is not None:
             raise Pulled
 
-    order = Order(spec=small, method="adversarial", changes=UPDATES)
+    order = FinetuneRequest(spec=small, method="adversarial", changes=UPDATES)
     with pytest.raises(Pulled):
-        finetune(run, target, order, tmp_path / "run", Watchers(on_training=pull))
+        finetune(run, target, order, tmp_path / "run", FinetuneCallbacks(on_training=pull))
     finetune(run, target, order, tmp_path / "run")
     ends = [load_bundle(folder).predictor.state_dict() for folder in (whole / "rivals/adversarial", tmp_path / "run")]
     assert ends[0].keys() == ends[1].keys()
@@ -170,14 +171,14 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
         (tmp_path / "alone" / file.name).write_bytes(file.read_bytes())
     notes = []
     changes = ("training.updates=2", "training.chunks.length=32")
-    order = Order(spec=small, method="two_phase", rivals=("adversarial",), changes=changes)
-    found = finetune(tmp_path / "alone", target, order, tmp_path / "run", Watchers(on_note=notes.append))
+    order = FinetuneRequest(spec=small, method="two_phase", rivals=("adversarial",), changes=changes)
+    found = finetune(tmp_path / "alone", target, order, tmp_path / "run", FinetuneCallbacks(on_note=notes.append))
     assert list(found["methods"]["two_phase"]["worlds"]) == ["target"]
     assert any("bundle without the run" in note for note in notes)
     assert any("sign of rise, turn was not checked" in note for note in notes)
     assert any(note.startswith("Replay, adversarial is left out: it needs the recordings") for note in notes)
     with pytest.raises(ConfigError, match=r"'adversarial' needs the recordings of the source.*bundle without the run"):
-        finetune(tmp_path / "alone", target, Order(spec=small, method="adversarial"), tmp_path / "other")
+        finetune(tmp_path / "alone", target, FinetuneRequest(spec=small, method="adversarial"), tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
@@ -231,9 +232,9 @@ def test_options_out_of_range_are_refused(change):
 
 def test_methods_that_leave_no_run_or_do_not_exist_are_refused(small):
     with pytest.raises(ConfigError, match=r"'ridge_arx' trains nothing.*two_phase"):
-        Order(spec=small, method="ridge_arx")
+        FinetuneRequest(spec=small, method="ridge_arx")
     with pytest.raises(ConfigError, match="unknown method 'two_phases'; did you mean 'two_phase'"):
-        Order(spec=small, rivals=("two_phases",))
+        FinetuneRequest(spec=small, rivals=("two_phases",))
 
 
 def test_the_defaults_of_the_two_phases_are_those_of_the_thesis():
@@ -264,7 +265,7 @@ def test_a_bypass_that_kept_its_regression_learns_the_target(
     blocks = 'model.blocks=[{kind="linear_bypass", taps=4, start="ridge", trained=false}]'
     logs = DataSource.of(written(tmp_path / "logs", [made_by(f"s{i}", i, (0.2, -0.1)) for i in range(4)]))
     train(logs, load_experiment(preset="quick", overrides=(*settings, blocks)), tmp_path / "run")
-    order = Order(spec=small, method=method, changes=("training.updates=10",))
+    order = FinetuneRequest(spec=small, method=method, changes=("training.updates=10",))
     finetune(tmp_path / "run", target, order, tmp_path / "out")
     before, after = (load_bundle(tmp_path / name).predictor for name in ("run", "out"))
     same = torch.equal(before.bypass.weight, after.bypass.weight)
@@ -277,7 +278,7 @@ def test_lessons_leave_every_parameter_as_free_as_it_was(run):
     source = read_source(run).predictor
     spec = read_source(run).experiment.training
     source.heads.biases[-1].requires_grad_(False)
-    for lesson in (GoOn(source), LowRank(source, 2), BothWorlds(source, [], BothSpec())):
+    for lesson in (WarmStart(source), LowRank(source, 2), BothDomains(source, [], BothSpec())):
         net = copy.deepcopy(source)
         lesson.begin(net, spec)
         assert net.heads.biases[-1].requires_grad == (not isinstance(lesson, LowRank))
@@ -317,7 +318,7 @@ def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
 
 
 def test_a_network_in_whole_numbers_is_refused(run, tmp_path):
-    from edp.downsizing.quantise import quantise
+    from edp.workflows.compression.quantise import quantise
 
     quantise(run, tmp_path / "whole")
     with pytest.raises(BundleError, match="cannot be trained on"):

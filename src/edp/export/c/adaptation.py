@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from edp.export.c.constants import Constant, total_bytes
+from edp.export.c.constants import CConstant, total_bytes
 from edp.export.c.text import array, filled, number
 from edp.export.escape import Code
-from edp.onboard import Adaptation
+from edp.ir.rls import Adaptation
 
 FILES = ("edp_adaptation.h", "edp_adaptation.c")
 POINTERS = ("offset", "scale", "directions", "middle", "spread", "rest", "change", "unit")
@@ -66,18 +66,18 @@ def values(law: Adaptation, upper: str, intervals: int) -> dict[str, object]:
     }
 
 
-def constants(law: Adaptation) -> list[Constant]:
+def constants(law: Adaptation) -> list[CConstant]:
     """All constants, those with a text in the order of the C code."""
     made = []
     for name in POINTERS:
         held = np.atleast_1d(getattr(law, name)).ravel()
         # C has no array of nothing: without directions one number stands there that is never read.
         numbers = held if held.size else np.zeros(1)
-        made.append(Constant("float", name, len(numbers), array("float", name, map(number, numbers))))
+        made.append(CConstant("float", name, len(numbers), array("float", name, map(number, numbers))))
     columns = array("uint16_t", "columns", (f"{column}u" for column in law.columns))
-    made.append(Constant("uint16_t", "columns", len(law.columns), columns))
-    shared = [Constant("edp_adapt_law", "law", 1), Constant("float", "adapt_most", law.unit.size)]
-    return [*made, *shared, Constant("uint32_t", "ahead", len(law.horizons))]
+    made.append(CConstant("uint16_t", "columns", len(law.columns), columns))
+    shared = [CConstant("edp_adapt_law", "law", 1), CConstant("float", "adapt_most", law.unit.size)]
+    return [*made, *shared, CConstant("uint32_t", "ahead", len(law.horizons))]
 
 
 def _intervals(upper: str) -> Code:

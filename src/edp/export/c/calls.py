@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 from edp.errors import ExportError
-from edp.export.c.plan import Plan, scratch_number
+from edp.export.c.plan import MemoryPlan, scratch_number
 from edp.export.c.text import call, identifier, number
 from edp.export.escape import c_comment
-from edp.graph import Graph, Layer, layers, memory
-from edp.graph.base import INPUT, Number
-from edp.graph.layers import runs as neighbours
-from edp.integer.layers import WGather
+from edp.ir import Graph, Layer, layers, memory
+from edp.ir.base import INPUT, Number
+from edp.ir.layers import runs as neighbours
+from edp.ir.w8a16.layers import WGather
 
 WORK = {Number.FLOAT: "work", Number.INT16: "work16", Number.INT32: "work32"}
 """Work memories."""
@@ -28,7 +28,7 @@ class Calls:
         plan: where their values lie.
     """
 
-    def __init__(self, graph: Graph, plan: Plan) -> None:
+    def __init__(self, graph: Graph, plan: MemoryPlan) -> None:
         self.graph, self.plan = graph, plan
 
     def value(self, name: str, offset: int = 0) -> str:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from edp.export.c import integer_calls
 from edp.export.c.calls import Calls, constant, needs_columns, slot, structs
 from edp.export.c.layout import laid
-from edp.export.c.plan import Plan
+from edp.export.c.plan import MemoryPlan
 from edp.export.c.text import array, number
-from edp.graph import Graph, Layer
+from edp.ir import Graph, Layer
 
 TYPES = {"float32": "float", "int8": "int8_t", "int16": "int16_t", "int32": "int32_t", "uint8": "uint8_t"}
 """C types of constants."""
@@ -33,7 +33,7 @@ STRUCTS = {
 
 
 @dataclass(frozen=True)
-class Machine:
+class DataModel:
     """How a compiler lays constants out.
 
     Attributes:
@@ -45,14 +45,14 @@ class Machine:
     boundary: int
 
 
-CORTEX_M = Machine(pointer=4, boundary=4)
+CORTEX_M = DataModel(pointer=4, boundary=4)
 """32-bit Arm cores: GCC lets every constant begin on a word (``DATA_ALIGNMENT`` of its Arm back end; not with -Os)."""
-DESKTOP = Machine(pointer=8, boundary=1)
+DESKTOP = DataModel(pointer=8, boundary=1)
 """64-bit computers, without the gaps between constants, which are the compiler's affair there."""
 
 
 @dataclass(frozen=True, eq=False)
-class Constant:
+class CConstant:
     """A constant of a model.
 
     Attributes:
@@ -67,7 +67,7 @@ class Constant:
     count: int
     text: str = ""
 
-    def bytes_on(self, machine: Machine) -> int:
+    def bytes_on(self, machine: DataModel) -> int:
         """What it takes on a machine, up to the next constant."""
         if self.kind in STRUCTS:
             pointers, numbers = STRUCTS[self.kind]
@@ -77,12 +77,12 @@ class Constant:
         return _up_to(self.count * each, machine.boundary)
 
 
-def total_bytes(constants: Iterator[Constant] | list[Constant], machine: Machine = CORTEX_M) -> int:
+def total_bytes(constants: Iterator[CConstant] | list[CConstant], machine: DataModel = CORTEX_M) -> int:
     """What constants take in read-only memory."""
     return sum(one.bytes_on(machine) for one in constants)
 
 
-def constants_of(graph: Graph, plan: Plan, written: bool = False) -> Iterator[Constant]:
+def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Iterator[CConstant]:
     """All constants of a model, in the order of the C code; those of ``NAME_weights.h`` first.
 
     Args:
@@ -97,16 +97,16 @@ def constants_of(graph: Graph, plan: Plan, written: bool = False) -> Iterator[Co
         if needs_columns(calls, layer):
             columns, name = layer.columns, constant(layer, "columns")  # type: ignore[attr-defined]
             text = array("uint16_t", name, (f"{column}u" for column in columns)) if written else ""
-            yield Constant("uint16_t", name, len(columns), text)
+            yield CConstant("uint16_t", name, len(columns), text)
         for line in structs(layer) + integer_calls.structs(layer):
             _, _, kind, name, *_ = line.split()  # static const KIND NAME = ...
-            yield Constant(kind, name, 1, line)
+            yield CConstant(kind, name, 1, line)
     for (layer_name, part), values in graph.initial.items():
         start = slot(layer_name, part).removeprefix("s->") + "_start"
-        yield Constant(TYPES[values.dtype.name], start, values.size, _array(start, values) if written else "")
+        yield CConstant(TYPES[values.dtype.name], start, values.size, _array(start, values) if written else "")
     yield _tables(graph)
     for name in ("input_low", "input_high"):
-        yield Constant("float", name, graph.inputs)
+        yield CConstant("float", name, graph.inputs)
 
 
 def stored(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -114,20 +114,20 @@ def stored(layer: Layer, name: str, values: NDArray[Any]) -> NDArray[Any]:
     return laid(layer, name, integer_calls.laid_out(layer, values))
 
 
-def _tensor(layer: Layer, name: str, values: NDArray[Any], written: bool) -> Constant:
+def _tensor(layer: Layer, name: str, values: NDArray[Any], written: bool) -> CConstant:
     full, note = constant(layer, name), " x ".join(map(str, values.shape))
     text = _array(full, stored(layer, name, values), note) if written else ""
-    return Constant(TYPES[values.dtype.name], full, values.size, text)
+    return CConstant(TYPES[values.dtype.name], full, values.size, text)
 
 
-def _tables(graph: Graph) -> Constant:
+def _tables(graph: Graph) -> CConstant:
     """Where the tensors are, for their checksum."""
     entries = [
         f"{{{constant(layer, name)}, {values.size}u, {values.itemsize}u}}"
         for layer in graph.layers
         for name, values in layer.tensors().items()
     ]
-    return Constant("edp_table", "tables", len(entries), array("edp_table", "tables", entries))
+    return CConstant("edp_table", "tables", len(entries), array("edp_table", "tables", entries))
 
 
 def _array(name: str, values: NDArray[Any], note: str = "") -> str:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from edp.export.c.calls import CALLS, Calls, Write, constant, needs_columns, ring, runs, slot
 from edp.export.c.text import array, call, identifier, number
-from edp.graph import Layer
-from edp.graph.layers import Function
-from edp.integer import arithmetic as whole
-from edp.integer import layers as made
+from edp.ir import Layer
+from edp.ir.layers import Function
+from edp.ir.w8a16 import arithmetic as whole
+from edp.ir.w8a16 import layers as made
 
 FILES = ("edp_integer.h", "edp_integer.c", "edp_integer_memory.c")
 """Of the runtime, with the tables of `tables_header`."""

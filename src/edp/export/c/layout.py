@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.graph import Layer, layers, memory
+from edp.ir import Layer, layers, memory
 
 PANEL = 16
 """Rows that a product computes side by side: `EDP_PANEL` of the runtime."""

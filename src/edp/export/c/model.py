@@ -12,16 +12,16 @@ from edp.errors import ExportError
 from edp.export.c import adaptation, integer_calls, tangents
 from edp.export.c.calls import WORK, Calls, describe, needs_columns, slot
 from edp.export.c.constants import constants_of, stored, total_bytes
-from edp.export.c.plan import Plan, plan
+from edp.export.c.plan import MemoryPlan, plan
 from edp.export.c.text import filled, indented, number
 from edp.export.escape import C_SIGNIFICANT, Code, c_comment, c_names, fill
 from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
-from edp.graph import Graph, Layer, memory
-from edp.graph.base import Number
-from edp.models.input_range import HOLD_TICKS, LIMIT, input_limits
-from edp.models.integer import IntegerPredictor
-from edp.models.predictor import describe as describe_network
+from edp.ir import Graph, Layer, memory
+from edp.ir.base import Number
+from edp.networks.input_range import HOLD_TICKS, LIMIT, input_limits
+from edp.networks.integer import IntegerPredictor
+from edp.networks.predictor import describe as describe_network
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
@@ -58,8 +58,8 @@ class Model:
     name: str
     bundle: Bundle
     graph: Graph
-    plan: Plan
-    changes: Plan | None = None
+    plan: MemoryPlan
+    changes: MemoryPlan | None = None
     adapts: bool = False
 
     @property
@@ -174,7 +174,7 @@ class Model:
             "clear_work": indented(cleared_work(self.plan)),
         }
 
-    def _tangent(self, changes: Plan) -> dict[str, object]:
+    def _tangent(self, changes: MemoryPlan) -> dict[str, object]:
         parts = [(layer, part) for layer, part in self.graph.slots() if part.name != "age"]
         calls, work = tangents.Tangents(self.graph, self.plan, changes), changes.sizes[Number.FLOAT]
         lines = [line for layer in self.graph.layers for line in ("", describe(layer), *calls.of(layer))]
@@ -238,12 +238,12 @@ def remembered(graph: Graph) -> tuple[list[str], list[str]]:
     return declared, cleared
 
 
-def cleared_work(plan: Plan) -> list[str]:
+def cleared_work(plan: MemoryPlan) -> list[str]:
     """Statements that clear the work memories."""
     return [f"{FILLS[kind]}{size}u, s->{WORK[kind]});" for kind, size in plan.sizes.items()]
 
 
-def computed(graph: Graph, plan: Plan) -> tuple[list[str], list[str]]:
+def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
     """Statements of a tick: the layers one after the other, and what becomes of the results."""
     calls = Calls(graph, plan)
     lines = [line for layer in graph.layers for line in ("", describe(layer), *calls.of(layer))]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from edp.graph import Graph, Layer, layers, memory
-from edp.graph.base import Number
-from edp.integer import layers as whole
+from edp.ir import Graph, Layer, layers, memory
+from edp.ir.base import Number
+from edp.ir.w8a16 import layers as whole
 
 
 @dataclass(frozen=True)
-class Plan:
+class MemoryPlan:
     """Places from the start of the work memory of their kind of number.
 
     Attributes:
@@ -60,7 +60,7 @@ def scratch_number(layer: Layer) -> Number:
     return Number.FLOAT if layer.number is Number.FLOAT else Number.INT32
 
 
-def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Plan:
+def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> MemoryPlan:
     """Give every value the first gap that is wide enough from where it is made to where it is last read.
 
     Args:
@@ -85,7 +85,7 @@ def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Plan:
             busy.append((number, start, start + wide, until))
             places[layer.name] = start
             sizes[number] = max(sizes.get(number, 0), start + wide)
-    return Plan(values, scratch, sizes)
+    return MemoryPlan(values, scratch, sizes)
 
 
 def _gap(taken: list[tuple[int, int]], wide: int) -> int:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from edp.export.c import adaptation as adapting
-from edp.export.c.constants import CORTEX_M, Machine, constants_of, total_bytes
+from edp.export.c.constants import CORTEX_M, DataModel, constants_of, total_bytes
 from edp.export.c.model import cleared_work, computed, remembered
 from edp.export.c.plan import plan
 from edp.export.c.program import FIXED, MOST_COPIED, called, own_bytes, runtime_bytes
-from edp.graph import Graph
-from edp.onboard import Adaptation
+from edp.ir import Graph
+from edp.ir.rls import Adaptation
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def sizes_of(graph: Graph, adaptation: Adaptation | None = None) -> Sizes:
     return Sizes(constant_bytes(graph, adaptation), program_bytes(graph, adaptation))
 
 
-def constant_bytes(graph: Graph, adaptation: Adaptation | None = None, machine: Machine = CORTEX_M) -> int:
+def constant_bytes(graph: Graph, adaptation: Adaptation | None = None, machine: DataModel = CORTEX_M) -> int:
     """Constants of a model in its C code, with those of its adaptation.
 
     Args:

@@ -7,10 +7,10 @@ from typing import Any
 
 from edp.errors import ExportError
 from edp.export.c.calls import Calls, constant, needs_columns, ring, runs, slot
-from edp.export.c.plan import Plan, scratch_of
+from edp.export.c.plan import MemoryPlan, scratch_of
 from edp.export.c.text import call, identifier, number
-from edp.graph import Graph, Layer, layers, memory
-from edp.graph.base import INPUT
+from edp.ir import Graph, Layer, layers, memory
+from edp.ir.base import INPUT
 
 FILES = ("edp_tangent.h", "edp_tangent.c", "edp_tangent_memory.c")
 """Of the runtime."""
@@ -34,7 +34,7 @@ class Tangents:
         changes: where the changes of their values lie.
     """
 
-    def __init__(self, graph: Graph, plan: Plan, changes: Plan) -> None:
+    def __init__(self, graph: Graph, plan: MemoryPlan, changes: MemoryPlan) -> None:
         self.graph, self.calls, self.plan = graph, Calls(graph, plan), changes
 
     def change(self, name: str, offset: int = 0) -> str:

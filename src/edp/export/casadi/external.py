@@ -8,8 +8,8 @@ from edp.export.c.model import has_ring
 from edp.export.c.text import call, identifier, indented, number
 from edp.export.casadi.states import Place, counts, is_ring, places, start
 from edp.export.escape import Code
-from edp.graph import Graph, Layer, memory
-from edp.graph.memory import UNSEEN
+from edp.ir import Graph, Layer, memory
+from edp.ir.memory import UNSEEN
 
 
 def blanks(graph: Graph, name: str) -> dict[str, object]:

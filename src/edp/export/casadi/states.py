@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from edp.export.c.text import identifier
-from edp.graph import Array, Graph, memory
-from edp.graph.base import Slot
+from edp.ir import Array, Graph, memory
+from edp.ir.base import Slot
 
 
 @dataclass(frozen=True, eq=False)

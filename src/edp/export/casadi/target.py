@@ -20,8 +20,8 @@ from edp.export.casadi.states import places, start
 from edp.export.description import Description, as_json, float_graph, golden
 from edp.export.escape import fill
 from edp.export.folder import write_export
-from edp.graph import Graph, Layer, memory
-from edp.graph import layers as plain
+from edp.ir import Graph, Layer, memory
+from edp.ir import layers as plain
 from edp.training.bundle import Bundle
 
 RULES = {

@@ -7,7 +7,7 @@ from typing import Literal
 
 from edp.export.c.model import Model
 from edp.export.escape import LONGEST_NAME, LONGEST_TEXT, shown_names, visible
-from edp.models.input_range import usual_range
+from edp.networks.input_range import usual_range
 from edp.signals import KINDS, Kind
 
 Form = Literal["real", "whole", "flag"]

@@ -22,7 +22,7 @@ from edp.export.fmu.describe import About, build_description, fmi2, fmi3
 from edp.export.fmu.interface import Variable, variables
 from edp.export.fmu.page import page
 from edp.export.folder import write_export
-from edp.models.integer import IntegerPredictor
+from edp.networks.integer import IntegerPredictor
 from edp.training.bundle import Bundle
 
 COMMON = ("edp_fmu.h", "edp_fmu.c")

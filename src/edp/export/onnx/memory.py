@@ -13,8 +13,8 @@ import numpy as np
 
 from edp.export.onnx.nodes import Nodes
 from edp.export.onnx.plain import normed
-from edp.graph import Layer, Slot, memory
-from edp.graph.memory import UNSEEN
+from edp.ir import Layer, Slot, memory
+from edp.ir.memory import UNSEEN
 
 Held = Mapping[str, str]
 """Values of a layer's slots."""

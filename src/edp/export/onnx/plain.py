@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from edp.export.onnx.nodes import Nodes
-from edp.graph import Layer, layers
-from edp.graph.layers import Function, runs
+from edp.ir import Layer, layers
+from edp.ir.layers import Function, runs
 
 MOST_PIECES = 12
 """Runs of neighbouring columns up to which numbers are moved by splitting and joining; beyond, by a 0/1 matrix."""

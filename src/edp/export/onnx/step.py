@@ -12,8 +12,8 @@ from edp.export.description import shape_of_result
 from edp.export.onnx.memory import STEPS, Held, shape_of, step_correction
 from edp.export.onnx.nodes import DEFAULT_OPSET, Nodes
 from edp.export.onnx.plain import PLAIN
-from edp.graph import Array, Graph, Layer, memory
-from edp.graph.base import INPUT
+from edp.ir import Array, Graph, Layer, memory
+from edp.ir.base import INPUT
 
 INPUTS = "inputs"
 """The graph's input of raw numbers, SI units."""

@@ -16,9 +16,9 @@ from edp.export.onnx.nodes import DEFAULT_OPSET, Nodes
 from edp.export.onnx.plain import PLAIN, activate
 from edp.export.onnx.sequence import Sequences
 from edp.export.onnx.step import INPUTS, add_results, corrections, plain_name, refuse, spoil
-from edp.graph import Graph, Layer, layers, memory
-from edp.graph.base import INPUT
-from edp.graph.memory import UNSEEN
+from edp.ir import Graph, Layer, layers, memory
+from edp.ir.base import INPUT
+from edp.ir.memory import UNSEEN
 
 TRAILING = (memory.TrailingMean, memory.AttentionPool, memory.WindowAttention)
 ELEMENTWISE = (layers.Activate, layers.Add, layers.Multiply)

@@ -16,7 +16,7 @@ from edp.export.description import Description, as_json
 from edp.export.escape import Code, fill, markdown_text, shown_names, xml_text, yaml_scalar
 from edp.export.folder import write_export
 from edp.export.hashes import model_hash
-from edp.models.predictor import describe as describe_network
+from edp.networks.predictor import describe as describe_network
 from edp.signals import Kind
 from edp.training.bundle import Bundle
 

@@ -17,9 +17,9 @@ from edp.export.description import SCHEMA, Description
 from edp.export.escape import LONGEST_NAME, Code, fill, markdown_text, matlab_names, visible
 from edp.export.hashes import model_hash, scale_hash
 from edp.export.simulink.native import Native, functions_for
-from edp.graph.base import Number
-from edp.models.input_range import HOLD_TICKS, input_limits
-from edp.models.predictor import describe as describe_network
+from edp.ir.base import Number
+from edp.networks.input_range import HOLD_TICKS, input_limits
+from edp.networks.predictor import describe as describe_network
 
 RULES = {
     "order": "inputs and targets in the order of this file, in SI units",

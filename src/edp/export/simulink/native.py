@@ -13,9 +13,9 @@ import numpy as np
 
 from edp.errors import ExportError
 from edp.export.escape import Code, matlab_comment, matlab_names
-from edp.graph import Array, Graph, Layer, layers, memory
-from edp.graph.base import INPUT
-from edp.graph.layers import Function, runs
+from edp.ir import Array, Graph, Layer, layers, memory
+from edp.ir.base import INPUT
+from edp.ir.layers import Function, runs
 
 LONGEST_LAYER = 47
 """Characters of a layer's part of it; names of constants and slots come behind."""

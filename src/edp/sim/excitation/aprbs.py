@@ -8,7 +8,7 @@ import numpy as np
 
 from edp.sim.excitation.base import AXES, EXCITATIONS, Array, Excitation, Hold, extend_probability, held
 from edp.sim.excitation.levers import dead_lever
-from edp.sim.machine import Machine
+from edp.sim.machine.machine import Machine
 from edp.sim.view import View
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.registry import Registry
-from edp.sim.machine import Machine
+from edp.sim.machine.machine import Machine
 from edp.sim.view import View
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from edp.sim import tip_control
 from edp.sim.excitation.base import EXCITATIONS, Array
 from edp.sim.excitation.tracking import Tracked
-from edp.sim.machine import Machine
+from edp.sim.machine.machine import Machine
 from edp.sim.view import View
 
 LOOSE_DENSITY = 1400.0

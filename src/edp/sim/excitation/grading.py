@@ -8,7 +8,7 @@ import numpy as np
 
 from edp.sim.excitation.base import EXCITATIONS, Array
 from edp.sim.excitation.tracking import Tracked
-from edp.sim.machine import Machine
+from edp.sim.machine.machine import Machine
 from edp.sim.view import View
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edp.sim.excitation.base import AXES, EXCITATIONS, Array, AxisStream, Excitation
-from edp.sim.machine import Machine
+from edp.sim.machine.machine import Machine
 from edp.sim.view import View
 
 

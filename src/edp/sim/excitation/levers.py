@@ -7,9 +7,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim import layout as at
-from edp.sim.machine import Machine
-from edp.sim.plant import Plant
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.physics.plant import Plant
 
 Array = NDArray[np.float64]
 AXES = 3

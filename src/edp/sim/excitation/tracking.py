@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from edp.sim import layout as at
-from edp.sim import pose, tip_control
+from edp.sim import tip_control
 from edp.sim.excitation.base import AXES, Array, Excitation
 from edp.sim.excitation.levers import speed_table
-from edp.sim.machine import Machine
-from edp.sim.parameters import pack
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import pose
 from edp.sim.view import View
 
 

@@ -8,16 +8,16 @@ import json
 import numpy as np
 import pytest
 
-from edp.config import load_experiment
-from edp.search.conduct import conduct
-from edp.search.ground import Ground, Outcome
-from edp.search.modules import MODULES
-from edp.search.phases import PHASES
-from edp.search.settings import SearchSpec
-from edp.search.smaller import Recipe
-from edp.search.space import Choice, Real
-from edp.search.study import SamplerSpec
-from edp.search.trainings import SCORES, costs_of, settings_of
+from edp.config.experiment import load_experiment
+from edp.workflows.search.context import Outcome, SearchContext
+from edp.workflows.search.modules import MODULES
+from edp.workflows.search.phases import PHASES
+from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.smaller import Recipe
+from edp.workflows.search.space import Choice, Real
+from edp.workflows.search.study import SamplerSpec
+from edp.workflows.search.trainings import SCORES, costs_of, settings_of
 
 SESSIONS = tuple(f"s{number:02d}" for number in range(12))
 SPEC = SearchSpec(
@@ -117,10 +117,13 @@ def smaller_outcome(order, score):
 def study_of(spec):
     """What the search writes, from all phases on the made-up world."""
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
-    ground, world = Ground(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:]), World()
+    ground, world = (
+        SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:]),
+        World(),
+    )
     for name in PHASES:
         world.phase = name
-        ground = conduct(ground, world, phases=[name])
+        ground = run_phases(ground, world, phases=[name])
     study = {
         "schema": 1,
         "state": "finished",

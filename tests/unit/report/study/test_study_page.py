@@ -9,12 +9,12 @@ import pytest
 
 from edp.errors import EdpError, StorageError
 from edp.report import read_study, write_study_page
-from edp.report.study_facts import NUMBERS, facts_of
-from edp.report.study_page import render_study, study_text
-from edp.report.study_plots import study_plots
-from edp.report.study_tables import identifiers, sheets
-from edp.report.study_views import PointView, arm_views, forests, front, point_views, top_of, tracks
-from edp.report.study_words import caveats, decided, headline, missing, tiles, verdict
+from edp.report.search.facts import NUMBERS, facts_of
+from edp.report.search.page import render_study, study_text
+from edp.report.search.plots import study_plots
+from edp.report.search.tables import identifiers, sheets
+from edp.report.search.views import PointView, arm_views, forests, front, point_views, top_of, tracks
+from edp.report.search.words import caveats, decided, headline, missing, tiles, verdict
 
 PHASES = (
     "isolation",
@@ -267,7 +267,7 @@ def test_missing_facts_name_their_phase(sound):
 def test_whatever_is_broken_gives_a_report_or_one_clear_error(request, mode, tmp_path, monkeypatch):
     whole = request.getfixturevalue(mode)
     rng = random.Random(7)
-    monkeypatch.setattr("edp.report.page.get_plotlyjs", str)
+    monkeypatch.setattr("edp.report.run.page.get_plotlyjs", str)
     messages = []
     for _ in range(24):
         study = copy.deepcopy(whole)

@@ -27,7 +27,7 @@ LOOPED_S = 1.0
 """A step back in time by more than this is another recording, not a late message."""
 
 
-class Status(IntEnum):
+class CallStatus(IntEnum):
     """What the C code did; see its header."""
 
     OK = 0
@@ -86,7 +86,7 @@ class Core:
         """Forget the past and the counts."""
         self._reset(self._state)
 
-    def step(self, row: list[float]) -> Status:
+    def step(self, row: list[float]) -> CallStatus:
         """One tick; `row` in SI units, in the order of `inputs`.
 
         Raises:
@@ -95,11 +95,11 @@ class Core:
         if len(row) != len(self.inputs):
             raise ValueError(f"a tick has {len(row)} numbers; the network reads {len(self.inputs)}")
         given = (ctypes.c_float * len(row))(*row)
-        return Status(self._step(self._state, given, self._out))
+        return CallStatus(self._step(self._state, given, self._out))
 
-    def missed(self, ticks: int) -> Status:
+    def missed(self, ticks: int) -> CallStatus:
         """Tell that so many ticks went by without inputs."""
-        return Status(self._missed(self._state, ctypes.c_uint32(min(ticks, 2**31)), self._out))
+        return CallStatus(self._missed(self._state, ctypes.c_uint32(min(ticks, 2**31)), self._out))
 
     def result(self, meaning: str = "prediction") -> list[list[list[float]]]:
         """The last result: ``[interval][horizon][target]``; a prediction has one interval."""
@@ -120,7 +120,7 @@ class Core:
 
 
 @dataclass(frozen=True)
-class Source:
+class InputSource:
     """Where an input comes from.
 
     Attributes:
@@ -137,13 +137,13 @@ class Source:
 KINDS = ("position", "velocity", "effort", "pressure", "constant")
 
 
-def read_sources(inputs: list[str], texts: list[str]) -> dict[str, Source]:
+def read_sources(inputs: list[str], texts: list[str]) -> dict[str, InputSource]:
     """Sources by input from texts such as ``CylVels_1=velocity:boom``, ``BmUp=pressure:boom_up``, ``Load=constant:0``.
 
     Raises:
         ValueError: inputs without a source, sources without an input, or a text of another form; all of them are named.
     """
-    found: dict[str, Source] = {}
+    found: dict[str, InputSource] = {}
     wrong = []
     for text in filter(None, texts):
         name, _, origin = text.partition("=")
@@ -152,11 +152,11 @@ def read_sources(inputs: list[str], texts: list[str]) -> dict[str, Source]:
             wrong.append(f"'{text}' (once each: INPUT=KIND:NAME with a kind of {', '.join(KINDS)})")
         elif kind == "constant":
             try:
-                found[name] = Source(kind, value=float(what))
+                found[name] = InputSource(kind, value=float(what))
             except ValueError:
                 wrong.append(f"'{text}' ({what} is no number)")
         else:
-            found[name] = Source(kind, what)
+            found[name] = InputSource(kind, what)
     missing = [name for name in inputs if name not in found]
     unknown = [name for name in found if name not in inputs]
     problems = [
@@ -181,7 +181,7 @@ class Tick:
         step_us: time of the C code, microseconds.
     """
 
-    status: Status | None
+    status: CallStatus | None
     valid: bool
     why: str = ""
     missed: int = 0
@@ -190,7 +190,7 @@ class Tick:
     @property
     def predicted(self) -> bool:
         """Whether there is a prediction."""
-        return self.status in (Status.OK, Status.WARMING, Status.HELD)
+        return self.status in (CallStatus.OK, CallStatus.WARMING, CallStatus.HELD)
 
 
 @dataclass
@@ -204,7 +204,7 @@ class Assembler:
     """
 
     core: Core
-    sources: dict[str, Source]
+    sources: dict[str, InputSource]
     rejected: int = 0
     _pressures: dict[str, tuple[float, float]] = field(default_factory=dict)
     _last: float | None = None
@@ -252,7 +252,7 @@ class Assembler:
         row, reason = self._row(dict(zip(names, range(len(names)))), (position, velocity, effort), stamp)
         status = self.core.step(row)
         spent = 1e6 * (perf_counter() - began)
-        if status is Status.OK:
+        if status is CallStatus.OK:
             reason = "" if len(self._gaps) == RATE_MESSAGES else "too few messages to know their rate"
         else:
             reason = reason or _why(status)
@@ -290,9 +290,9 @@ class Assembler:
         return [ordered[name] for name in self.core.inputs], why
 
 
-def _why(status: Status) -> str:
+def _why(status: CallStatus) -> str:
     return {
-        Status.WARMING: "fewer ticks than a window since the reset",
-        Status.HELD: "an input is beyond its limits; the last accepted ones were held",
-        Status.RESTARTED: "too many ticks without inputs, or a result that is not finite: started anew",
+        CallStatus.WARMING: "fewer ticks than a window since the reset",
+        CallStatus.HELD: "an input is beyond its limits; the last accepted ones were held",
+        CallStatus.RESTARTED: "too many ticks without inputs, or a result that is not finite: started anew",
     }.get(status, "not reset")

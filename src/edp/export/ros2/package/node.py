@@ -23,7 +23,7 @@ def seconds(stamp: Any) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
-class Predictor(Node):
+class PredictorNode(Node):
     """Predicts at each message of joints; see README.md for topics and parameters."""
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class Predictor(Node):
 def main(args: Any = None) -> None:
     """Run until interrupted."""
     rclpy.init(args=args)
-    node = Predictor()
+    node = PredictorNode()
     try:
         rclpy.spin(node)
     except KeyboardInterrupt:

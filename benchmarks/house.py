@@ -1,0 +1,260 @@
+"""How the code is laid out: is the package small enough in the large to be learnt by reading its folders?
+
+Counts are taken from the syntax trees of ``src/edp``; nothing is imported. The rival of every figure is the bound that
+the project set itself. The full form also times ``make check`` and ``make test``, by their processor time.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import itertools
+import os
+import resource
+import subprocess
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from common import Verdict, finish, parser, table, verdict
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "edp"
+LONG_FUNCTION, LONG_FILE = 60, 400
+BANNED = frozenset(
+    (
+        "held",
+        "found",
+        "made",
+        "place",
+        "known",
+        "given",
+        "said",
+        "told",
+        "taken",
+        "wanted",
+        "kept",
+        "got",
+        "thing",
+        "stuff",
+    )
+)
+"""Names that say how a value was come by and not what it is."""
+
+
+@dataclass
+class House:
+    """What is counted.
+
+    Attributes:
+        modules: number of Python files.
+        siblings: names directly below the package.
+        floors: longest chain of rooms that import one another.
+        arrows: pairs of rooms of which one imports the other.
+        circles: groups of modules that import one another in a circle, by their names.
+        long_functions: functions whose statements take more than `LONG_FUNCTION` lines; signatures and docstrings
+            do not count: a command of the terminal declares its options in its signature.
+        long_files: files of more than `LONG_FILE` lines.
+        comments: comments for each 100 lines of code, and the strings that explain a constant below its assignment.
+        docstrings: docstrings for each 100 lines of code.
+        duplicates: public classes whose name stands in more than one module.
+        banned: assigned variables of a banned name, ``file:line name``.
+    """
+
+    modules: int = 0
+    siblings: list[str] = field(default_factory=list)
+    floors: int = 0
+    arrows: int = 0
+    circles: list[list[str]] = field(default_factory=list)
+    long_functions: list[str] = field(default_factory=list)
+    long_files: list[str] = field(default_factory=list)
+    comments: float = 0.0
+    docstrings: float = 0.0
+    duplicates: dict[str, int] = field(default_factory=dict)
+    banned: list[str] = field(default_factory=list)
+
+
+def measure(package: Path = PACKAGE) -> House:
+    """Count a package; `package` is its folder."""
+    files = {_module(path, package): path for path in sorted(package.rglob("*.py"))}
+    trees = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in files.items()}
+    house = House(modules=len(files))
+    folders = (entry for entry in package.iterdir() if entry.suffix == ".py" or (entry / "__init__.py").exists())
+    house.siblings = sorted(entry.stem for entry in folders if not entry.stem.startswith("__"))
+    imports = {name: _imports(name, tree, set(trees)) for name, tree in trees.items()}
+    rooms: dict[str, set[str]] = {room: set() for room in house.siblings}
+    for name, targets in imports.items():
+        for target in targets:
+            source_room, target_room = _room(name), _room(target)
+            if source_room in rooms and target_room in rooms and source_room != target_room:
+                rooms[source_room].add(target_room)
+    house.arrows = sum(map(len, rooms.values()))
+    house.floors = max((_depth(room, rooms, ()) for room in rooms), default=0)
+    house.circles = [sorted(group) for group in _circles(imports) if len(group) > 1]
+    classes: Counter[str] = Counter()
+    lines = comments = docstrings = 0
+    for name, tree in trees.items():
+        text = files[name].read_text(encoding="utf-8")
+        count = text.count("\n")
+        lines += count
+        comments += sum(
+            token.type == tokenize.COMMENT for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        )
+        where = files[name].relative_to(package.parent)
+        if count > LONG_FILE:
+            house.long_files.append(f"{where} {count}")
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module):
+                docstrings += ast.get_docstring(node) is not None
+            if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - _first_line(node) + 1 > LONG_FUNCTION:
+                house.long_functions.append(f"{where}:{node.lineno} {node.name}")
+        classes.update(node.name for node in tree.body if isinstance(node, ast.ClassDef) and node.name[0] != "_")
+        house.banned += [f"{where}:{line} {variable}" for variable, line in assigned(tree) if variable in BANNED]
+    house.comments, house.docstrings = 100 * comments / lines, 100 * docstrings / lines
+    house.duplicates = {name: count for name, count in sorted(classes.items()) if count > 1}
+    return house
+
+
+def assigned(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Names of variables that are assigned, with their lines: by ``=``, ``for``, ``with``, ``:=`` and as parameters."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id, node.lineno
+        elif isinstance(node, ast.arg):
+            yield node.arg, node.lineno
+
+
+def _first_line(function: ast.FunctionDef) -> int:
+    """Of a function's statements, behind its docstring."""
+    body = function.body
+    return body[1].lineno if len(body) > 1 and ast.get_docstring(function) is not None else body[0].lineno
+
+
+def _constant_docstrings(node: ast.AST) -> int:
+    body = getattr(node, "body", None)
+    pairs = itertools.pairwise(body) if isinstance(body, list) else ()
+    return sum(
+        isinstance(first, ast.Assign | ast.AnnAssign)
+        and isinstance(second, ast.Expr)
+        and isinstance(second.value, ast.Constant)
+        and isinstance(second.value.value, str)
+        for first, second in pairs
+    )
+
+
+def _module(path: Path, package: Path) -> str:
+    parts = path.relative_to(package.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _room(module: str) -> str:
+    return module.split(".")[1] if "." in module else ""
+
+
+def _imports(name: str, tree: ast.Module, modules: set[str]) -> set[str]:
+    """Modules of the package that a module imports, at its top or deferred; not for types alone."""
+    targets: set[str] = set()
+    typing_only = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                targets.add(full if full in modules else node.module)
+        elif isinstance(node, ast.Import):
+            targets.update(alias.name for alias in node.names)
+    return {target for target in targets if target in modules and target != name}
+
+
+def _depth(room: str, rooms: dict[str, set[str]], above: tuple[str, ...]) -> int:
+    below = rooms[room] - {room, *above}
+    return 1 + max((_depth(one, rooms, (*above, room)) for one in below), default=0) if len(above) < len(rooms) else 0
+
+
+def _circles(imports: dict[str, set[str]]) -> list[list[str]]:
+    """Strongly connected groups (Tarjan 1972), without recursion."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    on_stack: set[str] = set()
+    groups: list[list[str]] = []
+    for root in imports:
+        if root in index:
+            continue
+        work = [(root, iter(imports[root]))]
+        index[root] = low[root] = len(index)
+        stack.append(root)
+        on_stack.add(root)
+        while work:
+            name, following = work[-1]
+            step = next(following, None)
+            if step is None:
+                work.pop()
+                if work:
+                    low[work[-1][0]] = min(low[work[-1][0]], low[name])
+                if low[name] == index[name]:
+                    cut = stack.index(name)
+                    groups.append(stack[cut:])
+                    on_stack.difference_update(stack[cut:])
+                    del stack[cut:]
+            elif step not in index:
+                index[step] = low[step] = len(index)
+                stack.append(step)
+                on_stack.add(step)
+                work.append((step, iter(imports[step])))
+            elif step in on_stack:
+                low[name] = min(low[name], index[step])
+    return groups
+
+
+def _processor_seconds(target: str) -> float:
+    """Processor time of a make target and its child processes; a failure counts as no time at all (NaN)."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(["make", target], cwd=ROOT, env=environment, capture_output=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return seconds if done.returncode == 0 else float("nan")
+
+
+def main() -> None:
+    given = parser(__doc__.splitlines()[0]).parse_args()
+    house = measure()
+    figures = (
+        ("siblings below the package", len(house.siblings), 22),
+        ("arrows between rooms", house.arrows, 130),
+        ("circles of modules", len(house.circles), 0),
+        (f"functions of more than {LONG_FUNCTION} lines", len(house.long_functions), 0),
+        (f"files of more than {LONG_FILE} lines", len(house.long_files), 0),
+        ("public class names that stand twice", len(house.duplicates), 0),
+        ("variables of a banned name", len(house.banned), 0),
+    )
+    rows: list[tuple[object, ...]] = [(name, value, f"<= {bound}") for name, value, bound in figures]
+    rows += [("floors", house.floors, ""), ("modules", house.modules, "")]
+    rows += [("comments per 100 lines", house.comments, ">= 3"), ("docstrings per 100 lines", house.docstrings, "")]
+    verdicts = [
+        Verdict(n, v, b, v / b if b else float(v), "<= 1" if b else "<= 0", v <= b, "count", given.quick)
+        for n, v, b in figures
+    ]
+    verdicts.append(verdict("comments per 100 lines", house.comments, 3.0, ">= 1", "comments", given.quick))
+    if not given.quick:
+        for target, bound in (("check", 150.0), ("test", 300.0)):
+            seconds = _processor_seconds(target)
+            rows.append((f"make {target}, processor seconds", seconds, f"<= {bound:g}"))
+            verdicts.append(verdict(f"make {target}", seconds, bound, "<= 1", "s", given.quick))
+    table(("figure", "now", "bound"), rows)
+    for line in (*house.circles, *house.long_functions, *house.long_files, *house.duplicates, *house.banned[:40]):
+        print("  ", line)
+    finish(Path(__file__).stem, verdicts, given.seed, {"floors": house.floors, "modules": house.modules})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,6 +1,0 @@
-"""Number formats in which a smaller network can run: one file and one registration each."""
-
-from edp.compress.formats import dynamic_int8, float32, w8a16
-from edp.compress.formats.base import FORMATS, Deployed, Format, Predict, Taken, deploy, taken
-
-__all__ = ["FORMATS", "Deployed", "Format", "Predict", "Taken", "deploy", "dynamic_int8", "float32", "taken", "w8a16"]

@@ -1,0 +1,174 @@
+"""The typed tree of settings: TOML in, validated specs out, every problem reported at once with the closest key."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from importlib import resources
+from pathlib import Path
+
+import tomli_w
+
+from edp import storage
+from edp.data.augment import AUGMENTATIONS
+from edp.data.feature_files import is_set_file, read_set_table
+from edp.data.features import FEATURE_SETS, Derived, FeatureSet
+from edp.data.frozen import SPLITS
+from edp.data.splits import ByRecording, SplitSpec
+from edp.data.task import TargetMode, Task, check_ends
+from edp.errors import ConfigError, closest
+from edp.evaluation.judge import JudgeSpec
+from edp.networks.losses import LOSSES, TERMS
+from edp.networks.physics import PhysicsSpec
+from edp.networks.plain import NETWORK_PARTS, USUAL_KINDS
+from edp.networks.predictor import ModelSpec
+from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+from edp.training.averages import AVERAGES
+from edp.training.fit import TrainingSpec
+from edp.training.optimizers import OPTIMIZERS
+from edp.training.schedules import SCHEDULES
+
+SETTINGS = SettingsTree(
+    {
+        **NETWORK_PARTS,
+        "augmentations": AUGMENTATIONS,
+        "loss": LOSSES,
+        "terms": TERMS,
+        "optimizer": OPTIMIZERS,
+        "schedule": SCHEDULES,
+        "average": AVERAGES,
+        "split": SPLITS,
+    },
+    USUAL_KINDS,
+)
+"""Reads and writes the tables of an experiment and of its parts."""
+build = SETTINGS.build
+plain_tree = SETTINGS.plain
+PRESETS = ("quick", "small", "standard", "thesis")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureSettings:
+    """A user's own feature set; see `edp.data.features.FeatureSet`."""
+
+    name: str = "own"
+    channels: tuple[str, ...] = ()
+    derived: tuple[Derived, ...] = ()
+    hidden: tuple[str, ...] = ()
+    starting: tuple[str, ...] = ()
+    starting_ticks: int = 5
+
+    def __post_init__(self) -> None:
+        FeatureSet(**{entry.name: getattr(self, entry.name) for entry in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskSettings:
+    """The task before the data's rate is known.
+
+    Attributes:
+        features: ``FG1``, ``FG2``, ``all`` (every channel of the recordings), or a table. The path of a feature-set
+            file stands for its table; in a settings file it is relative to that file.
+        targets: names of the predicted channels.
+        horizons: look-ahead in samples.
+        mode: ``delta`` or ``absolute``.
+        derived_targets: derived channels that serve as targets only.
+        integrate: targets whose running integral is judged too.
+    """
+
+    features: str | FeatureSettings = "FG2"
+    targets: tuple[str, ...] = ("CylVels_1", "CylVels_2", "CylVels_3")
+    horizons: tuple[int, ...] = (10,)
+    mode: TargetMode = TargetMode.DELTA
+    derived_targets: tuple[Derived, ...] = ()
+    integrate: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_ends(self)
+
+    def resolve(self, rate_hz: float, channels: Sequence[str] = (), physics: PhysicsSpec | None = None) -> Task:
+        """The task for recordings of `rate_hz` with these channels, with what a physics base reads beside them."""
+        chosen = self.features
+        if isinstance(chosen, FeatureSettings):
+            features = FeatureSet(**{field.name: getattr(chosen, field.name) for field in fields(chosen)})
+        elif chosen == "all":
+            features = FeatureSet("all", tuple(channels))
+        elif chosen in FEATURE_SETS:
+            features = FEATURE_SETS[chosen]
+        else:
+            hint = closest(chosen, [*FEATURE_SETS, "all"])
+            raise ConfigError(f"task.features: there is no feature set '{chosen}'{hint}")
+        extra = () if physics is None else tuple(n for n in physics.channels() if n not in features.inputs)
+        return Task(
+            features, self.targets, self.horizons, self.mode, rate_hz, self.derived_targets, self.integrate, extra
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Everything that settles a training and its judgement.
+
+    Attributes:
+        task: what is read and predicted.
+        split: how recordings are divided.
+        model: the network.
+        training: how it is trained.
+        judge: how it is judged.
+    """
+
+    task: TaskSettings = field(default_factory=TaskSettings)
+    split: SplitSpec = field(default_factory=ByRecording)
+    model: ModelSpec = field(default_factory=ModelSpec)
+    training: TrainingSpec = field(default_factory=TrainingSpec)
+    judge: JudgeSpec = field(default_factory=JudgeSpec)
+
+
+def load_experiment(
+    path: str | Path | None = None, preset: str | None = "standard", overrides: Sequence[str] = ()
+) -> Experiment:
+    """Settings from a preset, changed by a TOML file, changed by ``key.path=value`` overrides.
+
+    Without a preset the file is taken as it stands, over the defaults of the specs: what a run folder keeps is whole.
+
+    Raises:
+        ConfigError: names every unknown key, wrong type and impossible value at once.
+    """
+    table: Table = {}
+    where = f"preset '{preset}'"
+    if preset is not None:
+        table = preset_table(preset)
+    if path is not None:
+        table = merged(table, with_set_file(read_toml(path), Path(path).parent))
+        where = f"'{path}'"
+    for text in overrides:
+        table = merged(table, with_set_file(override(text), Path()))
+    where += " with --set" if overrides else ""
+    return build(Experiment, table, where)
+
+
+def preset_table(name: str) -> Table:
+    """The table of a preset.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f"there is no preset '{name}'{closest(name, PRESETS)}")
+    text = resources.files("edp.config").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8")
+    return storage.parse_toml(text, f"preset '{name}'", ConfigError)
+
+
+def experiment_toml(experiment: Experiment) -> str:
+    """The whole settings as TOML, defaults included: what a run folder keeps."""
+    return tomli_w.dumps(plain_tree(experiment))
+
+
+def with_set_file(table: Table, folder: Path) -> Table:
+    """`table` with the feature set that its ``task.features`` names by a file, so that a run folder keeps all of it."""
+    task = table.get("task")
+    if not isinstance(task, dict) or not is_set_file(task.get("features")):
+        return table
+    path = folder / task["features"]
+    features = read_set_table(path)
+    build(FeatureSettings, features, f"'{path}'")
+    return {**table, "task": {**task, "features": features}}

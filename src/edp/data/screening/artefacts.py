@@ -1,0 +1,193 @@
+"""Channels whose relation to anything is made by how the recordings were cut: they tell the file, not the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from edp.data.screening.compiled import spread
+from edp.data.screening.lagged import Lagged
+from edp.data.screening.ranks import ranks_of
+from edp.data.screening.result import Array, Flag, FlagKind
+from edp.data.screening.table import CandidateTable, chunks
+
+CLOCK = 0.98
+"""Rank correlation with time, in every piece, from which a channel only tells the time."""
+STRONG = 0.6
+"""Correlation that a relation must have in every piece before a change of its sign counts."""
+EXACT = 0.97
+"""The same before a change of its gain counts."""
+GAIN = 1.5
+"""Ratio of the largest to the smallest gain."""
+STEADY, SAME = 1.25, 1.05
+"""Largest ratio of gains (90 % to 10 %) that count as one gain where a sign turns, and where a relation is absent."""
+VISIBLE, ABSENT = 0.8, 0.3
+"""Correlation that gain and noise let expect, and the one found, where a relation is absent."""
+
+
+def dead_flags(table: CandidateTable) -> list[Flag]:
+    """Channels that never change, or change between recordings only; and those with missing values."""
+    flags = [
+        Flag(name, FlagKind.MISSING, value=1.0, evidence=f"{count} values are missing or infinite")
+        for name, count in table.missing.items()
+    ]
+    for i in np.flatnonzero(~table.live):
+        if table.between[i] > 0.5 and np.ptp(table.sums[0][:, i]) > 1e-6 * max(1e-30, float(np.abs(table.mean[i]))):
+            text = "constant within each recording, but not the same in all: it tells the file, not the machine"
+            flags.append(Flag(table.names[i], FlagKind.ARTEFACT, value=1.0, evidence=text))
+        else:
+            flags.append(Flag(table.names[i], FlagKind.CONSTANT, value=1.0, evidence="never changes"))
+    return flags
+
+
+def clock_flags(table: CandidateTable, live: Sequence[int]) -> list[Flag]:
+    """Channels that rise or fall throughout every recording."""
+
+    def of_channel(i: int) -> float:
+        found = []
+        for piece in table.pieces:
+            values = max(piece.stretches, key=len)[:, i]
+            values = values[:: max(1, len(values) // 2_000)]
+            if values.max() > values.min():
+                found.append(abs(float(np.corrcoef(ranks_of(values), np.arange(len(values)))[0, 1])))
+        return min(found) if len(found) > len(table.pieces) // 2 else 0.0
+
+    values = spread(of_channel, live)
+    return [
+        Flag(
+            table.names[i],
+            FlagKind.ARTEFACT,
+            value=value,
+            evidence=f"rises or falls throughout every recording (rank correlation with time {value:.3f} or more): it "
+            "tells the time since the start",
+        )
+        for i, value in zip(live, values)
+        if value >= CLOCK
+    ]
+
+
+def changing_flags(
+    names: Sequence[str], lagged: Lagged, judged: Sequence[int], trusted: Sequence[int], support: Array
+) -> list[Flag]:
+    """Channels that follow another one closely in every piece, but not with the same sign or gain.
+
+    Args:
+        names: channels.
+        lagged: covariances of every piece.
+        judged: columns that may be flagged.
+        trusted: columns that a channel is held against.
+        support: largest correlation of each channel with a target over all pieces, ``(channel,)``. Of two channels that
+            are both in question, the one that has less than half the other's is taken for the changing one.
+    """
+    squares = lagged.squares().astype(np.float64)
+    usable = np.asarray((squares > 0).all(axis=0))
+
+    def of_channel(i: int) -> Flag | None:
+        if not usable[i]:
+            return None
+        scale = np.sqrt(squares[:, None, i, None] * squares[:, None, :])
+        found: Array = np.divide(lagged.sums[:, :, i], scale, out=np.zeros(lagged.sums[:, :, i].shape), where=scale > 0)
+        held_against = np.zeros(len(names), dtype=np.bool_)
+        held_against[list(trusted)] = True
+        held_against[list(judged)] = support[list(judged)] > 2.0 * support[i]
+        found[:, :, ~(usable & held_against)] = 0.0
+        found[:, :, i] = 0.0
+        least: Array = np.abs(found).min(axis=0)
+        lag, j = (int(k) for k in np.unravel_index(int(least.argmax()), least.shape))
+        values = found[:, lag, j]
+        turned = min(int(np.sum(values > 0)), int(np.sum(values < 0)))
+        gains = np.abs(values) * np.sqrt(squares[:, i] / squares[:, j])
+        changed = float(gains.max() / gains.min()) if least[lag, j] >= EXACT else 1.0
+        if least[lag, j] < STRONG or (turned == 0 and changed < GAIN):
+            return None
+        what = (
+            f"its sign differs in {turned} of {len(values)} pieces"
+            if turned
+            else f"its gain differs by a factor of {changed:.1f} among pieces"
+        )
+        text = f"follows {names[j]} in every piece (correlation {least[lag, j]:.2f} or more), but {what}"
+        return Flag(names[i], FlagKind.ARTEFACT, names[j], lag - lagged.reach, float(least[lag, j]), text)
+
+    return [flag for flag in spread(of_channel, judged) if flag is not None]
+
+
+def broken_flags(
+    table: CandidateTable, live: Sequence[int], judged: Sequence[int], trusted: Sequence[int]
+) -> list[Flag]:
+    """Channels that show another one with one gain in some recordings, elsewhere with the other sign or not at all.
+
+    Pieces may join recordings with different relations, so every stretch is looked at for itself, at lag 0. Natural
+    relations change their gain where they change their sign or fade; a plug turned round or left out does not. A
+    stretch counts where the source moves so much that the gain and noise of the other stretches would show it.
+
+    Args:
+        table: the data.
+        live: its columns that change.
+        judged: places in `live` of the channels that may be flagged.
+        trusted: places of those that they are held against: of two in question, it cannot be told which one is broken.
+    """
+    found = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
+    relations, slopes, squares = (np.array(values) for values in zip(*found, strict=True))
+    flags = []
+    for i in judged:
+        sources = [j for j in trusted if j != i]
+        made = [(_broken(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
+        told = [(*verdict, j) for verdict, j in made if verdict is not None]
+        if told:
+            value, text, j = max(told)
+            source = table.names[live[j]]
+            flags.append(Flag(table.names[live[i]], FlagKind.ARTEFACT, source, 0, value, f"shows {source} {text}"))
+    return flags
+
+
+def _broken(relation: Array, slope: Array, squares: Array) -> tuple[float, str] | None:
+    """Mean correlation where there is one, and in words how it breaks; None where it does not.
+
+    Args:
+        relation: correlation of channel and source, ``(stretch,)``.
+        slope: size of the channel's slope on the source, ``(stretch,)``.
+        squares: variances of channel and source, ``(stretch, 2)``.
+    """
+    strong = np.abs(relation) >= STRONG
+    count = int(strong.sum())
+    if count < max(4, len(strong) // 5):
+        return None
+    low, high = np.quantile(slope[strong], (0.1, 0.9))
+    turned = min(int((strong & (relation > 0)).sum()), int((strong & (relation < 0)).sum()))
+    value = float(np.abs(relation[strong]).mean())
+    if high <= STEADY * low and turned >= max(2, 0.2 * count):
+        return (
+            value,
+            f"with one gain in {count} of {len(strong)} stretches, but with the other sign in {turned} of them",
+        )
+    noise = float(np.median((squares[:, 0] * (1.0 - relation**2))[strong]))
+    shown = float(np.median(slope[strong])) ** 2 * squares[:, 1]
+    looked = np.sqrt(shown / np.maximum(shown + noise, 1e-300)) >= VISIBLE
+    absent = int((looked & (np.abs(relation) <= ABSENT)).sum())
+    if high <= SAME * low and absent >= max(2, 0.2 * looked.sum()):
+        return value, f"with one gain in {count} stretches, but not at all in {absent} others where it moves as much"
+    return None
+
+
+def _moments(stretches: Sequence[np.ndarray]) -> tuple[Array, Array, Array]:
+    """Correlations ``[i, j]`` and slopes of i on j, 0 where one of them stands still; and variances ``(channel,)``."""
+    count = sum(len(stretch) for stretch in stretches)
+    mean = sum(stretch.sum(axis=0, dtype=np.float64) for stretch in stretches) / count
+    products = np.zeros((len(mean), len(mean)))
+    for part in chunks(stretches):
+        part -= mean
+        products += part.T @ part
+    square = np.diag(products)
+    moving = square > 1e-12 * count * np.maximum(mean * mean, 1e-30)
+    both = np.outer(moving, moving)
+    relation = np.divide(products, np.sqrt(np.outer(square, square)), out=np.zeros_like(products), where=both)
+    slope = np.divide(products, square[None, :], out=np.zeros_like(products), where=both)
+    return relation, slope, np.where(moving, square, 0.0) / count
+
+
+def lonely(values: Array, chance: float) -> int | None:
+    """The only piece in which a correlation is strong, given one value a piece; None where there is no such."""
+    order = np.argsort(-np.abs(values))
+    first, second = float(abs(values[order[0]])), float(abs(values[order[1]]))
+    return int(order[0]) if first > max(0.3, 4 * second, 3 * chance) else None

@@ -1,0 +1,260 @@
+"""Channels that add nothing since they are copies of another, and channels that know the future.
+
+A *copy* is a channel that equals another one, delayed, scaled and with noise of its own: what is left of it is related
+to nothing in a linear way, so that whoever has the past of the original gains nothing. A *leak of the future* is a
+channel that the presents and pasts of the trusted channels leave unexplained, but that the future of one of them
+explains: shifted, smoothed to both sides, differenced across the present. No sensor shows that.
+
+A channel that *causes* a trusted one through dynamics that can be inverted without loss and without noise looks the
+same; who has one names it as trusted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.screening.compiled import spread
+from edp.data.screening.linear import Tap, gram, peaks, unexplained
+from edp.data.screening.result import Array, Flag, FlagKind
+
+LEAKING, DETERMINED = 0.25, 0.5
+"""Of what pasts leave unexplained of a channel, the share that may remain once the future is known, for a leak; the
+second where hardly anything remains, as from the ends of stretches."""
+HARDLY = 0.01
+"""Share of the variance that counts as hardly anything."""
+DIFFERENCING = 2.5
+"""Sum of the absolute weights of the future, from which it is differences of the future that explain: so do leaks that
+are derivatives, but also causes, whose effect is turned back. Shifts and means have a sum of 2 or less."""
+EXACT_SHARE = 0.95
+"""Share that differences must take away to count as a leak: noise of sensors keeps a cause from being found so well."""
+TELLING = 1e-4
+"""Less left unexplained by pasts than this share of the variance: nothing to learn from the future."""
+MATERIAL = 0.15
+"""Correlation of the rest of a copy with anything, above which it is more than noise."""
+SEEN = 0.7
+"""Largest lag of a noisy copy, as a share of the largest one searched."""
+RELATED = 0.7
+"""Least correlation of a noisy copy with its original."""
+EXPLAINED = 0.01
+"""Share of a channel's variance left by the presents and pasts of others, below which it is made of them."""
+SLACK = 1
+"""Samples by which an exact copy may be off and still count as simultaneous."""
+_FAR = 30
+_NEAR_PAST = range(21)
+_LONG_PAST = range(61)
+_SPARSE_PAST = (0, 1, 2, 4, 7, 12, 20)
+_MOST_TRUSTED = 40
+_PARTNERS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class CopiedChannel:
+    """A channel that copies another: ``copy[t] = gain * source[t - lag] + noise``; `lag` is negative for a leader."""
+
+    copy: int
+    source: int
+    lag: int
+    correlation: float
+
+
+def find_leaks(
+    names: Sequence[str], correlations: Array, trusted: Sequence[int], targets: Sequence[int], known: Sequence[int]
+) -> list[Flag]:
+    """Channels that the future of a trusted channel explains.
+
+    Args:
+        names: channels.
+        correlations: ``[reach + lag, i, j]`` of ``x_i[t + lag]`` and ``x_j[t]``, over all pieces.
+        trusted: columns of the channels that are known to be measured.
+        targets: columns of the targets.
+        known: columns that need no judging, such as targets.
+    """
+    reach = len(correlations) // 2
+    far, near = min(_FAR, reach // 3), [a for a in _NEAR_PAST if a <= reach // 3]
+    sparse = [a for a in _SPARSE_PAST if a <= reach // 3]
+    _, best = peaks(correlations, -reach, reach)
+    strength = np.abs(best)
+    lead, _ = peaks(correlations, -reach, reach)
+
+    def judge(channel: int) -> Flag | None:
+        base = sorted((k for k in trusted if k != channel), key=lambda k: -strength[channel, k])[:_MOST_TRUSTED]
+        sources = list(dict.fromkeys([*base[:_PARTNERS], *(k for k in targets if k != channel)]))
+        # a channel far ahead of its source is looked at as if it came at a moderate distance
+        ahead = {k: max(far, min(reach - max(near), -int(lead[channel, k]) + 2)) for k in sources}
+        past = [(k, a) for k in base for a in (near if k in sources else sparse)]
+        future = [(k, -a) for k in sources for a in range(max(1, ahead[k] - far + 1), ahead[k] + 1)]
+        future = [tap for tap in future if -tap[1] + max(near) <= reach]
+        before, after = unexplained(correlations, channel, past, future)
+        if before < TELLING or after > (DETERMINED if after < HARDLY else LEAKING) * before:
+            return None
+        return _leak(names, correlations, channel, past, future, (before, after))
+
+    found = spread(judge, [k for k in range(len(names)) if k not in set(known)])
+    return [flag for flag in found if flag is not None]
+
+
+def _leak(
+    names: Sequence[str],
+    correlations: Array,
+    channel: int,
+    past: list[Tap],
+    future: list[Tap],
+    left: tuple[float, float],
+) -> Flag | None:
+    """Name the channel whose future explains most on its own, and how far ahead; None where it may be a cause."""
+    gains = {}
+    for source in dict.fromkeys(k for k, _ in future):
+        alone = unexplained(correlations, channel, past, [tap for tap in future if tap[0] == source])
+        gains[source] = alone[1]
+    source = min(gains, key=lambda k: gains[k])
+    # the tap of the future with the largest share in the linear fit
+    taps = [*past, *(tap for tap in future if tap[0] == source)]
+    joint = gram(correlations, taps, taps) + 1e-5 * np.eye(len(taps))
+    weights = np.linalg.solve(joint, gram(correlations, taps, [(channel, 0)])[:, 0])[len(past) :]
+    ahead = -taps[len(past) + int(np.abs(weights).argmax())][1]
+    share = 1.0 - left[1] / left[0]
+    differences = float(np.abs(weights).sum()) > DIFFERENCING
+    if differences and share < EXACT_SHARE:
+        return None
+    return Flag(
+        names[channel],
+        FlagKind.LEAK,
+        names[source],
+        -ahead,
+        share,
+        f"the pasts of the other channels leave {left[0]:.3g} of its variance; {names[source]} up to {ahead} samples "
+        f"later takes away {100 * share:.0f} % of that: it knows what has not happened yet"
+        + (f" (or it causes {names[source]}: then name it as trusted)" if differences else ""),
+    )
+
+
+def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
+    """Pairs of which each may be the copy: what is left of the one is unrelated to anything, at any lag.
+
+    Args:
+        correlations: ``[reach + lag, i, j]``, over all pieces.
+        least: correlation from which a channel that is not ahead counts as a copy, whatever is left of it.
+    """
+    reach = len(correlations) // 2
+    lags, best = peaks(correlations, -reach, reach)
+    candidates = [(i, j) for i, j in zip(*np.nonzero(np.abs(best) >= RELATED)) if i != j]
+
+    def judge(pair: tuple[int, int]) -> CopiedChannel | None:
+        i, j = int(pair[0]), int(pair[1])
+        lag, value = int(lags[i, j]), float(best[i, j])
+        if abs(lag) >= reach:
+            return None
+        # What leads may be a reference that a controlled machine follows closely: there the rest always counts.
+        exact = abs(value) >= least and lag >= -SLACK
+        # the rest can only be judged where enough lags lie on either side
+        if not exact and (abs(lag) > SEEN * reach or rest_related(correlations, i, j, lag, value) > MATERIAL):
+            return None
+        return CopiedChannel(i, j, lag, value)
+
+    return [pair for pair in spread(judge, candidates) if pair is not None]
+
+
+def rest_related(correlations: Array, i: int, j: int, lag: int, value: float) -> float:
+    """Largest correlation of ``x_i[t] - value x_j[t - lag]`` with any channel but i, at any lag.
+
+    Where i leads, also with the steps of the channels from sample to sample: what a reference tells of a machine that
+    follows it shows there, however slow both are.
+    """
+    reach = len(correlations) // 2
+    shown = np.arange(max(-reach, lag - reach), min(reach, lag + reach) + 1) + reach
+    rest = correlations[shown, i, :] - value * correlations[shown - lag, j, :]
+    rest[:, i] = 0.0
+    most = float(np.abs(rest).max())
+    if lag < -SLACK:
+        steps = np.sqrt(2.0 * np.maximum(1.0 - np.diagonal(correlations[reach + 1]), 1e-6))
+        steps[i] = np.inf
+        most = max(most, float((np.abs(np.diff(rest, axis=0)) / steps).max()))
+    return most / math.sqrt(max(1.0 - value * value, 1e-9))
+
+
+def copy_flags(
+    names: Sequence[str], pairs: Sequence[CopiedChannel], trusted: set[int], innovation: Array, settled: set[int]
+) -> list[Flag]:
+    """Of each pair, flag the copy; the original is the trusted one, else the earlier, else the smoother one.
+
+    Args:
+        names: channels.
+        pairs: as found, usually each pair in both directions.
+        trusted: columns of the channels known to be measured; never flagged.
+        innovation: share of each channel's variance that its own past does not explain, ``(channel,)``.
+        settled: columns that are flagged already, of no use as originals.
+    """
+    flags: dict[int, Flag] = {}
+    for pair in sorted(pairs, key=lambda p: -abs(p.correlation)):
+        copy, source = pair.copy, pair.source
+        if {copy, source} & settled or copy in trusted or copy in flags:
+            continue
+        if source not in trusted:
+            late = pair.lag > SLACK or (
+                abs(pair.lag) <= SLACK and (innovation[copy], names[copy]) > (innovation[source], names[source])
+            )
+            if not late or source in flags:
+                continue
+        flags[copy] = _copy_flag(names, pair, source in trusted)
+    return list(flags.values())
+
+
+def _copy_flag(names: Sequence[str], pair: CopiedChannel, trusted: bool) -> Flag:
+    name, source, value = names[pair.copy], names[pair.source], abs(pair.correlation)
+    if pair.lag < -SLACK and trusted:
+        text = (
+            f"shows {source} {-pair.lag} samples before {source} itself does (correlation {value:.4f}): it knows the "
+            "future, or a faster sensor measures the same; if the latter, name it as trusted"
+        )
+        return Flag(name, FlagKind.LEAK, source, pair.lag, value, text)
+    if abs(pair.lag) <= SLACK:
+        return Flag(name, FlagKind.DUPLICATE, source, pair.lag, value, f"equals {source} (correlation {value:.4f})")
+    text = f"is {source} {pair.lag} samples later (correlation {value:.4f}), and what is left of it relates to nothing"
+    if not trusted:
+        text += f"; or {source} knows its future: see which of the two is measured, and name it as trusted"
+    return Flag(name, FlagKind.COPY, source, pair.lag, value, text)
+
+
+def explained_flags(
+    names: Sequence[str], correlations: Array, judged: Sequence[int], base: Sequence[int]
+) -> list[Flag]:
+    """Channels that the presents and pasts of others make up, one after the other, so that something remains.
+
+    Args:
+        names: channels.
+        correlations: ``[reach + lag, i, j]``, over all pieces.
+        judged: columns in the order in which they may go.
+        base: columns that explain; those of `judged` are among them until they go.
+    """
+    reach = len(correlations) // 2
+    strength = np.abs(correlations).max(axis=0)
+    remaining = list(base)
+    flags = []
+    for channel in judged:
+        others = sorted((k for k in remaining if k != channel), key=lambda k: -strength[channel, k])
+        near = others[:_PARTNERS]
+        taps = [(k, a) for k in others for a in (_LONG_PAST if k in near else _SPARSE_PAST) if a <= reach]
+        if not taps or (left := unexplained(correlations, channel, taps)[1]) > EXPLAINED:
+            continue
+        text = f"the presents and pasts of {names[near[0]]} and others make up all but {100 * left:.2g} % of it"
+        value = 1.0 - left
+        flags.append(Flag(names[channel], FlagKind.REDUNDANT, names[near[0]], value=value, evidence=text))
+        remaining.remove(channel)
+    return flags
+
+
+def innovations(correlations: Array, order: int = 20) -> Array:
+    """Share of each channel's variance that its own last `order` samples do not explain, ``(channel,)``."""
+    reach = len(correlations) // 2
+    order = min(order, reach)
+    taps: NDArray[np.int64] = np.arange(1, order + 1)
+    found = []
+    for i in range(correlations.shape[1]):
+        own: list[Tap] = [(i, int(a)) for a in taps]
+        found.append(unexplained(correlations, i, own)[1])
+    return np.array(found)

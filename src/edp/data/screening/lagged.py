@@ -1,0 +1,159 @@
+"""Covariances of all channels with each other at all lags, piece by piece, in the frequency domain.
+
+A stretch is cut into blocks. The spectrum of a block, padded by the largest lag, times that of the stretch around it
+gives exactly the sums over its rows at all lags; blocks are added up before the way back. So all pairs at all lags cost
+one matrix product a frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from edp.data.screening.compiled import spread
+from edp.data.screening.result import Array
+from edp.data.screening.table import CandidateTable, Piece
+from edp.recording import FloatArray
+
+_SEGMENTS = 128
+"""Blocks whose spectra are held at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lagged:
+    """Covariances of live channels, each centred on its piece and scaled to deviation 1 within pieces.
+
+    Attributes:
+        live: columns of the table that the channels here are, ``(channel,)``.
+        reach: largest lag.
+        sums: ``[p, reach + lag, i, j]`` sums ``x_i[t + lag] x_j[t]`` over piece p, float32.
+        samples: rows of each piece, ``(piece,)``.
+        chance: correlations of channels with targets of other pieces, ``(piece, shift, lag, channel, target)``.
+    """
+
+    live: NDArray[np.int64]
+    reach: int
+    sums: FloatArray
+    samples: NDArray[np.int64]
+    chance: FloatArray
+
+    @property
+    def lags(self) -> NDArray[np.int64]:
+        """All lags, ``(lag,)``."""
+        return np.arange(-self.reach, self.reach + 1)
+
+    def pooled(self) -> Array:
+        """Correlation over all pieces, ``(lag, channel, channel)``: sums over the root of the sums of squares."""
+        sums = self.sums.sum(axis=0, dtype=np.float64)
+        deviation = np.sqrt(np.diagonal(sums[self.reach]))
+        sums /= np.outer(deviation, deviation)
+        return sums
+
+    def by_piece(self, columns: NDArray[np.int64]) -> FloatArray:
+        """Correlation of all channels with some, in each piece, ``(piece, lag, channel, column)``."""
+        squares = self.squares()
+        scale = np.sqrt(squares[:, None, :, None] * squares[:, None, None, columns])
+        shown = self.sums[:, :, :, columns]
+        return np.divide(shown, scale, out=np.zeros_like(shown), where=scale > 0)
+
+    def squares(self) -> FloatArray:
+        """Sums of squares in each piece, ``(piece, channel)``."""
+        return np.ascontiguousarray(np.diagonal(self.sums[:, self.reach], axis1=1, axis2=2))
+
+
+class _Spectra:
+    """Spectra of the blocks of one piece: of blocks alone, and with the rows around them."""
+
+    def __init__(self, table: CandidateTable, reach: int, live: NDArray[np.int64]) -> None:
+        self.table, self.reach, self.live = table, reach, live
+        self.size = 1024
+        while self.size < 8 * reach:
+            self.size *= 2
+        self.block = self.size - 2 * reach
+
+    def scaled(self, place: int) -> Iterator[FloatArray]:
+        """The stretches of a piece, centred and scaled, ``(time, channel)``."""
+        mean = self.table.sums[0][place, self.live]
+        deviation = self.table.within[self.live]
+        for stretch in self.table.pieces[place].stretches:
+            yield ((stretch[:, self.live] - mean) / deviation).astype(np.float32)
+
+    def blocks(self, place: int, columns: NDArray[np.int64] | None, around: bool) -> NDArray[np.complex64]:
+        """Spectra of all blocks of a piece, ``(frequency, block, channel)``."""
+        cut = []
+        for values in self.scaled(place):
+            chosen = values if columns is None else values[:, columns]
+            count = -(-len(chosen) // self.block)
+            padded = np.zeros((self.reach + count * self.block + self.reach, chosen.shape[1]), dtype=np.float32)
+            padded[self.reach : self.reach + len(chosen)] = chosen
+            for i in range(count):
+                part = padded[i * self.block : i * self.block + self.size]
+                if not around:
+                    part = part.copy()
+                    part[: self.reach] = part[-self.reach :] = 0.0
+                cut.append(part)
+        found = scipy.fft.rfft(np.stack(cut), axis=1)
+        return np.ascontiguousarray(found.transpose(1, 0, 2), dtype=np.complex64)
+
+    def back(self, product: NDArray[np.complex64]) -> FloatArray:
+        """From summed cross spectra ``(frequency, i, j)`` to sums at lags -reach to reach."""
+        flat = np.ascontiguousarray(product.reshape(len(product), -1).T)
+        sums = scipy.fft.irfft(flat, n=self.size, axis=1)
+        shown = np.concatenate([sums[:, -self.reach :], sums[:, : self.reach + 1]], axis=1)
+        return np.asarray(shown.T.reshape(-1, *product.shape[1:]), dtype=np.float32)
+
+
+def lagged_covariances(
+    table: CandidateTable, reach: int, shifts: int = 4, on_share: Callable[[float], None] | None = None
+) -> Lagged:
+    """All pairs at all lags up to `reach`, and what chance gives between channels and targets of different pieces.
+
+    Args:
+        table: the data.
+        reach: largest lag, samples.
+        shifts: with how many other pieces each piece is paired for chance.
+        on_share: hears the share that is done.
+    """
+    live = np.flatnonzero(table.live)
+    spectra = _Spectra(table, reach, live)
+    places = np.searchsorted(live, table.targets)
+    count = len(table.pieces)
+    shifts = min(shifts, count - 1)
+    answers = [spectra.blocks(p, places, around=False) for p in range(count)]
+    strengths = np.stack([_squares(table, p, live) for p in range(count)])
+
+    def of_piece(p: int) -> tuple[FloatArray, FloatArray]:
+        around = spectra.blocks(p, None, around=True)
+        sums = spectra.back(_product(around, spectra.blocks(p, None, around=False)))
+        pairs = []
+        for shift in range(1, shifts + 1):
+            other = (p + shift) % count
+            shared = min(around.shape[1], answers[other].shape[1])
+            found = spectra.back(_product(around[:, :shared], answers[other][:, :shared]))
+            share = shared / np.sqrt(around.shape[1] * answers[other].shape[1])
+            scale = share * np.sqrt(np.outer(strengths[p], strengths[other][places]))
+            pairs.append(np.divide(found, scale, out=np.zeros_like(found), where=scale > 0))
+        return sums, np.stack(pairs).astype(np.float32)
+
+    found = spread(of_piece, range(count), on_share)
+    rows = np.array([piece.samples for piece in table.pieces])
+    return Lagged(live, reach, np.stack([s for s, _ in found]), rows, np.stack([c for _, c in found]))
+
+
+def _product(left: NDArray[np.complex64], right: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Cross spectra summed over blocks, ``(frequency, i, j)``."""
+    total = np.zeros((left.shape[0], left.shape[2], right.shape[2]), dtype=np.complex64)
+    for start in range(0, left.shape[1], _SEGMENTS):
+        part = slice(start, start + _SEGMENTS)
+        total += np.matmul(np.ascontiguousarray(left[:, part].transpose(0, 2, 1)), right[:, part].conj())
+    return total
+
+
+def _squares(table: CandidateTable, place: int, live: NDArray[np.int64]) -> Array:
+    """Sums of squares of the scaled channels of a piece, ``(channel,)``."""
+    piece: Piece = table.pieces[place]
+    return table.sums[1][place, live] / np.square(table.within[live]) * piece.samples

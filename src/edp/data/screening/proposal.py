@@ -1,0 +1,295 @@
+"""From figures to a feature set: what is kept, what is dropped, in which order and why; and the memory needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.screening.artefacts import lonely
+from edp.data.screening.copies import explained_flags
+from edp.data.screening.result import (
+    ChannelVerdict,
+    Cluster,
+    Flag,
+    FlagKind,
+    GroupImportance,
+    LagCurve,
+    Proposal,
+    Value,
+)
+from edp.data.screening.stability import ABOVE_CHANCE, LEAST_INFORMATION, Relations
+from edp.data.screening.table import CandidateTable
+
+NEGLIGIBLE = 0.002
+"""Share of the remaining error that a channel must take away, held out, to be kept for that alone."""
+LARGE = 0.01
+"""The same, from which a channel that relates is not redundant even where the held-out pieces do not agree."""
+CLEAR = 0.2
+"""Correlation from which a lag counts for the window."""
+STEP = 5
+"""Windows are rounded up to so many samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScreeningEvidence:
+    """What the verdicts rest on; arrays of `relations` are over `live`.
+
+    Attributes:
+        table: the data.
+        live: columns of the table that change.
+        correlations: of live channels, ``[reach + lag, i, j]``, over all pieces.
+        relations: tests of live channels against targets.
+        pieces: correlation of each piece at the best lag with the best target, ``(piece, live channel)``.
+        curves: lag curves.
+        importance: of the forest, all entries.
+        values: of linear models.
+        clusters: collinear channels.
+        history: held-out error by window, and the shortest that suffices.
+    """
+
+    table: CandidateTable
+    live: NDArray[np.int64]
+    correlations: NDArray[np.float64]
+    relations: Relations
+    pieces: NDArray[np.float64]
+    curves: Sequence[LagCurve]
+    importance: Sequence[GroupImportance]
+    values: Sequence[Value]
+    clusters: Sequence[Cluster]
+    history: tuple[int, Mapping[int, float]]
+
+    def gain(self, name: str) -> tuple[float, float]:
+        """Largest linear value of a channel over the targets, and the lower end of its interval; NaN if not judged."""
+        found = [value for value in self.values if value.channel == name]
+        if not found:
+            return math.nan, math.nan
+        best = max(found, key=lambda value: value.gain)
+        return best.gain, best.low
+
+    def importance_of(self, name: str) -> GroupImportance | None:
+        """The entry over all targets of the group that holds a channel."""
+        found = (entry for entry in self.importance if entry.target == "all" and name in entry.members)
+        return next(found, None)
+
+
+def noise_flags(evidence: ScreeningEvidence, judged: Sequence[str]) -> list[Flag]:
+    """Channels that neither relate to a target nor help a forest or a linear model, held out."""
+    flags = []
+    for place, column in enumerate(evidence.live):
+        name = evidence.table.names[column]
+        if name not in judged or evidence.relations.related[place].any():
+            continue
+        entry = evidence.importance_of(name)
+        if _adds(evidence, name) or (entry is not None and entry.low > 0 and entry.increase > NEGLIGIBLE):
+            continue
+        flags.append(_noise(evidence, place, name))
+    return flags
+
+
+def _noise(evidence: ScreeningEvidence, place: int, name: str) -> Flag:
+    relations = evidence.relations
+    target = int(np.abs(relations.linear[place]).argmax())
+    value = float(abs(relations.linear[place, target]))
+    chance = float(relations.linear_chance[place, target])
+    only = lonely(evidence.pieces[:, place], chance)
+    if only is not None:
+        text = (
+            f"goes with a target in {evidence.table.pieces[only].name} only "
+            f"(correlation {evidence.pieces[only, place]:.2f}), in no other piece"
+        )
+        return Flag(name, FlagKind.ARTEFACT, value=abs(float(evidence.pieces[only, place])), evidence=text)
+    between = float(evidence.table.between[evidence.live[place]])
+    found = f"correlation with a target at most {value:.3f} (between unrelated pieces up to {chance:.3f})"
+    if between > 0.5:
+        text = f"{100 * between:.0f} % of its variance lies between recordings; within them {found}"
+        return Flag(name, FlagKind.ARTEFACT, value=between, evidence=text)
+    information = float(np.nan_to_num(relations.information[place]).max())
+    if value > ABOVE_CHANCE * chance or information > LEAST_INFORMATION:
+        spread = float(evidence.pieces[:, place].std(ddof=1))
+        text = (
+            f"relates to targets in some pieces, not in all alike (correlation {value:.2f} with deviation {spread:.2f} "
+            f"among pieces, mutual information above chance {information:.2f} nat); no help to forest or linear model"
+        )
+        return Flag(name, FlagKind.UNSTEADY, value=value, evidence=text)
+    text = f"{found}; mutual information above chance {information:.3f} nat; no help to a forest or a linear model"
+    return Flag(name, FlagKind.NOISE, value=value, evidence=text)
+
+
+def redundant_flags(evidence: ScreeningEvidence, judged: Sequence[str], free: Sequence[str]) -> list[Flag]:
+    """Channels that add nothing beside others: members of a cluster, and what the pasts of others make up.
+
+    Args:
+        evidence: figures.
+        judged: channels that may go.
+        free: all channels without a flag, `judged` among them.
+    """
+    idle = {name for name in judged if not (_adds(evidence, name) or evidence.gain(name)[0] > LARGE)}
+    flags = _cluster_flags(evidence, idle)
+    idle -= {flag.channel for flag in flags}
+    names = [evidence.table.names[column] for column in evidence.live]
+    scores = _scores(evidence)
+    order = [names.index(name) for name in sorted(idle, key=lambda name: (scores[name], name))]
+    gone = {flag.channel for flag in flags}
+    base = [k for k, name in enumerate(names) if name in free and name not in gone]
+    return flags + explained_flags(names, evidence.correlations, order, base)
+
+
+def _adds(evidence: ScreeningEvidence, name: str) -> bool:
+    """Whether the past of a channel takes away some of the error that the others leave, held out."""
+    gain, low = evidence.gain(name)
+    return low > 0 and gain > NEGLIGIBLE
+
+
+def _cluster_flags(evidence: ScreeningEvidence, idle: set[str]) -> list[Flag]:
+    flags = []
+    for cluster in evidence.clusters:
+        for name in cluster.members:
+            if name == cluster.representative or name not in idle:
+                continue
+            gain = evidence.gain(name)[0]
+            text = (
+                f"goes with {cluster.representative} (rank correlation {cluster.least:.2f} or more within the cluster) "
+                f"and takes away only {100 * gain:.2f} % of the error that is left"
+            )
+            flags.append(Flag(name, FlagKind.REDUNDANT, cluster.representative, value=cluster.least, evidence=text))
+    return flags
+
+
+def propose(
+    evidence: ScreeningEvidence, names: Sequence[str], targets: Sequence[str], horizon: int, flags: Sequence[Flag]
+) -> Proposal:
+    """Rank all candidates and suggest a window.
+
+    Args:
+        evidence: figures.
+        names: candidates, those with missing values too.
+        targets: names; inputs as well unless the horizon is 0.
+        horizon: samples ahead.
+        flags: whoever has one is dropped.
+    """
+    by_channel: dict[str, list[Flag]] = {}
+    for flag in flags:
+        by_channel.setdefault(flag.channel, []).append(flag)
+    scores = _scores(evidence)
+    rows = []
+    for name in names:
+        own = tuple(by_channel.get(name, ()))
+        barred = horizon == 0 and name in targets
+        keep = (name in targets and not barred) or (not own and not barred)
+        rows.append((not keep, -scores.get(name, 0.0), name, own, barred))
+    choices = tuple(
+        ChannelVerdict(name, not dropped, rank, -score, _reason(evidence, name, name in targets, own, barred), own)
+        for rank, (dropped, score, name, own, barred) in enumerate(sorted(rows, key=lambda row: row[:3]), start=1)
+    )
+    kept = {choice.channel for choice in choices if choice.keep}
+    window, reason = _window(evidence, kept, targets, horizon)
+    return Proposal(choices, window, reason, _notes(evidence, flags, horizon))
+
+
+def _scores(evidence: ScreeningEvidence) -> dict[str, float]:
+    """Half the importance, a quarter each of correlation and information, each relative to the largest; 0 to 1.
+
+    Correlation and information are penalised where they spread among the pieces: times ``m / (m + s)``, with mean m and
+    deviation s.
+    """
+    relations, count = evidence.relations, len(evidence.table.pieces)
+    linear = (np.abs(relations.linear) * _steadiness(relations.linear_t, count)).max(axis=1)
+    steady = _steadiness(relations.information_t, count)
+    information = (np.nan_to_num(relations.information) * steady).max(axis=1)
+    names = [evidence.table.names[column] for column in evidence.live]
+    entries = [evidence.importance_of(name) for name in names]
+    weight = np.array([max(e.increase, 0.0) / len(e.members) if e is not None else 0.0 for e in entries])
+    parts = [
+        share * np.maximum(values, 0.0) / max(float(values.max()), 1e-30)
+        for share, values in ((0.5, np.sqrt(weight)), (0.25, linear), (0.25, information))
+    ]
+    return dict(zip(names, np.clip(sum(parts), 0.0, 1.0).tolist()))
+
+
+def _steadiness(t: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """``m / (m + s)`` from mean over standard error, of `count` pieces."""
+    return t / (t + math.sqrt(count))
+
+
+def _reason(evidence: ScreeningEvidence, name: str, target: bool, flags: tuple[Flag, ...], barred: bool) -> str:
+    if barred:
+        return "is what is to be predicted; at horizon 0 its present value is no input"
+    if flags:
+        text = "; ".join(f"{flag.kind}: {flag.evidence}" for flag in flags)
+        return f"a target, kept for its past, but {text}" if target else text
+    place = int(np.flatnonzero(evidence.live == evidence.table.names.index(name))[0])
+    relations = evidence.relations
+    best = int(np.abs(relations.linear[place]).argmax())
+    goal = evidence.table.names[evidence.table.targets[best]]
+    parts = []
+    if target:
+        parts.append("a target: its own past")
+    else:
+        pieces = evidence.pieces[:, place]
+        same = int((np.sign(pieces) == np.sign(relations.linear[place, best])).sum())
+        parts.append(
+            f"correlation {relations.linear[place, best]:.2f} with {goal}, of this sign in {same} of "
+            f"{len(pieces)} pieces"
+        )
+    informed = int(np.nan_to_num(relations.information[place]).argmax())
+    goal = evidence.table.names[evidence.table.targets[informed]]
+    parts.append(f"{max(float(np.nan_to_num(relations.information[place, informed])), 0.0):.2f} nat on {goal}")
+    entry, (gain, _) = evidence.importance_of(name), evidence.gain(name)
+    if entry is not None:
+        group = "" if len(entry.members) == 1 else f" with {len(entry.members) - 1} collinear"
+        parts.append(f"forest importance {100 * entry.increase:.1f} % of the variance{group}")
+    if math.isfinite(gain):
+        parts.append(f"its past takes away {100 * gain:.1f} % of the error that the others leave")
+    return "; ".join(parts)
+
+
+def _window(evidence: ScreeningEvidence, kept: set[str], targets: Sequence[str], horizon: int) -> tuple[int, str]:
+    """The longer of two: from the present back to the earliest cause, and what a linear prediction makes use of."""
+    leads = [
+        curve
+        for curve in evidence.curves
+        if curve.channel in kept
+        and curve.channel not in targets
+        and curve.certain
+        and not curve.at_edge
+        and abs(curve.value) >= CLEAR
+        and curve.best < 0
+    ]
+    needed, errors = evidence.history
+    by_lag, text = 1, "no channel that is kept leads a target clearly"
+    if leads:
+        first = min(leads, key=lambda curve: curve.best)
+        by_lag = -first.best
+        text = f"the longest clear lead is {by_lag} samples ({first.channel} before {first.target})"
+    window = STEP * math.ceil(max(by_lag, needed) / STEP)
+    longest = max(errors)
+    text += (
+        f"; a linear prediction {horizon} samples ahead leaves {100 * errors[needed]:.1f} % of the change with "
+        f"{needed} samples of history and {100 * errors[longest]:.1f} % with {longest}"
+    )
+    return window, text
+
+
+def _notes(evidence: ScreeningEvidence, flags: Sequence[Flag], horizon: int) -> tuple[str, ...]:
+    notes = []
+    table = evidence.table
+    if len(table.pieces) < 8:
+        notes.append(
+            f"only {len(table.pieces)} pieces were compared: figures of stability are rough; give more recordings"
+        )
+    edge = sorted({c.channel for c in evidence.curves if c.certain and c.at_edge and abs(c.value) >= CLEAR})
+    if edge:
+        notes.append(f"the best lag of {', '.join(edge)} is the end of the search; raise max_lag")
+    leaks = [flag.channel for flag in flags if flag.kind == FlagKind.LEAK]
+    if leaks:
+        known = "a channel knows" if len(leaks) == 1 else f"{len(leaks)} channels know"
+        notes.append(f"{known} the future: a model fed with it does well in tests and fails on the machine")
+    if table.left_out:
+        notes.append(f"too short to be looked at and left out: {', '.join(table.left_out)}; lower max_lag to see them")
+    if horizon == 0:
+        notes.append("horizon 0: targets are no inputs")
+    return tuple(notes)

@@ -1,0 +1,336 @@
+"""What a screening found: plain tables and arrays, ready for a page, a picture or JSON.
+
+Lags are in samples, in the sense of Table 4.2: a lag of -15 means that the channel *leads*: the target at t goes best
+with the channel at t - 15. A positive lag means that the channel follows the target.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+OnProgress = Callable[[str, float], None]
+"""Called with the stage that begins or goes on, and the share of the whole screening that is done, 0 to 1."""
+
+
+class FlagKind(StrEnum):
+    """What is wrong with a channel."""
+
+    CONSTANT = "constant"
+    LEAK = "leak of the future"
+    COPY = "delayed copy"
+    DUPLICATE = "duplicate"
+    ARTEFACT = "per-file artefact"
+    NOISE = "no relation"
+    UNSTEADY = "unsteady relation"
+    REDUNDANT = "redundant"
+    MISSING = "missing values"
+
+
+@dataclass(frozen=True)
+class Flag:
+    """Something wrong with a channel, and by which figures it shows.
+
+    Attributes:
+        channel: the channel.
+        kind: what is wrong.
+        source: the channel of which it is a copy or whose future it knows; empty where there is none.
+        lag: of the channel against `source`: -12 means that it shows the source's value of 12 samples later.
+        value: the figure that decided (a correlation, a share), 0 to 1.
+        evidence: a sentence with the figures.
+    """
+
+    channel: str
+    kind: FlagKind
+    source: str = ""
+    lag: int = 0
+    value: float = math.nan
+    evidence: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Matrices:
+    """Dependencies at the same instant over all samples, shape ``(channel, channel)``; NaN for constant channels.
+
+    Attributes:
+        names: channels, in the order of rows and columns.
+        pearson: eq. 2.11.
+        spearman: rank correlation (fig. 4.1).
+        kendall: tau-b of evenly spread samples.
+        information: mutual information in nat of evenly spread samples (eq. 2.12, fig. 4.2).
+    """
+
+    names: tuple[str, ...]
+    pearson: Array
+    spearman: Array
+    kendall: Array
+    information: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LagCurve:
+    """Cross-correlation of a channel with a target (eq. 2.13, both centred and scaled to deviation 1).
+
+    Attributes:
+        channel, target: names.
+        group: kind of signal, as Table 4.2 groups them.
+        lags: shape ``(lag,)``, negative where the channel leads.
+        correlation: shape ``(lag,)``.
+        best: lag of the largest absolute correlation.
+        value: correlation there, with its sign.
+        low, high: 95 % interval of the best lag over the pieces.
+        agreement: share of the pieces whose correlation at `best` has this sign.
+        certain: the correlation at `best` differs from chance over the pieces.
+        at_edge: the best lag is the end of the search, so that the true one may lie beyond.
+    """
+
+    channel: str
+    target: str
+    group: str
+    lags: NDArray[np.int64]
+    correlation: Array
+    best: int
+    value: float
+    low: float
+    high: float
+    agreement: float
+    certain: bool
+    at_edge: bool
+
+
+@dataclass(frozen=True)
+class LagRange:
+    """A row of Table 4.2: where the best lags of a group of channels lie, each with the target it goes best with.
+
+    Attributes:
+        group: kind of signal.
+        low, high: smallest and largest best lag, samples.
+        channels: those whose best lag is certain and within the search.
+        left_out: the others of the group.
+    """
+
+    group: str
+    low: int
+    high: int
+    channels: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Stability:
+    """One metric of a channel at t and a target at t + horizon, in each piece of the data.
+
+    Attributes:
+        metric: ``pearson``, ``spearman``, ``kendall``, ``information`` or ``lag``.
+        channel, target: names.
+        values: shape ``(piece,)``; NaN where the channel is constant in a piece.
+        mean, deviation: over the pieces.
+        agreement: share of the pieces with the sign of the mean (1 for information).
+        chance: mean absolute value between a piece's channel and another piece's target, where nothing can relate.
+    """
+
+    metric: str
+    channel: str
+    target: str
+    values: Array
+    mean: float
+    deviation: float
+    agreement: float
+    chance: float
+
+
+@dataclass(frozen=True)
+class GroupImportance:
+    """Permutation importance of a group of collinear channels (eq. 2.14) on held-out recordings.
+
+    Attributes:
+        members: channels permuted together.
+        target: name, or ``all`` for the mean of the targets.
+        increase: mean increase of the mean squared error of the target's change up to the horizon, as a share of
+            that change's variance.
+        low, high: 95 % interval over the held-out pieces.
+        share: the group's part of all positive increases.
+    """
+
+    members: tuple[str, ...]
+    target: str
+    increase: float
+    low: float
+    high: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Value:
+    """What a channel's past adds to a linear prediction from the pasts of all other usable channels, held out.
+
+    Attributes:
+        channel, target: names.
+        gain: share of the remaining squared error at the horizon that the channel takes away; negative: it harms.
+        low, high: 95 % interval over the held-out pieces.
+    """
+
+    channel: str
+    target: str
+    gain: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Channels that go together: complete linkage on the absolute rank correlation.
+
+    Attributes:
+        members: names.
+        representative: the member that speaks for all where only one is kept.
+        least: smallest absolute rank correlation of two members.
+    """
+
+    members: tuple[str, ...]
+    representative: str
+    least: float
+
+
+@dataclass(frozen=True)
+class ChannelVerdict:
+    """Verdict on one channel.
+
+    Attributes:
+        channel: name.
+        keep: whether it is proposed.
+        rank: 1 is the most useful; kept channels come first.
+        score: 0 to 1, what the rank goes by.
+        reason: one or two sentences with the figures.
+        flags: what is wrong with it.
+    """
+
+    channel: str
+    keep: bool
+    rank: int
+    score: float
+    reason: str
+    flags: tuple[Flag, ...] = ()
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The feature set proposed, and the memory that it needs.
+
+    Attributes:
+        choices: all candidates by rank.
+        window: suggested W, samples.
+        window_reason: where it comes from.
+        notes: what the data does not tell, and what to do about it.
+    """
+
+    choices: tuple[ChannelVerdict, ...]
+    window: int
+    window_reason: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Proposed channels, most useful first."""
+        return tuple(choice.channel for choice in self.choices if choice.keep)
+
+    @property
+    def dropped(self) -> tuple[str, ...]:
+        """The others, by rank."""
+        return tuple(choice.channel for choice in self.choices if not choice.keep)
+
+
+@dataclass(frozen=True, eq=False)
+class ScreeningResult:
+    """Everything that a screening found.
+
+    Attributes:
+        recordings: names of the recordings.
+        pieces: names of the stretches that were compared with each other.
+        samples: rows of all recordings.
+        rate_hz: samples per second.
+        channels: candidates, targets among them, in the order of the recordings.
+        groups: kind of signal of each candidate, as Table 4.2 groups them.
+        targets: what is to be predicted.
+        horizon: samples ahead.
+        matrices: dependencies at one instant.
+        lags: a curve for each candidate and target.
+        stability: metrics by piece.
+        importance: of groups, for each target and for all.
+        values: linear value of each channel with its past.
+        clusters: collinear channels, those of one member left out.
+        flags: all of them.
+        proposal: what to keep.
+        options: the options of the screening.
+        seconds: time of each stage.
+    """
+
+    recordings: tuple[str, ...]
+    pieces: tuple[str, ...]
+    samples: int
+    rate_hz: float
+    channels: tuple[str, ...]
+    groups: tuple[str, ...]
+    targets: tuple[str, ...]
+    horizon: int
+    matrices: Matrices
+    lags: tuple[LagCurve, ...]
+    stability: tuple[Stability, ...]
+    importance: tuple[GroupImportance, ...]
+    values: tuple[Value, ...]
+    clusters: tuple[Cluster, ...]
+    flags: tuple[Flag, ...]
+    proposal: Proposal
+    options: dict[str, Any]
+    seconds: dict[str, float]
+
+    def curve(self, channel: str, target: str) -> LagCurve:
+        """The lag curve of a channel and a target."""
+        return next(c for c in self.lags if (c.channel, c.target) == (channel, target))
+
+    def lag_table(self) -> tuple[LagRange, ...]:
+        """Table 4.2 for this data: a row for each group with a certain lag; targets and flagged channels left out."""
+        left_out = {*self.targets, *(flag.channel for flag in self.flags)}
+        best: dict[str, LagCurve] = {}
+        for curve in self.lags:
+            known = best.get(curve.channel)
+            if curve.channel not in left_out and (known is None or abs(curve.value) > abs(known.value)):
+                best[curve.channel] = curve
+        rows = []
+        for group in dict.fromkeys(curve.group for curve in best.values()):
+            mine = [curve for curve in best.values() if curve.group == group]
+            sure = [curve for curve in mine if curve.certain and not curve.at_edge]
+            if sure:
+                lags = [curve.best for curve in sure]
+                others = tuple(curve.channel for curve in mine if curve not in sure)
+                rows.append(LagRange(group, min(lags), max(lags), tuple(c.channel for c in sure), others))
+        return tuple(rows)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON values: arrays as lists, a number that is not finite as None."""
+        plain: dict[str, Any] = _plain(self)
+        plain["lag_table"] = _plain(self.lag_table())
+        plain["proposal"]["kept"] = list(self.proposal.kept)
+        plain["proposal"]["dropped"] = list(self.proposal.dropped)
+        return plain
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

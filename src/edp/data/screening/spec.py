@@ -1,0 +1,115 @@
+"""What a screening is asked: targets, horizon, reach of the lags, sizes of the samples, thresholds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from edp.errors import ConfigError
+from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, whole
+
+# Rows that estimates rest on: errors of information and rank estimates fall with their root, and time grows at least
+# in proportion (of nearest neighbours, ranks and trees); a million is far beyond what any of them gains from.
+MOST_SAMPLES = 1_000_000
+MOST_TREES = 10_000
+MOST_REPEATS = 1_000
+MOST_PIECES = 10_000
+MOST_NEIGHBOURS = 100
+# A minute and a half at 100 Hz, to both sides, for each pair of channels and target.
+MOST_LAG = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForestSpec:
+    """The random forest whose permutation importance is measured on held-out recordings.
+
+    Attributes:
+        trees: number of trees.
+        samples: rows that it is fitted on, evenly spread over the training recordings.
+        tests: held-out rows on which channels are permuted.
+        repeats: permutations of each group.
+        leaf: least number of rows in a leaf.
+        share: share of the channels that a node may choose from.
+        held_out: share of the recordings (or pieces) held out.
+    """
+
+    trees: int = 30
+    samples: int = 12_000
+    tests: int = 6_000
+    repeats: int = 5
+    leaf: int = 5
+    share: float = 1 / 3
+    held_out: float = 0.34
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "screening.forest",
+            self,
+            trees=whole(1, MOST_TREES),
+            samples=whole(1, MOST_SAMPLES),
+            tests=whole(1, MOST_SAMPLES),
+            repeats=whole(1, MOST_REPEATS),
+            leaf=whole(1, MOST_SAMPLES),
+            share=above(0.0, 1.0),
+            held_out=above(0.0, 0.8),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreeningSpec:
+    """Options of a screening; lags and horizons are samples.
+
+    Attributes:
+        targets: channels to be predicted; empty takes the cylinder velocities of Table A.1, else every velocity.
+        candidates: channels to judge; empty takes all of the recordings. Targets are always among them.
+        trusted: channels known to be measured on the machine, besides the targets and the names of Table A.1. Of a
+            channel and its copy, the trusted one is taken for the original.
+        horizon: how far ahead the model will predict.
+        max_lag: lags from -max_lag to max_lag are searched.
+        pieces: least number of stretches to compare; recordings are cut where there are fewer.
+        neighbours: k of the nearest-neighbour estimate of mutual information.
+        information_samples: rows for that estimate, evenly spread over the data.
+        rank_samples: the same for Kendall's tau.
+        piece_samples: rows of each piece for the metrics that are compared among pieces.
+        collinear: rank correlation from which channels form a cluster.
+        copy: correlation at the best lag from which one channel is a copy of another.
+        level: chance of a false alarm of each test of significance, shared among the channels.
+        forest: the forest.
+        seed: of everything drawn.
+    """
+
+    targets: tuple[str, ...] = ()
+    candidates: tuple[str, ...] = ()
+    trusted: tuple[str, ...] = ()
+    horizon: int = 10
+    max_lag: int = 100
+    pieces: int = 8
+    neighbours: int = 3
+    information_samples: int = 4_000
+    rank_samples: int = 20_000
+    piece_samples: int = 1_000
+    collinear: float = 0.9
+    copy: float = 0.99
+    level: float = 0.01
+    forest: ForestSpec = field(default_factory=ForestSpec)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        shares = dict.fromkeys(("collinear", "copy", "level"), between(0.0, 1.0))
+        rows = dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), whole(100, MOST_SAMPLES))
+        check_bounds(
+            "screening",
+            self,
+            horizon=whole(0, MOST_LAG),
+            max_lag=whole(20, MOST_LAG),
+            pieces=whole(4, MOST_PIECES),
+            neighbours=whole(1, MOST_NEIGHBOURS),
+            seed=SEED,
+            **rows,
+            **shares,
+        )
+        for name in ("targets", "candidates", "trusted"):
+            check_count("screening", name, getattr(self, name), MOST_NAMES)
+        if self.horizon > self.max_lag:
+            raise ConfigError(
+                f"screening.horizon = {self.horizon} is beyond max_lag = {self.max_lag}; raise max_lag to see it"
+            )

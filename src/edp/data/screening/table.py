@@ -1,0 +1,247 @@
+"""The data of a screening: candidates of all recordings as one table, cut into pieces that are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.screening.result import Array
+from edp.data.screening.spec import ScreeningSpec
+from edp.errors import DataError, closest
+from edp.recording import FloatArray, Recording
+from edp.signals import TABLE_A1, Kind
+
+MOST_PIECES = 24
+"""Beyond, several recordings form a piece."""
+_GROUPS = {
+    "CylVels": "cylinder velocity",
+    "CylAcc": "cylinder acceleration",
+    "CylPressures": "cylinder pressure",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """What is compared with its like: stretches of recordings, each float32 ``(time, channel)``."""
+
+    name: str
+    stretches: tuple[FloatArray, ...]
+
+    @property
+    def samples(self) -> int:
+        """Rows of all stretches."""
+        return sum(len(stretch) for stretch in self.stretches)
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateTable:
+    """Candidates with finite values, targets among them.
+
+    Attributes:
+        names: channels, in the order of the columns.
+        groups: kind of signal of each, as Table 4.2 groups them.
+        targets: columns of the targets.
+        pieces: what is compared.
+        rate_hz: samples per second.
+        missing: names of the candidates left out since values are missing, with their count.
+        left_out: names of recordings that are too short for the lags.
+    """
+
+    names: tuple[str, ...]
+    groups: tuple[str, ...]
+    targets: tuple[int, ...]
+    pieces: tuple[Piece, ...]
+    rate_hz: float
+    missing: dict[str, int]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Rows of all pieces."""
+        return sum(piece.samples for piece in self.pieces)
+
+    @cached_property
+    def sums(self) -> tuple[Array, Array]:
+        """Mean and variance about it of each piece and channel, float64, each ``(piece, channel)``."""
+        means, variances = [], []
+        for piece in self.pieces:
+            mean = sum(s.sum(axis=0, dtype=np.float64) for s in piece.stretches) / piece.samples
+            squares = np.zeros(len(self.names))
+            for chunk in chunks(piece.stretches):
+                squares += np.square(chunk - mean).sum(axis=0)
+            means.append(mean)
+            # sums of millions of float32 values are not exactly zero for a constant channel
+            first = piece.stretches[0][0]
+            constant = np.all([(s == first).all(axis=0) for s in piece.stretches], axis=0)
+            variances.append(np.where(constant, 0.0, squares / piece.samples))
+        return np.array(means), np.array(variances)
+
+    @cached_property
+    def mean(self) -> Array:
+        """Mean over all rows, ``(channel,)``."""
+        return np.average(self.sums[0], axis=0, weights=[piece.samples for piece in self.pieces])
+
+    @cached_property
+    def within(self) -> Array:
+        """Deviation about the mean of each piece, pooled, ``(channel,)``."""
+        return np.sqrt(np.average(self.sums[1], axis=0, weights=[piece.samples for piece in self.pieces]))
+
+    @cached_property
+    def between(self) -> Array:
+        """Share of the variance that lies between the means of the pieces, ``(channel,)``; 0 for a constant one."""
+        weights = [piece.samples for piece in self.pieces]
+        among = np.average(np.square(self.sums[0] - self.mean), axis=0, weights=weights)
+        total = among + np.square(self.within)
+        return np.divide(among, total, out=np.zeros_like(total), where=total > 0)
+
+    @cached_property
+    def live(self) -> NDArray[np.bool_]:
+        """Whether a channel changes within some piece, ``(channel,)``."""
+        return self.within > 1e-9 * np.abs(self.mean)
+
+    def thinned(self, count: int, ahead: int = 0) -> list[NDArray[np.int64]]:
+        """Evenly spread rows, `count` in all, for each stretch in order; `ahead` rows follow each of them."""
+        lengths = [len(stretch) - ahead for piece in self.pieces for stretch in piece.stretches]
+        total = sum(max(length, 0) for length in lengths)
+        wanted = np.linspace(0, total - 1, min(count, total)).astype(np.int64)
+        rows, start = [], 0
+        for length in lengths:
+            inside = wanted[(wanted >= start) & (wanted < start + max(length, 0))]
+            rows.append(inside - start)
+            start += max(length, 0)
+        return rows
+
+    def sample(self, count: int) -> FloatArray:
+        """Evenly spread rows of all pieces, float32 ``(row, channel)``."""
+        stretches = [stretch for piece in self.pieces for stretch in piece.stretches]
+        return np.concatenate([s[rows] for s, rows in zip(stretches, self.thinned(count), strict=True)])
+
+
+def chunks(stretches: Sequence[FloatArray], rows: int = 32_768) -> list[Array]:
+    """Stretches in float64, some rows at a time."""
+    return [s[i : i + rows].astype(np.float64) for s in stretches for i in range(0, len(s), rows)]
+
+
+def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> CandidateTable:
+    """Gather candidates and targets and cut the recordings into pieces.
+
+    Raises:
+        DataError: no recordings, mixed rates, a channel that a recording lacks, no target, missing values in a
+            target, or too short recordings for the lags asked for.
+    """
+    if not recordings:
+        raise DataError("there are no recordings to screen; give a log or a folder of logs")
+    first = recordings[0]
+    for other in recordings[1:]:
+        if abs(other.rate_hz - first.rate_hz) > 1e-3 * first.rate_hz:
+            raise DataError(
+                f"recording '{other.name}' has {other.rate_hz:g} Hz, '{first.name}' {first.rate_hz:g} Hz; screening "
+                "needs one rate: set rate_hz in the signal map"
+            )
+    recordings, short = _long_enough(recordings, spec.max_lag)
+    targets = spec.targets or _usual_targets(first)
+    names = tuple(dict.fromkeys((*(spec.candidates or first.channel_names), *targets)))
+    for name in (*names, *spec.trusted):
+        if name not in first.channel_names:
+            raise DataError(
+                f"screening asks for '{name}', which '{first.name}' lacks{closest(name, first.channel_names)}"
+            )
+    names = tuple(sorted(names, key=first.index))
+    columns = [
+        recording.select(names) if recording.channel_names != names else recording.values for recording in recordings
+    ]
+    missing = _missing(names, columns)
+    blind = [name for name in targets if name in missing]
+    if blind:
+        raise DataError(
+            f"target '{blind[0]}' has {missing[blind[0]]} missing or infinite value(s); mend the log or ask for a "
+            'repair (nan = "hold")'
+        )
+    kept = [i for i, name in enumerate(names) if name not in missing]
+    if missing:
+        columns = [values[:, kept] for values in columns]
+    names = tuple(names[i] for i in kept)
+    kinds = {channel.name: channel.kind for channel in first.channels}
+    table = CandidateTable(
+        names,
+        tuple(group_of(name, kinds[name]) for name in names),
+        tuple(names.index(name) for name in targets),
+        _pieces([r.name for r in recordings], columns, spec),
+        first.rate_hz,
+        missing,
+        short,
+    )
+    still = [names[i] for i in table.targets if not table.live[i]]
+    if still:
+        raise DataError(f"target '{still[0]}' never changes; nothing can be told about it: choose another target")
+    return table
+
+
+def group_of(name: str, kind: Kind) -> str:
+    """Kind of signal, as Table 4.2 groups them; other channels by what they measure."""
+    if name in TABLE_A1:
+        if kind == Kind.PILOT_PRESSURE:
+            return "conflux pilot pressure" if name.endswith("Conf") else "pilot pressure"
+        return _GROUPS[name.split("_")[0]]
+    return str(kind).replace("_", " ")
+
+
+def _usual_targets(recording: Recording) -> tuple[str, ...]:
+    known = tuple(name for name in TABLE_A1 if name.startswith("CylVels") and name in recording.channel_names)
+    found = known or tuple(c.name for c in recording.channels if c.kind in (Kind.VELOCITY, Kind.ANGULAR_VELOCITY))
+    if not found:
+        raise DataError(
+            f"recording '{recording.name}' has no velocity, so that screening does not know what is to be predicted; "
+            "name the targets, or map a channel with kind velocity"
+        )
+    return found
+
+
+def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequence[Recording], tuple[str, ...]]:
+    """Recordings of at least five times the largest lag, and the names of the others."""
+    least = 5 * max_lag
+    long = [recording for recording in recordings if recording.samples >= least]
+    short = tuple(recording.name for recording in recordings if recording.samples < least)
+    if sum(recording.samples for recording in long) < 4 * least:
+        most = max(recording.samples for recording in recordings)
+        raise DataError(
+            f"lags up to {max_lag} samples need recordings of at least {least} samples, four times that in all; "
+            f"{len(long)} of {len(recordings)} recordings are long enough, the longest has {most}: lower max_lag, or "
+            "give longer recordings"
+        )
+    return long, short
+
+
+def _missing(names: Sequence[str], columns: Sequence[FloatArray]) -> dict[str, int]:
+    """Channels with missing or infinite values and how many."""
+    counts = np.zeros(len(names), dtype=np.int64)
+    for values in columns:
+        for start in range(0, len(values), 65_536):
+            counts += (~np.isfinite(values[start : start + 65_536])).sum(axis=0)
+    return {name: int(count) for name, count in zip(names, counts) if count}
+
+
+def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: ScreeningSpec) -> tuple[Piece, ...]:
+    """A piece a recording; long ones cut where there are too few, neighbours joined where there are too many."""
+    total = sum(len(values) for values in columns)
+    made: list[Piece] = []
+    if len(columns) >= spec.pieces:
+        # lagged covariances of all pairs are held for every piece: a gigabyte at most
+        each = 4 * (2 * spec.max_lag + 1) * columns[0].shape[1] ** 2
+        per = -(-len(columns) // max(spec.pieces, min(MOST_PIECES, int(1e9 / each))))
+        for start in range(0, len(columns), per):
+            label = names[start] if per == 1 else f"{names[start]} to {names[min(start + per, len(names)) - 1]}"
+            made.append(Piece(label, tuple(columns[start : start + per])))
+    else:
+        for name, values in zip(names, columns, strict=True):
+            # a part is as long as the lags need, if that leaves fewer parts than asked for
+            parts = max(1, min(round(spec.pieces * len(values) / total + 0.499), len(values) // (5 * spec.max_lag)))
+            edges = np.linspace(0, len(values), parts + 1).astype(int)
+            for i in range(parts):
+                label = name if parts == 1 else f"{name} part {i + 1}"
+                made.append(Piece(label, (values[edges[i] : edges[i + 1]],)))
+    return tuple(made)

@@ -1,0 +1,33 @@
+"""Recordings without the targets: their inputs as a series."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.errors import DataError
+from edp.recording import Recording
+
+
+def unlabelled(task: Task, recording: Recording) -> Series:
+    """The inputs of a recording for a lesson; the targets need not be in it.
+
+    Raises:
+        DataError: another rate, a missing input, or one that is not finite.
+    """
+    if abs(recording.rate_hz - task.rate_hz) > 1e-3 * task.rate_hz:
+        raise DataError(
+            f"recording '{recording.name}' has {recording.rate_hz:g} Hz, the task {task.rate_hz:g} Hz; the rates must "
+            "be equal: set rate_hz in the signal map"
+        )
+    inputs = np.ascontiguousarray(recording.select(task.inputs))
+    bad = ~np.isfinite(inputs)
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        raise DataError(
+            f"recording '{recording.name}' ({recording.source}): channel '{task.inputs[column]}' has "
+            f"{int(bad[:, column].sum())} missing or infinite value(s), the first at row {row}; mend the log or ask "
+            'for a repair (nan = "hold")'
+        )
+    return Series(recording.name, inputs, np.zeros((len(inputs), len(task.targets)), dtype=np.float32))

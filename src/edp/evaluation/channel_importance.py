@@ -1,0 +1,275 @@
+"""What each channel is worth to a trained predictor: how much its error grows when the channel is taken from it.
+
+A channel is taken away without training again, in two ways. *Exchanged*, its whole course is that of another recording
+(eq. 2.14 with recordings in place of rows, so that the course stays a plausible one and the stream can be run over it);
+the error then grows with all that the network reads in the channel, and with the contradiction to other channels.
+*Renewed*, only what the other channels, now and before, do not tell of it is that of another recording; the error grows
+with what the channel alone can tell. Collinear channels stand in for one another in the first sense too, so they are
+also taken away together.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.errors import ConfigError, DataError, closest
+from edp.evaluation.conditional import OthersModel
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
+from edp.settings.bounds import MOST_NAMES, MOST_ROWS, MOST_TICKS, SEED, check_bounds, whole
+from edp.signals import KINDS
+
+Array = NDArray[np.float64]
+OnGroup = Callable[[str, int, int], None]
+PIECES = 8
+"""Stretches that intervals are taken over, at least; recordings are cut where there are fewer."""
+COVERAGE = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorthSpec:
+    """How channels are taken away.
+
+    Attributes:
+        repeats: exchanges of each group, each with other recordings.
+        groups: channels that are taken away together, beside each alone.
+        lags: ticks back at which other channels may tell of a renewed one.
+        rows: training rows that the rule for renewing is fitted on.
+        skip: first ticks of each recording that are not scored; None leaves out a whole window.
+        seed: of the exchanges.
+    """
+
+    repeats: int = 3
+    groups: tuple[tuple[str, ...], ...] = ()
+    lags: tuple[int, ...] = (0, 1, 2, 4, 8, 16)
+    rows: int = 40_000
+    skip: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "worth",
+            self,
+            repeats=whole(1, MOST_NAMES),
+            lags=whole(0, MOST_TICKS),
+            rows=whole(100, MOST_ROWS),
+            skip=whole(0, MOST_ROWS),
+            seed=SEED,
+        )
+        if 0 not in self.lags or min(self.lags) < 0:
+            raise ConfigError(f"worth: lags = {list(self.lags)}; 0 must be among them, and nothing from the future")
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Growth of the mean absolute error, in the target's report unit, with its 95 % interval over stretches."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What a channel, or a group of them, is worth at one horizon for one target or for their mean.
+
+    Attributes:
+        members: the channels taken away.
+        horizon: samples ahead.
+        target: name, or ``mean``.
+        exchanged: growth of the error with another recording's course.
+        renewed: growth with another recording's surprise.
+        told: share of the members' variance that the other channels tell, on training rows; the mean over members.
+    """
+
+    members: tuple[str, ...]
+    horizon: int
+    target: str
+    exchanged: Growth
+    renewed: Growth
+    told: float
+
+
+@dataclass(frozen=True)
+class Worths:
+    """All of them, with the error that they are compared with.
+
+    Attributes:
+        rows: by group, horizon and target; the mean of the targets first.
+        error: by horizon and target, the undisturbed mean absolute error.
+        units: report unit of each target; ``mean`` has that of the targets, where they share it.
+        recordings: names of the judged recordings.
+    """
+
+    rows: tuple[Worth, ...]
+    error: dict[str, dict[str, float]]
+    units: dict[str, str]
+    recordings: tuple[str, ...]
+
+    def ranked(self, horizon: int) -> list[Worth]:
+        """Means over the targets at a horizon, the largest renewed growth first."""
+        chosen = [row for row in self.rows if row.horizon == horizon and row.target == "mean"]
+        return sorted(chosen, key=lambda row: -row.renewed.mean)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def channel_worths(
+    predictor: Predictor,
+    data: Prepared,
+    spec: WorthSpec | None = None,
+    on_group: OnGroup | None = None,
+) -> Worths:
+    """Take every input channel of a predictor away, one at a time and in groups, on ``data.test``.
+
+    Args:
+        predictor: the network; channels that only a physics base reads are taken away like the others.
+        data: prepared series: ``data.test`` is judged, ``data.train`` tells what channels say of each other.
+        spec: how.
+        on_group: called with the members, how many groups are done and of how many.
+
+    Raises:
+        ConfigError: a group names what is no input.
+        DataError: no tick can be scored.
+    """
+    spec = spec or WorthSpec()
+    groups = _groups(data.task.inputs, spec.groups)
+    ruler = _Ruler(data, predictor.spec.window if spec.skip is None else spec.skip)
+    others = OthersModel.fit([part.inputs for part in data.train], spec.lags, spec.rows)
+    places = [[data.task.inputs.index(name) for name in members] for members in groups]
+    expected, told = others.expect(places, [part.inputs for part in data.test])
+    plain = ruler.errors(stream_predictions(predictor, data.test))
+    donors = [_donors(data.test, np.random.default_rng([spec.seed, turn])) for turn in range(spec.repeats)]
+    rows: list[Worth] = []
+    for done, (members, columns) in enumerate(zip(groups, places, strict=True)):
+        if on_group is not None:
+            on_group(", ".join(members), done, len(groups))
+        growths = []
+        for base in ([np.zeros_like(values) for values in expected[done]], expected[done]):
+            changed = [part for turn in donors for part in _exchanged(data.test, columns, base, turn)]
+            predictions, count = stream_predictions(predictor, changed), len(data.test)
+            each = [ruler.errors(predictions[i * count : (i + 1) * count]) for i in range(spec.repeats)]
+            growths.append(np.mean(each, axis=0) - plain)
+        rows += ruler.rows(members, growths[0], growths[1], told[done])
+    return Worths(tuple(rows), ruler.table(plain), ruler.units(), tuple(part.name for part in data.test))
+
+
+def _groups(inputs: Sequence[str], given: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
+    """Each input alone, then the groups of several."""
+    for group in given:
+        for name in group:
+            if name not in inputs:
+                raise ConfigError(
+                    f"worth: group {list(group)} names '{name}', which is no input{closest(name, inputs)}"
+                )
+    alone = [(name,) for name in inputs]
+    return alone + [tuple(group) for group in given if len(group) > 1]
+
+
+@dataclass(frozen=True)
+class _Donor:
+    """Where a recording's new course comes from: which recording, from which row on, going round at its end."""
+
+    recording: int
+    start: int
+
+
+def _donors(series: Sequence[Series], rng: np.random.Generator) -> list[_Donor]:
+    """Another recording for each; the same one, far off in time, where there is only one."""
+    count = len(series)
+    if count == 1:
+        samples = series[0].samples
+        return [_Donor(0, int(rng.integers(samples // 4, max(samples // 4 + 1, 3 * samples // 4))))]
+    step, order = int(rng.integers(1, count)), rng.permutation(count)
+    place = np.argsort(order)
+    others = [int(order[(place[i] + step) % count]) for i in range(count)]
+    return [_Donor(other, int(rng.integers(0, series[other].samples))) for other in others]
+
+
+def _exchanged(
+    series: Sequence[Series], columns: Sequence[int], base: Sequence[NDArray[np.float32]], donors: Sequence[_Donor]
+) -> list[Series]:
+    """The series with `columns` as `base` says and, above that, what lies above it in the donor."""
+    changed = []
+    for part, own, donor in zip(series, base, donors, strict=True):
+        rows = (np.arange(part.samples) + donor.start) % series[donor.recording].samples
+        surprise = series[donor.recording].inputs[rows][:, columns] - base[donor.recording][rows]
+        inputs = part.inputs.copy()
+        inputs[:, columns] = (own + surprise).astype(np.float32)
+        changed.append(replace(part, inputs=inputs))
+    return changed
+
+
+class _Ruler:
+    """Mean absolute errors by stretch, horizon and target, in report units."""
+
+    def __init__(self, data: Prepared, skip: int) -> None:
+        self.task, self.data = data.task, data
+        self.facts = [KINDS[kind] for kind in data.target_kinds]
+        self.factors = np.array([fact.report_factor for fact in self.facts])
+        self.stretches: list[tuple[int, int, int]] = []
+        cuts = max(1, math.ceil(PIECES / len(data.test)))
+        for i, part in enumerate(data.test):
+            edges = np.linspace(skip, part.samples - self.task.max_horizon, cuts + 1).astype(int)
+            self.stretches += [(i, a, b) for a, b in itertools.pairwise(edges) if b > a]
+        if not self.stretches:
+            raise DataError(
+                f"no tick of the test recordings can be scored: the longest has {max(p.samples for p in data.test)} "
+                f"samples, the first {skip} are start-up; give longer recordings"
+            )
+        self.weights = np.array([b - a for _, a, b in self.stretches], dtype=float)
+
+    def errors(self, predictions: Sequence[NDArray[np.float32]]) -> Array:
+        """Shape ``(stretch, horizon, 1 + target)``; the mean of the targets first."""
+        found = np.empty((len(self.stretches), len(self.task.horizons), len(self.task.targets)))
+        for n, (i, start, stop) in enumerate(self.stretches):
+            for h, horizon in enumerate(self.task.horizons):
+                truth = self.data.test[i].targets[start + horizon : stop + horizon].astype(np.float64)
+                found[n, h] = np.abs(predictions[i][start:stop, h] - truth).mean(axis=0) * self.factors
+        return np.concatenate([found.mean(axis=2, keepdims=True), found], axis=2)
+
+    def rows(self, members: tuple[str, ...], exchanged: Array, renewed: Array, told: float) -> list[Worth]:
+        """A row for each horizon and target from growths by stretch."""
+        return [
+            Worth(members, horizon, name, self._growth(exchanged[:, h, n]), self._growth(renewed[:, h, n]), told)
+            for h, horizon in enumerate(self.task.horizons)
+            for n, name in enumerate(("mean", *self.task.targets))
+        ]
+
+    def _growth(self, values: Array) -> Growth:
+        share = self.weights / self.weights.sum()
+        mean, count = float(share @ values), len(values)
+        if count < 2:
+            return Growth(mean, mean, mean)
+        # Stretches of unequal length weigh by their ticks: the error of such a mean, then Student's t.
+        error = math.sqrt(float(share**2 @ (values - mean) ** 2) * count / (count - 1))
+        reach = float(stats.t.ppf(0.5 + COVERAGE / 2, count - 1)) * error
+        return Growth(mean, mean - reach, mean + reach)
+
+    def table(self, errors: Array) -> dict[str, dict[str, float]]:
+        """Errors over all ticks by horizon and target."""
+        share = self.weights / self.weights.sum()
+        names = ("mean", *self.task.targets)
+        means = np.tensordot(share, errors, axes=1)
+        return {
+            str(horizon): dict(zip(names, map(float, means[h]), strict=True))
+            for h, horizon in enumerate(self.task.horizons)
+        }
+
+    def units(self) -> dict[str, str]:
+        """Report unit by target."""
+        each = [fact.report_unit for fact in self.facts]
+        shared = each[0] if len(set(each)) == 1 else "mixed units"
+        return {"mean": shared, **dict(zip(self.task.targets, each, strict=True))}

@@ -1,0 +1,217 @@
+"""Multiply-accumulates as they run: networks traced operation by operation and held against their own count."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from edp.errors import ConfigError
+from edp.networks.physics import PhysicsBase
+from edp.networks.predictor import Predictor
+from edp.networks.streaming import State, Streaming
+
+# Factors of a product, by the place of the one whose last dimension is summed over.
+MATRIX = {"mm": 0, "bmm": 0, "mv": 0, "dot": 0, "addmm": 1, "baddbmm": 1, "addbmm": 1, "addmv": 1}
+MOVES = {"cat", "stack", "index", "index_put", "copy"}
+"""Operations on several tensors that only move numbers."""
+ARITHMETIC = {"mul", "div", "sqrt", "pow", "reciprocal", "exp", "sin", "cos"}
+"""What counts in a physics base, which is arithmetic only; sums and choices do not."""
+
+
+class Trace(TorchDispatchMode):
+    """Counts operations and multiply-accumulates under the innermost part that declares its operations.
+
+    Besides matrix products and convolutions it sees products with weights that are written element by element: those
+    that a sum or mean takes together, and those of a number with a row of weights that are added to one another.
+    Double precision keeps recurrent layers off fused kernels, which cannot be looked into.
+
+    Args:
+        network: whose parts are told apart; hooks are removed at the end.
+
+    Attributes:
+        operations: how often each ran, by part.
+        macs: multiply-accumulates by part.
+        opaque: operations on weights, or on several values, of which nobody knows what they multiply, by part.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.operations: dict[str, Counter[str]] = defaultdict(Counter)
+        self.macs: Counter[str] = Counter()
+        self.opaque: dict[str, set[str]] = defaultdict(set)
+        self._inside = [""]
+        self._hooks: list[Any] = []
+        self._physics = {name for name, part in network.named_modules() if isinstance(part, PhysicsBase)}
+        # Storages, not tensors: views share them. Tensors are kept so that no storage is used again.
+        self._kept: list[Tensor] = []
+        self._weights = {_storage(parameter) for parameter in network.parameters()}
+        self._data: set[int] = set()
+        self._spread: dict[int, int] = {}
+        self._scaled: set[int] = set()
+        for name, part in network.named_modules():
+            if hasattr(part, "operations"):
+                self._hooks.append(part.register_forward_pre_hook(lambda *_, name=name: self._inside.append(name)))
+                self._hooks.append(part.register_forward_hook(self._leave))
+        self._enter_answer(network)
+
+    def _enter_answer(self, network: nn.Module) -> None:
+        """An output is asked for its answer, not called as a module."""
+        output = getattr(network, "output", None)
+        if output is None:
+            return
+        answer = output.answer
+
+        def traced(*args: object) -> object:
+            self._inside.append("output")
+            result = answer(*args)
+            self._inside.pop()
+            return result
+
+        output.answer = traced
+        self._hooks.append(SimpleNamespace(remove=lambda: delattr(output, "answer")))
+
+    def _leave(self, *_: object) -> None:
+        self._inside.pop()
+
+    def __exit__(self, *error: Any) -> None:
+        for hook in self._hooks:
+            hook.remove()
+        super().__exit__(*error)
+
+    def read(self, values: Any) -> None:
+        """Take a tree of tensors for data: what the network is fed."""
+        self._data |= {_storage(value) for value in _tensors(values)}
+
+    def within(self, name: str) -> int:
+        """Multiply-accumulates of a part and of the parts inside it."""
+        inside = f"{name}." if name else ""
+        return sum(macs for part, macs in self.macs.items() if f"{part}.".startswith(inside))
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = function(*args, **(kwargs or {}))
+        name = function._schema.name.removeprefix("aten::")
+        name = name if name.startswith("_") else name.rstrip("_")
+        part = self._inside[-1]
+        self.operations[part][name] += 1
+        given = _tensors((args, kwargs))
+        made = _tensors(result)
+        self._kept += made
+        known = name in MATRIX or name == "convolution"
+        if known:
+            self.macs[part] += macs_of(name, args, result)
+        elif part in self._physics:
+            self.macs[part] += arithmetic_of(name, args, result)
+        else:
+            self.macs[part] += self._element_wise(name, given, made)
+        if not known and name not in MOVES and torch.Tag.pointwise not in function.tags and self._hides(given):
+            self.opaque[part].add(name)
+        self._follow(given, made)
+        return result
+
+    def _follow(self, given: list[Tensor], made: list[Tensor]) -> None:
+        """Note which results come from data, and which from weights alone."""
+        read = {_storage(value) for value in given}
+        into = self._data if read & self._data else self._weights if read & self._weights else None
+        if into is not None:
+            into |= {_storage(value) for value in made}
+
+    def _hides(self, given: list[Tensor]) -> bool:
+        """Whether an operation could multiply: data by a matrix of weights, or data by data."""
+        data = [value for value in given if _storage(value) in self._data]
+        matrices = [value for value in given if value.dim() > 1 and self._constant(value)]
+        return bool(data) and len(data) + len(matrices) > 1
+
+    def _constant(self, value: Tensor) -> bool:
+        """Whether a tensor comes from weights alone."""
+        place = _storage(value)
+        return place in self._weights and place not in self._data
+
+    def _element_wise(self, name: str, given: list[Tensor], made: list[Tensor]) -> int:
+        """Multiply-accumulates of matrix products that are written as products and sums."""
+        places = [_storage(value) for value in given]
+        if name in ("sum", "mean", "cumsum") and places[0] in self._scaled:
+            return given[0].numel()
+        if name in ("add", "sub") and len(places) == 2 and set(places) <= set(self._spread):
+            first = sum(self._spread[place] for place in places)
+            self._spread[_storage(made[0])] = 0  # counted: only what is added to it still counts
+            return first
+        if name == "mul" and len(places) == 2:
+            data = [value for value, place in zip(given, places, strict=True) if place in self._data]
+            if len(data) == 1 and set(places) & self._weights:
+                self._scaled.add(_storage(made[0]))
+                if made[0].numel() > data[0].numel():
+                    self._spread[_storage(made[0])] = made[0].numel()
+        return 0
+
+
+def _storage(value: Tensor) -> int:
+    return value.untyped_storage()._cdata
+
+
+def _tensors(tree: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
+
+
+def macs_of(name: str, args: Any, result: Tensor) -> int:
+    """Multiply-accumulates of a matrix product or convolution."""
+    if name == "convolution":
+        return result.numel() * math.prod(args[1].shape[1:])
+    terms = args[MATRIX[name]].shape[0 if name == "addbmm" else -1]
+    return int(result.numel() * terms) * (args[1].shape[-1] if name == "addbmm" else 1)
+
+
+def arithmetic_of(name: str, args: Iterable[Any], result: Tensor) -> int:
+    """Arithmetic of a physics base: what makes numbers from inputs counts.
+
+    What the machine's numbers alone give, tensors of at most one dimension, is computed once.
+    """
+    of_inputs = any(isinstance(entry, Tensor) and entry.dim() > 1 for entry in args)
+    return result.numel() if name in ARITHMETIC and of_inputs else 0
+
+
+def trace(predictor: Predictor, ticks: int, state: State | None = None) -> tuple[Trace, State]:
+    """A traced call on `ticks` ticks of zeros from `state` or from reset, and the next state."""
+    like = next(predictor.parameters())
+    x = like.new_zeros(1, ticks, predictor.front.inputs)
+    state = predictor.initial_state(1, x) if state is None else state
+    with torch.no_grad(), Trace(predictor) as seen:
+        seen.read((x, state))
+        _, state = predictor(x, state)
+    return seen, state
+
+
+def check_counted(predictor: Predictor) -> None:
+    """Hold the multiply-accumulates that the parts of a network count against those of a tick that runs.
+
+    Raises:
+        ConfigError: a part counts others than it runs, or computes with an operation that hides what it multiplies.
+    """
+    seen, _ = trace(copy.deepcopy(predictor).cpu().double().eval(), 1)
+    for name, operations in seen.opaque.items():
+        raise ConfigError(
+            f"the part '{name}' of the network computes {', '.join(sorted(operations))}, of which nobody knows the "
+            "multiply-accumulates; write it with matrix products, convolutions and element-wise operations"
+        )
+    wrong = []
+    for name, part in predictor.named_modules():
+        if isinstance(part, Streaming):
+            rows = part.costs()
+            counted = sum(row.per_column + row.per_prediction + row.pooling for row in rows)
+            if seen.within(name) != counted:
+                wrong.append((name, type(part).__name__, counted, seen.within(name)))
+    if wrong:
+        # The innermost part is the one to mend: those around it sum it up.
+        name, kind, counted, ran = max(wrong, key=lambda entry: (entry[0].count("."), len(entry[0])))
+        raise ConfigError(
+            f"the part '{name}' of the network ({kind}) counts {counted:,} multiply-accumulates a tick, but "
+            f"{ran:,} run: correct its method `costs`"
+        )

@@ -1,6 +1,0 @@
-"""A network as a plain list of streaming layers, each one tick at a time: what export targets and quantisation read."""
-
-from edp.graph.base import Array, Graph, Layer, Slot
-from edp.graph.builder import Builder
-
-__all__ = ["Array", "Builder", "Graph", "Layer", "Slot"]

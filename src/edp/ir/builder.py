@@ -1,0 +1,104 @@
+"""Makes a graph layer by layer, with names that say where in the network each one sits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from edp.errors import ExportError
+from edp.ir.base import INPUT, Array, Graph, Layer, Slot
+from edp.ir.layers import Gather
+
+
+def constant(values: Any) -> Array:
+    """Numbers, an array or a tensor as a float32 array of its own.
+
+    Raises:
+        ExportError: one of them is not finite.
+    """
+    plain = values.detach().cpu().numpy() if hasattr(values, "detach") else values
+    made = np.array(plain, dtype=np.float32, order="C")
+    if not np.isfinite(made).all():
+        raise ExportError("a weight of the network is NaN or infinite; train again before exporting")
+    return made
+
+
+class Builder:
+    """Layers in the making; parts of a network add theirs in ``lower(build, x)``.
+
+    Args:
+        inputs: numbers fed at each tick.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        self.inputs = inputs
+        self.layers: list[Layer] = []
+        self._initial: dict[tuple[str, str], Array] = {}
+        self._scope: list[str] = []
+
+    @contextmanager
+    def inside(self, name: str) -> Iterator[None]:
+        """Names of layers added within begin with `name`."""
+        self._scope.append(name)
+        try:
+            yield
+        finally:
+            self._scope.pop()
+
+    def add(self, kind: type[Layer], name: str, *inputs: str, **options: Any) -> str:
+        """Add a layer; arrays among `options` are taken as constants.
+
+        Returns:
+            The name of its value.
+        """
+        full = ".".join([*self._scope, name])
+        taken = {layer.name for layer in self.layers}
+        if full in taken or full == INPUT:
+            full = next(f"{full}_{n}" for n in range(2, len(taken) + 3) if f"{full}_{n}" not in taken)
+        given = {key: constant(value) if hasattr(value, "shape") else value for key, value in options.items()}
+        self.layers.append(kind(name=full, inputs=inputs, **given))
+        return full
+
+    def pick(self, name: str, x: str, columns: Sequence[int]) -> str:
+        """Chosen numbers of a value; the value itself where they are all of it in order."""
+        chosen = tuple(columns)
+        if chosen == tuple(range(self.width(x))):
+            return x
+        return self.add(Gather, name, x, columns=chosen)
+
+    def join(self, name: str, *parts: str) -> str:
+        """Values end to end."""
+        if len(parts) == 1:
+            return parts[0]
+        return self.add(Gather, name, *parts, columns=tuple(range(sum(map(self.width, parts)))))
+
+    def width(self, value: str) -> int:
+        """How many numbers a value has."""
+        return self.inputs if value == INPUT else next(x.width for x in self.layers if x.name == value)
+
+    def slots_since(self, count: int) -> list[tuple[str, Slot]]:
+        """What the layers after the first `count` remember, in order."""
+        return [(layer.name, slot) for layer in self.layers[count:] for slot in layer.slots]
+
+    def start_from(self, slots: Sequence[tuple[str, Slot]], numbers: Any) -> None:
+        """Let these slots start from `numbers`, one slot after the other, instead of from their fill."""
+        values, at = constant(numbers).ravel(), 0
+        for layer, slot in slots:
+            self._initial[layer, slot.name] = values[at : at + slot.size].reshape(slot.shape)
+            at += slot.size
+        if at != values.size:
+            raise ExportError(f"{values.size} numbers for the state at reset, but the layers remember {at}")
+
+    def graph(self, results: dict[str, str], window: int) -> Graph:
+        """The finished list without layers whose value nobody reads."""
+        kept: list[Layer] = []
+        wanted = set(results.values())
+        for layer in reversed(self.layers):
+            if layer.name in wanted or not layer.width:
+                kept.append(layer)
+                wanted |= set(layer.inputs)
+        return Graph(self.inputs, tuple(replace(layer) for layer in reversed(kept)), results, self._initial, window)

@@ -1,0 +1,241 @@
+"""Layers without memory: moving numbers, element-wise work, linear maps and norms.
+
+A value is a flat vector; where a layer has `rows`, it is that many rows of equal length, one after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from edp.ir.base import Array, Layer
+
+
+class Function(StrEnum):
+    """Element-wise functions."""
+
+    RELU = "relu"
+    SIGMOID = "sigmoid"
+    TANH = "tanh"
+    GELU = "gelu"
+    SOFTPLUS = "softplus"
+    EXP = "exp"
+    SQRT = "sqrt"
+    SINE = "sine"
+    COSINE = "cosine"
+    POSITIVE = "positive"
+    """1 where a number is above 0, else 0."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gather(Layer):
+    """Chosen numbers of the inputs, which are laid end to end: selects, joins, repeats and transposes."""
+
+    columns: tuple[int, ...]
+
+    @property
+    def width(self) -> int:
+        return len(self.columns)
+
+
+def runs(columns: Sequence[int], widths: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Runs of neighbouring columns of inputs that are laid end to end: which input, its first column, how many."""
+    origin = [(which, column) for which, width in enumerate(widths) for column in range(width)]
+    found: list[tuple[int, int, int]] = []
+    for column in columns:
+        which, at = origin[column]
+        if found and found[-1][0] == which and sum(found[-1][1:]) == at:
+            found[-1] = (which, found[-1][1], found[-1][2] + 1)
+        else:
+            found.append((which, at, 1))
+    return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Standardise(Layer):
+    """``(x - offset) / scale``, in this order: offsets may be large."""
+
+    offset: Array
+    scale: Array
+
+    @property
+    def width(self) -> int:
+        return len(self.offset)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaleShift(Layer):
+    """``gain x + shift``, each ``(width,)``."""
+
+    gain: Array
+    shift: Array
+
+    @property
+    def width(self) -> int:
+        return len(self.gain)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Add(Layer):
+    """Sum of two values of `size` numbers."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Subtract(Layer):
+    """First value less the second, of `size` numbers each."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Multiply(Layer):
+    """Product of two values of `size` numbers, element by element."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Divide(Layer):
+    """First value over the second, of `size` numbers each, element by element."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Minimum(Layer):
+    """The smaller one of each pair of two values of `size` numbers."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Maximum(Layer):
+    """The larger one of each pair of two values of `size` numbers."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Activate(Layer):
+    """A function of each number."""
+
+    function: Function
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Glu(Layer):
+    """Each row's first half times the sigmoid of its second; a row of `size` numbers gives ``size / 2``."""
+
+    rows: int
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.rows * self.size // 2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Accumulate(Layer):
+    """Running sums down `rows` rows of `size` numbers: row i is the sum of rows 0 to i."""
+
+    rows: int
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.rows * self.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Dense(Layer):
+    """``W x + b`` on each row; `weight` ``(out, in)``, `bias` ``(out,)``, zeros where the network has none."""
+
+    weight: Array
+    bias: Array
+    rows: int = 1
+
+    @property
+    def width(self) -> int:
+        return self.rows * len(self.bias)
+
+    @property
+    def macs(self) -> int:
+        return self.rows * self.weight.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroupedDense(Layer):
+    """``W_i x_i + b_i``, row i with its own `weight` ``(rows, out, in)`` and `bias` ``(rows, out)``."""
+
+    weight: Array
+    bias: Array
+
+    @property
+    def width(self) -> int:
+        return self.bias.size
+
+    @property
+    def macs(self) -> int:
+        return self.weight.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LayerNorm(Layer):
+    """Each row less its mean, over the root of its variance plus `epsilon`, times `gain` plus `shift`."""
+
+    gain: Array
+    shift: Array
+    epsilon: float
+    rows: int = 1
+
+    @property
+    def width(self) -> int:
+        return self.rows * len(self.gain)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RowAttention(Layer):
+    """Each row of queries attends to all rows of keys and values (the three inputs), one head."""
+
+    rows: int
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.rows * self.size
+
+    @property
+    def macs(self) -> int:
+        return 2 * self.rows * self.rows * self.size

@@ -1,0 +1,233 @@
+"""Runs an adaptation tick by tick in NumPy, in single precision: the bits that the C code gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edp.errors import ConfigError
+from edp.ir.rls.constants import CLIP, FEATURE_LIMIT, MOST_ERROR, Adaptation, Array
+
+
+class RlsStatus(IntEnum):
+    """What a step of an adaptation has done."""
+
+    NONE = 0
+    """Nothing: there is no prediction to correct."""
+    HOLDING = 1
+    """The prediction is corrected; nothing was learned: at rest, frozen, or too few ticks in a row."""
+    LEARNING = 2
+    """The prediction is corrected, and the error of an earlier one has taught."""
+    FALLBACK = 3
+    """At least one of the numbers goes out as it was, because its corrections were worse than none."""
+
+
+@dataclass(frozen=True, eq=False)
+class RlsState:
+    """What an adaptation has learned, to be kept over a restart.
+
+    Attributes:
+        digest: of the adaptation that it belongs to.
+        theta: coefficients ``(H, J, n)``.
+    """
+
+    digest: str
+    theta: Array
+
+
+def total(products: Array) -> Array:
+    """Sums over the last axis, one number after the other, as a loop adds them."""
+    return np.asarray(np.add.accumulate(products, axis=-1, dtype=np.float32)[..., -1], dtype=np.float32)
+
+
+class RlsCorrector:
+    """An adaptation at work.
+
+    With the error ``e = (v(t) - y(t - k)) / unit`` of the prediction that has just come due, P for ``P = P(t - 1)``
+    and ``phi = phi(t - k)``, a tick in motion does (a Kalman filter on coefficients that fade with time)::
+
+        g = P phi,  d = noise + phi' g
+        theta = a (theta + g clip(e - theta phi) / d)
+        P = a^2 (P - g g' / d) + (1 - a^2) prior^2 I
+
+    and each tick gives ``y + unit clip(theta phi(t))``. One P serves all targets of a horizon. With `a` below 1 nothing
+    winds up: without excitation P goes back to its start, and so does theta.
+
+    Args:
+        adaptation: the constants.
+
+    Attributes:
+        theta: coefficients ``(H, J, n)``.
+        covariance: P of each horizon ``(H, n, n)``.
+        fallback: numbers whose correction is taken back ``(H, J)``.
+        repairs: times that coefficients or a covariance were found damaged and started anew; 0 in health.
+    """
+
+    def __init__(self, adaptation: Adaptation) -> None:
+        self.adaptation, self._numbers = adaptation, adaptation.numbers
+        self._columns = list(adaptation.columns)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        law = self.adaptation
+        ahead, targets, n = len(law.horizons), len(law.columns), law.features
+        self.theta = np.zeros((ahead, targets, n), dtype=np.float32)
+        self.covariance = np.stack([self._start()] * ahead)
+        self._plain, self._corrected = (np.zeros((ahead, targets), dtype=np.float32) for _ in range(2))
+        self.fallback = np.zeros((ahead, targets), dtype=bool)
+        self._rows = [np.zeros((k, n + 2 * targets), dtype=np.float32) for k in law.horizons]
+        self._at = [0] * ahead
+        self.repairs = self._streak = 0
+
+    def interrupt(self) -> None:
+        """Tell that ticks are missing: what was predicted before them is not judged; what was learned stays."""
+        self._streak = 0
+
+    @property
+    def learned(self) -> RlsState:
+        """What was learned so far."""
+        return RlsState(self.adaptation.digest, self.theta.copy())
+
+    def restore(self, learned: RlsState) -> None:
+        """Go on from what was learned earlier.
+
+        Raises:
+            ConfigError: it belongs to another adaptation, or holds numbers out of their bounds.
+        """
+        if learned.digest != self.adaptation.digest or learned.theta.shape != self.theta.shape:
+            raise ConfigError("what was learned belongs to another adaptation; start from nothing instead")
+        if not (np.abs(learned.theta) <= self._numbers["bound"]).all():
+            raise ConfigError("what was learned is damaged: a coefficient is out of its bounds; start from nothing")
+        self.theta = learned.theta.astype(np.float32)
+
+    def step(
+        self, inputs: ArrayLike, prediction: ArrayLike, fresh: bool = True, learn: bool = True
+    ) -> tuple[Array, RlsStatus]:
+        """Learn from what has come due, and correct a prediction.
+
+        Args:
+            inputs: of this tick ``(I,)``, SI units.
+            prediction: the network's from them ``(H, J)``, SI units.
+            fresh: whether they are this tick's own, and the prediction rests on a whole window.
+            learn: False freezes what was learned; it is judged all the same.
+
+        Returns:
+            The corrected prediction ``(H, J)`` in SI units, and what was done. Numbers that are not finite are given
+            back as they came.
+        """
+        x, y = np.asarray(inputs, dtype=np.float32), np.asarray(prediction, dtype=np.float32)
+        if not (np.isfinite(x).all() and np.isfinite(y).all()):
+            self.interrupt()
+            return y.copy(), RlsStatus.NONE
+        with np.errstate(over="ignore"):
+            return self._step(x, y, fresh, learn)
+
+    def _step(self, x: Array, y: Array, fresh: bool, learn: bool) -> tuple[Array, RlsStatus]:
+        law, out, taught = self.adaptation, y.copy(), False
+        measured, directed = x[self._columns], self._directed(x)
+        for h, k in enumerate(law.horizons):
+            error = np.zeros(len(measured), dtype=np.float32)
+            if fresh and self._streak >= k:
+                error = self._error(h, measured)
+                taught = self._due(h, error, learn) or taught
+            phi = self._phi(h, measured, y[h], error, directed)
+            correction = self._correction(h, phi)
+            if fresh:
+                self._rows[h][self._at[h]] = np.concatenate([phi, y[h], correction])
+                self._at[h] = (self._at[h] + 1) % k
+            out[h] = np.where(self.fallback[h], y[h], y[h] + law.unit[h] * correction)
+        self._streak = min(self._streak + 1, law.reach) if fresh else 0
+        if self.fallback.any():
+            return out, RlsStatus.FALLBACK
+        return out, RlsStatus.LEARNING if taught else RlsStatus.HOLDING
+
+    def _directed(self, x: Array) -> Array:
+        """The inputs along the directions ``(r,)``."""
+        law = self.adaptation
+        if not law.spec.rank:
+            return np.zeros(0, dtype=np.float32)
+        scaled = _within((x - law.offset) / law.scale, FEATURE_LIMIT)
+        return _within(total(law.directions * scaled), FEATURE_LIMIT)
+
+    def _phi(self, h: int, measured: Array, y: Array, error: Array, directed: Array) -> Array:
+        law = self.adaptation
+        if not (self._moves(measured) or self._moves(y)):
+            return np.zeros(law.features, dtype=np.float32)
+        present = _within((measured - law.middle) / law.spread, FEATURE_LIMIT)
+        change = _within((y - measured) / law.change[h], FEATURE_LIMIT)
+        return np.concatenate([np.ones(1, dtype=np.float32), present, change, _within(error, FEATURE_LIMIT), directed])
+
+    def _moves(self, values: Array) -> bool:
+        """Whether one of the targets is farther from its middle than at rest."""
+        return bool((np.abs(values - self.adaptation.middle) > self.adaptation.rest).any())
+
+    def _error(self, h: int, measured: Array) -> Array:
+        """Error in units ``(J,)`` of the prediction that comes due."""
+        n, row = self.adaptation.features, self._rows[h][self._at[h]]
+        return np.asarray((measured - row[n : n + len(measured)]) / self.adaptation.unit[h])
+
+    def _correction(self, h: int, phi: Array) -> Array:
+        """In units ``(J,)``; coefficients that are not finite, which nothing but damaged memory makes, are cleared."""
+        found = total(self.theta[h] * phi)
+        damaged = ~np.isfinite(found)
+        if damaged.any():
+            self.theta[h][damaged], found[damaged] = 0.0, 0.0
+            self.repairs += 1
+        return _within(found, self._numbers["limit"])
+
+    def _due(self, h: int, error: Array, learn: bool) -> bool:
+        """Judge, and learn from, the prediction that has come due; returns whether something was learned."""
+        n, row = self.adaptation.features, self._rows[h][self._at[h]]
+        if row[0] == 0:  # at rest
+            return False
+        self._judge(h, error, row[n + len(error) :], learn)
+        return learn and self._learn(h, row[:n], error)
+
+    def _judge(self, h: int, error: Array, correction: Array, learn: bool) -> None:
+        """Compare the running errors without and with the correction; take it back, or let it out again."""
+        held, most = self._numbers, np.float32(MOST_ERROR)
+        for running, of in ((self._plain[h], error), (self._corrected[h], error - correction)):
+            running += held["rate"] * (np.minimum(np.abs(of), most) - running)
+        worse = ~self.fallback[h] & (self._corrected[h] > held["worse"] * self._plain[h])
+        better = self.fallback[h] & (self._corrected[h] < held["better"] * self._plain[h])
+        self.fallback[h] = (self.fallback[h] | worse) & ~better
+        if learn and worse.any():
+            self.theta[h][worse] = 0.0
+            self._corrected[h][worse] = self._plain[h][worse]
+            self.covariance[h] = self._start()
+
+    def _learn(self, h: int, phi: Array, error: Array) -> bool:
+        held, p = self._numbers, self.covariance[h]
+        g = total(p * phi)
+        d = held["noise"] + total(phi * g)
+        if not d >= held["noise"]:
+            self._repair(h)
+            return False
+        inverse = np.float32(1.0) / d
+        innovation = _within(error - total(self.theta[h] * phi), CLIP)
+        step = (innovation * inverse)[:, None]
+        self.theta[h] = _within(held["keep"] * (self.theta[h] + g * step), held["bound"])
+        p = held["keep_squared"] * (p - (g[:, None] * g) * inverse)
+        diagonal = np.einsum("ii->i", p)
+        diagonal += held["refresh"]
+        self.covariance[h] = p
+        if not ((diagonal > 0) & (diagonal <= np.float32(2.0) * held["prior"])).all():
+            self._repair(h)
+        return True
+
+    def _repair(self, h: int) -> None:
+        self.covariance[h] = self._start()
+        self.repairs += 1
+
+    def _start(self) -> Array:
+        return np.eye(self.adaptation.features, dtype=np.float32) * self._numbers["prior"]
+
+
+def _within(values: Array, limit: float | np.floating) -> Array:
+    """Numbers cut off at plus and minus `limit`."""
+    bound = np.float32(limit)
+    return np.asarray(np.minimum(np.maximum(values, -bound), bound), dtype=np.float32)

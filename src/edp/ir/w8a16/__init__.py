@@ -1,0 +1,7 @@
+"""W8A16: networks in whole numbers, 8-bit weights and 16-bit values, and what they compute to the last bit."""
+
+from edp.ir.w8a16.calibration import calibrate
+from edp.ir.w8a16.quantise import Formats, quantise
+from edp.ir.w8a16.reference import Integers
+
+__all__ = ["Formats", "Integers", "calibrate", "quantise"]

@@ -1,0 +1,113 @@
+"""How large each value of a network becomes, and what its weights are multiplied by, seen on recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.ir.base import INPUT, Graph
+from edp.ir.layers import Standardise
+from edp.ir.memory import Rotation
+from edp.ir.reference import Reference
+from edp.ir.w8a16.moments import InputMoments
+from edp.ir.w8a16.quantise import Formats, formats, integer_part, quantise, weights_of
+from edp.ir.w8a16.single import OVER_TIME
+
+PIECE = 500
+"""Ticks of a piece, from reset."""
+PATIENCE = 2
+
+
+def calibrate(
+    graph: Graph,
+    recordings: Sequence[NDArray[np.floating]],
+    ticks: int = 20_000,
+    error_of: Callable[[int], float] | None = None,
+) -> Formats:
+    """Formats of all values and 8-bit weights, chosen on recordings.
+
+    What is computed before the first weights is seen at every tick, since clipped inputs cost most; the rest on pieces
+    of `PIECE` ticks spread evenly over all recordings. All inputs share one format: where a few of them are very large
+    at rare moments (derivatives), a finer one that clips these may cost less than a coarse one costs the others.
+
+    Args:
+        graph: the float network.
+        recordings: inputs ``(time, input)`` in SI units, of the training part.
+        ticks: about how many of them run through the whole network.
+        error_of: the network's error when its standardised inputs have so many fractional bits and the others are as
+            they were; None keeps the format in which nothing is clipped.
+
+    Raises:
+        ExportError: a part of the network has no whole-number form.
+    """
+    found: dict[str, float] = {}
+    moments = InputMoments(graph)
+    for rows in recordings:
+        for name, values in _before_weights(graph, rows).items():
+            _raise(found, name, values)
+    for rows in pieces(recordings, ticks):
+        moments.add(_follow(graph, rows, found))
+    chosen = formats(found)
+    if error_of is not None:
+        names = [layer.name for layer in graph.layers if isinstance(layer, Standardise) and layer.name in chosen.fracs]
+        fracs = {name: finer(chosen.fracs[name], error_of) for name in names}
+        chosen = replace(chosen, fracs={**chosen.fracs, **fracs})
+    return replace(chosen, weights=weights_of(quantise(graph, chosen, moments.means())))
+
+
+def finer(frac: int, error_of: Callable[[int], float]) -> int:
+    """The format of least error from `frac` on, until `PATIENCE` finer ones in a row bring nothing."""
+    best, error, place = frac, error_of(frac), frac
+    while place - best < PATIENCE:
+        place += 1
+        if (found := error_of(place)) < error:
+            best, error = place, found
+    return best
+
+
+def pieces(recordings: Sequence[NDArray[np.floating]], ticks: int) -> list[NDArray[np.floating]]:
+    """Pieces of recordings, of about so many ticks in all, at even distances."""
+    total = sum(len(rows) for rows in recordings)
+    share = min(1.0, ticks / max(1, total))
+    cut = []
+    for rows in recordings:
+        count = max(1, round(share * len(rows) / PIECE))
+        starts = np.linspace(0, max(0, len(rows) - PIECE), count).astype(int)
+        cut += [rows[start : start + PIECE] for start in starts]
+    return cut
+
+
+def _before_weights(graph: Graph, rows: NDArray[np.floating]) -> dict[str, Any]:
+    inside = integer_part(graph)
+    values: dict[str, Any] = {INPUT: np.asarray(rows, dtype=np.float32)[:, None]}
+    for layer in graph.layers:
+        known = layer.inputs and set(layer.inputs) <= set(values)
+        if known and layer.name not in inside and type(layer) in OVER_TIME:
+            memory = {slot.name: graph.start(layer.name, slot).astype(np.float32) for slot in layer.slots}
+            values[layer.name] = OVER_TIME[type(layer)](layer, memory, *(values[name] for name in layer.inputs))
+    return values
+
+
+def _follow(graph: Graph, rows: NDArray[np.floating], found: dict[str, float]) -> dict[str, Any]:
+    """Values of every layer at every tick, ``(time, number)``."""
+    run = Reference(graph)
+    turning = [layer.name for layer in graph.layers if isinstance(layer, Rotation)]
+    seen: dict[str, list[Any]] = {}
+    for row in rows:
+        for name, values in run.step(row).items():
+            seen.setdefault(name, []).append(values)
+        for name in turning:
+            _raise(found, f"{name}/h", run.memory[name]["h"])
+    stacked = {name: np.stack(values) for name, values in seen.items()}
+    for name, values in stacked.items():
+        _raise(found, name, values)
+    return stacked
+
+
+def _raise(found: dict[str, float], name: str, values: Any) -> None:
+    if np.size(values):
+        found[name] = max(found.get(name, 0.0), float(np.abs(values).max()))

@@ -1,0 +1,347 @@
+"""A list of float layers as one of whole-number layers, given how large each value becomes.
+
+What lies between the standardised inputs and the last weights is computed in whole numbers; scaling of the inputs, the
+way back to SI units and the few kinds in `FLOAT` stay in single precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ExportError
+from edp.ir import layers, memory
+from edp.ir.base import INPUT, Graph, Layer, Number
+from edp.ir.layers import Function
+from edp.ir.w8a16 import arithmetic as whole
+from edp.ir.w8a16 import layers as made
+from edp.ir.w8a16.rounding import WeightRounding
+from edp.ir.w8a16.rows import halves, rows, to_gates
+
+Ranges = Mapping[str, float]
+"""Largest magnitude of each value, and of each slot as ``layer/slot``."""
+FLOAT = (layers.LayerNorm, layers.RowAttention, layers.Accumulate, memory.WindowAttention)
+"""Kinds that stay in single precision wherever they stand: they have no weights, or a few gains."""
+REFUSED = {
+    memory.LayerNormLstm: "train with the cell 'lstm', or export in float32",
+    memory.PrefixCorrection: "train with the initial state 'zero' or 'learned', or export in float32",
+}
+
+
+@dataclass(frozen=True)
+class Formats:
+    """Fractional bits of values, chosen on data.
+
+    Attributes:
+        fracs: by value of the float graph, and of slots that have a format of their own as ``layer/slot``.
+        weights: 8-bit weights by matrix; those that are left out are rounded to the nearest.
+    """
+
+    fracs: Mapping[str, int]
+    weights: Mapping[str, NDArray[np.int8]] = field(default_factory=dict)
+
+
+def formats(ranges: Ranges, margin: float = 1.25) -> Formats:
+    """The finest format of each value that holds `margin` times its largest magnitude."""
+    fracs = {name: whole.frac_for(margin * size) for name, size in ranges.items() if "/" not in name}
+    # The state of a rotation is 32-bit, and half of what it may grow to is kept free.
+    wide = {name: whole.frac_for(2.0 * margin * size, 29) for name, size in ranges.items() if "/" in name}
+    return Formats(fracs | wide)
+
+
+@dataclass
+class _Work:
+    """A graph in the making."""
+
+    graph: Graph
+    fracs: Mapping[str, int]
+    rounding: WeightRounding
+    kept: dict[str, int]
+    """Fractional bits of values that are whole numbers by now."""
+    out: list[Layer]
+    slots: dict[tuple[str, str], int]
+    """Fractional bits of slots."""
+
+    def rows(self, layer: Any, given: int) -> dict[str, Any]:
+        """Whole-number weights and biases of a layer."""
+        return rows(layer.name, layer.weight, layer.bias, (given, self.frac(layer.name)), self.rounding)
+
+    def gates(self, layer: Any, given: int) -> dict[str, Any]:
+        """Whole-number matrices of a recurrent layer."""
+        found: dict[str, Any] = {}
+        for side, frac in (("x", given), ("h", whole.UNIT_FRAC)):
+            made_of = to_gates(f"{layer.name}/{side}", getattr(layer, f"weight_{side}"), frac, self.rounding)
+            found |= {f"{key}_{side}": values for key, values in made_of.items()}
+        return found
+
+    def whole(self, value: str) -> str:
+        """The name of a value as whole numbers."""
+        if value in self.kept:
+            return value
+        name = f"{value}.whole"
+        if name not in self.kept:
+            size = self.graph.width_of(value)
+            self.out.append(made.Quantise(name=name, inputs=(value,), frac=self.frac(value), size=size))
+            self.kept[name] = self.frac(value)
+        return name
+
+    def real(self, value: str) -> str:
+        """The name of a value as real numbers."""
+        if value not in self.kept:
+            return value
+        name = f"{value}.real"
+        if not any(layer.name == name for layer in self.out):
+            size, frac = self.graph.width_of(value), self.kept[value]
+            self.out.append(made.Dequantise(name=name, inputs=(value,), frac=frac, size=size))
+        return name
+
+    def frac(self, value: str) -> int:
+        """The format chosen for a value."""
+        if value not in self.fracs:
+            raise ExportError(f"value '{value}' has no format; the formats are those of another network")
+        return self.fracs[value]
+
+
+def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.floating]] | None = None) -> Graph:
+    """The same network in W8A16.
+
+    Args:
+        graph: the float network.
+        chosen: formats of its values, and known weights.
+        moments: of what each matrix is multiplied by (see `WeightRounding`), for weights that are not known.
+
+    Raises:
+        ExportError: a kind of layer that has no whole-number form, sums that would not fit in 32 bits, or formats of
+            another graph.
+    """
+    inside = integer_part(graph)
+    work = _Work(graph, chosen.fracs, WeightRounding(chosen.weights, moments or {}), {}, [], {})
+    for layer in graph.layers:
+        kind = type(layer)
+        if kind in REFUSED:
+            raise ExportError(
+                f"layer '{layer.name}' is a {kind.__name__}, which has no form in whole numbers; {REFUSED[kind]}"
+            )
+        if layer.name not in inside:
+            work.out.append(replace(layer, inputs=tuple(work.real(name) for name in layer.inputs)))
+            continue
+        inputs = tuple(work.whole(name) for name in layer.inputs)
+        done = LOWER[kind](work, layer, [work.kept[name] for name in inputs])
+        work.out.append(replace(done, inputs=inputs))
+        work.kept[layer.name] = done.frac
+    results = {meaning: work.real(value) for meaning, value in graph.results.items()}
+    finished = Graph(graph.inputs, tuple(work.out), results, {}, graph.window)
+    return replace(finished, initial=_initial(graph, finished, work))
+
+
+def outline(graph: Graph) -> Graph:
+    """The network in W8A16 with nothing in it: every constant has its shape and kind, but noughts for numbers.
+
+    What a network takes of a controller depends on no number, so neither training nor recordings are needed.
+
+    Raises:
+        ExportError: a kind of layer that has no whole-number form.
+    """
+    hollow = []
+    for layer in graph.layers:
+        empty: dict[str, Any] = {name: np.zeros_like(values) for name, values in layer.tensors().items()}
+        hollow.append(replace(layer, **empty))
+    names = [INPUT, *(layer.name for layer in graph.layers)]
+    names += [f"{layer}/{slot.name}" for layer, slot in graph.slots()]
+    return quantise(replace(graph, layers=tuple(hollow)), Formats(dict.fromkeys(names, 0)))
+
+
+def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str], Any]:
+    """What slots start from, in their formats."""
+    numbers = {(name, slot.name): slot.number for name, slot in finished.slots()}
+    start: dict[tuple[str, str], Any] = {}
+    for key, values in graph.initial.items():
+        if numbers[key] is Number.FLOAT:
+            start[key] = values
+        else:
+            small = numbers[key] is Number.INT16
+            largest = whole.LARGEST if small else whole.CELL_LIMIT
+            held = whole.to_fixed(values, work.slots[key], largest)
+            start[key] = held.astype(np.int16 if small else np.int32)
+    return start
+
+
+def integer_part(graph: Graph) -> set[str]:
+    """Layers that are computed in whole numbers: after the scaling of the inputs, up to the last weights.
+
+    Functions and selections of whole numbers behind the last weights belong to it too.
+    """
+    scaled: set[str] = set()
+    before: set[str] = set()
+    for layer in graph.layers:
+        if isinstance(layer, layers.Standardise) or scaled & set(layer.inputs):
+            scaled.add(layer.name)
+    for layer in reversed(graph.layers):
+        if layer.macs or layer.name in before:
+            before |= set(layer.inputs) | {layer.name}
+    inside: set[str] = set()
+    for layer in graph.layers:
+        if layer.name not in scaled or isinstance(layer, (layers.Standardise, *FLOAT)):
+            continue
+        exponential = isinstance(layer, layers.Activate) and layer.function is Function.EXP
+        light = isinstance(layer, layers.Activate | layers.Gather) and set(layer.inputs) <= inside
+        if not exponential and (layer.name in before or light):
+            inside.add(layer.name)
+    return inside - {INPUT}
+
+
+def _within(frac: int, finest: int) -> int:
+    """A format to which a shift right of 0 to 31 bits leads from `finest`."""
+    return min(max(frac, finest - 31), finest)
+
+
+Lower = Callable[[_Work, Any, list[int]], made.Whole]
+
+
+def _gather(work: _Work, x: layers.Gather, given: list[int]) -> made.Whole:
+    frac = min(given)
+    shifts = tuple(own - frac for own in given)
+    return made.WGather(name=x.name, inputs=(), frac=frac, columns=x.columns, shifts=shifts)
+
+
+def _sum(work: _Work, x: layers.Add | layers.Subtract, given: list[int]) -> made.Whole:
+    """The finer of two formats is the common one, as far as 32 bits reach."""
+    frac, (a, b) = work.frac(x.name), given
+    common = min(max(a, b), min(a, b) + 14)
+    lefts, minus = (common - a, common - b), isinstance(x, layers.Subtract)
+    frac = _within(frac, common)
+    return made.WSum(name=x.name, inputs=(), frac=frac, size=x.size, lefts=lefts, right=common - frac, minus=minus)
+
+
+def _multiply(work: _Work, x: layers.Multiply, given: list[int]) -> made.Whole:
+    frac = _within(work.frac(x.name), sum(given))
+    return made.WMultiply(name=x.name, inputs=(), frac=frac, size=x.size, right=sum(given) - frac)
+
+
+def _scale_shift(work: _Work, x: layers.ScaleShift, given: list[int]) -> made.Whole:
+    # The offset is in the format of the product, 32-bit.
+    most = whole.frac_for(float(np.abs(x.shift).max()), 30) - given[0]
+    gain, bits = halves(x.gain, most)
+    frac = _within(work.frac(x.name), given[0] + bits)
+    offset = whole.to_fixed(x.shift, given[0] + bits, 2**30 - 1).astype(np.int32)
+    right = given[0] + bits - frac
+    return made.WScaleShift(name=x.name, inputs=(), frac=frac, gain=gain, offset=offset, right=right)
+
+
+def _activate(work: _Work, x: layers.Activate, given: list[int]) -> made.Whole:
+    frac = given[0]
+    if x.function in (Function.SIGMOID, Function.TANH):
+        frac = whole.UNIT_FRAC
+    elif x.function is Function.SOFTPLUS:
+        frac = min(work.frac(x.name), whole.GATE_FRAC)
+    return made.WActivate(name=x.name, inputs=(), frac=frac, function=x.function, size=x.size, given=given[0])
+
+
+def _glu(work: _Work, x: layers.Glu, given: list[int]) -> made.Whole:
+    return made.WGlu(name=x.name, inputs=(), frac=given[0], rows=x.rows, size=x.size)
+
+
+def _dense(work: _Work, x: layers.Dense, given: list[int]) -> made.Whole:
+    return made.WDense(name=x.name, inputs=(), frac=work.frac(x.name), rows=x.rows, **work.rows(x, given[0]))
+
+
+def _grouped(work: _Work, x: layers.GroupedDense, given: list[int]) -> made.Whole:
+    return made.WGroupedDense(name=x.name, inputs=(), frac=work.frac(x.name), **work.rows(x, given[0]))
+
+
+def _convolution(work: _Work, x: memory.Convolution, given: list[int]) -> made.Whole:
+    frac = work.frac(x.name)
+    work.slots[x.name, "ring"] = given[0]
+    return made.WConvolution(name=x.name, inputs=(), frac=frac, dilation=x.dilation, **work.rows(x, given[0]))
+
+
+def _lstm(work: _Work, x: memory.Lstm, given: list[int]) -> made.Whole:
+    work.slots |= {(x.name, "h"): whole.UNIT_FRAC, (x.name, "c"): whole.CELL_FRAC}
+    share = round(x.share * 2**whole.UNIT_FRAC)
+    bias = whole.to_fixed(x.bias, whole.GATE_FRAC, whole.GATE_LIMIT).astype(np.int32)
+    matrices = work.gates(x, given[0])
+    return made.WLstm(name=x.name, inputs=(), frac=whole.UNIT_FRAC, bias=bias, share=share, **matrices)
+
+
+def _gru(work: _Work, x: memory.Gru, given: list[int]) -> made.Whole:
+    work.slots[x.name, "h"] = whole.UNIT_FRAC
+    biases: dict[str, Any] = {
+        name: whole.to_fixed(values, whole.GATE_FRAC, whole.GATE_LIMIT).astype(np.int32)
+        for name, values in (("bias_x", x.bias_x), ("bias_h", x.bias_h))
+    }
+    return made.WGru(name=x.name, inputs=(), frac=whole.UNIT_FRAC, **work.gates(x, given[0]), **biases)
+
+
+def _min_gru(work: _Work, x: memory.MinGru, given: list[int]) -> made.Whole:
+    work.slots[x.name, "h"] = given[0] + made.WMinGru.EXTRA
+    return made.WMinGru(name=x.name, inputs=(), frac=given[0], units=x.units)
+
+
+def _rotation(work: _Work, x: memory.Rotation, given: list[int]) -> made.Whole:
+    held = max(work.frac(f"{x.name}/h"), given[0])
+    frac = _within(work.frac(x.name), held)
+    work.slots[x.name, "h"] = held
+    factor = whole.to_fixed(x.factor, 30, 2**30).astype(np.int32)
+    return made.WRotation(name=x.name, inputs=(), frac=frac, factor=factor, left=held - given[0], right=held - frac)
+
+
+def _difference(work: _Work, x: memory.Difference, given: list[int]) -> made.Whole:
+    factor, bits = halves(x.factor)
+    frac = _within(work.frac(x.name), given[0] + bits)
+    work.slots[x.name, "before"] = given[0]
+    right = given[0] + bits - frac
+    return made.WDifference(name=x.name, inputs=(), frac=frac, factor=factor, from_zero=x.from_zero, right=right)
+
+
+def _mean(work: _Work, x: memory.TrailingMean, given: list[int]) -> made.Whole:
+    work.slots[x.name, "ring"] = given[0]
+    return made.WTrailingMean(name=x.name, inputs=(), frac=given[0], size=x.size, window=x.window)
+
+
+def _pool(work: _Work, x: memory.AttentionPool, given: list[int]) -> made.Whole:
+    work.slots |= {(x.name, "ring"): given[0], (x.name, "scores"): whole.GATE_FRAC}
+    numbers = to_gates(x.name, x.score[None], given[0], work.rounding)
+    return made.WAttentionPool(
+        name=x.name,
+        inputs=(),
+        frac=given[0],
+        window=x.window,
+        score=numbers["weight"][0],
+        multiplier=numbers["multiplier"],
+        shift=numbers["shift"],
+    )
+
+
+def weights_of(graph: Graph) -> dict[str, NDArray[np.int8]]:
+    """8-bit weights of a whole-number graph, by matrix."""
+    found: dict[str, NDArray[np.int8]] = {}
+    for layer, name, values in graph.tensors():
+        if values.dtype == np.int8:
+            found[layer + ("/" + name[-1] if name in ("weight_x", "weight_h") else "")] = values
+    return found
+
+
+LOWER: dict[type[Layer], Lower] = {
+    layers.Gather: _gather,
+    layers.Add: _sum,
+    layers.Subtract: _sum,
+    layers.Multiply: _multiply,
+    layers.ScaleShift: _scale_shift,
+    layers.Activate: _activate,
+    layers.Glu: _glu,
+    layers.Dense: _dense,
+    layers.GroupedDense: _grouped,
+    memory.Convolution: _convolution,
+    memory.Lstm: _lstm,
+    memory.Gru: _gru,
+    memory.MinGru: _min_gru,
+    memory.Rotation: _rotation,
+    memory.Difference: _difference,
+    memory.TrailingMean: _mean,
+    memory.AttentionPool: _pool,
+}
+"""By kind of layer that has a whole-number form."""

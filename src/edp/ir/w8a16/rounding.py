@@ -1,0 +1,82 @@
+"""Which whole numbers weights become: the nearest, or those that make the least error in what a layer gives.
+
+The second way takes the columns of a matrix one after the other, rounds each, and lets the columns that follow make up
+for its error (E. Frantar et al., GPTQ, 2022): with ``H`` the mean of ``x x'`` over data, the error of an output is
+``(w - q)' H (w - q)``, and what the rest of w must become is its minimum given the columns already rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.ir.w8a16 import arithmetic as whole
+
+Array = NDArray[np.floating]
+DAMPING = 0.01
+"""Share of the mean diagonal that is added to ``H``: inputs that hardly move must not be given large weights."""
+
+
+@dataclass(frozen=True)
+class WeightRounding:
+    """How weights are rounded; without data or known numbers to the nearest.
+
+    Attributes:
+        weights: whole numbers found before, by matrix.
+        moments: mean ``x x'`` of what a matrix is multiplied by, ``(terms, terms)``, or ``(row, terms, terms)`` where
+            each row has its own input.
+    """
+
+    weights: Mapping[str, NDArray[np.int8]] = field(default_factory=dict)
+    moments: Mapping[str, Array] = field(default_factory=dict)
+
+    def of(self, matrix: str, weight: Array, scale: Array) -> NDArray[np.int8]:
+        """Whole multiples of a scale for each output.
+
+        Args:
+            matrix: its name.
+            weight: first dimensions as `scale`, the others are summed over.
+            scale: ``(out,)`` or ``(row, out)``.
+        """
+        if matrix in self.weights:
+            return self.weights[matrix].reshape(weight.shape)
+        if matrix not in self.moments:
+            return nearest(weight, scale)
+        flat = weight.reshape(*scale.shape, -1).astype(np.float64)
+        moments = self.moments[matrix]
+        if scale.ndim == 1:
+            found = least_error(flat, scale, moments)
+        else:
+            found = np.stack([least_error(*row) for row in zip(flat, scale, moments, strict=True)])
+        return found.reshape(weight.shape)
+
+
+def nearest(weight: Array, scale: Array) -> NDArray[np.int8]:
+    """Rounded half to even."""
+    wide = scale.reshape(scale.shape + (1,) * (weight.ndim - scale.ndim))
+    return np.clip(np.rint(weight / wide), -whole.WEIGHT, whole.WEIGHT).astype(np.int8)
+
+
+def least_error(weight: Array, scale: Array, moments: Array) -> NDArray[np.int8]:
+    """Columns one after the other, the ones with the largest inputs first.
+
+    Args:
+        weight: ``(out, terms)``.
+        scale: ``(out,)``.
+        moments: ``(terms, terms)``.
+    """
+    terms = len(moments)
+    damped = moments + (DAMPING * np.trace(moments) / terms + 1e-12) * np.eye(terms)
+    order = np.argsort(-np.diag(damped), kind="stable")
+    # Row i of the upper factor of the inverse says how the columns after i make up for an error in column i.
+    upper = np.linalg.cholesky(np.linalg.inv(damped[np.ix_(order, order)])).T
+    left = weight[:, order].copy()
+    found = np.empty(left.shape, dtype=np.int8)
+    for column in range(terms):
+        found[:, column] = nearest(left[:, column], scale)
+        error = (left[:, column] - found[:, column] * scale) / upper[column, column]
+        left[:, column:] -= error[:, None] * upper[column, column:]
+    return found[:, np.argsort(order, kind="stable")]

@@ -1,0 +1,213 @@
+"""Layers that stay in single precision, over many ticks at once, with the operations of the C runtime in their order.
+
+So both give the same bits. Sums are taken one after the other; the functions are the runtime's own. Values are
+``(time, stream, number)``: several streams side by side, all of the same age.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.ir import layers, memory
+from edp.ir.base import Layer
+from edp.ir.layers import Function
+
+Rows = NDArray[np.float32]
+Memory = dict[str, Any]
+ONE = np.float32(1.0)
+
+
+def _small_expm1(r: Rows) -> Rows:
+    f = np.float32
+    tail = f(1 / 6) + r * (f(1 / 24) + r * (f(1 / 120) + r * (f(1 / 720) + r * f(1 / 5040))))
+    return np.asarray(r + r * r * (f(0.5) + r * tail))
+
+
+def exp(x: Rows) -> Rows:
+    """``edp_exp`` of the runtime."""
+    f = np.float32
+    limited = np.clip(x, f(-87.0), f(88.0))
+    turns = limited * f(1.44269504)
+    n = np.trunc(np.where(turns >= 0, turns + f(0.5), turns - f(0.5))).astype(np.int32)
+    r = (limited - n.astype(f) * f(0.693359375)) - n.astype(f) * f(-2.12194440e-4)
+    power = ((n + 127).astype(np.uint32) << np.uint32(23)).view(np.float32)
+    return np.asarray((ONE + _small_expm1(r)) * power)
+
+
+def tanh(x: Rows) -> Rows:
+    """``edp_tanh`` of the runtime."""
+    f = np.float32
+    size = np.abs(x)
+    e = _small_expm1(f(2.0) * np.minimum(size, f(0.17)))
+    near = e / (e + f(2.0))
+    far = ONE - f(2.0) / (exp(f(2.0) * np.minimum(size, f(10.0))) + ONE)
+    y = np.where(size < f(0.17), near, np.where(size < f(10.0), far, ONE))
+    return np.asarray(np.where(x < 0, -y, y))
+
+
+def sigmoid(x: Rows) -> Rows:
+    """``edp_sigmoid`` of the runtime."""
+    small = exp(-np.abs(x))
+    return np.asarray(np.where(x >= 0, ONE, small) / (ONE + small))
+
+
+def log1p(x: Rows) -> Rows:
+    """log(1 + x) as the runtime has it, for x in [0, 1]."""
+    f = np.float32
+    s = x / (f(2.0) + x)
+    q = s * s
+    tail = f(1 / 11) + q * (f(1 / 13) + q * f(1 / 15))
+    tail = f(1 / 3) + q * (f(1 / 5) + q * (f(1 / 7) + q * (f(1 / 9) + q * tail)))
+    return np.asarray(f(2.0) * (s + s * q * tail))
+
+
+def _softplus(x: Rows) -> Rows:
+    return np.asarray(np.where(x > 0, x, np.float32(0)) + log1p(exp(-np.abs(x))))
+
+
+def _gelu(x: Rows) -> Rows:
+    erf = np.vectorize(math.erf, otypes=[np.float32])(x * np.float32(0.707106781))
+    return np.asarray(np.float32(0.5) * x * (ONE + erf))
+
+
+def _turned(x: Rows, quarters: int) -> Rows:
+    """The runtime's sine of x and of so many quarter turns more."""
+    f = np.float32
+    limited = np.clip(x, f(-8192.0), f(8192.0))
+    turns = limited * f(0.636619772)
+    n = np.trunc(np.where(turns >= 0, turns + f(0.5), turns - f(0.5))).astype(np.int32)
+    whole = n.astype(f)
+    r = ((limited - whole * f(1.5703125)) - whole * f(4.83751297e-4)) - whole * f(7.54978995e-8)
+    q = r * r
+    sine = r + r * q * (f(-1 / 6) + q * (f(1 / 120) + q * (f(-1 / 5040) + q * f(1 / 362880))))
+    tail = f(1 / 24) + q * (f(-1 / 720) + q * (f(1 / 40320) + q * f(-1 / 3628800)))
+    cosine = ONE + q * (f(-0.5) + q * tail)
+    quarter = (n + quarters) & 3
+    y = np.where(quarter & 1, cosine, sine)
+    return np.asarray(np.where(quarter >= 2, -y, y))
+
+
+FUNCTIONS: dict[Function, Callable[[Rows], Rows]] = {
+    Function.RELU: lambda x: np.where(x > 0, x, np.float32(0)),
+    Function.SIGMOID: sigmoid,
+    Function.TANH: tanh,
+    Function.GELU: _gelu,
+    Function.SOFTPLUS: _softplus,
+    Function.EXP: exp,
+    Function.SQRT: np.sqrt,
+    Function.SINE: lambda x: _turned(x, 0),
+    Function.COSINE: lambda x: _turned(x, 1),
+    Function.POSITIVE: lambda x: (x > 0).astype(np.float32),
+}
+
+
+def _sum(x: Rows, axis: int = -1) -> Rows:
+    """Sum one after the other, as a loop does; NumPy's own sum adds in pairs."""
+    return np.asarray(np.take(np.add.accumulate(x, axis=axis, dtype=np.float32), -1, axis=axis))
+
+
+def softmax(scores: Rows) -> Rows:
+    """Weights over the last axis."""
+    raised = exp(scores - scores.max(axis=-1, keepdims=True))
+    return np.asarray(raised / _sum(raised)[..., None])
+
+
+def split(x: Any, rows: int) -> Any:
+    """The last dimension as so many rows."""
+    return x.reshape(*x.shape[:-1], rows, -1)
+
+
+def flat(x: Any) -> Any:
+    """The last two dimensions as one."""
+    return x.reshape(*x.shape[:-2], -1)
+
+
+def gather(layer: Any, m: Memory, *parts: Any) -> Any:
+    """Chosen columns."""
+    return np.concatenate(parts, axis=-1)[..., list(layer.columns)]
+
+
+def _difference(layer: memory.Difference, m: Memory, x: Rows) -> Rows:
+    before = m["before"] if layer.from_zero or m["age"][0] > 0 else x[0]
+    past = np.concatenate([before[None], x[:-1]])
+    m["before"], m["age"] = x[-1], np.ones_like(m["age"])
+    return np.asarray(layer.factor * (x - past))
+
+
+def _starting(layer: memory.Starting, m: Memory, x: Rows) -> Rows:
+    age = int(m["age"][0])
+    read = age + np.arange(len(x)) < layer.ticks
+    m["age"] = np.full_like(m["age"], min(age + len(x), layer.ticks))
+    flag = np.broadcast_to(read[:, None, None], (*x.shape[:-1], 1))
+    return np.concatenate([np.where(flag, x, layer.mean), flag.astype(np.float32)], axis=-1)
+
+
+def _layer_norm(layer: layers.LayerNorm, m: Memory, x: Rows) -> Rows:
+    n = np.float32(len(layer.gain))
+    rows = split(x, layer.rows)
+    middle = rows - (_sum(rows) / n)[..., None]
+    scale = ONE / np.sqrt(_sum(middle * middle) / n + np.float32(layer.epsilon))
+    return np.asarray(middle * scale[..., None] * layer.gain + layer.shift).reshape(x.shape)
+
+
+def _rows(layer: layers.RowAttention, m: Memory, *qkv: Rows) -> Rows:
+    q, k, v = (split(x, layer.rows) for x in qkv)
+    root = np.sqrt(np.float32(layer.size))
+    weights = softmax(_sum(q[..., :, None, :] * k[..., None, :, :]) / root)
+    return _sum(weights[..., None] * v[..., None, :, :], axis=3).reshape(qkv[0].shape)
+
+
+def _window(layer: memory.WindowAttention, m: Memory, q: Rows, k: Rows, v: Rows) -> Rows:
+    """The ring is read as it lies in memory: the order of a sum matters to its last bit."""
+    root = np.sqrt(np.float32(layer.size // layer.heads))
+    out = np.empty_like(q)
+    for tick in range(len(q)):
+        at, seen = m.setdefault("at", 0), int(m["age"][0])
+        keys = split(np.concatenate([m["keys"][:seen], k[tick][None]]), layer.heads)
+        values = split(np.concatenate([v[tick][None], m["values"][:seen]]), layer.heads)
+        scores = _sum(split(q[tick], layer.heads) * keys) / root
+        weights = softmax(np.moveaxis(scores, 0, -1))
+        order = np.moveaxis(np.concatenate([weights[..., -1:], weights[..., :-1]], axis=-1), -1, 0)
+        out[tick] = _sum(order[..., None] * values, axis=0).reshape(out[tick].shape)
+        if layer.window > 1:
+            m["keys"][at], m["values"][at] = k[tick], v[tick]
+            m["at"] = (at + 1) % (layer.window - 1)
+        m["age"] = np.full_like(m["age"], min(seen + 1, layer.window - 1))
+    return out
+
+
+def _accumulate(layer: layers.Accumulate, m: Memory, x: Rows) -> Rows:
+    return np.add.accumulate(split(x, layer.rows), axis=2).reshape(x.shape)
+
+
+def _glu(layer: layers.Glu, m: Memory, x: Rows) -> Rows:
+    halves = x.reshape(*x.shape[:-1], layer.rows, 2, -1)
+    return flat(halves[..., 0, :] * sigmoid(halves[..., 1, :]))
+
+
+Run = Callable[..., Any]
+OVER_TIME: dict[type[Layer], Run] = {
+    layers.Gather: gather,
+    layers.Standardise: lambda layer, m, x: (x - layer.offset) / layer.scale,
+    layers.ScaleShift: lambda layer, m, x: x * layer.gain + layer.shift,
+    layers.Add: lambda layer, m, a, b: a + b,
+    layers.Subtract: lambda layer, m, a, b: a - b,
+    layers.Multiply: lambda layer, m, a, b: a * b,
+    layers.Divide: lambda layer, m, a, b: a / b,
+    layers.Minimum: lambda layer, m, a, b: np.where(a > b, b, a),
+    layers.Maximum: lambda layer, m, a, b: np.where(a < b, b, a),
+    layers.Activate: lambda layer, m, x: FUNCTIONS[layer.function](x),
+    layers.Glu: _glu,
+    layers.Accumulate: _accumulate,
+    layers.LayerNorm: _layer_norm,
+    layers.RowAttention: _rows,
+    memory.Difference: _difference,
+    memory.Starting: _starting,
+    memory.WindowAttention: _window,
+}
+"""Many ticks of a kind of layer: (layer, memory, inputs ...) to its value; the memory is brought on."""

@@ -1,0 +1,1 @@
+"""Readers and writers of log files: one format a file, registered by its name."""

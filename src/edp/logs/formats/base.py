@@ -1,0 +1,268 @@
+"""What a file holds before any map, unit or time rule is applied, and the registry of file formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, closest
+from edp.recording import Recording
+from edp.registry import Registry
+from edp.signals import TABLE_A1, TIME_UNITS, VOCABULARY, Kind, SignalMap
+
+Column = NDArray[np.float64]
+
+PIECE_ROWS = 1 << 16
+"""Rows that a table reads at a time: what bounds the memory that a log of any length takes."""
+
+
+class ColumnTable(Protocol):
+    """Columns of one file that share their rows, read together in one go through the file."""
+
+    def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+        """Rows ``start <= row < stop`` of the named columns, in pieces of some rows, in order.
+
+        Yields:
+            one array of numbers a name, all of the same length, shape ``(rows of the piece,)``.
+
+        Raises:
+            DataError: a column is damaged or holds text.
+        """
+
+
+def load_column(table: ColumnTable, name: str, samples: int) -> Column:
+    """One whole column of a table, shape ``(samples,)``."""
+    parts = [columns[0] for columns in table.pieces([name], 0, samples)]
+    return np.concatenate(parts).astype(np.float64, copy=False) if parts else np.empty(0)
+
+
+@dataclass(frozen=True, eq=False)
+class RawSignal:
+    """One column as the file has it.
+
+    Attributes:
+        name: the file's own name.
+        load: returns the values, float64, shape ``(time,)``; called when needed so that columns pass one by one.
+        samples: number of values.
+        time: its time stamps in seconds, shape ``(time,)``, or what reads them; columns of one table share the same.
+        unit: the unit the file gives, None when it says nothing.
+        kind: the kind the file gives (only files that EDP wrote do).
+        description: the file's description.
+        table: the table that it is a column of, where several columns are best read together.
+        key: its name in the table.
+    """
+
+    name: str
+    load: Callable[[], Column]
+    samples: int
+    time: Column | Callable[[], Column] | None = None
+    unit: str | None = None
+    kind: Kind | None = None
+    description: str = ""
+    table: ColumnTable | None = None
+    key: str = ""
+
+    @property
+    def values(self) -> Column:
+        """The values, read now; not kept."""
+        return self.load()
+
+    @property
+    def time_s(self) -> Column | None:
+        """The time stamps in seconds, shape ``(time,)``; columns of one table give the same array."""
+        return self.time() if callable(self.time) else self.time
+
+
+@dataclass(frozen=True)
+class RawLog:
+    """All columns of one file.
+
+    Attributes:
+        path: the file.
+        signals: columns by the file's names, in the file's order.
+        scalars: single numbers of a MAT file (gains and the like); used only where a map names them.
+        rate_hz: the rate the file itself states; its rows are then uniform.
+        name: the recording's name as the file states it.
+        source: where the recording came from as the file states it.
+        meta: facts the file carries.
+        aliases: further names of columns, each with its name in `signals` (the whole path of a signal).
+        repeated: names that several columns have, with the names in `signals` that tell them apart.
+        digest: of the values that EDP wrote (`Recording.digest`), where the file states it.
+    """
+
+    path: Path
+    signals: Mapping[str, RawSignal]
+    scalars: Mapping[str, float] = field(default_factory=dict)
+    rate_hz: float | None = None
+    name: str | None = None
+    source: str = ""
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    repeated: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    digest: str | None = None
+
+    def __post_init__(self) -> None:
+        check_names(self.path, self.signals)
+
+    def __contains__(self, name: str) -> bool:
+        """Whether the file has a column of this name or alias."""
+        return name in self.signals or name in self.aliases
+
+    def signal(self, name: str) -> RawSignal:
+        """The named column.
+
+        Raises:
+            DataError: no such column, or several; the names to choose from are offered.
+        """
+        name = self.aliases.get(name, name)
+        if name in self.signals:
+            return self.signals[name]
+        if name in self.repeated:
+            raise DataError(
+                f"'{self.path}' has {len(self.repeated[name])} columns named '{name}': "
+                f"{self._told_apart(name)}; name the wanted one in the signal map"
+            )
+        raise DataError(
+            f"'{self.path}' has no column '{name}'{closest(name, [*self.signals, *self.scalars])}; "
+            "name an existing column in the signal map"
+        )
+
+    def _told_apart(self, name: str) -> str:
+        found = [self.signals[full] for full in self.repeated[name]]
+        return ", ".join(signal.name + (f" [{signal.unit}]" if signal.unit else "") for signal in found[:8])
+
+
+LONGEST_NAME = 256
+"""Characters of a column's name; a full path of a Simulink signal has some hundred."""
+MOST_COLUMNS = 65_536
+
+
+def check_names(path: Path, names: Iterable[str]) -> None:
+    """Refuse names that pictures, tables and generated programs cannot carry.
+
+    Raises:
+        DataError: a name that is too long or holds control characters, or more columns than a log has.
+    """
+    count = 0
+    for name in names:
+        count += 1
+        if len(name) > LONGEST_NAME:
+            raise DataError(
+                f"'{path}': column {name[:40]!r}... has a name of {len(name)} characters, at most {LONGEST_NAME} are "
+                "read; rename it"
+            )
+        if not name.isprintable() and any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in name):
+            raise DataError(f"'{path}': the name of column {name[:80]!r} holds control characters; rename it")
+    if count > MOST_COLUMNS:
+        raise DataError(f"'{path}' has {count} columns, at most {MOST_COLUMNS} are read; split it")
+
+
+TRUTH_PLACES = ("with", "apart", "without")
+TRUTH = "truth"
+"""Variable of a MAT file, and middle part of a file's name, that hold the truth."""
+
+
+@dataclass(frozen=True)
+class WriteOptions:
+    """How a MAT file is laid out, and where truth goes (the vocabulary beyond Table A.1).
+
+    Attributes:
+        mat_layout: a name in `edp.logs.formats.mat_layouts.LAYOUTS`; other formats have one layout.
+        mat_version: ``v5`` or ``v7.3``.
+        truth: ``with`` the other channels; ``apart``, in a variable ``truth`` of the MAT file or a file
+            ``NAME.truth.SUFFIX`` beside the log; or ``without`` it.
+
+    Raises:
+        DataError: no such way to keep the truth.
+    """
+
+    mat_layout: str = "struct"
+    mat_version: str = "v5"
+    truth: str = "with"
+
+    def __post_init__(self) -> None:
+        if self.truth not in TRUTH_PLACES:
+            raise DataError(f"truth = '{self.truth}' cannot be written{closest(self.truth, TRUTH_PLACES)}")
+
+
+def is_truth(name: str) -> bool:
+    """Whether a channel is one that only a simulation knows: of the vocabulary, but not of Table A.1."""
+    return name in VOCABULARY and name not in TABLE_A1
+
+
+def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
+    """The measured channels and the truth of a recording; None for a part without channels."""
+    of_truth = [is_truth(name) for name in recording.channel_names]
+
+    def part(wanted: bool) -> Recording | None:
+        places = [i for i, found in enumerate(of_truth) if found == wanted]
+        channels = tuple(recording.channels[i] for i in places)
+        return replace(recording, channels=channels, values=recording.values[:, places]) if places else None
+
+    return part(False), part(True)
+
+
+class LogFormat(Protocol):
+    """One file format; instances are entered in `FORMATS`.
+
+    `parts`: whether one file can hold truth apart. A format may also have `libraries`: names of modules that reading
+    imports, which the sandbox then imports once instead of once a log.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    content: str
+    parts: bool
+
+    def claims(self, head: bytes) -> bool:
+        """Whether a file that begins with `head` (up to 4 KiB) holds this format."""
+
+    def read(self, path: Path, signal_map: SignalMap) -> RawLog:
+        """Read a file; raises `DataError` for anything it cannot be read for."""
+
+    def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
+        """Write a recording to `path`, which need not carry the format's suffix."""
+
+
+FORMATS: Registry[LogFormat] = Registry("file format")
+
+_TIME_NAMES = ("time_s", "time", "timestamp", "timestamps", "tout", "time_ms", "time_us", "time_ns")
+_TIME_UNIT_NAMES = {"sec": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
+
+
+def find_time(names: Sequence[str], signal_map: SignalMap, path: Path) -> str | None:
+    """The name of the time column among `names`; None where rows are uniform by the map or nothing looks like time.
+
+    Raises:
+        DataError: the map names a time column that the file lacks.
+    """
+    if signal_map.sample_time_s is not None:
+        return None
+    if signal_map.time is not None:
+        if signal_map.time not in names:
+            raise DataError(
+                f"'{path}' has no time column '{signal_map.time}'{closest(signal_map.time, names)}; "
+                "set 'time' in the signal map to an existing column, or set 'sample_time_s'"
+            )
+        return signal_map.time
+    for wanted in _TIME_NAMES:
+        for name in names:
+            if name.lower() == wanted:
+                return name
+    return "t" if "t" in names else None
+
+
+def time_factor(name: str, unit: str | None, signal_map: SignalMap) -> float:
+    """Seconds per unit of the time column: the map's unit, else the header's, else the name's ending, else s."""
+    stated = _TIME_UNIT_NAMES.get(unit or "", unit or "")
+    ending = name.lower().rpartition("_")[2]
+    if signal_map.time_unit != "s":
+        return TIME_UNITS[signal_map.time_unit]
+    if stated in TIME_UNITS:
+        return TIME_UNITS[stated]
+    return TIME_UNITS.get(ending, 1.0)

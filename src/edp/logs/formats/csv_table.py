@@ -1,0 +1,194 @@
+"""The rows of a text file as columns: all at once where it is small, else block by block."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as arrow_csv
+from numpy.typing import NDArray
+
+from edp.errors import DataError, brief
+from edp.logs.formats.base import PIECE_ROWS
+from edp.storage.memory import free_bytes
+
+WHOLE_BYTES = 1 << 30
+"""Files up to this size are parsed once and kept; longer ones are parsed once to check them, then once a reading."""
+_WHOLE_SHARE = 0.25
+"""Of free memory, what a kept file may take."""
+_WIDEST = 4
+"""Bytes of memory a byte of text: a digit and a delimiter become a number of eight."""
+_TRIES = 8
+"""Parses that end at text in a column of numbers; after the second, the columns are looked at all at once."""
+NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "-nan", "-nan(ind)", "1.#QNAN"]
+_BLOCK_BYTES = 1 << 24
+
+
+@dataclass(frozen=True)
+class TextLayout:
+    """How a text file is laid out: its columns with units, and where its numbers begin."""
+
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+    numeric: tuple[bool, ...]
+    delimiter: str
+    decimal: str
+    skip_rows: int
+    encoding: str
+
+
+def is_number(cell: str, decimal: str = ".") -> bool:
+    """Whether a cell holds a number or nothing."""
+    text = cell.strip()
+    if text in NULLS:
+        return True
+    try:
+        float(text.replace(decimal, ".") if decimal != "." else text)
+    except ValueError:
+        return False
+    return True
+
+
+def _all_numbers(cells: pa.Array, nulls: pa.Array, decimal: str) -> bool:
+    cells = pc.utf8_trim_whitespace(cells)
+    cells = pc.if_else(pc.is_in(cells, nulls), pa.scalar(None, pa.string()), cells)
+    if decimal != ".":
+        cells = pc.replace_substring(cells, decimal, ".")
+    try:
+        pc.cast(cells, pa.float64())
+    except pa.ArrowInvalid:
+        return False
+    return True
+
+
+class CsvTable:
+    """The columns of a text file; a column goes by its place.
+
+    Raises:
+        DataError: a row with too few or too many cells, or text that is no table.
+    """
+
+    def __init__(self, path: Path, layout: TextLayout) -> None:
+        self.path = path
+        self.layout = layout
+        self.keys = [f"c{i}" for i in range(len(layout.names))]
+        self.types = {key: pa.float64() if number else pa.string() for key, number in zip(self.keys, layout.numeric)}
+        self.kept: pa.Table | None = None
+        self.rows = 0
+        self.ragged: list[Any] = []
+        size = path.stat().st_size
+        small = size <= WHOLE_BYTES and _WIDEST * size <= _WHOLE_SHARE * free_bytes()
+        for tried in range(_TRIES):
+            self.ragged.clear()
+            try:
+                if small:
+                    self.kept = arrow_csv.read_csv(self.path, *self.options(self.keys))
+                    self.rows = self.kept.num_rows
+                else:
+                    self.rows = sum(batch.num_rows for batch in self.stream(self.keys))
+            except (pa.ArrowException, OSError, ValueError) as error:
+                column = re.search(r"CSV column #(\d+)", str(error))
+                if column is None or self.types[self.keys[int(column[1])]] == pa.string():
+                    raise DataError(f"'{path}' cannot be read as CSV: {brief(error)}") from error
+                # Text further down a column of numbers: keep it as text, so that only a map that needs it is refused.
+                self.types[self.keys[int(column[1])]] = pa.string()
+                if tried:
+                    self.find_texts()
+                continue
+            self.refuse_ragged()
+            return
+        raise DataError(f"'{path}' cannot be read as CSV: its columns hold numbers and text in turn")
+
+    def find_texts(self) -> None:
+        """Find all columns that hold text further down in one go: a parse a column would take columns times rows."""
+        numeric = [key for key in self.keys if self.types[key] != pa.string()]
+        self.types |= dict.fromkeys(numeric, pa.string())
+        texts: set[str] = set()
+        nulls = pa.array(NULLS)
+        for batch in self.stream(numeric):
+            for key in numeric:
+                if key not in texts and not _all_numbers(batch.column(key), nulls, self.layout.decimal):
+                    texts.add(key)
+        self.types |= {key: pa.float64() for key in numeric if key not in texts}
+
+    def options(self, keys: Sequence[str]) -> tuple[Any, Any, Any]:
+        """How pyarrow reads the wanted columns."""
+
+        def note(row: Any) -> str:
+            self.ragged.append(row)
+            return "skip"
+
+        layout = self.layout
+        encoding = "utf-8" if layout.encoding == "utf-8-sig" else layout.encoding
+        read = arrow_csv.ReadOptions(
+            use_threads=False,
+            column_names=self.keys,
+            skip_rows=layout.skip_rows,
+            encoding=encoding,
+            block_size=_BLOCK_BYTES,
+        )
+        parse = arrow_csv.ParseOptions(delimiter=layout.delimiter, invalid_row_handler=note)
+        convert = arrow_csv.ConvertOptions(
+            column_types=self.types, null_values=NULLS, decimal_point=layout.decimal, include_columns=list(keys)
+        )
+        return read, parse, convert
+
+    def stream(self, keys: Sequence[str]) -> Iterator[pa.RecordBatch]:
+        """Blocks of rows of the wanted columns, from the file or from what is kept."""
+        if self.kept is not None:
+            yield from self.kept.select(list(keys)).to_batches(max_chunksize=PIECE_ROWS)
+            return
+        with arrow_csv.open_csv(self.path, *self.options(keys)) as reader:
+            yield from reader
+
+    def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+        """See `edp.logs.formats.base.ColumnTable`."""
+        places = [int(name) for name in names]
+        keys = [self.keys[place] for place in places]
+        for place in places:
+            if self.types[self.keys[place]] == pa.string():
+                self.refuse_text(place)
+        first = 0
+        for batch in self.stream(list(dict.fromkeys(keys))):
+            low, high = max(start - first, 0), min(stop - first, batch.num_rows)
+            if high > low:
+                part = batch.slice(low, high - low)
+                yield [np.asarray(part.column(key).to_numpy(zero_copy_only=False), dtype=np.float64) for key in keys]
+            first += batch.num_rows
+            if first >= stop:
+                return
+
+    def texts(self, place: int) -> list[str | None]:
+        """The cells of a column of text."""
+        key = self.keys[place]
+        return [cell for batch in self.stream([key]) for cell in batch.column(key).to_pylist()]
+
+    def refuse_ragged(self) -> None:
+        if self.ragged:
+            bad = self.ragged[0]
+            raise DataError(
+                f"'{self.path}': line {bad.number} has {bad.actual_columns} cells, the header has "
+                f"{bad.expected_columns} ('{bad.text[:60]}'); the file may be cut off: export it again or delete "
+                "the line"
+            )
+
+    def refuse_text(self, place: int) -> None:
+        """Say where a column that should hold numbers holds text."""
+        name, row, key = self.layout.names[place], self.layout.skip_rows + 1, self.keys[place]
+        for batch in self.stream([key]):
+            for cell in batch.column(key).to_pylist():
+                if not is_number(cell or "", self.layout.decimal):
+                    raise DataError(
+                        f"'{self.path}': column '{name}' holds text '{cell[:40]}' in line {row}; "
+                        "expected a number or an empty cell"
+                    )
+                row += 1
+        raise DataError(
+            f"'{self.path}': column '{name}' holds numbers that cannot be read; check the decimal sign in the map"
+        )

@@ -1,0 +1,155 @@
+"""MAT files: v4, v5 and v7.3; arrays, structs, Simulink logs, timeseries, Dataset and timetable objects."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, closest
+from edp.logs.formats.base import (
+    FORMATS,
+    TRUTH,
+    Column,
+    RawLog,
+    RawSignal,
+    WriteOptions,
+    find_time,
+    parted,
+    time_factor,
+)
+from edp.logs.formats.edp_metadata import OwnFacts, facts_text, own_facts
+from edp.logs.formats.mat_layouts import LAYOUTS
+from edp.logs.formats.matlab import INFO, MAGIC, MatVariables, is_v4
+from edp.logs.units import normalise_unit
+from edp.recording import Recording
+from edp.signals import SignalMap
+
+_VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
+
+
+class MatFormat:
+    """MATLAB's MAT file."""
+
+    name = "mat"
+    suffixes: tuple[str, ...] = (".mat",)
+    content = "a MAT file"
+    parts = True
+    libraries = ("edp.logs.formats.matlab.unpacking",)
+
+    def claims(self, head: bytes) -> bool:
+        """The text header of v5 and v7.3 (also when cut off), or the numbers of a v4 header."""
+        if any(head.startswith(magic) or magic.startswith(head) for magic in MAGIC):
+            return True
+        return is_v4(head)
+
+    def read(self, path: Path, signal_map: SignalMap) -> RawLog:
+        """Read all variables, or the one that the map names."""
+        from edp.logs.formats.matlab.unpacking import unpack  # pandas takes seconds to import
+
+        found = unpack(path, signal_map.variable)
+        own = OwnFacts() if found.info is None else own_facts(found.info, f"'{path}', variable '{INFO}'")
+        if signal_map.variable is not None:
+            if signal_map.variable not in found.names:
+                raise DataError(
+                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, found.names)}; "
+                    "set 'variable' in the signal map to an existing one"
+                )
+            if signal_map.variable == TRUTH and own.truth:
+                own = replace(own, channels=own.truth, digest=own.truth_digest)
+        if not found.signals:
+            raise DataError(
+                f"'{path}' holds no signals (variables: {', '.join(found.names[:12]) or 'none'}); expected "
+                "numeric vectors, structs of them, timeseries, a Dataset or a timetable"
+            )
+        return _raw_log(path, found, own, signal_map)
+
+    def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
+        """Write the variables of the wanted layout, and ``edp_info``, a JSON text with units and facts."""
+        if options.mat_version not in _VERSIONS:
+            known = closest(options.mat_version, _VERSIONS)
+            raise DataError(f"MAT version '{options.mat_version}' cannot be written{known}")
+        long = [name for name in recording.channel_names if not name.isidentifier() or len(name) > 63]
+        if long:
+            raise DataError(
+                f"channel(s) {', '.join(long)} cannot be MATLAB names (letters, digits, underscore, at most 63); "
+                "rename them in the signal map"
+            )
+        from edp.logs.formats.matlab.library import matio
+
+        layout = LAYOUTS[options.mat_layout]
+        measured, truth = parted(recording) if options.truth == "apart" else (recording, None)
+        variables = layout.variables(measured or recording)
+        if truth is not None:
+            variables[TRUTH] = layout.build(truth)
+        variables[INFO] = facts_text(measured or recording, truth)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                matio.save_to_mat(
+                    str(path),
+                    variables,
+                    version=_VERSIONS[options.mat_version],
+                    saveobj_classes=list(layout.saveobj_classes) or None,
+                )
+                if options.mat_version == "v7.3":
+                    # mat-io leaves the text of a v5 header there; MATLAB goes by the version number behind it.
+                    with path.open("rb+") as stream:
+                        stream.write(MAGIC[1])
+            except RuntimeError as error:
+                # h5py reports a failed write (disk full) as RuntimeError.
+                raise OSError(str(error)) from error
+
+
+FORMATS.register("mat")(MatFormat())
+
+
+class _Table:
+    """Columns in memory."""
+
+    def __init__(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        self.columns = columns
+
+    def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+        """See `edp.logs.formats.base.ColumnTable`."""
+        yield [self.columns[name][start:stop] for name in names]
+
+
+def _raw_log(path: Path, found: MatVariables, own: OwnFacts, signal_map: SignalMap) -> RawLog:
+    names = [part.name for part in found.signals]
+    timeless = [part.name for part in found.signals if part.time is None]
+    time_name = None if own.rate_hz else find_time(timeless, signal_map, path)
+    time: Column | None = None
+    if time_name is not None:
+        part = found.signals[names.index(time_name)]
+        time = np.asarray(part.values, dtype=np.float64) * time_factor(time_name, None, signal_map)
+    signals: dict[str, RawSignal] = {}
+    table = _Table({part.name: part.values for part in found.signals})
+    for part in found.signals:
+        if part.name == time_name:
+            continue
+        channel = own.channels.get(part.name)
+        own_time = part.time if signal_map.sample_time_s is None else None
+        if own_time is None and time is not None and len(time) == len(part.values):
+            own_time = time
+        signals[part.name] = RawSignal(
+            part.name,
+            partial(np.asarray, part.values, dtype=np.float64),
+            len(part.values),
+            own_time,
+            unit=normalise_unit(part.unit) or (channel.unit if channel else None),
+            kind=channel.kind if channel else None,
+            description=channel.description if channel else "",
+            table=table,
+            key=part.name,
+        )
+    if own.channels:
+        signals = {name: signals[name] for name in own.channels if name in signals}
+    repeated = {name: full for name, full in found.repeated.items() if name != time_name and set(full) <= set(signals)}
+    return RawLog(path, signals, found.scalars, repeated=repeated, **own.for_log())

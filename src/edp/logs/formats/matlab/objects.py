@@ -1,0 +1,236 @@
+"""The signals inside a loaded MAT file, whatever they are wrapped in.
+
+Known wrappers: vectors and matrices, structs (one time vector per struct), Simulink's structure with time,
+``timeseries``, ``Simulink.SimulationData.Dataset`` and ``Signal``, ``SimulationOutput``, cells, tables and timetables.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.logs.formats.matlab.library import MatlabOpaque
+from edp.logs.formats.matlab.library import pandas as pd
+from edp.logs.formats.matlab.variables import MatVariables, Part
+
+_TIME_FIELDS = ("time_s", "time", "Time", "t", "tout")
+_SECONDS = {
+    "seconds": 1.0,
+    "milliseconds": 1e-3,
+    "microseconds": 1e-6,
+    "nanoseconds": 1e-9,
+    "minutes": 60.0,
+    "hours": 3600.0,
+    "days": 86400.0,
+}
+
+
+def collect(variables: dict[str, Any]) -> MatVariables:
+    """Walk all variables; names that occur twice are told apart by their path (``log.x``)."""
+    found = MatVariables()
+    for name, value in variables.items():
+        _walk(value, name, name, None, found)
+    short = [part.name for part in found.signals]
+    counts = Counter(short)
+    for part in found.signals:
+        if counts[part.name] > 1:
+            outer = f"{re.split(r'[.({]', part.path)[0]}.{part.name}"
+            part.name = part.path if outer in counts else outer
+    counts_now = Counter(part.name for part in found.signals)
+    for name, part in zip(short, found.signals):
+        part.name = part.path if counts_now[part.name] > 1 else part.name
+        if counts[name] > 1:
+            found.repeated.setdefault(name, []).append(part.name)
+    _share_times(found)
+    return found
+
+
+def _share_times(found: MatVariables) -> None:
+    """Make equal times one array: a Dataset holds them once a signal, and each would be judged and kept again."""
+    known: list[NDArray[np.float64]] = []
+    for part in found.signals:
+        if part.time is None:
+            continue
+        same = next((time for time in known if time is part.time or np.array_equal(time, part.time)), None)
+        if same is None:
+            known.append(part.time)
+        else:
+            part.time = same
+
+
+def _walk(value: Any, name: str, path: str, time: NDArray[np.float64] | None, found: MatVariables) -> None:
+    if isinstance(value, MatlabOpaque):
+        _walk_object(value, name, path, found)
+    elif isinstance(value, pd.DataFrame):
+        _walk_table(value, path, found)
+    elif isinstance(value, np.ndarray) and value.dtype.names:
+        _walk_struct(value, path, found)
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        for i, item in enumerate(value.ravel(order="F")):
+            inner = f"{name}_{i + 1}" if value.size > 1 else name
+            _walk(item, inner, f"{path}{{{i + 1}}}" if value.size > 1 else path, time, found)
+    elif isinstance(value, np.ndarray | np.generic) and np.asarray(value).dtype.kind in "fiub":
+        _add_array(np.asarray(value), name, path, time, found)
+
+
+def _add_array(
+    array: NDArray[Any],
+    name: str,
+    path: str,
+    time: NDArray[np.float64] | None,
+    found: MatVariables,
+    unit: str | None = None,
+) -> None:
+    if array.size == 1 and time is None:
+        found.scalars[name] = float(array.ravel()[0])
+        return
+    columns = _columns(array, None if time is None else len(time))
+    if columns is None:
+        return
+    own = time if time is not None and len(time) == columns.shape[0] else None
+    for i in range(columns.shape[1]):
+        ending = f"_{i + 1}" if columns.shape[1] > 1 else ""
+        found.signals.append(Part(name + ending, columns[:, i], own, unit, path + ending))
+
+
+def _columns(array: NDArray[Any], samples: int | None) -> NDArray[Any] | None:
+    """An array as ``(time, column)``: time is the axis of `samples` values, else the longest; None if there is none."""
+    if array.size == 0:
+        return None
+    kept = [length for length in array.shape if length > 1]
+    if len(kept) <= 1:
+        return array.reshape(-1, 1)
+    fitting = [axis for axis, length in enumerate(array.shape) if length == samples]
+    axis = fitting[0] if fitting else int(np.argmax(array.shape))
+    if array.ndim > 2 and not fitting:
+        return None
+    moved = np.moveaxis(array, axis, 0)
+    return moved.reshape(moved.shape[0], -1)
+
+
+def _walk_struct(value: NDArray[Any], path: str, found: MatVariables) -> None:
+    fields = value.dtype.names or ()
+    for number, element in enumerate(value.ravel(order="F")):
+        here = f"{path}({number + 1})" if value.size > 1 else path
+        if "signals" in fields and "time" in fields:
+            _walk_structure_with_time(element, here, found)
+            continue
+        time = _struct_time(element, fields)
+        for name in fields:
+            if time is not None and name == time[0]:
+                continue
+            _walk(element[name], name, f"{here}.{name}", time[1] if time else None, found)
+
+
+def _struct_time(element: Any, fields: tuple[str, ...]) -> tuple[str, NDArray[np.float64]] | None:
+    for name in _TIME_FIELDS:
+        if name in fields and isinstance(element[name], np.ndarray) and element[name].dtype.kind in "fiu":
+            stamps = element[name].ravel().astype(np.float64)
+            if len(stamps) > 1:
+                return name, stamps
+    return None
+
+
+def _walk_structure_with_time(element: Any, path: str, found: MatVariables) -> None:
+    """Simulink's 'Structure with time': fields time and signals(k).values, signals(k).label."""
+    stamps = np.asarray(element["time"], dtype=np.float64).ravel()
+    signals = element["signals"]
+    if not isinstance(signals, np.ndarray) or not signals.dtype.names or "values" not in signals.dtype.names:
+        return
+    for number, signal in enumerate(signals.ravel(order="F")):
+        label = _text(signal["label"]) if "label" in signals.dtype.names else ""
+        name = label or f"signal_{number + 1}"
+        time = stamps if len(stamps) > 1 else None
+        _add_array(np.asarray(signal["values"]), name, f"{path}.{name}", time, found)
+
+
+def _walk_table(table: pd.DataFrame, path: str, found: MatVariables) -> None:
+    time = None
+    if isinstance(table.index, pd.TimedeltaIndex | pd.DatetimeIndex):
+        index = table.index.to_numpy()
+        first = index[:1] if isinstance(table.index, pd.DatetimeIndex) else np.zeros(1, dtype=index.dtype)
+        time = np.asarray((index - first) / np.timedelta64(1, "s"), dtype=np.float64)
+    units = table.attrs.get("varUnits") or table.attrs.get("VariableUnits") or []
+    for i, name in enumerate(table.columns):
+        values = table[name].to_numpy()
+        if values.dtype.kind in "fiub" and len(values):
+            unit = str(units[i]) if i < len(units) else None
+            found.signals.append(Part(str(name), values, time, unit, f"{path}.{name}"))
+
+
+def _walk_object(value: MatlabOpaque, name: str, path: str, found: MatVariables) -> None:
+    props = value.properties
+    if not isinstance(props, dict):
+        return
+    if value.classname == "timeseries" or {"Data_", "TimeInfo"} <= set(props):
+        _add_timeseries(props, name, path, found)
+    elif "Values" in props:
+        _walk(props["Values"], _text(props.get("Name")) or name, path, None, found)
+    else:
+        for key in ("any", "Storage", "Elements", "Data"):
+            if key in props:
+                _walk_contents(props[key], name, path, found)
+
+
+def _walk_contents(value: Any, name: str, path: str, found: MatVariables) -> None:
+    """The inside of a Dataset or SimulationOutput: structs with Storage or Elements, cells, or plain fields."""
+    if isinstance(value, np.ndarray) and value.dtype.names and {"Storage", "Elements"} & set(value.dtype.names):
+        for element in value.ravel():
+            for key in ("Storage", "Elements"):
+                if key in value.dtype.names:
+                    _walk(element[key], name, path, None, found)
+    else:
+        _walk(value, name, path, None, found)
+
+
+def _add_timeseries(props: dict[str, Any], name: str, path: str, found: MatVariables) -> None:
+    data = np.asarray(props.get("Data_", np.empty(0)))
+    if data.dtype.kind not in "fiub" or data.size == 0:
+        return
+    time = _timeseries_time(props)
+    unit = _timeseries_unit(props.get("DataInfo"))
+    own = _text(props.get("Name"))
+    _add_array(data, own if own and own != "unnamed" else name, path, time, found, unit)
+
+
+def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:
+    """Time in seconds: its own vector, else start, increment and length."""
+    info = props.get("TimeInfo")
+    facts = info.properties if isinstance(info, MatlabOpaque) and isinstance(info.properties, dict) else {}
+    factor = _SECONDS.get(_text(facts.get("Units")).lower(), 1.0)
+    for source in (props.get("Time_"), facts.get("Time_")):
+        if source is not None and np.asarray(source).size:
+            return np.asarray(source, dtype=np.float64).ravel() * factor
+    start, step, length = (_number(facts.get(key)) for key in ("Start_", "Increment_", "Length"))
+    if step is None or length is None:
+        return None
+    return _even(start or 0.0, step, int(length), factor)
+
+
+@lru_cache(maxsize=1)
+def _even(start: float, step: float, length: int, factor: float) -> NDArray[np.float64]:
+    """Even times; the signals of one Dataset mostly have the same, and then share the array."""
+    return np.asarray((start + step * np.arange(length)) * factor, dtype=np.float64)
+
+
+def _timeseries_unit(info: Any) -> str:
+    facts = info.properties if isinstance(info, MatlabOpaque) and isinstance(info.properties, dict) else {}
+    units = facts.get("Units")
+    if isinstance(units, MatlabOpaque) and isinstance(units.properties, dict):
+        units = units.properties.get("Name")
+    return _text(units)
+
+
+def _text(value: Any) -> str:
+    array = np.asarray(value) if value is not None else np.empty(0)
+    return str(array.ravel()[0]) if array.size and array.dtype.kind in "UTO" else ""
+
+
+def _number(value: Any) -> float | None:
+    array = np.asarray(value) if value is not None else np.empty(0)
+    return float(array.ravel()[0]) if array.size and array.dtype.kind in "fiu" else None

@@ -1,0 +1,80 @@
+"""Unpacking a MAT file whole, in the process that calls it: damaged ones crash, hang or exhaust the libraries.
+
+Logs are therefore opened by `edp.logs.open_log`, which calls this in a sandbox.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from edp.errors import DataError, brief
+from edp.logs.formats.matlab.check import check_size
+from edp.logs.formats.matlab.library import matio
+from edp.logs.formats.matlab.objects import collect
+from edp.logs.formats.matlab.variables import INFO, MAGIC, MatVariables, is_v4
+from edp.storage.memory import announce
+
+COPIES = 8
+"""Memory a byte of unpacked variables: the libraries copy them several times."""
+OBJECT_BYTES = 8192
+
+
+def unpack(path: Path, variable: str | None = None) -> MatVariables:
+    """Everything in a file, or in one variable of it.
+
+    Args:
+        path: the file.
+        variable: read this one only.
+
+    Raises:
+        DataError: the file is damaged or holds more than this machine's memory.
+    """
+    variables = _load(path)
+    info = variables.pop(INFO, None)
+    names = list(variables)
+    if variable is not None:
+        variables = {name: value for name, value in variables.items() if name == variable}
+    found = collect(variables)
+    found.names = names
+    if info is not None:
+        array = np.asarray(info)
+        found.info = str(array.ravel()[0]) if array.size else ""
+    return found
+
+
+def _load(path: Path) -> dict[str, Any]:
+    with path.open("rb") as stream:
+        head = stream.read(128)
+    if any(magic.startswith(head[: len(magic)]) for magic in MAGIC) and len(head) < 128:
+        raise DataError(f"'{path}' is a MAT file that ends inside its header (truncated); copy or export it again")
+    held, objects = (path.stat().st_size, 1) if is_v4(head) else check_size(path)
+    announce(memory=COPIES * held + objects * OBJECT_BYTES, work=held, parts=objects)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            if is_v4(head):
+                variables = scipy.io.loadmat(str(path))
+            else:
+                variables = matio.load_from_mat(str(path), add_table_attrs=True)
+        except Exception as error:
+            # The parsers meet damaged bytes with any exception there is; every one means the same to the user.
+            raise DataError(
+                f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {brief(error)}); it may be truncated "
+                "or damaged: copy or export it again"
+            ) from error
+    failed = [str(item.message) for item in caught if "Failed to load" in str(item.message)]
+    if failed:
+        raise DataError(
+            f"'{path}': an object in this MAT file is damaged ({brief(failed[0])}); copy or export it again"
+        )
+    nameless = [name for name in variables if not isinstance(name, str)]
+    if nameless:
+        raise DataError(
+            f"'{path}' holds a variable whose name is no text ({nameless[0]!r}); it is damaged: copy or export it again"
+        )
+    return {name: value for name, value in variables.items() if not name.startswith("__")}

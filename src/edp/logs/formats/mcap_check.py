@@ -1,0 +1,135 @@
+"""Whether the records of an MCAP file fit into it, looked at before a library takes their sizes as they are.
+
+Layout: magic, then records of an operation code (1 byte), a length (8) and content, then magic again.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from pathlib import Path
+
+from edp.errors import DataError
+from edp.logs.formats.bag_memory import MemoryFile
+from edp.storage.memory import check_memory
+
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER, _SCHEMA, _CHANNEL, _CHUNK, _CHUNK_INDEX, _STATISTICS = 0x02, 0x03, 0x04, 0x06, 0x08, 0x0B
+RATIO = 1100
+"""A packed part may hold so many times its size: deflate reaches 1,032, messages of machines some 10."""
+SPARE = 1 << 20
+"""And so many bytes beyond that."""
+_LONGEST = {_SCHEMA: 1 << 20, _CHANNEL: 1 << 16}
+"""Bytes of a definition of messages, and of a topic with its settings."""
+_SMALLEST_MESSAGE = 31
+_PREFIX = 9
+
+
+def check_records(path: Path | MemoryFile) -> None:
+    """Walk the records of an MCAP file, on disk or in memory.
+
+    Raises:
+        DataError: the file is cut off, a record does not fit, or a chunk is larger than memory.
+    """
+    size = path.stat().st_size
+    if size < 2 * len(_MAGIC) + _PREFIX:
+        raise _broken(Path(str(path)), "ends inside its header (truncated)")
+    if isinstance(path, MemoryFile):
+        _walk(Path(path.name), memoryview(path.data), size)
+        return
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as view:
+        _walk(path, view, size)
+
+
+def _walk(path: Path, view: mmap.mmap | memoryview, size: int) -> None:
+    if view[-len(_MAGIC) :] != _MAGIC:
+        raise _broken(path, "has no end (truncated, half downloaded, or its recorder was killed)")
+    walk = _Walk(path, view)
+    at, last = len(_MAGIC), 0
+    while at < size - len(_MAGIC):
+        if at + _PREFIX > size - len(_MAGIC):
+            raise _broken(path, f"has at byte {at} a record that is cut off")
+        last, length = struct.unpack_from("<BQ", view, at)
+        if not last or at + _PREFIX + length > size - len(_MAGIC):
+            raise _broken(path, f"has at byte {at} a record of {length} bytes, more than the file holds")
+        try:
+            walk.record(last, at + _PREFIX, length)
+        except struct.error as error:
+            raise _broken(path, f"has at byte {at} a record that is cut off ({error})") from error
+        at += _PREFIX + length
+    if last != _FOOTER:
+        raise _broken(path, "has no footer (truncated)")
+    walk.end()
+
+
+class _Walk:
+    """The records one after the other, and what they announce together."""
+
+    def __init__(self, path: Path, view: mmap.mmap | memoryview) -> None:
+        self.path = path
+        self.view = view
+        self.unpacked = len(view)
+        self.spans: list[tuple[int, int, int]] = []
+        self.indexed: set[int] = set()
+        self.announced = 0
+
+    def record(self, kind: int, at: int, length: int) -> None:
+        if length > _LONGEST.get(kind, length):
+            raise _broken(self.path, f"has at byte {at} a definition of {length} bytes")
+        if kind == _CHUNK:
+            self.chunk(at, length)
+        elif kind == _CHUNK_INDEX:
+            self.index(at, length)
+        elif kind == _STATISTICS:
+            (self.announced,) = struct.unpack_from("<Q", self.view, at)
+            (count,) = struct.unpack_from("<I", self.view, at + 42)
+            for entry in range(min(count, length) // 10):
+                (messages,) = struct.unpack_from("<Q", self.view, at + 46 + 10 * entry + 2)
+                self.announced = max(self.announced, messages)
+
+    def chunk(self, at: int, length: int) -> None:
+        """Times (16 bytes), size unpacked (8), checksum (4), name of the packing, size packed (8), content."""
+        if length < 40:
+            raise _broken(self.path, f"has at byte {at} a chunk of {length} bytes")
+        start, stop, unpacked, _, named = struct.unpack_from("<QQQII", self.view, at)
+        if 40 + named > length:
+            raise _broken(self.path, f"has at byte {at} a chunk whose packing has a name of {named} bytes")
+        (packed,) = struct.unpack_from("<Q", self.view, at + 32 + named)
+        if packed != length - 40 - named:
+            raise _broken(self.path, f"has at byte {at} a chunk of {length} bytes that announces {packed}")
+        self.weigh(at, start, stop, packed, unpacked)
+
+    def index(self, at: int, length: int) -> None:
+        """Times (16 bytes), place and length of the chunk (16), then lists, and at the end both sizes (16)."""
+        if length < 64:
+            raise _broken(self.path, f"has at byte {at} an index of {length} bytes")
+        start, stop, place, _ = struct.unpack_from("<QQQQ", self.view, at)
+        packed, unpacked = struct.unpack_from("<QQ", self.view, at + length - 16)
+        if place in self.indexed:
+            raise _broken(self.path, f"has at byte {at} a second index of the chunk at byte {place}")
+        self.indexed.add(place)
+        if packed > len(self.view):
+            raise _broken(self.path, f"has at byte {at} an index of {packed} packed bytes, more than the file holds")
+        self.weigh(at, start, stop, packed, unpacked)
+
+    def weigh(self, at: int, start: int, stop: int, packed: int, unpacked: int) -> None:
+        if unpacked > RATIO * packed + SPARE:
+            raise _broken(self.path, f"has at byte {at} a chunk of {packed} bytes that claims to hold {unpacked}")
+        check_memory(self.path, unpacked, "a chunk of messages", "it may be damaged; record smaller chunks")
+        self.unpacked += unpacked
+        self.spans += [(start, 1, unpacked), (max(start, stop), 2, -unpacked)]
+
+    def end(self) -> None:
+        """Chunks whose times overlap are unpacked at once; counts of messages are those that bytes can hold."""
+        together = most = 0
+        for _, _, size in sorted(self.spans):
+            together += size
+            most = max(most, together)
+        # Each chunk stands here twice, by itself and by its index.
+        check_memory(self.path, most // 2, "the chunks of one moment", "it may be damaged; record it again")
+        if self.announced * _SMALLEST_MESSAGE > self.unpacked:
+            raise _broken(self.path, f"announces {self.announced} messages in {self.unpacked} bytes")
+
+
+def _broken(path: Path, what: str) -> DataError:
+    return DataError(f"'{path}' is a damaged MCAP file: it {what}; copy or record it again")

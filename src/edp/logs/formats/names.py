@@ -1,0 +1,66 @@
+"""Names of columns where a file has groups, topics or variables: short where that is clear, else with the place."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from edp.logs.formats.base import RawSignal
+
+Named = tuple[dict[str, RawSignal], dict[str, str], dict[str, list[str]]]
+
+
+def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
+    """Columns by name.
+
+    Args:
+        found: the full name of each column (with group or topic), and the column under its short name.
+
+    Returns:
+        columns under their short names where those occur once, else under the full ones, numbered where even those
+        occur twice; the full names of the former; and the short names of the latter with their full ones.
+    """
+    counts = Counter(signal.name for _, signal in found)
+    often = {name for name, count in counts.items() if count > 1}
+    once = counts.keys() - often
+    signals: dict[str, RawSignal] = {}
+    aliases: dict[str, str] = {}
+    repeated: dict[str, list[str]] = {}
+    numbers: Counter[str] = Counter()
+    for name, signal in found:
+        full = name
+        if signal.name not in often:
+            signals[signal.name] = signal
+            aliases[full] = signal.name
+            continue
+        while full in signals or full in once:
+            numbers[name] += 1
+            full = f"{name}#{numbers[name] + 1}"
+        signals[full] = replace(signal, name=full)
+        repeated.setdefault(signal.name, []).append(full)
+    return signals, aliases, repeated
+
+
+def name_of_file(path: Path) -> str:
+    r"""The name of a recording from that of its file; bytes that are not UTF-8 stand as ``\xff``."""
+    return path.stem.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def only(
+    wanted: Iterable[str], signals: Mapping[str, RawSignal], repeated: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, RawSignal], dict[str, list[str]]]:
+    """The wanted columns of a log, in that order, and the names that several of them have."""
+    kept = {name: signals[name] for name in wanted if name in signals}
+    among = {name: [full for full in several if full in kept] for name, several in repeated.items()}
+    return kept, {name: several for name, several in among.items() if len(several) > 1}
+
+
+SHOWN = 80
+"""Characters of a name in a message."""
+
+
+def shown_name(name: str) -> str:
+    """A name of a file in quotes for a message: shortened, with control characters as escapes."""
+    return repr(name if len(name) <= SHOWN else name[: SHOWN - 3] + "...")

@@ -1,0 +1,309 @@
+"""Bags of ROS 1 and ROS 2 and MCAP files, read through rosbags without an installed ROS.
+
+A column is a number in the messages of a topic. Its full name is ``/topic.path.of.field``; elements of a list count
+from 1 (``/cylinders.data_1``) or go by the names beside them (``/joint_states.velocity.boom``). Its short name is the
+path, or the topic's last part where the topic holds nothing but ``data``.
+"""
+
+from __future__ import annotations
+
+import struct
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, brief
+from edp.logs.formats.bag_guard import check_counts, definitions_of, open_reader
+from edp.logs.formats.base import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
+from edp.logs.formats.edp_metadata import OwnFacts, own_facts
+from edp.logs.formats.names import only, told_apart
+from edp.logs.formats.ros_message import columns_of, layout_of
+from edp.logs.formats.rosbag_write import FACTS_TOPIC, write_bag
+from edp.recording import Recording
+from edp.signals import VOCABULARY, SignalMap
+
+KEPT_BYTES = 1 << 29
+"""Wanted columns up to this size are read in one go through the file; beyond, each topic in pieces."""
+_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+_LOG_TIME, _HEADER_TIME = "log_time", "header.stamp"
+
+
+class BagFormat:
+    """One container of messages."""
+
+    parts = False
+    libraries = ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")
+
+    def __init__(self, name: str, suffix: str, content: str, magic: bytes) -> None:
+        self.name = name
+        self.suffixes: tuple[str, ...] = (suffix,)
+        self.content = content
+        self.magic = magic
+
+    def claims(self, head: bytes) -> bool:
+        """Begins with the container's magic number."""
+        return head.startswith(self.magic)
+
+    def read(self, path: Path, signal_map: SignalMap) -> RawLog:
+        """Read topics, types and each topic's first message; the others when their values are asked for."""
+        wanted = {entry.column for entry in signal_map.channels} or set(VOCABULARY)
+        bag = _Bag(path, wanted, signal_map)
+        own = bag.facts()
+        found = [signal for topic in bag.topics for signal in topic.signals(own)]
+        if not found:
+            known = ", ".join(sorted(bag.about)) or "none"
+            raise DataError(f"'{path}' holds no numbers in messages (topics: {known}); record topics that hold some")
+        signals, aliases, repeated = told_apart(found)
+        bag.wanted = {aliases.get(name, name) for name in wanted}
+        if own.channels:
+            signals, repeated = only(own.channels, signals, repeated)
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
+
+    def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
+        """Write a topic of one message a sample, float32, and EDP's facts as a topic of text."""
+        write_bag(recording, path, self.name)
+
+
+FORMATS.register("mcap")(BagFormat("mcap", ".mcap", "MCAP", b"\x89MCAP0\r\n"))
+FORMATS.register("rosbag2")(BagFormat("rosbag2", ".db3", "an SQLite database", b"SQLite format 3\0"))
+FORMATS.register("rosbag1")(BagFormat("rosbag1", ".bag", "a ROS 1 bag", b"#ROSBAG V"))
+
+
+class _Bag:
+    """An open file or folder."""
+
+    def __init__(self, path: Path, wanted: set[str], signal_map: SignalMap) -> None:
+        if signal_map.time not in (None, _LOG_TIME, _HEADER_TIME):
+            raise DataError(
+                f"'{path}' has no time column '{signal_map.time}'; in a bag 'time' of the signal map is "
+                f"'{_HEADER_TIME}' or '{_LOG_TIME}'"
+            )
+        self.path = path
+        self.wanted = wanted
+        self.time = signal_map.time
+        with damage(path):
+            self.reader = open_reader(path)
+            self.cdr = not hasattr(self.reader, "chunk_infos")
+            self.reader.open()
+            weakref.finalize(self, _close, self.reader)
+            by_topic: dict[str, list[Any]] = {}
+            for connection in self.reader.connections:
+                if not isinstance(connection.topic, str):
+                    raise DataError("a topic without a name")
+                by_topic.setdefault(connection.topic, []).append(connection)
+            self.about = {name: sum(each.msgcount for each in group) for name, group in by_topic.items()}
+            check_counts(path, self.about, sorted(path.iterdir()) if path.is_dir() else [path])
+            filled = {name: group for name, group in by_topic.items() if self.about[name]}
+            self.topics = [_Topic(self, name, group) for name, group in filled.items() if name != FACTS_TOPIC]
+            self.facts_from = filled.get(FACTS_TOPIC)
+            self.origin_ns = int(self.reader.start_time)
+
+    def facts(self) -> OwnFacts:
+        if not self.facts_from:
+            return OwnFacts()
+        with damage(self.path):
+            raw = next(iter(self.reader.messages(connections=self.facts_from)))[2]
+            start = 8 if self.cdr else 4
+            (count,) = struct.unpack_from("<I", raw, start - 4)  # a slice ends where the message does
+            text = bytes(raw[start : start + count]).rstrip(b"\0").decode()
+        return own_facts(text, f"'{self.path}', topic '{FACTS_TOPIC}'")
+
+    @cached_property
+    def together(self) -> None:
+        """Read the wanted topics in one go; done at most once."""
+        chosen = [topic for topic in self.topics if topic.wanted_paths()]
+        values = sum(topic.samples * len(topic.wanted_paths()) for topic in chosen)
+        keep = 8 * values <= KEPT_BYTES
+        self.scan(chosen, keep)
+
+    def scan(self, topics: Sequence[_Topic], keep: bool) -> None:
+        """Stamps of some topics, and with `keep` their wanted columns."""
+        by_name = {topic.name: topic for topic in topics}
+        paths = {topic.name: [*topic.stamp_paths, *(topic.wanted_paths() if keep else [])] for topic in topics}
+        collected = {name: _Collected(by_name[name], paths[name]) for name in by_name}
+        with damage(self.path):
+            for connection, log_ns, raw in self.reader.messages([c for topic in topics for c in topic.connections]):
+                collected[connection.topic].add(log_ns, raw)
+            for name, topic in by_name.items():
+                topic.take(*collected[name].columns(), paths[name])
+
+
+class _Collected:
+    """Messages of one topic, turned into columns some thousand at a time."""
+
+    def __init__(self, topic: _Topic, paths: list[str]) -> None:
+        self.topic = topic
+        self.paths = paths
+        self.log_ns: list[int] = []
+        self.raws: list[bytes] = []
+        self.done: list[list[NDArray[Any]]] = []
+
+    def add(self, log_ns: int, raw: bytes) -> None:
+        self.log_ns.append(log_ns)
+        if self.paths:
+            self.raws.append(raw)
+            if len(self.raws) >= PIECE_ROWS // 8:
+                self.flush()
+
+    def flush(self) -> None:
+        if self.raws:
+            self.done.append(self.topic.columns(self.raws, self.paths))
+            self.raws = []
+
+    def columns(self) -> tuple[NDArray[np.int64], list[NDArray[Any]]]:
+        self.flush()
+        joined = [np.concatenate(parts) for parts in zip(*self.done)] if self.done else []
+        return np.asarray(self.log_ns, dtype=np.int64), joined
+
+
+class _Topic:
+    """The messages of one topic: a table of its numbers."""
+
+    def __init__(self, bag: _Bag, name: str, connections: list[Any]) -> None:
+        self.bag = bag
+        self.name = name
+        self.connections = connections
+        self.samples = bag.about[name]
+        self.kind = connections[0].msgtype
+        self.types: Any = definitions_of(connections[0].msgdef, self.kind)
+        self.kept: dict[str, NDArray[Any]] = {}
+        self._stamps: Column | None = None
+        self.paths: dict[str, str] = {}
+        self.stamp_paths: list[str] = []
+        if self.types is None:
+            return
+        first = next(iter(bag.reader.messages(connections=connections)), None)
+        if first is None:
+            raise DataError(f"no message of topic '{name}', of which {self.samples} are announced")
+        fields = layout_of(first[2], self.kind, self.types, bag.cdr).fields
+        self.stamp_paths = [path for path in _STAMP if path in fields and bag.time != _LOG_TIME]
+        numbers = [path for path in fields if not path.startswith(("header.", "layout."))]
+        for path in numbers:
+            parent, _, last = path.rpartition(".")
+            plain = not parent and (last == "data" or last.startswith("data_"))
+            self.paths[path] = name.rpartition("/")[2] + last.removeprefix("data") if plain else path
+
+    def signals(self, own: OwnFacts) -> list[tuple[str, RawSignal]]:
+        found = []
+        for path, short in self.paths.items():
+            known = own.channels.get(short)
+            signal = RawSignal(
+                short,
+                partial(load_column, self, path, self.samples),
+                self.samples,
+                None if own.rate_hz else self.stamps,
+                unit=known.unit if known else None,
+                kind=known.kind if known else None,
+                description=known.description if known else "",
+                table=self,
+                key=path,
+            )
+            found.append((f"{self.name}.{path}", signal))
+        return found
+
+    def wanted_paths(self) -> list[str]:
+        wanted = self.bag.wanted
+        return [path for path, short in self.paths.items() if short in wanted or f"{self.name}.{path}" in wanted]
+
+    def columns(self, raws: list[bytes], paths: Sequence[str]) -> list[NDArray[Any]]:
+        return columns_of(raws, paths, self.kind, self.types, self.bag.cdr)
+
+    def stamps(self) -> Column:
+        """Seconds since the bag's first message: of the headers where they state time, else of the log."""
+        if self._stamps is None and self.wanted_paths():
+            _ = self.bag.together
+        if self._stamps is None:
+            self.bag.scan([self], keep=False)
+        if self._stamps is None:
+            raise DataError(f"'{self.bag.path}': topic '{self.name}' has no time stamps")
+        return self._stamps
+
+    def take(self, log_ns: NDArray[np.int64], columns: list[NDArray[Any]], paths: list[str]) -> None:
+        """Keep what a scan found."""
+        self.check_count(len(log_ns))
+        seconds = np.zeros(0)
+        if len(self.stamp_paths) == 2:
+            seconds, nanoseconds = columns[0], columns[1]
+        if seconds.any():
+            at_ns = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+        elif self.bag.time == _HEADER_TIME:
+            raise DataError(
+                f"'{self.bag.path}': messages of '{self.name}' state no time in their header; set time = '{_LOG_TIME}' "
+                "in the signal map"
+            )
+        else:
+            at_ns = log_ns
+        self._stamps = np.asarray((at_ns - self.bag.origin_ns) * 1e-9, dtype=np.float64)
+        self.kept = dict(zip(paths, columns))
+
+    def check_count(self, count: int) -> None:
+        if count != self.samples:
+            raise DataError(
+                f"'{self.bag.path}': topic '{self.name}' announces {self.samples} messages and holds {count}; the file "
+                "is truncated or damaged: copy it again or rebuild its index"
+            )
+
+    def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
+        """See `edp.logs.formats.base.ColumnTable`."""
+        if self._stamps is None and set(names) <= set(self.wanted_paths()):
+            _ = self.bag.together
+        if all(name in self.kept for name in names):
+            yield [self.kept[name][start:stop] for name in names]
+            return
+        raws: list[bytes] = []
+        row = 0
+        with damage(self.bag.path):
+            for _, _, raw in self.bag.reader.messages(connections=self.connections):
+                row += 1
+                if start < row <= stop:
+                    raws.append(raw)
+                    if len(raws) >= PIECE_ROWS // 8:
+                        yield self.columns(raws, names)
+                        raws = []
+            self.check_count(row)
+            if raws:
+                yield self.columns(raws, names)
+
+
+def _close(reader: Any) -> None:
+    reader.close()
+
+
+@contextmanager
+def damage(path: Path) -> Iterator[None]:
+    """The library meets damaged bytes with any exception there is; every one means the same to the user."""
+    try:
+        yield
+    except ImportError as error:
+        raise DataError(
+            f"'{path}': bags and MCAP files need the package rosbags, which is not installed; run pip install "
+            "'excavator-dynamics-predictor[ros]', or convert the wanted topics to CSV or Parquet"
+        ) from error
+    except DataError as error:
+        if str(path) in str(error):
+            raise
+        raise DataError(f"'{path}' holds {brief(error)}; it may be damaged: copy or record it again") from error
+    except MemoryError as error:
+        raise DataError(
+            f"'{path}' announces more data than this machine has memory for; it may be damaged: copy or record it again"
+        ) from error
+    except Exception as error:
+        text = str(error) or type(error).__name__
+        raise DataError(f"'{path}' cannot be read: {brief(text)}{_advice(text)}") from error
+
+
+def _advice(text: str) -> str:
+    known = {
+        "Profile is not": " (only ROS 2 messages in MCAP are read); convert the wanted topics to CSV or Parquet",
+        "encryption": "; decrypt the bag first",
+        "not indexed": " (its recorder was killed): run 'rosbag reindex' or record it again",
+        "encrypted": "; it may be password-protected",
+    }
+    found = [advice for part, advice in known.items() if part in text]
+    return found[0] if found else "; it may be truncated or damaged: copy or record it again"

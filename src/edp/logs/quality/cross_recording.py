@@ -1,0 +1,108 @@
+"""What only shows where recordings stand beside each other: repeated sessions, a channel in two units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edp.logs.quality.checks import Finding
+from edp.logs.quality.quality import QualityReport, plain, verdict_of
+from edp.logs.quality.repeats import Repeat, Sketch, find_repeats
+from edp.signals import UNITS, Kind
+
+_LEAST_RATIO = 9.0
+_NEAR_DECADES = 0.35
+
+
+@dataclass(frozen=True)
+class DataQuality:
+    """The quality of a data set.
+
+    Attributes:
+        reports: one for each log.
+        repeats: pairs of recordings that hold the same session.
+        findings: what else stands out between recordings.
+    """
+
+    reports: tuple[QualityReport, ...]
+    repeats: tuple[Repeat, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def errors(self) -> int:
+        """Findings that keep a log from being used as it is."""
+        return sum(len(report.errors) for report in self.reports)
+
+    @property
+    def verdict(self) -> str:
+        """Of the worst finding: ``unusable`` as it is, ``check`` before use, or ``good``."""
+        every = [finding for report in self.reports for finding in report.findings]
+        return verdict_of([*every, *self.findings])
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "verdict": self.verdict,
+            "errors": self.errors,
+            "recordings": [report.to_json() for report in self.reports],
+            "repeats": [repeat.to_json() for repeat in self.repeats],
+            "between": [plain(vars(finding)) for finding in self.findings],
+        }
+
+
+def compare(reports: Sequence[QualityReport], sketches: Sequence[Sketch]) -> DataQuality:
+    """Compare the recordings of a data set.
+
+    Args:
+        reports: of the recordings, each alone.
+        sketches: of those that could be read.
+    """
+    repeats = find_repeats(sketches)
+    advice = (
+        "keep one of them, or put both on one side of the split: a test that repeats training says nothing of new data"
+    )
+    found = [Finding("warning", None, repeat.what, 1, "", advice) for repeat in repeats]
+    return DataQuality(tuple(reports), repeats, (*found, *_two_units(reports)))
+
+
+def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
+    """Channels whose size and noise in one recording both lie a unit's ratio off those of the others.
+
+    A machine at rest makes a channel small, but not its noise; a weaker sensor makes noise large, but not the size.
+    """
+    sizes: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
+    for report in reports:
+        for channel in report.channels:
+            largest = max(abs(channel.min), abs(channel.max))
+            if channel.noise > 0 and math.isfinite(largest) and largest > 0:
+                sizes.setdefault((channel.name, channel.kind), []).append((report.name, largest, channel.noise))
+    found = []
+    for (name, kind), entries in sizes.items():
+        if len(entries) < 2:
+            continue
+        usual = [float(np.median([entry[i] for entry in entries])) for i in (1, 2)]
+        for recording, largest, noise in entries:
+            ratios = largest / usual[0], noise / usual[1]
+            unit = _unit_ratio(Kind(kind), ratios)
+            if unit:
+                what = f"in '{recording}' {ratios[0]:.2g} times its usual size, its noise {ratios[1]:.2g} times: {unit}"
+                advice = "give that log a map of its own with the right unit"
+                found.append(Finding("warning", name, what, 1, recording, advice))
+    return found
+
+
+def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
+    """Which two units explain both ratios, empty where none do."""
+    known = [(name, unit.factor) for name, unit in UNITS.items() if kind in unit.kinds and not unit.offset]
+    for name, factor in known:
+        for other, base in known:
+            ratio = base / factor
+            if max(ratio, 1 / ratio) < _LEAST_RATIO:
+                continue
+            if all(abs(math.log10(found / ratio)) < _NEAR_DECADES for found in ratios):
+                return f"{name} read as {other}?"
+    return ""

@@ -1,0 +1,173 @@
+"""Looking at a log file without refusing it: every defect becomes a finding."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from edp.errors import DataError, closest
+from edp.logs.assemble import assemble
+from edp.logs.detect import open_log
+from edp.logs.formats.base import RawLog
+from edp.logs.formats.names import name_of_file
+from edp.logs.quality.checks import Finding
+from edp.logs.quality.quality import ClockFacts, QualityReport, inspect
+from edp.logs.quality.repeats import Sketch, sketch
+from edp.logs.repair import Repair
+from edp.logs.resolve import ChannelSource, resolve
+from edp.logs.timebase import Clock, judge
+from edp.recording import Recording
+from edp.signals import VOCABULARY, SignalMap
+
+_LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
+_MOST_NAMES = 2000
+"""Columns that are compared with the vocabulary: each costs half a millisecond."""
+_LONGEST_MISS = 64
+
+
+def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> QualityReport:
+    """Find what is wrong with a log: its columns, units, time stamps and values.
+
+    Args:
+        path: a log of any known format.
+        signal_map: as in `read_recording`.
+
+    Raises:
+        DataError: only where the file itself cannot be read (missing, damaged, of another format).
+    """
+    return look_into(path, signal_map)[0]
+
+
+def look_into(
+    path: str | Path,
+    signal_map: SignalMap | None = None,
+    name: str | None = None,
+    rows: tuple[int, int | None] | None = None,
+) -> tuple[QualityReport, Sketch | None]:
+    """As `inspect_log`, with a sketch to compare recordings by; None where no sample could be read.
+
+    Args:
+        path: a log file of a known format.
+        signal_map: as in `read_recording`.
+        name: as in `read_recording`.
+        rows: as in `read_recording`.
+
+    Raises:
+        DataError: as `inspect_log`.
+    """
+    signal_map = signal_map or SignalMap()
+    raw = open_log(path, signal_map)
+    wanted, problems = resolve(raw, signal_map)
+    findings = [Finding("error", None, str(problem)) for problem in problems]
+    if not signal_map.channels and not signal_map.others:
+        findings += _near_misses(raw)
+    findings += _unit_clashes(raw, signal_map)
+    usable, more = _readable(wanted)
+    findings += more
+    try:
+        clocks = _clocks(raw, usable, signal_map)
+        recording, _ = assemble(raw, usable, signal_map, _LENIENT, (name, rows))
+    except DataError as error:
+        findings.append(Finding("error", None, str(error)))
+        empty = Recording(name or name_of_file(raw.path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))
+        return inspect(empty, tuple(findings)), None
+    findings += _changed(raw, recording, signal_map, rows)
+    for signal, clock in clocks:
+        findings += _time_findings(signal, clock)
+    facts = tuple(_clock_facts(signal, clock) for signal, clock in clocks)
+    return inspect(recording, tuple(findings), facts), sketch(recording)
+
+
+def _changed(
+    raw: RawLog, recording: Recording, signal_map: SignalMap, rows: tuple[int, int | None] | None
+) -> list[Finding]:
+    """Whether reading would refuse the values, as not those that EDP wrote."""
+    mapped = signal_map.channels or signal_map.rate_hz is not None or signal_map.sample_time_s is not None
+    if raw.digest is None or mapped or rows is not None or recording.digest == raw.digest:
+        return []
+    what = "the values are not the ones that EDP wrote"
+    advice = "copy the file again, or where the change is wanted, remove EDP's facts from it (edp_info)"
+    return [Finding("error", None, what, 1, "", advice)]
+
+
+def _clocks(raw: RawLog, wanted: list[ChannelSource], signal_map: SignalMap) -> list[tuple[str, Clock]]:
+    """Each distinct time column judged as it is in the file, under the name of its first channel."""
+    if signal_map.sample_time_s is not None or raw.rate_hz is not None:
+        return []
+    seen: dict[int, tuple[str, Clock]] = {}
+    for entry in wanted:
+        signal = entry.signal
+        if signal is not None and signal.time_s is not None and id(signal.time_s) not in seen:
+            seen[id(signal.time_s)] = (signal.name, judge(signal.time_s, f"'{raw.path}', time of '{signal.name}'"))
+    return list(seen.values())
+
+
+def _clock_facts(name: str, clock: Clock) -> ClockFacts:
+    at = clock.stamps
+    longest = float((at[clock.gaps + 1] - at[clock.gaps]).max()) if len(clock.gaps) else 0.0
+    counts = len(clock.duplicates), len(clock.falling)
+    return ClockFacts(name, clock.rate_hz, clock.jitter, len(clock.gaps), longest, *counts)
+
+
+def _readable(wanted: list[ChannelSource]) -> tuple[list[ChannelSource], list[Finding]]:
+    """The channels whose columns can be read as numbers; a finding for each that cannot."""
+    usable, findings = [], []
+    for entry in wanted:
+        try:
+            if entry.signal is not None:
+                entry.signal.load()
+            usable.append(entry)
+        except DataError as error:
+            findings.append(Finding("error", entry.channel.name, str(error)))
+    return usable, findings
+
+
+def _near_misses(raw: RawLog) -> list[Finding]:
+    """Columns that are not taken although their names nearly are in the vocabulary."""
+    found = []
+    for name in islice(raw.signals, _MOST_NAMES):
+        if len(name) <= _LONGEST_MISS and name not in VOCABULARY and raw.signals[name].kind is None:
+            hint = closest(name, VOCABULARY)
+            if hint.startswith("; did you mean"):
+                what = f"column '{name}' is not taken{hint}"
+                found.append(Finding("warning", None, what, 1, "", "map it or rename it"))
+    return found
+
+
+def _unit_clashes(raw: RawLog, signal_map: SignalMap) -> list[Finding]:
+    """Units of the map that differ from the file's."""
+    found = []
+    for entry in signal_map.channels:
+        stated = raw.signal(entry.column).unit if entry.column in raw else None
+        if stated and entry.unit and stated != entry.unit:
+            what = f"the map says {entry.unit}, the file says {stated}; the map's unit is used"
+            found.append(Finding("warning", entry.name, what, 1, "", "check which is right"))
+    return found
+
+
+def _time_findings(name: str, clock: Clock) -> list[Finding]:
+    at = clock.stamps
+    found = []
+    if len(clock.falling):
+        row = int(clock.falling[0])
+        what = f"time goes back ('{name}')"
+        where = f"row {row} (t = {at[row]:g} s)"
+        found.append(Finding("error", None, what, len(clock.falling), where, 'repair falling = "sort"'))
+    if len(clock.duplicates):
+        row = int(clock.duplicates[0])
+        what = f"duplicate time stamps ('{name}')"
+        where = f"row {row} (t = {at[row]:g} s)"
+        found.append(Finding("error", None, what, len(clock.duplicates), where, 'repair duplicates = "last"'))
+    if len(clock.gaps):
+        row = int(clock.gaps[0])
+        longest = float((at[clock.gaps + 1] - at[clock.gaps]).max())
+        what = f"gaps in time ('{name}'), longest {longest:g} s"
+        where = f"after row {row} (t = {at[row]:g} s)"
+        found.append(Finding("error", None, what, len(clock.gaps), where, 'repair gaps = "hold" or "cut"'))
+    if not clock.uniform:
+        what = f"time steps are not uniform ('{name}'): rms {clock.jitter:.3g} of a step, median {clock.step_s:g} s"
+        advice = f"rows are resampled causally to {clock.rate_hz:g} Hz; set rate_hz for another rate"
+        found.append(Finding("note", None, what, len(at), "", advice))
+    return found

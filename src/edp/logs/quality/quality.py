@@ -1,0 +1,191 @@
+"""What is odd in a recording: found and reported, never mended here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from edp.logs.quality.checks import (
+    CHECKS,
+    SEVERITIES,
+    Finding,
+    Looked,
+    copies,
+    in_report_unit,
+    look_at,
+    size_in_report_unit,
+)
+from edp.recording import Recording
+from edp.signals import KINDS
+
+VERDICTS = {"error": "unusable", "warning": "check", "note": "good"}
+"""What the worst finding makes of a channel or a recording; without any it is good."""
+
+
+@dataclass(frozen=True)
+class ChannelFacts:
+    """Facts of one channel in its report unit (``mm/s``, ``bar`` and so on); missing samples are left out.
+
+    Attributes:
+        name: of the channel.
+        kind: what it measures.
+        unit: the report unit.
+        min: smallest value.
+        max: largest value.
+        mean: mean value.
+        std: standard deviation.
+        missing: samples that are NaN or infinite.
+        constant: one value throughout.
+        step: distance between neighbouring values of a quantised channel, None where there is none.
+        levels: distinct values, of at most 500,000 samples.
+        noise: deviation of its white noise at rest.
+        snr_db: deviation over noise in decibels, None without noise.
+        new_hz: how often a new value comes.
+        stuck_s: longest time at exactly one value between the ends of the range.
+        at_ends: share of the samples at the minimum or maximum.
+        verdict: ``good``, ``check`` or ``unusable``.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    min: float
+    max: float
+    mean: float
+    std: float
+    missing: int
+    constant: bool
+    step: float | None
+    levels: int
+    noise: float
+    snr_db: float | None
+    new_hz: float
+    stuck_s: float
+    at_ends: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class ClockFacts:
+    """Facts of one time column: rate, jitter (rms distance from a straight line, in steps), gaps and bad stamps."""
+
+    name: str
+    rate_hz: float
+    jitter: float
+    gaps: int
+    longest_gap_s: float
+    duplicates: int
+    falling: int
+
+
+@dataclass(frozen=True)
+class QualityReport:
+    """All findings of one log, worst first, with the facts of its time and channels."""
+
+    name: str
+    source: str
+    samples: int
+    rate_hz: float
+    duration_s: float
+    jitter: float
+    clocks: tuple[ClockFacts, ...]
+    channels: tuple[ChannelFacts, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """Findings that keep the log from being used as it is."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    @property
+    def verdict(self) -> str:
+        """``unusable`` as it is, ``check`` before use, or ``good``."""
+        return verdict_of(self.findings)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON values; a number that is not finite becomes None."""
+        return plain({**asdict(self), "verdict": self.verdict})
+
+
+def verdict_of(findings: Sequence[Finding]) -> str:
+    """What the worst of some findings makes of their subject."""
+    worst = min((SEVERITIES.index(finding.severity) for finding in findings), default=len(SEVERITIES) - 1)
+    return VERDICTS[SEVERITIES[worst]]
+
+
+def inspect(
+    recording: Recording, extra: tuple[Finding, ...] = (), clocks: tuple[ClockFacts, ...] = ()
+) -> QualityReport:
+    """Check every channel of a recording.
+
+    Args:
+        recording: values float32, shape ``(time, channel)``, SI units; NaN marks missing values.
+        extra: findings about the file made before (time stamps, columns).
+        clocks: facts of the file's time columns.
+    """
+    findings = list(extra)
+    facts = []
+    for place, channel in enumerate(recording.channels):
+        looked = look_at(channel, recording.values[:, place], recording.rate_hz)
+        found = [finding for check in CHECKS for finding in check(looked)]
+        own = [finding for finding in extra if finding.channel == channel.name]
+        facts.append(_facts(looked, verdict_of([*found, *own])))
+        findings += found
+    findings += copies(recording)
+    return QualityReport(
+        recording.name,
+        recording.source,
+        recording.samples,
+        recording.rate_hz,
+        recording.duration_s,
+        max((clock.jitter for clock in clocks), default=0.0),
+        clocks,
+        tuple(facts),
+        tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))),
+    )
+
+
+def plain(value: Any) -> Any:
+    """Nested JSON values; a number that is not finite becomes None."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _facts(looked: Looked, verdict: str) -> ChannelFacts:
+    channel, good, found = looked.channel, looked.good, looked.measures
+    unit = KINDS[channel.kind].report_unit
+    nan = float("nan")
+    low, high, mean, std = nan, nan, nan, nan
+    if len(good):
+        sums = good.astype(np.float64)
+        low, high, mean = (in_report_unit(channel, float(x)) for x in (good.min(), good.max(), sums.mean()))
+        std = 0.0 if looked.constant else size_in_report_unit(channel, float(sums.std()))
+    noise = size_in_report_unit(channel, found.noise)
+    return ChannelFacts(
+        channel.name,
+        str(channel.kind),
+        unit,
+        low,
+        high,
+        mean,
+        std,
+        looked.samples - len(good),
+        looked.constant,
+        None if found.quantum is None else size_in_report_unit(channel, found.quantum),
+        found.levels,
+        noise,
+        20.0 * math.log10(std / noise) if noise > 0 and std > 0 else None,
+        looked.rate_hz / found.every,
+        looked.stuck_samples / looked.rate_hz,
+        found.at_low + found.at_high,
+        verdict,
+    )

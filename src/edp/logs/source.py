@@ -1,0 +1,220 @@
+"""Where recordings come from: a log, a folder of logs, or a data-set file that lists them; maps of their columns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from edp.errors import ConfigError, DataError
+from edp.logs.quality.cross_recording import DataQuality, compare
+from edp.logs.quality.inspection import look_into
+from edp.logs.read import find_recordings, read_data_set, read_recording, unique_names
+from edp.logs.repair import Repair
+from edp.recording import MACHINE, Recording
+from edp.settings.tree import Table, build, plain_tree, read_toml
+from edp.signals import SignalMap
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingEntry:
+    """One recording of a data-set file.
+
+    Attributes:
+        path: the log, relative to the data-set file; ``${NAME}`` is replaced by that environment variable.
+        name: unique name; the file's stem by default.
+        rows: ``[start, stop]`` to use a part of the log.
+        map: signal map for this log: a table, or the path of a map file; the data set's map by default.
+        machine: which machine was recorded, where parts are divided by machine.
+    """
+
+    path: str
+    name: str | None = None
+    rows: tuple[int, int] | None = None
+    map: str | SignalMap | None = None
+    machine: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSetSettings:
+    """A data-set file: its recordings, the map that they share, and allowed repairs."""
+
+    recordings: tuple[RecordingEntry, ...] = ()
+    map: str | SignalMap | None = None
+    repair: Repair = field(default_factory=Repair)
+
+
+@dataclass(frozen=True)
+class DataSource:
+    """Where recordings come from.
+
+    Attributes:
+        path: a log, a folder of logs, or a data-set file (``.toml``).
+        signal_map: columns to channels; None takes the vocabulary's names.
+        repair: what may be mended.
+    """
+
+    path: Path
+    signal_map: SignalMap | None = None
+    repair: Repair | None = None
+
+    @staticmethod
+    def of(path: str | Path, map_file: str | Path | None = None, repair: Repair | None = None) -> DataSource:
+        """A source from paths."""
+        return DataSource(Path(path), None if map_file is None else load_signal_map(map_file), repair)
+
+    def to_plain(self) -> dict[str, Any]:
+        """What provenance keeps, to read the same data again."""
+        kept: dict[str, Any] = {"path": str(self.path.resolve())}
+        if self.signal_map is not None:
+            kept["map"] = plain_tree(self.signal_map)
+        if self.repair is not None:
+            kept["repair"] = plain_tree(self.repair)
+        return kept
+
+    @staticmethod
+    def from_plain(plain: dict[str, Any]) -> DataSource:
+        """The source that `to_plain` described."""
+        signal_map = build(SignalMap, plain["map"], "provenance map") if "map" in plain else None
+        repair = build(Repair, plain["repair"], "provenance repair") if "repair" in plain else None
+        return DataSource(Path(plain["path"]), signal_map, repair)
+
+    def logs(self) -> list[Log]:
+        """The logs of the source, unread, each with the map that belongs to it."""
+        if self.path.suffix == ".toml":
+            return _listed(self.path, self.signal_map, self.repair)
+        return [Log(path, self.signal_map, self.repair) for path in find_recordings(self.path)]
+
+    def read(self) -> list[Recording]:
+        """All recordings, at one rate.
+
+        Raises:
+            DataError: nothing to read, or a log that cannot be used as it is.
+        """
+        if self.path.suffix != ".toml":
+            return read_data_set(find_recordings(self.path), self.signal_map, repair=self.repair)
+        recordings = [log.read() for log in self.logs()]
+        _check_listed(recordings, self.path)
+        return recordings
+
+    def inspect(self, on_log: Callable[[Path, int, int], None] | None = None) -> DataQuality:
+        """What is in each log, what is wrong with it, and which repeat each other; nothing is mended or refused.
+
+        Args:
+            on_log: called with the path of each log before it is read, its number from 1, and how many there are.
+
+        Raises:
+            DataError: a file that cannot be read at all.
+        """
+        logs = self.logs()
+        seen = []
+        for i, log in enumerate(logs):
+            if on_log is not None:
+                on_log(log.path, i + 1, len(logs))
+            seen.append(look_into(log.path, log.signal_map, log.name, log.rows))
+        names = unique_names([report.name for report, _ in seen], [log.path for log in logs])
+        reports = [replace(report, name=name) for (report, _), name in zip(seen, names)]
+        sketches = [replace(sketch, name=name) for (_, sketch), name in zip(seen, names) if sketch is not None]
+        return compare(reports, sketches)
+
+
+@dataclass(frozen=True)
+class Log:
+    """One log of a source, with what is needed to read it; see `RecordingEntry`."""
+
+    path: Path
+    signal_map: SignalMap | None = None
+    repair: Repair | None = None
+    name: str | None = None
+    rows: tuple[int, int] | None = None
+    machine: str = ""
+
+    def read(self) -> Recording:
+        """The recording."""
+        found = read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
+        return replace(found, meta={**found.meta, MACHINE: self.machine}) if self.machine else found
+
+
+def load_signal_map(path: str | Path) -> SignalMap:
+    """A signal map from a TOML file.
+
+    Raises:
+        ConfigError: unknown keys or wrong values, all at once.
+    """
+    return build(SignalMap, _map_table(read_toml(path)), f"'{path}'")
+
+
+def load_data_set(path: str | Path) -> DataSetSettings:
+    """A data-set file; `map` entries that name files are left as paths relative to it."""
+    table = read_toml(path)
+    listed = table.get("recordings", [])
+    if not isinstance(listed, list):
+        raise ConfigError(
+            f"'{path}': recordings = {listed!r} is no list of [[recordings]]; a scenario file is simulated first, "
+            "with `edp simulate FOLDER --scenario`, and then the folder is read"
+        )
+    for entry in [table, *listed]:
+        if isinstance(entry, dict) and isinstance(entry.get("map"), dict):
+            entry["map"] = _map_table(entry["map"])
+    settings = build(DataSetSettings, table, f"'{path}'")
+    if not settings.recordings:
+        raise ConfigError(f"'{path}' lists no [[recordings]]; give at least one with its path")
+    return settings
+
+
+def _listed(path: Path, signal_map: SignalMap | None, repair: Repair | None) -> list[Log]:
+    """The logs of a data-set file; paths in it are relative to it; a map given here replaces the shared one."""
+    settings = load_data_set(path)
+
+    def resolved(entry: str | SignalMap | None) -> SignalMap | None:
+        return load_signal_map(path.parent / entry) if isinstance(entry, str) else entry
+
+    shared, allowed = signal_map or resolved(settings.map), repair or settings.repair
+    return [
+        # An absolute path stands for itself.
+        Log(
+            path.parent / _expanded(entry.path, path),
+            resolved(entry.map) or shared,
+            allowed,
+            entry.name,
+            entry.rows,
+            entry.machine,
+        )
+        for entry in settings.recordings
+    ]
+
+
+def _check_listed(recordings: list[Recording], path: Path) -> None:
+    names = [recording.name for recording in recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DataError(f"'{path}': recording name(s) {', '.join(twice)} occur twice; set name = \"...\" for each")
+    rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
+    if max(rates) > 1.001 * min(rates):
+        shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
+        raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")
+
+
+def _expanded(entry: str, path: Path) -> str:
+    """`entry` with environment variables put in, so that a data-set file can name logs on another disk."""
+    full = os.path.expandvars(entry)
+    if "$" in full:
+        raise ConfigError(
+            f"'{path}': path = '{entry}' names an environment variable that is not set; set it to the folder of the "
+            "logs, or write the path out"
+        )
+    return full
+
+
+def _map_table(table: Table) -> Table:
+    """The user's form ``[channels.NAME] column = ...`` as a list of entries."""
+    channels = table.get("channels")
+    if not isinstance(channels, dict):
+        return table
+    entries = [
+        {"name": name, "column": name} | (dict(entry) if isinstance(entry, dict) else {"column": entry})
+        for name, entry in channels.items()
+    ]
+    return {**table, "channels": entries}

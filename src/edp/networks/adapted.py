@@ -1,0 +1,66 @@
+"""A predictor and its adaptation as one stream."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from edp.ir.rls import Adaptation, RlsCorrector, RlsStatus
+from edp.networks.predictor import Predictor
+from edp.networks.stream import Inputs, Stream, StreamStatus, StreamTick
+
+
+class AdaptedStream(Stream):
+    """A stream whose predictions are corrected by what was learned on the way; see `edp.ir.rls.RlsCorrector`.
+
+    Held and missed ticks teach nothing; their predictions are corrected all the same, as in the exported C. Bounds of
+    intervals move with the prediction.
+
+    Args:
+        predictor: the network; it is put in evaluation mode.
+        adaptation: how it is corrected.
+        threads: as of `Stream`.
+
+    Attributes:
+        adapter: what was learned; `adapter.learned` outlives a restart, `adapter.restore` brings it back.
+        learn: False freezes what was learned.
+        status: what the adaptation has done in the last step.
+        correction: what it added ``(horizon, target)``, SI units.
+    """
+
+    def __init__(self, predictor: Predictor, adaptation: Adaptation, threads: int = 1) -> None:
+        self.adapter, self.learn = RlsCorrector(adaptation), True
+        super().__init__(predictor, threads)
+
+    def reset(self) -> None:
+        """Forget all ticks; what was learned stays. ``adapter.reset()`` forgets that."""
+        super().reset()
+        self.adapter.interrupt()
+        self.status = RlsStatus.NONE
+        self.correction = np.zeros_like(self.adapter.adaptation.unit)
+        self._corrected: StreamTick | None = None
+
+    def step(self, inputs: Inputs) -> StreamTick:
+        """Feed one tick ``(input,)`` in SI units; the prediction is the corrected one."""
+        return self._adapted(super().step(inputs))
+
+    def missed(self, ticks: int = 1) -> StreamTick:
+        """Tell that ticks went by without a step; the prediction is the corrected one."""
+        result = super().missed(ticks)
+        self.adapter.interrupt()
+        return self._adapted(result)
+
+    def _adapted(self, base: StreamTick) -> StreamTick:
+        if not base.valid:
+            # No prediction to correct: the last corrected one stays, as the output of the exported C does.
+            self.adapter.interrupt()
+            self.status = RlsStatus.NONE
+            kept = base if self._corrected is None else self._corrected
+            return replace(kept, status=base.status)
+        fresh = base.status is StreamStatus.OK
+        adapted, self.status = self.adapter.step(self._last, base.prediction, fresh=fresh, learn=self.learn)
+        self.correction = adapted - base.prediction
+        lower, upper = base.lower + self.correction, base.upper + self.correction
+        self._corrected = replace(base, prediction=adapted, lower=lower, upper=upper)
+        return self._corrected

@@ -1,0 +1,287 @@
+"""Backbones on the streaming contract: recurrent, convolutional, and the hybrid of both (thesis 3.2.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from edp.errors import ConfigError
+from edp.ir import Builder
+from edp.networks.blocks.base import BlockSlot, BranchMaker
+from edp.networks.cells import CellSpec, GruCell, LstmCell, Stack
+from edp.networks.cells.base import check_cell
+from edp.networks.convolution import ConvolutionStack, receptive_field
+from edp.networks.initial import InitialSpec, ZeroState
+from edp.networks.pooling import AttentionPooling
+from edp.networks.streaming import Chain, Cost, State, Streaming
+from edp.registry import Registry
+from edp.settings.bounds import (
+    MOST_CHANNELS,
+    MOST_KERNEL,
+    MOST_LAYERS,
+    MOST_LEVELS,
+    MOST_UNITS,
+    below,
+    check_bounds,
+    check_count,
+    whole,
+)
+
+Blocks = Sequence[object]
+
+
+class BackboneSpec(Protocol):
+    """Options of a backbone."""
+
+    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+        """The backbone and the width of its representation; `blocks` are the specs for its slots."""
+        ...
+
+    def slots(self) -> tuple[BlockSlot, ...]:
+        """The slots that it offers."""
+        ...
+
+    def parts(self) -> tuple[str, ...]:
+        """Sub-modules of what it builds, from the input on, for learning rates that differ; none: it is one piece."""
+        ...
+
+
+BACKBONES: Registry[type] = Registry("backbone")
+UNITS, LAYERS = whole(1, MOST_UNITS), whole(1, MOST_LAYERS)
+CHANNELS, KERNEL = whole(1, MOST_CHANNELS), whole(1, MOST_KERNEL)
+DROPOUT = below(0.0, 1.0)
+
+
+@BACKBONES.register("lstm")
+@dataclass(frozen=True, kw_only=True)
+class LstmSpec:
+    """LSTM with attention pooling over the trailing window (eq. 3.32 to 3.35).
+
+    Attributes:
+        units: hidden units D.
+        layers: stacked recurrent layers.
+        dropout: rate on the hidden states, in training.
+        zoneout: probability that a unit keeps its state over a tick, in training; in evaluation states are blended.
+        cell: options of a registered recurrent layer, of the family of the LSTM.
+        initial: options of a registered initial state: what the state is after a reset.
+    """
+
+    units: int = 64
+    layers: int = 1
+    dropout: float = 0.0
+    zoneout: float = 0.0
+    cell: CellSpec = field(default_factory=LstmCell)
+    initial: InitialSpec = field(default_factory=ZeroState)
+
+    def __post_init__(self) -> None:
+        check_bounds("backbone", self, units=UNITS, layers=LAYERS, dropout=DROPOUT, zoneout=DROPOUT)
+        check_cell("lstm", self.cell, self.zoneout, families=("lstm",))
+
+    def slots(self) -> tuple[BlockSlot, ...]:
+        """Features derived from the recurrent states."""
+        return (BlockSlot.FEATURES,)
+
+    def parts(self) -> tuple[str, ...]:
+        """The recurrent layers, then what reads their states."""
+        return ("recurrent", "pooling", "extras")
+
+    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+        """The recurrent backbone on the scaled features."""
+        stack = Stack(self.cell, features, self.units, self.layers, self.dropout, self.zoneout)
+        net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
+        return net, net.width
+
+
+@BACKBONES.register("gru")
+@dataclass(frozen=True, kw_only=True)
+class GruSpec:
+    """GRU with attention pooling over the trailing window (eq. 3.12 to 3.15, 3.33 to 3.35).
+
+    Attributes:
+        units: hidden units D.
+        layers: stacked recurrent layers.
+        dropout: rate on the hidden states, in training.
+        cell: options of a registered recurrent layer, of the family of the GRU.
+        initial: options of a registered initial state: what the state is after a reset.
+    """
+
+    units: int = 64
+    layers: int = 1
+    dropout: float = 0.0
+    cell: CellSpec = field(default_factory=GruCell)
+    initial: InitialSpec = field(default_factory=ZeroState)
+
+    def __post_init__(self) -> None:
+        check_bounds("backbone", self, units=UNITS, layers=LAYERS, dropout=DROPOUT)
+        check_cell("gru", self.cell, 0.0, families=("gru",))
+
+    def slots(self) -> tuple[BlockSlot, ...]:
+        """Features derived from the recurrent states."""
+        return (BlockSlot.FEATURES,)
+
+    def parts(self) -> tuple[str, ...]:
+        """The recurrent layers, then what reads their states."""
+        return ("recurrent", "pooling", "extras")
+
+    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+        """The recurrent backbone on the scaled features."""
+        stack = Stack(self.cell, features, self.units, self.layers, self.dropout)
+        net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
+        return net, net.width
+
+
+@BACKBONES.register("tcn")
+@dataclass(frozen=True, kw_only=True)
+class TcnSpec:
+    """Temporal convolutional network whose last column is the representation (eq. 3.36 to 3.38).
+
+    Attributes:
+        channels: width of each level; the dilation doubles from level to level.
+        kernel: kernel size; the receptive field must span the window (R >= W).
+        dropout: rate after each convolution, in training.
+    """
+
+    channels: tuple[int, ...] = (64, 64, 64, 64)
+    kernel: int = 3
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_count("backbone", "channels", self.channels, MOST_LEVELS, least=1)
+        check_bounds("backbone", self, channels=CHANNELS, kernel=KERNEL, dropout=DROPOUT)
+
+    def slots(self) -> tuple[BlockSlot, ...]:
+        """Parallel stacks, and what works on their channels."""
+        return (BlockSlot.BRANCHES, BlockSlot.CHANNELS)
+
+    def parts(self) -> tuple[str, ...]:
+        """One piece."""
+        return ()
+
+    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+        """The convolution stack(s); refused where the receptive field is shorter than the window."""
+        reach = receptive_field(len(self.channels), self.kernel)
+        if reach < window:
+            levels = next((n for n in range(1, 64) if receptive_field(n, self.kernel) >= window), 0)
+            change = f"give {levels} channels entries" if levels else "use a kernel of at least 2"
+            raise ConfigError(
+                f"tcn: {len(self.channels)} level(s) of kernel {self.kernel} see {reach} samples, the window is "
+                f"{window}; R >= W must hold (thesis 3.2.3.2): {change}, a larger kernel or a smaller window"
+            )
+        return _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
+
+
+@BACKBONES.register("hybrid")
+@dataclass(frozen=True, kw_only=True)
+class HybridSpec:
+    """Convolutions, then a recurrent layer, the LSTM of the thesis or another, with attention pooling (eq. 3.39, 3.40).
+
+    Attributes:
+        channels: width of each convolution level.
+        kernel: kernel size.
+        units: hidden units of the recurrent layer.
+        layers: stacked recurrent layers; the thesis has one.
+        dropout: rate after each convolution and on the hidden states, in training.
+        zoneout: probability that a unit keeps its state over a tick, in training; in evaluation states are blended.
+        cell: options of a registered recurrent layer.
+        initial: options of a registered initial state: what the state is after a reset.
+    """
+
+    channels: tuple[int, ...] = (64,)
+    kernel: int = 5
+    units: int = 64
+    layers: int = 1
+    dropout: float = 0.0
+    zoneout: float = 0.0
+    cell: CellSpec = field(default_factory=LstmCell)
+    initial: InitialSpec = field(default_factory=ZeroState)
+
+    def __post_init__(self) -> None:
+        check_count("backbone", "channels", self.channels, MOST_LEVELS, least=1)
+        check_bounds("backbone", self, channels=CHANNELS, kernel=KERNEL, units=UNITS, layers=LAYERS)
+        check_bounds("backbone", self, dropout=DROPOUT, zoneout=DROPOUT)
+        check_cell("hybrid", self.cell, self.zoneout)
+
+    def slots(self) -> tuple[BlockSlot, ...]:
+        """Parallel stacks, what works on their channels, and features derived from the recurrent states."""
+        return (BlockSlot.BRANCHES, BlockSlot.CHANNELS, BlockSlot.FEATURES)
+
+    def parts(self) -> tuple[str, ...]:
+        """The convolutions, the recurrent layers, then what reads their states."""
+        return ("encoder", "recurrent", "pooling", "extras")
+
+    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+        """Convolutions and the recurrent backbone on their channels."""
+        encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
+        stack = Stack(self.cell, width, self.units, self.layers, self.dropout, self.zoneout)
+        net = RecurrentBackbone(encoder, self.initial.build(stack, width), self.units, self.dropout, window, blocks)
+        return net, net.width
+
+
+class RecurrentBackbone(Streaming):
+    """``[attention pooling ; h_t ; further features]`` of recurrent layers on the input or on an encoder's channels."""
+
+    def __init__(
+        self, encoder: Streaming | None, recurrent: Streaming, units: int, dropout: float, window: int, blocks: Blocks
+    ) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.recurrent = recurrent
+        self.dropout = nn.Dropout(dropout)
+        self.pooling = AttentionPooling(units, window)
+        extras = in_slot(blocks, BlockSlot.FEATURES)
+        self.extras = nn.ModuleList(spec.build(units, window) for spec in extras)  # type: ignore[attr-defined]
+        self.width = 2 * units + sum(spec.extra(units) for spec in extras)  # type: ignore[attr-defined]
+
+    def _tail(self) -> list[Streaming]:
+        return [self.pooling, *(extra for extra in self.extras if isinstance(extra, Streaming))]
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        first = () if self.encoder is None else self.encoder.initial_state(batch, like)
+        tail = tuple(part.initial_state(batch, like) for part in self._tail())
+        return first, self.recurrent.initial_state(batch, like), tail
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        first, recurrent, tail = state
+        if self.encoder is not None:
+            x, first = self.encoder(x, first)
+        h, recurrent = self.recurrent(x, recurrent)
+        h = self.dropout(h)
+        results = [part(h, old) for part, old in zip(self._tail(), tail, strict=True)]
+        return torch.cat([y for y, _ in results], dim=-1), (first, recurrent, tuple(new for _, new in results))
+
+    def lower(self, build: Builder, x: str) -> str:
+        if self.encoder is not None:
+            with build.inside("encoder"):
+                x = self.encoder.lower(build, x)
+        h = self.recurrent.lower(build, x)
+        parts = [part.lower(build, h) for part in self._tail()]
+        return build.join("representation", *parts)
+
+    def costs(self) -> list[Cost]:
+        encoder = [] if self.encoder is None else self.encoder.costs()
+        return encoder + self.recurrent.costs() + [cost for part in self._tail() for cost in part.costs()]
+
+
+def in_slot(blocks: Blocks, slot: BlockSlot) -> list[object]:
+    """The block specs that sit in `slot`, in order."""
+    return [block for block in blocks if getattr(block, "slot", None) is slot]
+
+
+def _convolutions(
+    features: int, channels: tuple[int, ...], kernel: int, dropout: float, window: int, blocks: Blocks
+) -> tuple[Streaming, int]:
+    def make_branch(first_dilation: int) -> Streaming:
+        return ConvolutionStack(features, channels, kernel, first_dilation, dropout)
+
+    net, width = make_branch(1), channels[-1]
+    branches = in_slot(blocks, BlockSlot.BRANCHES)
+    if branches:
+        build: BranchMaker = make_branch
+        net = branches[0].build(build)  # type: ignore[attr-defined]
+        width *= len(net.branches)
+    behind = [spec.build(width, window) for spec in in_slot(blocks, BlockSlot.CHANNELS)]  # type: ignore[attr-defined]
+    return (Chain([net, *behind]) if behind else net), width

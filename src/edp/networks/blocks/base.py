@@ -1,0 +1,153 @@
+"""Slots: where an optional structural module sits in the network, and the tensor contract it keeps there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from torch import Tensor
+
+from edp.networks.streaming import Streaming
+from edp.registry import Registry
+
+
+class BlockSlot(StrEnum):
+    """Tensor contract of a block, in the order of the computation.
+
+    BRANCHES: scaled features ``(batch, time, feature)`` to ``(batch, time, channel)`` by several convolution stacks.
+    CHANNELS: channels of the convolutions ``(batch, time, channel)`` to the same shape, before a recurrent layer.
+    FEATURES: recurrent states ``(batch, time, width)`` to further features ``(batch, time, extra)``, concatenated.
+    GATE: representation ``(batch, time, width)`` to one per output, ``(batch, time, output, width)``.
+    MIX: hidden features of the heads ``(batch, time, output, hidden)`` to the same shape, before their last layer.
+    BYPASS: scaled features to ``(batch, time, horizon, output)``, added to the network's standardised output.
+    """
+
+    BRANCHES = "branches"
+    CHANNELS = "channels"
+    FEATURES = "features"
+    GATE = "gate"
+    MIX = "mix"
+    BYPASS = "bypass"
+
+
+OUTPUT_SLOTS = (BlockSlot.GATE, BlockSlot.MIX, BlockSlot.BYPASS)
+"""Slots behind the backbone: every network has them."""
+SHARED_SLOTS = (BlockSlot.CHANNELS, BlockSlot.FEATURES)
+"""Slots that take several blocks, in the order given; the others take one."""
+
+BranchMaker = Callable[[int], Streaming]
+"""Builds one convolution stack whose first dilation is the argument."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutputSpace:
+    """What a block at the output knows of the network's two ends.
+
+    Attributes:
+        features: scaled features.
+        horizons: look-ahead times.
+        outputs: targets.
+        present: for each target the feature that holds its present value, None where it is not measured.
+        gain: ``(horizon, output)``; a present value in the standardised space of its target is its scaled feature
+            times `gain` plus `shift`.
+        shift: ``(horizon, output)``.
+    """
+
+    features: int
+    horizons: int
+    outputs: int
+    present: tuple[int | None, ...]
+    gain: Tensor
+    shift: Tensor
+
+
+@runtime_checkable
+class BlockSpec(Protocol):
+    """A frozen dataclass of a block's options; a subclass-free interface, one per slot adds `build`.
+
+    Attributes:
+        slot: where it sits.
+        space: values worth searching, by option.
+    """
+
+    slot: ClassVar[BlockSlot]
+    space: ClassVar[dict[str, Any]]
+
+
+class BranchesSpec(BlockSpec, Protocol):
+    """A block that replaces the single convolution stack."""
+
+    def build(self, make_branch: BranchMaker) -> Streaming: ...
+
+
+class ChannelsSpec(BlockSpec, Protocol):
+    """A block that works on the channels of the convolutions."""
+
+    def build(self, width: int, window: int) -> Streaming: ...
+
+
+class FeaturesSpec(BlockSpec, Protocol):
+    """A block that adds features derived from the recurrent states."""
+
+    def extra(self, width: int) -> int: ...
+
+    def build(self, width: int, window: int) -> Streaming: ...
+
+
+class GateSpec(BlockSpec, Protocol):
+    """A block that gives each output its own view of the representation."""
+
+    def build(self, width: int, outputs: int) -> Streaming: ...
+
+
+class MixSpec(BlockSpec, Protocol):
+    """A block that lets the heads of the outputs see one another."""
+
+    def build(self, hidden: int, outputs: int) -> Streaming: ...
+
+
+class BypassSpec(BlockSpec, Protocol):
+    """A block that adds a direct path from the scaled features to the output."""
+
+    def build(self, space: OutputSpace) -> Streaming: ...
+
+
+class TaskView(Protocol):
+    """What a part may ask of the task before it agrees to be built."""
+
+    @property
+    def mode(self) -> str: ...
+    @property
+    def targets(self) -> tuple[str, ...]: ...
+    @property
+    def present(self) -> tuple[int | None, ...]: ...
+    @property
+    def inputs(self) -> tuple[str, ...]: ...
+
+
+class ModelView(Protocol):
+    """What a part may ask of its neighbours before it agrees to be built."""
+
+    @property
+    def backbone(self) -> object: ...
+    @property
+    def head(self) -> object: ...
+    @property
+    def activation(self) -> object: ...
+    @property
+    def blocks(self) -> tuple[object, ...]: ...
+    @property
+    def physics(self) -> object | None: ...
+
+
+@runtime_checkable
+class HasConflicts(Protocol):
+    """A part (block, backbone, head, activation) that does not go with everything."""
+
+    def conflicts(self, model: ModelView, task: TaskView) -> str | None:
+        """Why this part contradicts the model or the task and what to change, None where it does not."""
+
+
+BLOCKS: Registry[type] = Registry("block")

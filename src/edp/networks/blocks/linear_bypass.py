@@ -1,0 +1,90 @@
+"""Linear by-pass: a finite impulse response from the scaled features straight to the output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor, nn
+
+from edp.errors import ConfigError, closest
+from edp.ir import Builder
+from edp.ir.memory import Convolution
+from edp.networks.blocks.base import BLOCKS, BlockSlot, OutputSpace
+from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
+from edp.settings.bounds import MOST_KERNEL, check_bounds, whole
+
+STARTS = ("ridge", "crossed", "zero")
+
+
+@BLOCKS.register("linear_bypass")
+@dataclass(frozen=True, kw_only=True)
+class LinearBypass:
+    """Add ``sum_i A_i x[t - i] + b`` to the standardised output, outside the output activation.
+
+    Attributes:
+        taps: samples of history, the present one included.
+        start: ``ridge`` starts from the ridge regression on the training data, with penalty and history chosen on
+            the validation data; ``crossed`` from the one on both, chosen by cross-validation (for little data);
+            ``zero`` from nothing.
+        trained: False keeps the start values, so that the network learns what the linear map leaves.
+
+    Raises:
+        ConfigError: taps below 1, unknown start, or a by-pass that is zero and not trained.
+    """
+
+    slot: ClassVar[BlockSlot] = BlockSlot.BYPASS
+    space: ClassVar[dict[str, Any]] = {"taps": (5, 50), "start": STARTS}
+    taps: int = 25
+    start: str = "ridge"
+    trained: bool = True
+
+    def __post_init__(self) -> None:
+        check_bounds("linear_bypass", self, taps=whole(1, MOST_KERNEL))
+        if self.start not in STARTS:
+            raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, STARTS)}")
+        if self.start == "zero" and not self.trained:
+            raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
+
+    def build(self, space: OutputSpace) -> Streaming:
+        """The by-pass, at zero; training puts the ridge solution in."""
+        return Bypass(space.features, space.horizons, space.outputs, self)
+
+
+class Bypass(Streaming):
+    """Causal linear filter; ``weight`` has shape ``(horizon * output, feature, tap)``, the last tap is the present."""
+
+    operations = frozenset({Operation.CONV1D})
+    matrices = (("weight", (0,)),)
+
+    def __init__(self, features: int, horizons: int, outputs: int, spec: LinearBypass) -> None:
+        super().__init__()
+        self.spec, self.features, self.horizons, self.outputs = spec, features, horizons, outputs
+        self.weight = nn.Parameter(torch.zeros(horizons * outputs, features, spec.taps), requires_grad=spec.trained)
+        self.bias = nn.Parameter(torch.zeros(horizons * outputs), requires_grad=spec.trained)
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        return like.new_zeros(batch, self.spec.taps - 1, self.features)
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        history = torch.cat([state, x], dim=1)
+        y = functional.conv1d(history.transpose(1, 2), self.weight, self.bias).transpose(1, 2)
+        return y.unflatten(-1, (self.horizons, self.outputs)), history[:, x.shape[1] :]
+
+    def lower(self, build: Builder, x: str) -> str:
+        return build.add(Convolution, "bypass", x, weight=self.weight.transpose(1, 2), bias=self.bias)
+
+    def costs(self) -> list[Cost]:
+        wide = self.horizons * self.outputs
+        return [
+            Cost(
+                "linear by-pass",
+                parameters_of(self),
+                per_prediction=self.weight.numel(),
+                width_in=self.features,
+                width_out=wide,
+                per_time_step=False,
+            )
+        ]

@@ -1,0 +1,44 @@
+"""Backbone and head of a network, by the names of its parameters (thesis 3.4.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.networks.predictor import Predictor
+
+BACKBONE = "backbone"
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Which parameters belong to what.
+
+    Attributes:
+        backbone: names of parameters by part of the backbone, from the input on; parts are the beginnings of names.
+        head: names of all others: gate, heads, output, activation, by-pass and what a physics base learns.
+        last: those of `head` that are the last linear layer of the heads.
+    """
+
+    backbone: dict[str, tuple[str, ...]]
+    head: tuple[str, ...]
+    last: tuple[str, ...]
+
+    @property
+    def encoding(self) -> tuple[str, ...]:
+        """Names of all parameters of the backbone."""
+        return tuple(name for names in self.backbone.values() for name in names)
+
+
+def decompose(predictor: Predictor) -> Decomposition:
+    """The decomposition that the backbone declares (`BackboneSpec.parts`); parts without parameters are left out."""
+    names = [name for name, _ in predictor.named_parameters()]
+    parts = [f"{BACKBONE}.{part}" for part in predictor.spec.backbone.parts()] or [BACKBONE]
+    held = {part: tuple(name for name in names if name.startswith(f"{part}.")) for part in parts}
+    inside = {name for some in held.values() for name in some}
+    depth = len(predictor.heads.weights) - 1
+    last = (f"heads.weights.{depth}", f"heads.biases.{depth}")
+    return Decomposition(
+        {part: some for part, some in held.items() if some},
+        tuple(name for name in names if name not in inside),
+        tuple(name for name in names if name in last),
+    )

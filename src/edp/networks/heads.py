@@ -1,0 +1,193 @@
+"""Per-output heads: one small network for each target on the shared representation (eq. 3.25 to 3.27)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor, nn
+
+from edp.ir import Builder
+from edp.ir.layers import Activate, Dense, Function, Glu, GroupedDense
+from edp.networks.streaming import Cost, Operation, State, Streaming
+from edp.registry import Registry
+from edp.settings.bounds import MOST_LAYERS, MOST_UNITS, check_bounds, whole
+
+
+class HeadSpec(Protocol):
+    """Options of the heads."""
+
+    @property
+    def hidden(self) -> int:
+        """Width of the features before the last layer."""
+        ...
+
+    def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
+        """Heads from a representation of `width` to `values` numbers for each output.
+
+        `mix` works on the hidden features of all outputs before the last layer.
+        """
+        ...
+
+
+HEADS: Registry[type] = Registry("head")
+
+
+@HEADS.register("mlp")
+@dataclass(frozen=True, kw_only=True)
+class MlpHead:
+    """``y_c = w_c ReLU(W_c h + b_c) + b'_c`` for each output c (eq. 3.26).
+
+    Attributes:
+        hidden: width d' of the hidden layers.
+        layers: hidden layers; 1 is the thesis's baseline, 2 its deeper head.
+
+    Raises:
+        ConfigError: a width or depth below 1.
+    """
+
+    space: ClassVar[dict[str, Any]] = {"hidden": (16, 32, 64, 128), "layers": (1, 2)}
+    hidden: int = 32
+    layers: int = 1
+
+    def __post_init__(self) -> None:
+        check_bounds("head", self, hidden=whole(1, MOST_UNITS), layers=whole(1, MOST_LAYERS))
+
+    def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
+        """Heads with ReLU."""
+        return Heads(width, outputs, values, [RELU] * self.layers, self.hidden, mix)
+
+
+@HEADS.register("glu")
+@dataclass(frozen=True, kw_only=True)
+class GluHead:
+    """A head whose first layer is gated: ``GLU(u) = u_1 sigmoid(u_2)`` with ``u = W_c h + b_c`` (eq. 3.27).
+
+    The two halves of u are as wide as the hidden layer, so W_c is twice as high as in the plain head. Further hidden
+    layers are those of the deeper head, with ReLU.
+
+    Attributes:
+        hidden: width d' of the hidden layers.
+        layers: hidden layers, the gated one included.
+
+    Raises:
+        ConfigError: a width or depth below 1.
+    """
+
+    space: ClassVar[dict[str, Any]] = {"hidden": (16, 32, 64, 128), "layers": (1, 2)}
+    hidden: int = 32
+    layers: int = 1
+
+    def __post_init__(self) -> None:
+        check_bounds("head", self, hidden=whole(1, MOST_UNITS), layers=whole(1, MOST_LAYERS))
+
+    def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
+        """Heads that begin with a gated linear unit."""
+        return Heads(width, outputs, values, [GATED] + [RELU] * (self.layers - 1), self.hidden, mix)
+
+
+@dataclass(frozen=True)
+class GatedUnit:
+    """A non-linearity behind a linear layer that is `factor` times as wide as what it gives."""
+
+    factor: int
+    apply: Callable[[Tensor], Tensor]
+    operation: Operation
+
+    def lower(self, build: Builder, x: str, rows: int) -> str:
+        """Add it to a graph, on each of `rows` rows."""
+        size = build.width(x)
+        if self.operation is Operation.GLU:
+            return build.add(Glu, "gated", x, rows=rows, size=size // rows)
+        return build.add(Activate, "relu", x, function=Function.RELU, size=size)
+
+
+RELU = GatedUnit(1, torch.relu, Operation.RELU)
+GATED = GatedUnit(2, functional.glu, Operation.GLU)
+
+
+class Heads(Streaming):
+    """Hidden layers and a last linear layer for every output at once.
+
+    Maps ``(batch, time, width)`` (shared) or ``(batch, time, output, width)`` (gated) to
+    ``(batch, time, value, output)``.
+    """
+
+    matrices = (("weights", (0, 2)),)
+
+    def __init__(
+        self,
+        width: int,
+        outputs: int,
+        values: int,
+        units: Sequence[GatedUnit],
+        hidden: int,
+        mix: Streaming | None = None,
+    ) -> None:
+        super().__init__()
+        self.outputs, self.units = outputs, tuple(units)
+        self.operations = frozenset({Operation.LINEAR, *(unit.operation for unit in units)})
+        self.widths = [width] + [hidden] * len(self.units) + [values]
+        wide = [hidden * unit.factor for unit in self.units] + [values]
+        pairs = list(zip(self.widths[:-1], wide, strict=True))
+        self.weights = nn.ParameterList(nn.Parameter(torch.empty(outputs, into, out)) for into, out in pairs)
+        self.biases = nn.ParameterList(nn.Parameter(torch.empty(outputs, out)) for out in wide)
+        with torch.no_grad():
+            for weight, bias in zip(self.weights, self.biases, strict=True):
+                bound = 1.0 / math.sqrt(weight.shape[1])
+                weight.uniform_(-bound, bound)
+                bias.uniform_(-bound, bound)
+        self.mix = mix
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        return () if self.mix is None else self.mix.initial_state(batch, like)
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        if x.ndim == 3:
+            shared = self.weights[0].transpose(0, 1).flatten(1)
+            y = (x @ shared).unflatten(-1, (self.outputs, -1)) + self.biases[0]
+        else:
+            y = self._layer(0, x)
+        y = self.units[0].apply(y)
+        for layer, unit in enumerate(self.units[1:], start=1):
+            y = unit.apply(self._layer(layer, y))
+        if self.mix is not None:
+            y, state = self.mix(y, state)
+        return self._layer(len(self.units), y).transpose(2, 3), state
+
+    def _layer(self, layer: int, x: Tensor) -> Tensor:
+        """``(batch, time, output, in)`` to ``(batch, time, output, out)``."""
+        return torch.einsum("btci,cio->btco", x, self.weights[layer]) + self.biases[layer]
+
+    def lower(self, build: Builder, x: str) -> str:
+        weights = [weight.transpose(1, 2) for weight in self.weights]
+        if build.width(x) == self.widths[0]:
+            first, bias = weights[0].flatten(0, 1), self.biases[0].flatten()
+            x = build.add(Dense, "layer1", x, weight=first, bias=bias)
+        else:
+            x = build.add(GroupedDense, "layer1", x, weight=weights[0], bias=self.biases[0])
+        x = self.units[0].lower(build, x, self.outputs)
+        for number, unit in enumerate(self.units[1:], start=1):
+            x = build.add(GroupedDense, f"layer{number + 1}", x, weight=weights[number], bias=self.biases[number])
+            x = unit.lower(build, x, self.outputs)
+        if self.mix is not None:
+            x = self.mix.lower(build, x)
+        last = f"layer{len(self.weights)}"
+        x = build.add(GroupedDense, last, x, weight=weights[-1], bias=self.biases[-1])
+        values = self.widths[-1]
+        return build.pick("by_value", x, [c * values + v for v in range(values) for c in range(self.outputs)])
+
+    def costs(self) -> list[Cost]:
+        own = Cost(
+            f"heads, {self.outputs} x {'-'.join(map(str, self.widths))}",
+            sum(weight.numel() for weight in [*self.weights, *self.biases]),
+            per_prediction=sum(weight.numel() for weight in self.weights),
+            width_in=self.widths[0],
+            width_out=self.outputs * max(weight.shape[2] for weight in self.weights),
+            per_time_step=False,
+        )
+        return [own] if self.mix is None else [own, *self.mix.costs()]

@@ -1,0 +1,75 @@
+"""What a loss reads, the registry of main losses, and their weighted mean over the ticks that count."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from torch import Tensor
+
+from edp.registry import Registry
+
+POINT, QUANTILES, NORMAL, LAPLACE = "point", "quantiles", "normal", "laplace"
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a network says, in standard deviations of the target.
+
+    Attributes:
+        center: ``(batch, time, horizon, output)``: the prediction itself, a median or a mean.
+        spread: ``(batch, time, horizon, number, output)``: what it says about its own error. Nothing for a point
+            (no numbers); for quantiles the signed distance of each other level from the median; for a law the
+            logarithm of the variance.
+        levels: of the quantiles in `spread`, in order.
+        law: of the error, ``normal`` or ``laplace``, where `spread` is a variance.
+    """
+
+    center: Tensor
+    spread: Tensor
+    levels: tuple[float, ...] = ()
+    law: str = ""
+
+
+class LossSpec(Protocol):
+    """Options of a main loss."""
+
+    outputs: ClassVar[tuple[str, ...]]
+    """Kinds of output that it trains, names of `edp.networks.outputs.OUTPUTS`."""
+
+    def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
+        """The loss of each prediction, ``(batch, time, horizon, output)``; `target` likewise, standardised."""
+        ...
+
+
+class Penalty(ABC):
+    """A loss that reads the error of a point prediction and nothing else."""
+
+    outputs: ClassVar[tuple[str, ...]] = (POINT,)
+
+    @abstractmethod
+    def penalty(self, error: Tensor) -> Tensor:
+        """Penalty of each error, same shape."""
+
+    def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
+        """The penalty of the prediction's error."""
+        return self.penalty(answer.center - target)
+
+
+LOSSES: Registry[type] = Registry("loss")
+
+
+def masked_loss(spec: LossSpec, answer: Prediction, target: Tensor, valid: Tensor, weights: Tensor) -> Tensor:
+    """Mean weighted loss over the valid ticks.
+
+    Args:
+        spec: the loss.
+        answer: what the network says.
+        target: standardised, ``(batch, time, horizon, output)``.
+        valid: ``(batch, time)``; ticks that count.
+        weights: ``(horizon, output)`` or ``(output,)``.
+    """
+    each = (spec.evaluate(answer, target) * weights).mean(dim=(-1, -2))
+    mask = valid.to(each.dtype)
+    return (each * mask).sum() / mask.sum().clamp(min=1.0)

@@ -1,0 +1,35 @@
+"""Error of the change from tick to tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor
+
+from edp.networks.losses.terms import TERMS, Course, check_weight, masked_mean
+
+
+@TERMS.register("derivative")
+@dataclass(frozen=True, kw_only=True)
+class Derivative:
+    """Mean square of the first difference of the error, ``(e[t+1] - e[t])^2`` with e = prediction - target.
+
+    Attributes:
+        weight: factor in the training loss.
+
+    Raises:
+        ConfigError: the weight is not positive.
+    """
+
+    span: ClassVar[int] = 2
+
+    weight: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_weight("derivative", self.weight)
+
+    def evaluate(self, course: Course) -> Tensor:
+        """Mean over pairs of consecutive ticks."""
+        error = course.predicted - course.target
+        return masked_mean((error[:, 1:] - error[:, :-1]).square(), course.together(2))

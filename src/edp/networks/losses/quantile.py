@@ -1,0 +1,32 @@
+"""Pinball loss of quantiles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from edp.networks.losses.base import LOSSES, QUANTILES, Prediction
+
+
+@LOSSES.register("quantile")
+@dataclass(frozen=True, kw_only=True)
+class Quantile:
+    """Pinball loss, mean over the levels of the model's output: ``2 max(p u, (p - 1) u)``, u = target - quantile.
+
+    Twice the pinball loss, so that the median's share is the absolute error.
+    """
+
+    outputs: ClassVar[tuple[str, ...]] = (QUANTILES,)
+
+    def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
+        """The mean pinball loss of each prediction's quantiles."""
+        below = target - answer.center
+        total = below.abs()
+        beyond = below.unsqueeze(-2) - answer.spread
+        for place, level in enumerate(answer.levels):
+            u = beyond[..., place, :]
+            total = total + 2.0 * torch.maximum(level * u, (level - 1.0) * u)
+        return total / (1 + len(answer.levels))

@@ -1,0 +1,71 @@
+"""Further terms of the training objective: what they read, and their registry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from torch import Tensor
+
+from edp.errors import ConfigError
+from edp.registry import Registry
+from edp.settings.bounds import WEIGHT, shown
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Consecutive predictions and their targets, in standard deviations of the target.
+
+    Attributes:
+        predicted: ``(stream, time, horizon, output)``, as the network's standardised output.
+        target: likewise.
+        level: ``(stream, time, 1 or horizon, output)``: what both are counted from, the present value in delta mode;
+            zero in absolute mode. ``predicted + level`` is the prediction of the value itself.
+        valid: ``(stream, time)``; ticks that count.
+    """
+
+    predicted: Tensor
+    target: Tensor
+    level: Tensor
+    valid: Tensor
+
+    def together(self, ticks: int) -> Tensor:
+        """``(stream, time - ticks + 1)``: where `ticks` consecutive ones all count."""
+        last = self.valid.shape[1] - ticks + 1
+        whole = self.valid[:, :last]
+        for place in range(1, ticks):
+            whole = whole & self.valid[:, place : last + place]
+        return whole
+
+
+class TermSpec(Protocol):
+    """Options of a term."""
+
+    weight: float
+    span: ClassVar[int]
+    """Consecutive predictions that it compares."""
+
+    def evaluate(self, course: Course) -> Tensor:
+        """The unweighted term, a mean over what it compares; zero where nothing can be compared."""
+        ...
+
+
+TERMS: Registry[type] = Registry("term")
+
+
+def check_weight(name: str, weight: float) -> None:
+    """Refuse a weight that does nothing or rewards what the term penalises.
+
+    Raises:
+        ConfigError: the weight is not positive.
+    """
+    if not WEIGHT.holds(weight):
+        raise ConfigError(
+            f"{name}: weight = {shown(weight)}; {WEIGHT.rule('weight')} must hold (leave the term out to do without it)"
+        )
+
+
+def masked_mean(each: Tensor, valid: Tensor) -> Tensor:
+    """Mean over horizons and outputs, then over the ticks that count; ``(stream, time, horizon, output)``."""
+    mask = valid.to(each.dtype)
+    return (each.mean(dim=(-1, -2)) * mask).sum() / mask.sum().clamp(min=1.0)

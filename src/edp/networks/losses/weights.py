@@ -1,0 +1,64 @@
+"""Weights of outputs and horizons: fixed, falling with the horizon, or led by the running error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from edp.settings.bounds import MOST_WEIGHT, SHARE, above, below, check_bounds
+
+
+def output_weights(sigma: Tensor, power: float) -> Tensor:
+    """Weights ``w_i`` proportional to ``1 / sigma_i^power`` with mean one (eq. 3.31; the sum is the output count).
+
+    Args:
+        sigma: standard deviation of each target in SI units, ``(..., output)``.
+        power: p; 0 weighs all outputs alike, right where targets are standardised already.
+    """
+    weights = sigma.double().pow(-power)
+    return (weights / weights.mean(dim=-1, keepdim=True)).to(sigma.dtype)
+
+
+def horizon_weights(horizons: int, decay: float) -> Tensor:
+    """Weights ``(horizon, 1)`` proportional to ``decay^i`` for the i-th horizon, i from 0, with mean one."""
+    weights = torch.tensor([decay**place for place in range(horizons)], dtype=torch.float64)
+    return (weights / weights.mean()).float().unsqueeze(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptiveWeights:
+    """Outputs weighted by the inverse of their running error, so that each has a like share of the loss.
+
+    With r_i the running mean absolute error of output i in standard deviations and ``a_i`` proportional to ``1 / r_i``,
+    cut where it exceeds `max_ratio` times the smallest and with mean one, output i is weighted by
+    ``1 - blend + blend a_i``, besides its fixed weight. Each horizon has its own.
+
+    Attributes:
+        blend: share of the adaptive part; 0 leaves the fixed weights alone.
+        max_ratio: largest ratio of two adaptive weights.
+        memory: share of the running error that an update keeps.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    blend: float = 0.0
+    max_ratio: float = 3.0
+    memory: float = 0.99
+
+    def __post_init__(self) -> None:
+        check_bounds("adaptive", self, blend=SHARE, max_ratio=above(1.0, MOST_WEIGHT), memory=below(0.0, 1.0))
+
+    def weights(self, running: Tensor) -> Tensor:
+        """Weights ``(horizon, output)`` from the running errors, same shape."""
+        inverse = running.clamp(min=1e-9).reciprocal()
+        cut = torch.minimum(inverse, self.max_ratio * inverse.amin(dim=-1, keepdim=True))
+        return 1.0 - self.blend + self.blend * cut / cut.mean(dim=-1, keepdim=True)
+
+    def follow(self, running: Tensor, error: Tensor, valid: Tensor) -> Tensor:
+        """The running errors after a batch with errors ``(batch, time, horizon, output)``."""
+        count = valid.sum()
+        mean = torch.where(valid[..., None, None], error.abs(), 0.0).sum(dim=(0, 1)) / count.clamp(min=1)
+        return torch.where(count > 0, self.memory * running + (1.0 - self.memory) * mean, running)

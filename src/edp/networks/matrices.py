@@ -1,0 +1,65 @@
+"""Weights of multiply-accumulates in a network: what compression, adapters and probes act on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from edp.networks.cells import Stack
+from edp.networks.streaming import Streaming
+
+Declared = tuple[tuple[str, tuple[int, ...]], ...]
+LAYERS: dict[type[nn.Module], Declared] = {
+    nn.Linear: (("weight", (0,)),),
+    nn.LSTM: (("weight_ih_l0", (0,)), ("weight_hh_l0", (0,))),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Matrix:
+    """A weight of multiply-accumulates.
+
+    Attributes:
+        name: in the network.
+        part: the module that is called with it.
+        holder: the module that it is a parameter of, under `key`.
+        axes: of its outputs.
+    """
+
+    name: str
+    part: nn.Module
+    holder: nn.Module
+    key: str
+    axes: tuple[int, ...]
+
+    @property
+    def values(self) -> Tensor:
+        """The parameter."""
+        return self.holder.get_parameter(self.key)
+
+
+def matrices_of(network: nn.Module, recurrent: bool = True) -> list[Matrix]:
+    """Weights of the convolutions, recurrent layers, linear layers and heads of a network.
+
+    Args:
+        network: its parts say which of their parameters they multiply with (`Streaming.matrices`).
+        recurrent: False leaves out those of recurrent layers.
+    """
+    stacks = [stack for stack in network.modules() if isinstance(stack, Stack)]
+    recurring = {part for stack in stacks for layer in stack.layers for part in layer.modules()}
+    found = []
+    for name, part in network.named_modules():
+        if part not in recurring or recurrent:
+            for key, axes in _declared(part):
+                held = getattr(part, key)
+                listed = isinstance(held, nn.ParameterList)
+                for last in map(str, range(len(held))) if listed else [key]:
+                    full = ".".join(filter(None, (name, key if listed else "", last)))
+                    found.append(Matrix(full, part, held if listed else part, last, axes))
+    return found
+
+
+def _declared(part: nn.Module) -> Declared:
+    known = next((matrices for kind, matrices in LAYERS.items() if isinstance(part, kind)), ())
+    return known or (part.matrices if isinstance(part, Streaming) else ())

@@ -1,0 +1,56 @@
+"""Students: the same network, narrower and less deep."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+from edp.errors import ConfigError
+from edp.networks.predictor import ModelSpec
+
+
+def width_of(model: ModelSpec) -> int:
+    """The width by which a network is named: its recurrent units, or the channels of its first level."""
+    units = getattr(model.backbone, "units", None)
+    return int(units if units is not None else model.backbone.channels[0])  # type: ignore[attr-defined]
+
+
+def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpec:
+    """A network of the same parts, all widths scaled from those of `model` to `units`, with fewer convolution levels.
+
+    The thesis's students (Table 4.9): half or a quarter of the teacher's units, channels and head width, and of three
+    convolution levels the first two.
+
+    Args:
+        model: the teacher's specs.
+        units: recurrent units, or channels of the first level where nothing recurs.
+        levels: convolution levels to keep, from the input on; None for one less than the teacher has, at least one
+            (a pure TCN keeps all, since its receptive field must span the window).
+
+    Raises:
+        ConfigError: units below 1 or above the teacher's, or levels that the teacher does not have.
+    """
+    full = width_of(model)
+    if not 1 <= units <= full:
+        raise ConfigError(f"student: units = {units}; 1 <= units <= {full}, those of the teacher, must hold")
+
+    def narrower(width: int) -> int:
+        return max(1, round(width * units / full))
+
+    changed: dict[str, Any] = {}
+    names: set[str] = {entry.name for entry in fields(model.backbone)} if is_dataclass(model.backbone) else set()
+    if "units" in names:
+        changed["units"] = units
+    if "channels" in names:
+        channels = model.backbone.channels  # type: ignore[attr-defined]
+        if levels is None:
+            levels = max(1, len(channels) - 1) if "units" in names else len(channels)
+        if not 1 <= levels <= len(channels):
+            raise ConfigError(
+                f"student: levels = {levels}; 1 <= levels <= {len(channels)}, those of the teacher, must hold"
+            )
+        changed["channels"] = tuple(narrower(width) for width in channels[:levels])
+    elif levels is not None:
+        raise ConfigError(f"student: levels = {levels}, but the teacher has no convolutions; leave it out")
+    head = replace(model.head, hidden=narrower(model.head.hidden))  # type: ignore[type-var]
+    return replace(model, backbone=replace(model.backbone, **changed), head=head)  # type: ignore[type-var]

@@ -1,0 +1,219 @@
+"""Physics bases: deterministic predictions of cylinder velocities that the network corrects (eq. 3.6)."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from edp.data.task import Task
+from edp.errors import ConfigError, closest
+from edp.ir import Builder
+from edp.ir.memory import Difference
+from edp.networks.blocks.base import ModelView, TaskView
+from edp.networks.physics.geometry import AXES, Geometry, Pose, inverse
+from edp.networks.physics.symbols import Symbol
+from edp.networks.streaming import Cost, Operation, State, Streaming
+from edp.registry import Registry
+
+PHYSICS: Registry[type] = Registry("physics base")
+SPEEDS = tuple(f"CylVels_{i + 1}" for i in range(AXES))
+"""Targets that a physics base predicts."""
+HEADS = tuple(f"CylPressures_{i + 1}" for i in range(AXES))
+RODS = tuple(f"CylPressures_{i + 5}" for i in range(AXES))
+ANGLE, RATE, SPEED = 0.5, 0.5, 0.2
+"""Usual widths of joint angles in rad, joint rates in rad/s and cylinder velocities in m/s."""
+PRESSURE = (1e7, 5e6)
+"""Usual middle and width of a pressure, Pa."""
+POSES = {
+    "angles": (*(f"JointAngle_{i + 1}" for i in range(AXES)), *(f"JointVel_{i + 1}" for i in range(AXES))),
+    "strokes": tuple(f"CylStroke_{i + 1}" for i in range(AXES)),
+}
+"""Channels that tell the pose and its rate: relative joint angles and rates, or cylinder strokes from closed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsSpec(ABC):
+    """What every physics base must know.
+
+    Attributes:
+        machine: name of a machine or path of its TOML file, read when a network is made; a bundle holds its numbers.
+        pose: ``angles`` (``JointAngle_*`` and ``JointVel_*``) or ``strokes`` (``CylStroke_*``, differenced for rates).
+
+    Raises:
+        ConfigError: another pose.
+    """
+
+    space: ClassVar[dict[str, Any]] = {}
+    machine: str = "M22"
+    pose: str = "angles"
+
+    def __post_init__(self) -> None:
+        if self.pose not in POSES:
+            raise ConfigError(
+                f"physics: pose = '{self.pose}' must hold one of {', '.join(POSES)}{closest(self.pose, POSES)}"
+            )
+
+    def channels(self) -> tuple[str, ...]:
+        """Logged channels that the base reads."""
+        return POSES[self.pose]
+
+    def conflicts(self, model: ModelView, task: TaskView) -> str | None:
+        """Why it cannot be added to this network, None where it can."""
+        name = f"physics base '{PHYSICS.name_of(self)}'"
+        missing = [channel for channel in self.channels() if channel not in task.inputs]
+        if missing:
+            return f"{name} reads {', '.join(missing)}, which the task does not; list them in its `physics`"
+        if not any(target in SPEEDS for target in task.targets):
+            return (
+                f"{name} predicts {', '.join(SPEEDS)}, but the targets are {', '.join(task.targets)}; give the "
+                "velocities these names in the signal map, or remove model.physics"
+            )
+        if any(getattr(block, "start", "zero") != "zero" for block in model.blocks):
+            return (
+                f"{name} would be added to the regression of the whole target, from which linear_bypass starts; set "
+                "its start = 'zero', or remove one of them"
+            )
+        return None
+
+    def digest(self) -> str:
+        """Content address of the machine's numbers.
+
+        Raises:
+            ConfigError: no such machine or file, or one that cannot be.
+        """
+        geometry = Geometry()
+        geometry.read(self.machine)
+        state = hashlib.blake2b(digest_size=16)
+        for tensor in (geometry.axes, geometry.plant):
+            state.update(tensor.numpy().tobytes())
+        return state.hexdigest()
+
+    @abstractmethod
+    def build(self, task: Task) -> PhysicsBase:
+        """The base without its machine's numbers."""
+
+
+class PhysicsBase(Streaming):
+    """Inputs ``(batch, time, input)`` in SI units to velocities ``(batch, time, horizon, target)`` in m/s.
+
+    `known` is 1 for the targets that are cylinder velocities and 0 for others, of which the base says nothing. State:
+    the strokes of the tick before and whether there was one, where strokes tell the pose; else none.
+    """
+
+    known: Tensor
+
+    def __init__(self, spec: PhysicsSpec, task: Task) -> None:
+        super().__init__()
+        self.spec, self.task, self.rate_hz = spec, task, task.rate_hz
+        self.columns = {name: task.inputs.index(name) for name in spec.channels()}
+        # Targets that are no cylinder velocity take any column; `known` takes them out.
+        self.order = [SPEEDS.index(target) if target in SPEEDS else 0 for target in task.targets]
+        known = torch.tensor([float(target in SPEEDS) for target in task.targets])
+        self.register_buffer("known", known, persistent=False)
+        self.geometry = Geometry()
+        self.operations = frozenset({Operation.SQRT, *((Operation.SINE,) if spec.pose == "angles" else ())})
+
+    def read(self) -> None:
+        """Take the machine's numbers, as a new network does.
+
+        Raises:
+            ConfigError: no such machine or file, or one that cannot be.
+        """
+        self.geometry.read(self.spec.machine)
+
+    def settle(self, parts: Sequence[Tensor]) -> None:
+        """Take averages over training inputs ``(time, input)`` where the base has any; most have none."""
+
+    def usual(self) -> dict[str, tuple[float, float]]:
+        """Middle and width of what each channel that the base reads usually is, SI units."""
+        pose = self.geometry.at_strokes(0.5 * self.geometry.axis("STROKE"))
+        middle = torch.atan2(pose.sine, pose.cosine).tolist()
+        stroke = self.geometry.axis("STROKE").tolist()
+        found = dict.fromkeys(SPEEDS, (0.0, SPEED)) | dict.fromkeys((*HEADS, *RODS), PRESSURE)
+        for i in range(AXES):
+            found[POSES["angles"][i]] = (middle[i], ANGLE)
+            found[POSES["angles"][AXES + i]] = (0.0, RATE)
+            found[POSES["strokes"][i]] = (0.5 * stroke[i], 0.25 * stroke[i])
+        return {name: found[name] for name in self.columns}
+
+    def take(self, x: Tensor, names: Sequence[str]) -> Tensor:
+        """Input columns by name."""
+        return x[..., [self.columns[name] for name in names]]
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        if self.spec.pose == "angles":
+            return ()
+        return like.new_zeros(batch, 1, AXES), like.new_zeros(batch, 1, 1)
+
+    def pose(self, x: Tensor) -> Pose:
+        """The pose at each tick."""
+        values = self.take(x, POSES[self.spec.pose][:AXES])
+        return self.geometry.at_angles(values) if self.spec.pose == "angles" else self.geometry.at_strokes(values)
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        pose = self.pose(x)
+        if self.spec.pose == "angles":
+            rate = self.take(x, POSES["angles"][AXES:])
+            speed = pose.lever * rate
+        else:
+            strokes = self.take(x, POSES["strokes"])
+            previous, seen = state
+            # Nothing is known of the rate at the first tick; it is taken as rest.
+            before = torch.cat([torch.where(seen > 0.5, previous, strokes[:, :1]), strokes[:, :-1]], dim=1)
+            speed = (strokes - before) * self.rate_hz
+            rate = speed * inverse(pose.lever)
+            state = strokes[:, -1:], torch.ones_like(seen)
+        return self.ahead(x, pose, rate, speed)[..., self.order], state
+
+    @abstractmethod
+    def ahead(self, x: Tensor, pose: Pose, rate: Tensor, speed: Tensor) -> Tensor:
+        """Velocities ``(batch, time, horizon, 3)`` of the cylinders.
+
+        Args:
+            x: inputs ``(batch, time, input)``.
+            pose: at each tick.
+            rate: joint rates in rad/s, ``(batch, time, 3)``.
+            speed: cylinder velocities J rate in m/s, ``(batch, time, 3)``.
+        """
+
+    @abstractmethod
+    def arithmetic(self) -> int:
+        """Multiplications, divisions, roots, sines and the like of one tick, beyond those of the pose."""
+
+    def lower(self, build: Builder, x: str) -> str:
+        """Velocities, ``horizon * target`` numbers: the equations themselves, recorded."""
+        with build.inside("physics"):
+            inputs = Symbol(build, x, (build.width(x),))
+            # The equations are written for tensors; symbols stand in for them.
+            pose = self.pose(inputs)  # type: ignore[arg-type]
+            if self.spec.pose == "angles":
+                rate = self.take(inputs, POSES["angles"][AXES:])  # type: ignore[arg-type]
+                speed = pose.lever * rate
+            else:
+                strokes = self.take(inputs, POSES["strokes"])  # type: ignore[arg-type]
+                factor = torch.full((AXES,), float(self.rate_hz))
+                value = build.add(Difference, "speed", strokes.value, factor=factor, from_zero=False)  # type: ignore[attr-defined]
+                speed = Symbol(build, value, (AXES,))  # type: ignore[assignment]
+                rate = speed * inverse(pose.lever)
+            found = self.ahead(inputs, pose, rate, speed)[..., self.order]  # type: ignore[arg-type]
+            return build.join("ahead", found.value)  # type: ignore[attr-defined]
+
+    def costs(self) -> list[Cost]:
+        count = (52 if self.spec.pose == "angles" else 101) + AXES + self.arithmetic()
+        width = len(self.task.horizons) * len(self.task.targets)
+        return [
+            Cost(
+                f"physics base ({PHYSICS.name_of(self.spec)})",
+                0,
+                per_prediction=count,
+                width_in=len(self.columns),
+                width_out=width,
+                per_time_step=False,
+            )
+        ]

@@ -1,0 +1,266 @@
+"""Equations written with torch, recorded as streaming layers: the physics bases are written once, for both."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from edp.errors import ExportError
+from edp.ir import Builder
+from edp.ir.layers import (
+    Activate,
+    Add,
+    Divide,
+    Function,
+    Maximum,
+    Minimum,
+    Multiply,
+    ScaleShift,
+    Standardise,
+    Subtract,
+)
+
+
+class Symbol:
+    """Numbers of one tick in the making; what is computed with it is added to a graph.
+
+    It stands where equations expect a tensor ``(batch, time, ...)``, without batch and time. Comparisons give 1 or 0.
+
+    Args:
+        build: takes the layers.
+        value: name of the value in the graph.
+        shape: of the numbers, the last dimension next to each other.
+    """
+
+    def __init__(self, build: Builder, value: str, shape: tuple[int, ...]) -> None:
+        self.build, self.value, self.shape = build, value, shape
+        self.dtype = torch.float32
+        self._factors: tuple[str, np.ndarray] | None = None
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Called by torch for its functions and for operators with a tensor on the left."""
+        name = function.__name__.strip("_")
+        if name not in FUNCTIONS:
+            raise ExportError(f"torch's {name} has no form as layers; write the equation with {', '.join(FUNCTIONS)}")
+        return FUNCTIONS[name](*args, **(kwargs or {}))
+
+    def layer(self, kind: type, name: str, *inputs: str, shape: tuple[int, ...], **options: Any) -> Symbol:
+        """The value of a new layer."""
+        return Symbol(self.build, self.build.add(kind, name, *inputs, **options), shape)
+
+    def spread(self, shape: tuple[int, ...]) -> Symbol:
+        """The numbers repeated as broadcasting does."""
+        if shape == self.shape:
+            return self
+        size = int(np.prod(self.shape))
+        columns = np.broadcast_to(np.arange(size).reshape(self.shape), shape).ravel().tolist()
+        return Symbol(self.build, self.build.pick("repeated", self.value, columns), shape)
+
+    def activate(self, function: Function) -> Symbol:
+        """A function of each number."""
+        size = int(np.prod(self.shape))
+        return self.layer(Activate, str(function), self.value, shape=self.shape, function=function, size=size)
+
+    def affine(self, gain: Any, shift: Any) -> Symbol:
+        """``gain x + shift``, each a number or an array of the same shape."""
+        gain, shift = (np.broadcast_to(np.asarray(part, np.float32), self.shape).ravel() for part in (gain, shift))
+        value = self.value
+        if self._factors is not None and (np.abs(gain) == 1).all():
+            # A product to which something is added, or whose sign is turned, is one layer; it rounds alike.
+            value, gain = self._factors[0], self._factors[1] * gain
+        made = self.layer(ScaleShift, "scaled", value, shape=self.shape, gain=gain, shift=shift)
+        if not shift.any():
+            made._factors = value, gain
+        return made
+
+    def __getitem__(self, key: Any) -> Symbol:
+        if not (isinstance(key, tuple) and len(key) == 2 and key[0] is Ellipsis):
+            raise ExportError("only the last dimension of a value can be chosen from: x[..., columns]")
+        places = np.arange(int(np.prod(self.shape))).reshape(self.shape)[..., key[1]]
+        picked = self.build.pick("picked", self.value, places.ravel().tolist())
+        return Symbol(self.build, picked, places.shape)
+
+    def unbind(self, dim: int) -> list[Symbol]:
+        """The numbers of the last dimension."""
+        return [self[..., i] for i in range(self.shape[-1])]
+
+    def unsqueeze(self, dim: int) -> Symbol:
+        """A dimension of length 1 more."""
+        at = dim + len(self.shape) + 1
+        return Symbol(self.build, self.value, (*self.shape[:at], 1, *self.shape[at:]))
+
+    def expand(self, *shape: int) -> Symbol:
+        """Repeated along dimensions of length 1."""
+        return self.spread(shape)
+
+    def to(self, dtype: object) -> Symbol:
+        """The same numbers: there is one kind only."""
+        return self
+
+    def square(self) -> Symbol:
+        """Each number times itself."""
+        return multiply(self, self)
+
+    def abs(self) -> Symbol:
+        """Without sign."""
+        return maximum(self, -self)
+
+    def __neg__(self) -> Symbol:
+        return self.affine(-1.0, 0.0)
+
+    def __add__(self, other: Any) -> Symbol:
+        return add(self, other)
+
+    def __radd__(self, other: Any) -> Symbol:
+        return add(self, other)
+
+    def __sub__(self, other: Any) -> Symbol:
+        return subtract(self, other)
+
+    def __rsub__(self, other: Any) -> Symbol:
+        return subtract(other, self)
+
+    def __mul__(self, other: Any) -> Symbol:
+        return multiply(self, other)
+
+    def __rmul__(self, other: Any) -> Symbol:
+        return multiply(self, other)
+
+    def __truediv__(self, other: Any) -> Symbol:
+        return divide(self, other)
+
+    def __rtruediv__(self, other: Any) -> Symbol:
+        return divide(other, self)
+
+    def __lt__(self, other: Any) -> Symbol:
+        return positive(subtract(other, self))
+
+    def __gt__(self, other: Any) -> Symbol:
+        return positive(subtract(self, other))
+
+    def __and__(self, other: Symbol) -> Symbol:
+        return multiply(self, other)
+
+    def __or__(self, other: Symbol) -> Symbol:
+        return maximum(self, other)
+
+
+def _array(value: Any) -> np.ndarray:
+    """Numbers that are known when the graph is made."""
+    return np.asarray(value.detach().cpu().numpy() if isinstance(value, Tensor) else value, dtype=np.float32)
+
+
+def _both(kind: type, a: Symbol, b: Symbol) -> Symbol:
+    shape = np.broadcast_shapes(a.shape, b.shape)
+    a, b = a.spread(shape), b.spread(shape)
+    return a.layer(kind, kind.__name__.lower(), a.value, b.value, shape=shape, size=int(np.prod(shape)))
+
+
+def _meet(a: Any, b: Any) -> tuple[Symbol, np.ndarray]:
+    """The one that is a value and the other one's numbers, in their common shape."""
+    known, value = (_array(b), a) if isinstance(a, Symbol) else (_array(a), b)
+    shape = np.broadcast_shapes(value.shape, known.shape)
+    return value.spread(shape), np.broadcast_to(known, shape)
+
+
+def _constant(like: Symbol, numbers: np.ndarray) -> Symbol:
+    """Known numbers as a value; one that is not finite still spoils them."""
+    return like.affine(0.0, numbers)
+
+
+def add(a: Any, b: Any) -> Symbol:
+    """Sum, of which one may be known numbers."""
+    if isinstance(a, Symbol) and isinstance(b, Symbol):
+        return _both(Add, a, b)
+    value, known = _meet(a, b)
+    return value.affine(1.0, known)
+
+
+def subtract(a: Any, b: Any) -> Symbol:
+    """Difference, of which one may be known numbers."""
+    if isinstance(a, Symbol) and isinstance(b, Symbol):
+        return _both(Subtract, a, b)
+    value, known = _meet(a, b)
+    return value.affine(1.0, -known) if isinstance(a, Symbol) else value.affine(-1.0, known)
+
+
+def multiply(a: Any, b: Any) -> Symbol:
+    """Product, of which one may be known numbers."""
+    if isinstance(a, Symbol) and isinstance(b, Symbol):
+        return _both(Multiply, a, b)
+    value, known = _meet(a, b)
+    return value.affine(known, 0.0)
+
+
+def divide(a: Any, b: Any) -> Symbol:
+    """Quotient, of which one may be known numbers."""
+    if isinstance(a, Symbol) and isinstance(b, Symbol):
+        return _both(Divide, a, b)
+    value, known = _meet(a, b)
+    if isinstance(b, Symbol):
+        return _both(Divide, _constant(value, known), value)
+    known, zero = known.ravel(), np.zeros(known.size, np.float32)
+    return value.layer(Standardise, "divided", value.value, shape=value.shape, offset=zero, scale=known)
+
+
+def maximum(a: Any, b: Any) -> Symbol:
+    """The larger one of each pair; one side may be known numbers."""
+    return _extreme(Maximum, a, b)
+
+
+def _extreme(kind: type, a: Any, b: Any) -> Symbol:
+    if isinstance(a, Symbol) and isinstance(b, Symbol):
+        return _both(kind, a, b)
+    value, known = _meet(a, b)
+    return _both(kind, value, _constant(value, known))
+
+
+def positive(a: Symbol) -> Symbol:
+    """1 where a number is above 0, else 0."""
+    return a.activate(Function.POSITIVE)
+
+
+def sign(a: Symbol) -> Symbol:
+    """1, 0 or -1."""
+    return positive(a) - positive(-a)
+
+
+def stack(parts: Sequence[Any], dim: int = 0) -> Symbol:
+    """Single numbers as the last dimension, some of them known."""
+    like = next(part for part in parts if isinstance(part, Symbol))
+    made = [part if isinstance(part, Symbol) else _constant(like, _array(part)) for part in parts]
+    return Symbol(like.build, like.build.join("stacked", *(part.value for part in made)), (len(made),))
+
+
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "add": add,
+    "sub": subtract,
+    "mul": multiply,
+    "div": divide,
+    "truediv": divide,
+    "radd": add,
+    "rsub": lambda a, b: subtract(b, a),
+    "rmul": multiply,
+    "lt": operator.lt,
+    "gt": operator.gt,
+    "neg": operator.neg,
+    "abs": lambda a: a.abs(),
+    "square": lambda a: a.square(),
+    "sign": sign,
+    "sqrt": lambda a: a.activate(Function.SQRT),
+    "exp": lambda a: a.activate(Function.EXP),
+    "cos": lambda a: a.activate(Function.COSINE),
+    "sin": lambda a: a.activate(Function.SINE),
+    "clamp": lambda a, min: maximum(a, min),
+    "maximum": maximum,
+    "minimum": lambda a, b: _extreme(Minimum, a, b),
+    "zeros_like": lambda a: torch.zeros(a.shape),
+    "stack": stack,
+}
+"""Torch's functions by name."""

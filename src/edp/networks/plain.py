@@ -1,0 +1,72 @@
+"""Networks and tasks as plain values: what bundles and settings keep."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from edp.data.task import Task
+from edp.errors import BundleError, ConfigError
+from edp.networks.activations import ACTIVATIONS
+from edp.networks.backbones import BACKBONES
+from edp.networks.blocks import BLOCKS
+from edp.networks.cells import CELLS
+from edp.networks.heads import HEADS
+from edp.networks.initial import INITIAL_STATES
+from edp.networks.outputs import OUTPUTS
+from edp.networks.physics import PHYSICS
+from edp.networks.predictor import ModelSpec
+from edp.registry import Registry
+from edp.settings.tree import SettingsTree, Table, plain_tree
+from edp.settings.tree import build as build_plain
+
+NETWORK_PARTS: Mapping[str, Registry[type]] = {
+    "backbone": BACKBONES,
+    "cell": CELLS,
+    "initial": INITIAL_STATES,
+    "head": HEADS,
+    "activation": ACTIVATIONS,
+    "output": OUTPUTS,
+    "blocks": BLOCKS,
+    "physics": PHYSICS,
+}
+"""Registries of the parts of a network, by the field of the specs that holds one."""
+USUAL_KINDS = {"head": "mlp"}
+"""Heads of the usual kind need not say so."""
+NETWORK = SettingsTree(NETWORK_PARTS, USUAL_KINDS)
+
+
+def model_to_plain(spec: ModelSpec) -> Table:
+    """A network spec as JSON values; options that are None are left out."""
+    plain: Table = NETWORK.plain(spec)
+    return plain
+
+
+def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
+    """A network spec from JSON values; one without ``physics`` has no physics base.
+
+    Raises:
+        BundleError: a value that this version does not understand.
+    """
+    try:
+        return NETWORK.build(ModelSpec, plain, "of the bundle's network")
+    except ConfigError as error:
+        raise BundleError(f"the bundle's network is not understood by this version: {error}") from error
+
+
+def task_to_plain(task: Task) -> Table:
+    """A task as JSON values."""
+    plain: Table = plain_tree(task)
+    return plain
+
+
+def task_from_plain(plain: Mapping[str, Any]) -> Task:
+    """A task from JSON values.
+
+    Raises:
+        BundleError: a value that this version does not understand.
+    """
+    try:
+        return build_plain(Task, plain, "of the bundle's task")
+    except ConfigError as error:
+        raise BundleError(f"the bundle's task is not understood by this version: {error}") from error

@@ -1,0 +1,160 @@
+"""Run a predictor over whole recordings, as a stream, several side by side, or window by window."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edp.data.series import Series
+from edp.networks.losses import Prediction
+from edp.networks.predictor import Predictor
+from edp.networks.streaming import State
+
+Run = Callable[[Tensor, State], tuple[Tensor, State]]
+PIECE = 512  # ticks per call, or windows: long enough for speed, short enough for memory
+
+
+def stream_predictions(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:
+    """Predictions for every tick of every series, each from reset, state carried to its end.
+
+    Returns:
+        For each series float32 ``(time, horizon, target)`` in SI units: row t is the prediction made at t.
+    """
+    return _stream(predictor, predictor.predict, series, batch)
+
+
+def window_predictions(predictor: Predictor, series: Sequence[Series]) -> list[NDArray[np.float32]]:
+    """As `stream_predictions`, each prediction from reset over the window that ends at its tick (thesis 3.1.4).
+
+    W times the work of a stream. The first ticks, which have no whole window, have what there is of it.
+    """
+    return _windows(predictor, predictor.predict, series)
+
+
+def mean_error(predictor: Predictor, series: Sequence[Series]) -> float:
+    """Mean absolute error over series, horizons and targets, SI units; each series from reset, after a whole window.
+
+    Not a number where no series is longer than that.
+    """
+    errors = [np.abs(error).mean(axis=0) for _, error in stream_errors(predictor, series)]
+    return float(np.mean(errors)) if errors else math.nan
+
+
+def stream_errors(predictor: Predictor, series: Sequence[Series]) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Place of a horizon and errors ``(time, target)`` in SI units; each series from reset, after a whole window.
+
+    Series that are no longer than window and horizon are passed over.
+    """
+    skip = predictor.spec.window
+    for predicted, part in zip(stream_predictions(predictor, series), series, strict=True):
+        for place, k in enumerate(predictor.task.horizons):
+            if part.samples > skip + k:
+                yield place, predicted[skip : part.samples - k, place] - part.targets[skip + k :]
+
+
+def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:
+    """Interval bounds for every tick of every series, each from reset.
+
+    Returns:
+        For each series float32 ``(time, coverage, 2, horizon, target)`` in SI units, lower then upper, in the order of
+        ``predictor.spec.output.coverages``.
+    """
+    return _stream(predictor, predictor.intervals, series, batch)
+
+
+def stream_answers(
+    predictor: Predictor, series: Sequence[Series], batch: int = 16, windowed: bool = False
+) -> list[Prediction]:
+    """All that the network says at every tick, standardised, with a batch of one; double precision, on the CPU.
+
+    Args:
+        predictor: the network.
+        series: each from reset.
+        batch: streams side by side.
+        windowed: each answer from reset over the window that ends at its tick, and not as a stream.
+    """
+    form: list[Prediction] = []
+
+    def run(x: Tensor, state: State) -> tuple[Tensor, State]:
+        answer, _, new = predictor.run(x, state)
+        form[:] = [answer]
+        return torch.cat([answer.center.unsqueeze(-2), answer.spread], dim=-2), new
+
+    answers = _windows(predictor, run, series) if windowed else _stream(predictor, run, series, batch)
+    values = [torch.from_numpy(found).double().unsqueeze(0) for found in answers]
+    levels, law = (form[0].levels, form[0].law) if form else ((), "")
+    return [Prediction(every[..., 0, :], every[..., 1:, :], levels, law) for every in values]
+
+
+def stream_hidden(predictor: Predictor, series: Sequence[Series], batch: int = 4) -> list[NDArray[np.float32]]:
+    """The backbone's representation at every tick of every series, float32 ``(time, width)``, each from reset."""
+
+    def run(x: Tensor, state: State) -> tuple[Tensor, State]:
+        _, _, hidden, new = predictor.forward_features(x, state)
+        return hidden, new
+
+    return _stream(predictor, run, series, batch)
+
+
+def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int) -> list[NDArray[np.float32]]:
+    order = sorted(range(len(series)), key=lambda i: series[i].samples)
+    results: dict[int, NDArray[np.float32]] = {}
+    was_training = predictor.training
+    predictor.eval()
+    try:
+        with torch.inference_mode():
+            for at in range(0, len(order), batch):
+                group = order[at : at + batch]
+                found = _run_group(predictor, run, [series[i] for i in group])
+                results.update(zip(group, found, strict=True))
+    finally:
+        predictor.train(was_training)
+    return [results[i] for i in range(len(series))]
+
+
+def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[NDArray[np.float32]]:
+    like, window = next(predictor.parameters()), predictor.spec.window
+    was_training = predictor.training
+    predictor.eval()
+
+    def answers(x: NDArray[np.float32]) -> NDArray[np.float32]:
+        tensor = torch.from_numpy(np.ascontiguousarray(x)).to(device=like.device, dtype=like.dtype)
+        found: NDArray[np.float32] = run(tensor, predictor.initial_state(len(x), like))[0].float().cpu().numpy()
+        return found
+
+    made = []
+    try:
+        with torch.inference_mode():
+            for part in series:
+                pieces = [answers(part.inputs[None, : window - 1])[0]] if window > 1 else []
+                ends = np.arange(window, part.samples + 1)
+                for at in range(0, len(ends), PIECE):
+                    rows = ends[at : at + PIECE, None] - window + np.arange(window)
+                    pieces.append(answers(part.inputs[rows])[:, -1])
+                made.append(np.concatenate(pieces)[: part.samples])
+    finally:
+        predictor.train(was_training)
+    return made
+
+
+def _run_group(predictor: Predictor, run: Run, group: list[Series]) -> list[NDArray[np.float32]]:
+    longest = max(part.samples for part in group)
+    like = next(predictor.parameters())
+    state = predictor.initial_state(len(group), like)
+    out: list[list[NDArray[np.float32]]] = [[] for _ in group]
+    for start in range(0, longest, PIECE):
+        stop = min(start + PIECE, longest)
+        rows = np.arange(start, stop)
+        # A shorter stream repeats its last tick; those predictions are cut off below.
+        x = np.stack([part.inputs[np.minimum(rows, part.samples - 1)] for part in group])
+        y, state = run(torch.from_numpy(x).to(device=like.device, dtype=like.dtype), state)
+        values = y.float().cpu().numpy()
+        for i, part in enumerate(group):
+            if start < part.samples:
+                out[i].append(values[i, : part.samples - start])
+    return [np.concatenate(pieces) for pieces in out]

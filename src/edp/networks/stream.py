@@ -1,0 +1,230 @@
+"""A predictor run tick by tick, under the rules of the exported C: validity, hold, missed ticks, warm-up, restart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edp.errors import ConfigError, DataError
+from edp.networks.input_range import HOLD_TICKS, input_limits
+from edp.networks.predictor import Predictor
+
+Rows = NDArray[np.float32]
+Inputs = Sequence[float] | NDArray[np.floating] | Tensor
+
+
+class StreamStatus(IntEnum):
+    """What a tick of a stream has done; the numbers are those of `edp_status` in the exported C."""
+
+    OK = 0
+    """A prediction from this tick's inputs."""
+    WARMING = 1
+    """The same, from fewer ticks than a whole window since the last reset: less accurate."""
+    HELD = 2
+    """Inputs were rejected or missed: a prediction from the last accepted ones."""
+    RESTARTED = 3
+    """Nothing left to hold, or a result that is not finite: the memory was cleared, and there is no new prediction."""
+
+
+@dataclass(frozen=True, eq=False)
+class StreamTick:
+    """What one tick of a stream gives.
+
+    Attributes:
+        prediction: ``(horizon, target)``, float32, SI units. After `RESTARTED` the last valid one, as in C, where the
+            output is left as it was; NaN before the first.
+        lower: bounds of intervals ``(coverage, horizon, target)``, SI units; no rows where the network has none.
+        upper: the same.
+        coverages: of the intervals, in the order of their rows.
+        status: what was done.
+    """
+
+    prediction: Rows
+    lower: Rows
+    upper: Rows
+    coverages: tuple[float, ...]
+    status: StreamStatus
+
+    @property
+    def valid(self) -> bool:
+        """Whether the prediction is of this tick; False after a restart."""
+        return self.status is not StreamStatus.RESTARTED
+
+    def interval(self, coverage: float) -> tuple[Rows, Rows]:
+        """Lower and upper bounds ``(horizon, target)`` of an interval in SI units.
+
+        Raises:
+            ConfigError: the network has no interval of this coverage.
+        """
+        for row, known in enumerate(self.coverages):
+            if math.isclose(known, coverage, abs_tol=1e-6):
+                return self.lower[row], self.upper[row]
+        known_text = ", ".join(f"{known:g}" for known in self.coverages) or "none: its output is a point"
+        raise ConfigError(f"no interval of coverage {coverage:g}; this network has {known_text}")
+
+
+class Stream:
+    """A predictor run tick by tick, as on the machine: one row of SI inputs in; predictions, intervals and flags out.
+
+    The rules are those of the exported C (docs/export.md): inputs with a NaN, an infinite value or one beyond a
+    million standard widths are rejected as a whole, counted, and the tick is held: the last accepted inputs are fed
+    again. After `HOLD_TICKS` held ticks in a row the memory is cleared, and the next accepted inputs start it anew.
+
+    Args:
+        predictor: the network; it is put in evaluation mode.
+        threads: of PyTorch while a tick is computed; a tick is too small to be shared out.
+
+    Attributes:
+        ticks: steps and held ticks since the last reset.
+        rejected: inputs that were not accepted since then.
+        held: ticks fed with the last accepted inputs since then.
+        restarts: times since then that the memory was cleared because nothing could be held or a result was not finite.
+
+    Raises:
+        ConfigError: `threads` is below 1.
+    """
+
+    def __init__(self, predictor: Predictor, threads: int = 1) -> None:
+        if threads < 1:
+            raise ConfigError(f"a stream on {threads} threads was asked for; give at least 1")
+        self.predictor, self._threads = predictor.eval(), threads
+        self._like = next(predictor.parameters())
+        self._dtype = np.float64 if self._like.dtype is torch.float64 else np.float32
+        # In single precision, as the exported code compares.
+        self._low, self._high = (limit.astype(np.float32) for limit in input_limits(predictor))
+        task, self._coverages = predictor.task, tuple(predictor.output.coverages)
+        self._shape = (len(task.horizons), len(task.targets))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all ticks and counts."""
+        self.ticks = self.rejected = self.held = self.restarts = 0
+        self._last: NDArray[np.floating] = np.zeros(len(self.predictor.task.inputs), dtype=self._dtype)
+        self._numbers = np.full((1 + 2 * len(self._coverages), *self._shape), np.nan, dtype=np.float32)
+        self._forget()
+
+    @property
+    def warm(self) -> bool:
+        """True once a whole window has been seen since the memory was cleared."""
+        return self._age >= self.predictor.spec.window
+
+    def step(self, inputs: Inputs) -> StreamTick:
+        """Feed one tick ``(input,)`` in SI units, in the order of the network's inputs.
+
+        Raises:
+            DataError: another number of inputs, or something else than numbers.
+        """
+        row = self._row(inputs)
+        # A value beyond float32 becomes infinite, and is rejected as such; a comparison with NaN is false.
+        with np.errstate(over="ignore"):
+            single = row.astype(np.float32)
+        if bool(((single >= self._low) & (single <= self._high)).all()):
+            self._last, self._holding = row, 0
+            return self._tick(self._run(held=False))
+        self.rejected += 1
+        return self._tick(self._hold())
+
+    def missed(self, ticks: int = 1) -> StreamTick:
+        """Tell that ticks went by without a step; the result is that of the last of them.
+
+        A gap that ends in a restart leaves the prediction as it was before the gap.
+
+        Raises:
+            DataError: `ticks` is below 1.
+        """
+        if ticks < 1:
+            raise DataError(f"{ticks} missed ticks were told; give at least 1")
+        if ticks > HOLD_TICKS:
+            # More than can be held: what came before is given up at once.
+            self._holding = HOLD_TICKS
+            self.ticks += ticks - 1
+            return self._tick(self._hold())
+        before = self._numbers
+        for _ in range(ticks):
+            status = self._hold()
+        if status is StreamStatus.RESTARTED:
+            self._numbers = before
+        return self._tick(status)
+
+    def _row(self, inputs: Inputs) -> NDArray[np.floating]:
+        wanted = self.predictor.task.inputs
+        values = inputs.detach().cpu().numpy() if isinstance(inputs, Tensor) else inputs
+        try:
+            with np.errstate(over="ignore"):
+                row: NDArray[np.floating] = np.array(values, dtype=np.float64).astype(self._dtype)
+        except (TypeError, ValueError) as error:
+            raise DataError(f"a tick of a stream takes {len(wanted)} numbers ({', '.join(wanted)}): {error}") from error
+        if row.shape != (len(wanted),):
+            raise DataError(
+                f"a tick of a stream has shape {row.shape}; ({len(wanted)},) must hold, in this order: "
+                f"{', '.join(wanted)}"
+            )
+        return row
+
+    def _forget(self) -> None:
+        """Clear the network's memory; counts and the last prediction stay."""
+        self._age = self._holding = 0
+        self._state = self.predictor.initial_state(1, self._like)
+
+    def _run(self, held: bool) -> StreamStatus:
+        """One tick of the network from the last accepted inputs."""
+        self.ticks += 1
+        numbers = self._computed()
+        if not np.isfinite(numbers).all():
+            self.restarts += 1
+            self._forget()
+            return StreamStatus.RESTARTED
+        self._numbers = numbers
+        self._age = min(self._age + 1, self.predictor.spec.window)
+        if held:
+            return StreamStatus.HELD
+        return StreamStatus.OK if self.warm else StreamStatus.WARMING
+
+    def _computed(self) -> Rows:
+        """Predictions, then lower and upper bounds, ``(1 + 2 * coverage, horizon, target)``, SI units."""
+        x = torch.from_numpy(self._last).to(dtype=self._like.dtype, device=self._like.device).reshape(1, 1, -1)
+        with torch.inference_mode(), _threads(self._threads):
+            center, bounds, self._state = self.predictor.predict_with_intervals(x, self._state)
+            parts = [center[0, 0].unsqueeze(0)]
+            parts += [] if bounds is None else [bounds[0, 0, :, side] for side in (0, 1)]
+            numbers: Rows = torch.cat(parts).float().cpu().numpy()
+        return numbers
+
+    def _hold(self) -> StreamStatus:
+        """A tick without inputs of its own."""
+        if self._age > 0 and self._holding < HOLD_TICKS:
+            self._holding += 1
+            self.held += 1
+            return self._run(held=True)
+        self.ticks += 1
+        if self._age > 0:
+            self.restarts += 1
+            self._forget()
+        return StreamStatus.RESTARTED
+
+    def _tick(self, status: StreamStatus) -> StreamTick:
+        count = len(self._coverages)
+        center, lower, upper = np.split(self._numbers.copy(), [1, 1 + count])
+        return StreamTick(center[0], lower, upper, self._coverages, status)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """PyTorch's threads for what is computed here; those of the caller come back."""
+    before = torch.get_num_threads()
+    if before == count:
+        yield
+        return
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

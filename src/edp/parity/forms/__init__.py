@@ -1,5 +1,0 @@
-"""Forms that `edp parity` runs: a file each."""
-
-from edp.parity.forms import c_code, casadi, fmu, matlab, onnx_runtime, ros2, ticks
-
-__all__ = ["c_code", "casadi", "fmu", "matlab", "onnx_runtime", "ros2", "ticks"]

@@ -1,0 +1,1 @@
+"""The animated page of a simulation, and its film."""

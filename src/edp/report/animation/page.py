@@ -1,0 +1,229 @@
+"""Side view of a recording: one offline HTML page that plays the front, with pressures and velocities beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, DataError
+from edp.recording import Recording
+from edp.report.common.templates import template
+from edp.sim import Machine, load_machine
+from edp.sim.machine import layout as at
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import linkage
+from edp.sim.physics.soil import BEYOND_M, SPACING_M
+from edp.storage import write_bytes
+
+Array = NDArray[np.float64]
+JOINTS = ("boom", "arm", "bucket")
+FRAMES_PER_S = 25.0
+LONGEST_S = 600.0
+"""Longest stretch on one page; longer ones would make it slow to open."""
+OUTSIDE = 0.03
+"""How far (m) beyond its stops a stroke may be logged: stops give way, and sensors err."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is shown, at `FRAMES_PER_S`; every array has shape (frame, columns).
+
+    Attributes:
+        name: of the recording.
+        machine: whose geometry is drawn.
+        start_s: time of the first frame in the recording.
+        angles: of boom, arm and bucket, rad.
+        velocity: of the cylinders, mm/s.
+        pressure: head and rod of boom, arm and bucket, bar; no columns where the recording has none.
+        ground: heights above the boom foot, m; no columns without soil.
+        ground_x: where they are, m before the boom foot.
+        readings: further values by name, with their unit.
+    """
+
+    name: str
+    machine: Machine
+    start_s: float
+    angles: Array
+    velocity: Array
+    pressure: Array
+    ground: Array
+    ground_x: Array
+    readings: dict[str, Array]
+
+
+def scene_of(
+    recording: Recording, machine: str | None = None, start_s: float = 0.0, seconds: float | None = None
+) -> Scene:
+    """What a page or film of a recording shows.
+
+    Args:
+        recording: with joint angles (`JointAngle_1..3`) or strokes (`CylStroke_1..3`).
+        machine: name or file of the machine; default: the one the recording was simulated with.
+        start_s: first second shown.
+        seconds: how many; default: to the end, at most `LONGEST_S`.
+
+    Raises:
+        DataError: neither angles nor strokes, or strokes that this machine does not have.
+        ConfigError: a machine is needed and not known, or the stretch lies outside the recording.
+    """
+    chosen = load_machine(machine or _machine_of(recording))
+    if not 0.0 <= start_s < recording.duration_s or (seconds is not None and not seconds > 0.0):
+        raise ConfigError(
+            f"start {start_s:g} s and seconds {seconds} of '{recording.name}': it lasts {recording.duration_s:g} s; "
+            "the start must lie within, the length be positive"
+        )
+    length = min(seconds or LONGEST_S, LONGEST_S, recording.duration_s - start_s)
+    when = start_s + np.arange(max(2, math.floor(length * FRAMES_PER_S))) / FRAMES_PER_S
+    rows = np.minimum(np.round(when * recording.rate_hz).astype(int), recording.samples - 1)
+    shown = _Columns(recording, rows)
+    strokes_per_s = recording.rate_hz
+    angles = _angles(shown, chosen)
+    if shown.has("CylVels_1", "CylVels_2", "CylVels_3"):
+        velocity = shown.take("CylVels_1", "CylVels_2", "CylVels_3")
+    else:
+        whole = np.stack([_filled(recording.column(f"CylStroke_{i}")) for i in (1, 2, 3)], axis=1)
+        velocity = np.gradient(whole, axis=0)[rows] * strokes_per_s
+    pressures = [f"CylPressures_{k}" for i in (1, 2, 3) for k in (i, i + 4)]
+    ground = [f"Ground_{k:02d}" for k in range(at.GROUND_POINTS)]
+    soil = shown.has(*ground)
+    points = math.ceil((sum(chosen.bodies.length) + BEYOND_M) / SPACING_M)
+    index = np.arange(at.GROUND_POINTS) * (points - 1) // (at.GROUND_POINTS - 1)
+    extra = {"payload kg": ("Payload", 1.0, 0.0), "oil °C": ("OilTemperature", 1.0, -273.15)}
+    readings = {k: f * shown.take(n)[:, 0] + add for k, (n, f, add) in extra.items() if shown.has(n)}
+    if shown.has("TipForceX", "TipForceY"):
+        readings["tip force kN"] = np.hypot(*shown.take("TipForceX", "TipForceY").T) * 1e-3
+    return Scene(
+        name=recording.name,
+        machine=chosen,
+        start_s=start_s,
+        angles=angles,
+        velocity=1e3 * velocity,
+        pressure=1e-5 * shown.take(*pressures) if shown.has(*pressures) else np.zeros((len(rows), 0)),
+        ground=shown.take(*ground) if soil else np.zeros((len(rows), 0)),
+        ground_x=np.asarray(index * SPACING_M, dtype=np.float64),
+        readings=readings,
+    )
+
+
+class _Columns:
+    """Some rows of a recording's channels, missing values filled."""
+
+    def __init__(self, recording: Recording, rows: NDArray[np.int_]) -> None:
+        self.recording, self._rows = recording, rows
+
+    def has(self, *names: str) -> bool:
+        return set(names) <= set(self.recording.channel_names)
+
+    def take(self, *names: str) -> Array:
+        return np.stack([_filled(self.recording.column(name))[self._rows] for name in names], axis=1)
+
+
+def _filled(values: Any) -> Array:
+    """Missing values by straight lines between their neighbours; zeros where there is nothing."""
+    made = np.asarray(values, dtype=float)
+    known = np.isfinite(made)
+    if known.all():
+        return made
+    return np.interp(np.arange(len(made)), np.flatnonzero(known), made[known]) if known.any() else np.zeros(len(made))
+
+
+def _machine_of(recording: Recording) -> str:
+    named = recording.meta.get("machine")
+    if isinstance(named, str):
+        return named
+    if recording.source.startswith("sim:"):
+        return recording.source.removeprefix("sim:")
+    raise ConfigError(
+        f"recording '{recording.name}' does not say which machine it is of; give --machine with a name or the path of "
+        "a machine file (.toml): its geometry is drawn"
+    )
+
+
+def _angles(shown: _Columns, machine: Machine) -> Array:
+    """Joint angles, shape (frame, 3), from the angles themselves or from strokes."""
+    angles, strokes = ([f"{kind}_{i}" for i in (1, 2, 3)] for kind in ("JointAngle", "CylStroke"))
+    if shown.has(*angles):
+        return shown.take(*angles)
+    if not shown.has(*strokes):
+        raise DataError(
+            f"recording '{shown.recording.name}' has neither {', '.join(angles)} nor {', '.join(strokes)}; an "
+            "animation needs one set: map your columns to these names in a signal map (--map)"
+        )
+    axes, plant = pack(machine)
+    found = []
+    for i, name in enumerate(strokes):
+        values, full = shown.take(name)[:, 0], float(axes[i, at.STROKE])
+        if values.min() < -OUTSIDE or values.max() > full + OUTSIDE:
+            raise DataError(
+                f"channel '{name}' of '{shown.recording.name}' runs from {values.min():.3f} to {values.max():.3f} m, "
+                f"the {JOINTS[i]} cylinder of {machine.name} from 0 to {full:.3f} m; choose another --machine, or "
+                "mend unit and zero in the signal map"
+            )
+        grid = np.linspace(0.0, full, 201)
+        if i < 2:
+            psi = np.array([linkage.angle_at_stroke(i, s, axes, plant) for s in grid])
+        else:
+            branch, length = linkage.bucket_branch(axes[i, at.CLOSED], axes[i, at.CLOSED] + full, plant)
+            psi = np.interp(grid + axes[i, at.CLOSED], length[::-1], branch[::-1])
+        found.append(np.interp(values, grid, psi))
+    return np.stack(found, axis=1)
+
+
+def write_animation(scene: Scene, output: str | Path) -> Path:
+    """Write one HTML page that plays a scene with no network.
+
+    Raises:
+        StorageError: the page cannot be written.
+    """
+    seconds = len(scene.angles) / FRAMES_PER_S
+    page = template("animation.html.jinja").render(
+        name=scene.name,
+        machine=f"{scene.machine.name}, {scene.machine.description}",
+        stretch=f"{scene.start_s:g} to {scene.start_s + seconds:g} s",
+        style=Markup(_asset("animation.css")),
+        script=Markup(_asset("animation.js")),
+        data=Markup(_script_json(_plain(scene))),
+    )
+    target = Path(output)
+    write_bytes(target, page.encode("utf-8", "replace"))
+    return target
+
+
+def _plain(scene: Scene) -> dict[str, Any]:
+    machine = scene.machine
+    return {
+        "rate": FRAMES_PER_S,
+        "start": scene.start_s,
+        "geometry": {
+            "length": machine.bodies.length,
+            "boom": asdict(machine.boom_cylinder),
+            "arm": asdict(machine.arm_cylinder),
+            "linkage": asdict(machine.bucket_linkage),
+            "bucket": asdict(machine.bucket),
+            "foot": machine.chassis.boom_foot_height,
+        },
+        "angles": np.round(scene.angles.T, 4).tolist(),
+        "velocity": np.round(scene.velocity.T, 1).tolist(),
+        "pressure": np.round(scene.pressure.T, 1).tolist(),
+        "ground": np.round(scene.ground[::5], 2).tolist(),
+        "ground_every": 5,
+        "ground_x": np.round(scene.ground_x, 3).tolist(),
+        "readings": {name: np.round(values, 1).tolist() for name, values in scene.readings.items()},
+    }
+
+
+def _asset(name: str) -> str:
+    return resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def _script_json(value: Any) -> str:
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

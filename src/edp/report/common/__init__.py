@@ -1,0 +1,1 @@
+"""What all pages share: style, tables, figures, templates, wording."""

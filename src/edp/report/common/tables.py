@@ -1,0 +1,238 @@
+"""The tables of the report, worded: columns with units, cells as text, the network's row marked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from edp.report.common.wording import MISSING, decimals_for, duration, moment, number, percent, whole
+from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
+from edp.report.run.figures import recording_errors
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Text in rows; the first column is a name, the others are right-aligned figures.
+
+    Attributes:
+        columns: (heading, unit) of each column.
+        marked: Places of the rows that are the network's.
+    """
+
+    caption: str
+    columns: tuple[tuple[str, str], ...]
+    rows: tuple[tuple[str, ...], ...]
+    marked: frozenset[int] = frozenset()
+
+
+def comparison_tables(facts: Facts) -> list[TextTable]:
+    """Metrics of every model, one table per horizon, the headline's horizon first."""
+    order = sorted(facts.horizons, key=lambda k: (k != main_horizon(facts), k))
+    return [table for table in (_comparison(facts, horizon) for horizon in order) if table.rows]
+
+
+def _comparison(facts: Facts, horizon: int) -> TextTable:
+    rows = comparison_rows(facts, horizon)
+    unit = facts.unit
+    shown = [metric for metric in ("mae", "rmse", "p95", "p99", "composite") if _any(rows, metric)]
+    places = {metric: decimals_for(row[metric] for row in rows) for metric in shown}
+    names = {"mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99", "composite": "Composite"}
+    with_bias, with_r2, with_time = _any(rows, "bias"), _any(rows, "r2"), _any(rows, "seconds")
+    columns = [("Model", ""), *((names[metric], unit) for metric in shown)]
+    columns += [("Bias", unit)] * with_bias + [("R²", "")] * with_r2
+    columns += [("Network relative to it", "MAE")] + [("Fitted in", "")] * with_time
+    lines = []
+    for row in rows:
+        cells = [row["label"], *(number(row[metric], places[metric]) for metric in shown)]
+        cells += [number(row["bias"], places["mae"], signed=True)] * with_bias
+        cells += [number(row["r2"], 4)] * with_r2
+        cells += [percent(row["change"], signed=True)]
+        cells += [duration(row["seconds"])] * with_time
+        lines.append(tuple(cells))
+    marked = frozenset(place for place, row in enumerate(rows) if row["is_network"])
+    return TextTable(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
+
+
+def _any(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
+    return any(row[key] is not None for row in rows)
+
+
+def output_table(facts: Facts) -> TextTable | None:
+    """Mean absolute error by output at the longest horizon."""
+    horizon = main_horizon(facts)
+    rows = comparison_rows(facts)
+    if horizon is None or not rows or len(facts.targets) < 2:
+        return None
+    names = [target.name for target in facts.targets]
+    places = {name: decimals_for(row["outputs"][name] for row in rows) for name in names}
+    lines = tuple((row["label"], *(number(row["outputs"][name], places[name]) for name in names)) for row in rows)
+    columns = (("Model", ""), *((target.description, target.unit) for target in facts.targets))
+    marked = frozenset(place for place, row in enumerate(rows) if row["is_network"])
+    return TextTable(f"MAE by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
+
+
+def interval_table(facts: Facts) -> TextTable | None:
+    """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
+    held = facts.models.get(NETWORK, {}).get("intervals", {})
+    rows = [(k, row) for k in facts.horizons for row in held.get(str(k), ())]
+    if not rows:
+        return None
+    places = decimals_for(row["width"]["mean"] for _, row in rows)
+    lines = tuple(
+        (
+            f"{horizon_text(facts, k)} ahead",
+            percent(row["coverage"]),
+            percent(row["covered"]["mean"]),
+            number(row["width"]["mean"], places),
+        )
+        for k, row in rows
+    )
+    columns = (("Interval", ""), ("Meant to hold", ""), ("Holds", ""), ("Mean width", facts.unit))
+    return TextTable("The network's intervals: share of the truth inside, mean over outputs", columns, lines)
+
+
+def worst_recordings_table(facts: Facts, most: int = 10) -> TextTable | None:
+    """The recordings on which the network does worst, worst first."""
+    horizon = main_horizon(facts)
+    if horizon is None or NETWORK not in facts.models:
+        return None
+    order, errors = recording_errors(facts, horizon)
+    if not order:
+        return None
+    models = [name for name in facts.models if name in errors]
+    places = decimals_for(errors[NETWORK]) if NETWORK in errors else 2
+    picked = list(range(len(order)))[::-1][:most]
+    lines = tuple((order[i], *(number(errors[name][i], places) for name in models)) for i in picked)
+    columns = (("Recording", ""), *((label_of(facts, name), facts.unit) for name in models))
+    return TextTable(f"The {len(picked)} hardest recordings, {horizon_text(facts, horizon)} ahead", columns, lines)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the budget: how much of it is used."""
+
+    what: str
+    value: str
+    limit: str
+    unit: str
+    share: float | None
+    fits: bool
+    note: str
+
+    @property
+    def share_text(self) -> str:
+        """The share used, as a percentage."""
+        return percent(self.share)
+
+
+def budget_checks(facts: Facts) -> list[Check]:
+    """The footprint against each limit of the budget."""
+    checks = []
+    for row in (facts.footprint or {}).get("verdict", []):
+        value, limit = row.get("value"), row.get("limit")
+        share = value / limit if value is not None and limit else None
+        checks.append(
+            Check(
+                str(row["what"]),
+                _amount(value),
+                _amount(limit),
+                str(row.get("unit") or ""),
+                share,
+                bool(row["fits"]),
+                str(row.get("note") or ""),
+            )
+        )
+    return checks
+
+
+def _amount(value: float | None) -> str:
+    return whole(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
+
+
+def parts_table(facts: Facts) -> TextTable | None:
+    """Parameters and multiply-accumulates of each part of the network."""
+    rows = (facts.footprint or {}).get("rows", [])
+    if not rows:
+        return None
+    keys = [key for key in ("parameters", "macs_tick", "macs_window") if any(row.get(key) is not None for row in rows)]
+    names = {"parameters": ("Parameters", ""), "macs_tick": ("Per tick", "MAC"), "macs_window": ("Per window", "MAC")}
+    lines = tuple((str(row["part"]), *(whole(row.get(key)) for key in keys)) for row in rows)
+    return TextTable("By part", (("Part", ""), *(names[key] for key in keys)), lines)
+
+
+def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
+    """The network's size and cost, name and worded figure."""
+    names = {
+        "parameters": ("Parameters", ""),
+        "parameters_folded": ("Parameters after folding", ""),
+        "macs_tick": ("Work per tick, streaming", "MAC"),
+        "macs_window": ("Work per window, from scratch", "MAC"),
+        "float32": ("Constants on a controller, FP32", "B"),
+        "w8a16": ("Constants on a controller, W8A16", "B"),
+        "peak_activation_bytes": ("Peak activations, streaming", "B"),
+        "peak_activation_bytes_window": ("Peak activations, window", "B"),
+        "state_bytes": ("State carried between ticks", "B"),
+        "window": ("Window", "samples"),
+    }
+    values = dict(facts.footprint or {})
+    values |= {row["number_format"]: row["parameter_bytes"] for row in values.get("estimates", [])}
+    found = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
+    return [(label, f"{whole(value)} {unit}".rstrip()) for label, value, unit in found if value is not None]
+
+
+def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
+    """Where the run came from: command, seed, data, machine, versions."""
+    if facts.provenance is None:
+        return []
+    source = facts.provenance
+    rows: list[tuple[str, str]] = []
+
+    def add(label: str, value: object) -> None:
+        if value is not None and value != "":
+            rows.append((label, str(value)))
+
+    add("Created", moment(source.get("created")))
+    add("Command", source.get("command"))
+    add("Version", source.get("edp_version"))
+    add("Seed", source.get("seed"))
+    add("Regime", source.get("regime"))
+    add("Device", source.get("device"))
+    add("Diverged", source.get("diverged"))
+    add("Training time", duration(source["seconds"]) if "seconds" in source else None)
+    add("Parameters", whole(source["parameters"]) if "parameters" in source else None)
+    data = source.get("data", {})
+    add("Data", data.get("source"))
+    add("Data digest", data.get("digest"))
+    add("Rate", f"{facts.rate_hz:g} Hz" if facts.rate_hz else None)
+    for part in ("train", "validation", "test"):
+        held = data.get(part)
+        if isinstance(held, Mapping):
+            hours = f", {number(held['hours'], 2)} h" if held.get("hours") is not None else ""
+            add(part.capitalize(), f"{whole(held.get('recordings'))} recordings{hours}")
+    for key, value in source.get("environment", {}).items():
+        add(key.replace("_", " ").capitalize(), value)
+    return rows
+
+
+def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
+    """The tiles under the headline: (figure, unit, what it is)."""
+    rows = comparison_rows(facts)
+    tiles: list[tuple[str, str, str]] = []
+    ours = next((row for row in rows if row["is_network"]), None)
+    if ours:
+        tiles.append((number(ours["mae"]), facts.unit, "mean absolute error"))
+        if ours["p95"] is not None:
+            tiles.append((number(ours["p95"]), facts.unit, "95 % of errors are below"))
+    best = next((row for row in rows if row["change"] is not None), None)
+    if best:
+        tiles.append((percent(best["change"], signed=True), "", f"error against {best['label']}, the best baseline"))
+    elif ours and ours["r2"] is not None:
+        tiles.append((number(ours["r2"], 4), "", "R²"))
+    checks = budget_checks(facts)
+    if checks:
+        fitting = sum(check.fits for check in checks)
+        tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
+    elif (facts.provenance or {}).get("parameters") is not None:
+        tiles.append((whole((facts.provenance or {})["parameters"]), "", "parameters"))
+    return [tile for tile in tiles if tile[0] != MISSING]

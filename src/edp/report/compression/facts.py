@@ -1,0 +1,210 @@
+"""What a search for a smaller network left on disk, as tables and points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.report.common.wording import listed, number, percent
+from edp.storage import read_json
+
+RESULT, SCHEMA = "compression.json", 1
+LIMITS = {"cycles": "cycles", "parameter_bytes": "parameters", "ram_bytes": "memory", "flash_bytes": "flash"}
+COSTS = {"cycles": "Cycles per tick, high estimate", "parameter_bytes": "Memory for parameters [bytes]"}
+
+
+@dataclass(frozen=True)
+class CompressionFacts:
+    """Content of ``compression.json``.
+
+    Attributes:
+        held: plain values.
+        folder: where it lies.
+    """
+
+    held: Mapping[str, Any]
+    folder: Path
+
+    @property
+    def rows(self) -> Sequence[Mapping[str, Any]]:
+        """All networks in all formats."""
+        rows: Sequence[Mapping[str, Any]] = self.held["rows"]
+        return rows
+
+    def smallest(self) -> list[int]:
+        """Places of a row for each network: that of its smallest format; the teacher in float32 comes first."""
+        found: dict[tuple[str, bool], int] = {}
+        for place, row in enumerate(self.rows):
+            whole = row["way"] == "teacher" and row["number_format"] == "float32"
+            held = found.get((row["run"], whole))
+            if held is None or row["taken"]["parameter_bytes"] < self.rows[held]["taken"]["parameter_bytes"]:
+                found[row["run"], whole] = place
+        return sorted(found.values(), key=lambda place: (self.rows[place]["way"] != "teacher", place))
+
+    @property
+    def horizons(self) -> list[str]:
+        """Look-aheads in samples, as keys of scores."""
+        return [str(horizon) for horizon in self.held["task"]["horizons"]]
+
+    @property
+    def chosen(self) -> Mapping[str, Any] | None:
+        """The network that was chosen, None where none fits."""
+        place = self.held["chosen"]
+        return None if place is None else self.rows[place]
+
+    def mae(self, row: Mapping[str, Any], horizon: str, when: str = "scores") -> float:
+        """MAE on the validation part; `when` is ``scores`` or ``before``."""
+        return float(row[when][horizon]["mae"])
+
+    def cost(self, row: Mapping[str, Any], name: str) -> float:
+        """A name of `COSTS`."""
+        held = row["taken"][name]
+        return float(held[2] if name == "cycles" else held)
+
+    def ahead(self, horizon: str) -> str:
+        """A horizon in words."""
+        return f"{1e3 * int(horizon) / self.held['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
+
+
+def read_compression(folder: str | Path) -> CompressionFacts:
+    """What `edp compress` wrote into a folder.
+
+    Raises:
+        StorageError: nothing, or something of another version.
+    """
+    file = Path(folder) / RESULT
+    if not file.is_file():
+        raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp compress")
+    held = read_json(file)
+    if not isinstance(held, dict) or held.get("schema") != SCHEMA:
+        raise StorageError(f"'{file}' is of another version of EDP; run edp compress again")
+    return CompressionFacts(held, Path(folder))
+
+
+def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
+    """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
+    teacher = facts.mae(facts.held["teacher"], horizon)
+    rows: list[tuple[Value, ...]] = []
+    for row in facts.rows:
+        taken, mae = row["taken"], facts.mae(row, horizon)
+        rows.append(
+            (
+                row["name"],
+                row["way"],
+                mae,
+                100 * (mae / teacher - 1),
+                taken["parameters"],
+                taken["parameter_bytes"] / 1e6,
+                row["label"],
+                taken["macs_window"] / 1e6,
+                taken["macs_tick"],
+                taken["cycles"][2],
+                "fits" if row["fits"] else f"over: {listed(LIMITS[name] for name in row['over'])}",
+            )
+        )
+    unit = facts.held["unit"]
+    columns = (
+        Column("Variant"),
+        Column("Made"),
+        Column("MAE", unit, figures([row[2] for row in rows])),
+        Column("Δ MAE", "%", figures([row[3] for row in rows], signed=True, decimals=2)),
+        Column("Parameters", "", figures([], decimals=0)),
+        Column("Size", "MB", figures([], decimals=4)),
+        Column("Numbers"),
+        Column("MACs per window", "M", figures([], decimals=3)),
+        Column("MACs per tick", "", figures([], decimals=0)),
+        Column("Cycles, high", "", figures([], decimals=0)),
+        Column("Budget"),
+    )
+    caption = f"{facts.ahead(horizon)}, validation part"
+    return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(facts.held["front"]))
+
+
+def box_sheet(facts: CompressionFacts) -> Sheet | None:
+    """Teacher and chosen on the lock-box."""
+    scores = facts.held["box"].get("scores")
+    if not scores:
+        return None
+    rows: list[tuple[Value, ...]] = []
+    for horizon, first in scores["teacher"].items():
+        last = scores["chosen"][horizon]
+        change = 100 * (last["mae"] / first["mae"] - 1)
+        composites = first["composite"], last["composite"]
+        rows.append((facts.ahead(horizon), first["mae"], last["mae"], change, *composites))
+    unit = facts.held["unit"]
+    columns = (
+        Column("Horizon"),
+        Column("MAE, teacher", unit, figures([row[1] for row in rows])),
+        Column("MAE, chosen", unit, figures([row[2] for row in rows])),
+        Column("Δ MAE", "%", figures([], signed=True, decimals=2)),
+        Column("Composite, teacher", unit, figures([row[4] for row in rows])),
+        Column("Composite, chosen", unit, figures([row[5] for row in rows])),
+    )
+    return Sheet("lockbox", "On recordings that took part in no choice", columns, tuple(rows))
+
+
+def headline(facts: CompressionFacts) -> str:
+    """One sentence: what was found."""
+    best, budget = facts.chosen, facts.held["budget"]["name"]
+    if best is None:
+        return f"None of the networks made fits the budget “{budget}”"
+    change = percent(best["error"] - 1, signed=True)
+    return f"{best['name']} fits “{budget}” with an error {change} against the teacher's"
+
+
+def verdict(facts: CompressionFacts) -> list[str]:
+    """Sentences under the headline."""
+    best, box = facts.chosen, facts.held["box"]
+    if best is None:
+        near = min(facts.rows, key=lambda row: max(value / limit for value, limit in row["over"].values()))
+        over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near["over"].items())
+        return [f"The nearest is {near['name']}: {over}."]
+    taken, budget = best["taken"], facts.held["budget"]
+    lines = [
+        f"It takes {taken['cycles'][2]:,} of {budget['cycles']:,} cycles a tick (high estimate) and "
+        f"{taken['parameter_bytes']:,} of {budget['parameter_bytes']:,} bytes for parameters."
+    ]
+    if "error" in box:
+        lines.append(f"On the lock-box its MAE is {percent(box['error'] - 1, signed=True)} against the teacher's.")
+    return lines
+
+
+def caveats(facts: CompressionFacts) -> list[str]:
+    """What the figures can and cannot show."""
+    box, parts = facts.held["box"], facts.held["recordings"]
+    lines = [
+        "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
+        "constants, as the exported C code holds them (INT8, which has no such code: as in Table 4.9). The high "
+        "estimate decides.",
+        f"Networks are compared and chosen on {parts['validation']} validation recordings, which chose their best "
+        "epochs too: the least of many errors is a little too good there.",
+        f"The lock-box, {parts['test']} recordings, was opened for the chosen network and the teacher alone.",
+        "One training each: differences of a percent between neighbours may be chance.",
+    ]
+    if box.get("seen_before"):
+        lines.append(
+            "The run of the teacher was judged on the lock-box before, so the teacher was perhaps chosen by it. "
+            "Recordings that nobody looked at, given with --data, would show more."
+        )
+    if len(box.get("openings", ())) > 1:
+        lines.append(f"The lock-box was opened {len(box['openings'])} times; each look after the first shows less.")
+    return [*lines, *facts.held["notes"]]
+
+
+def tiles(facts: CompressionFacts) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, meaning."""
+    best = facts.chosen
+    if best is None:
+        return []
+    horizon, taken, teacher = facts.horizons[-1], best["taken"], facts.held["teacher"]
+    return [
+        (number(facts.mae(best, horizon)), facts.held["unit"], f"MAE {facts.ahead(horizon)}"),
+        (number(facts.mae(teacher, horizon)), facts.held["unit"], "MAE of the teacher"),
+        (f"{taken['parameter_bytes'] / 1e3:.1f}", "kB", "for parameters"),
+        (f"{taken['cycles'][2] / 1e3:,.0f}", "k", "cycles per tick, high estimate"),
+        (f"{taken['macs_tick'] / 1e3:,.1f}", "k", "MACs per tick"),
+    ]

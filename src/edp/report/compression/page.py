@@ -1,0 +1,59 @@
+"""The report of a search for a smaller network: one offline HTML page, tables and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from edp.report.common.drawing import write_drawings
+from edp.report.common.sheets import Sheet, write_sheets
+from edp.report.common.templates import template
+from edp.report.common.wording import unbroken
+from edp.report.compression import facts as words
+from edp.report.compression.facts import CompressionFacts, read_compression
+from edp.report.compression.plots import compression_plots, drawings
+from edp.report.run.page import shown
+from edp.storage import write_bytes
+
+
+def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
+    """Write ``report.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp compress`.
+
+    Returns:
+        The page.
+
+    Raises:
+        StorageError: the folder holds no search, or a file cannot be written.
+    """
+    facts = read_compression(folder)
+    tables = sheets(facts)
+    page = facts.folder / "report.html"
+    write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
+    write_sheets(facts.folder / "tables", tables)
+    if pictures:
+        write_drawings(facts.folder / "pictures", drawings(facts))
+    return page
+
+
+def sheets(facts: CompressionFacts) -> list[Sheet]:
+    """A table a horizon, longest first, and that of the lock-box."""
+    box = words.box_sheet(facts)
+    return [*(words.table_sheet(facts, horizon) for horizon in reversed(facts.horizons)), *([box] if box else [])]
+
+
+def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
+    """The page's text."""
+    plots = compression_plots(facts)
+    context: dict[str, Any] = {
+        "title": facts.folder.resolve().name,
+        "headline": unbroken(words.headline(facts)),
+        "verdict": words.verdict(facts),
+        "tiles": words.tiles(facts),
+        "caveats": words.caveats(facts),
+        "tables": [sheet.table() for sheet in tables if sheet.name != "lockbox"],
+        "box": next((sheet.table() for sheet in tables if sheet.name == "lockbox"), None),
+        "opened": facts.held["box"].get("opened", ""),
+        "budget": facts.held["budget"],
+        **shown(plots),
+    }
+    return template("compression.html.jinja").render(**context)

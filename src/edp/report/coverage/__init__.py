@@ -1,0 +1,1 @@
+"""The page of how data cover a machine's range, and of their quality."""

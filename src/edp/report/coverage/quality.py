@@ -1,0 +1,103 @@
+"""The quality of recordings as tables of a page."""
+
+from __future__ import annotations
+
+import math
+
+from edp.logs import DataQuality, Finding, QualityReport
+from edp.report.common.tables import TextTable
+from edp.report.common.wording import MISSING, number, percent, whole
+
+SHOWN_CHANNELS = 400
+"""Rows of the table of channels; the rest is in the JSON."""
+
+
+def quality_tables(found: DataQuality) -> dict[str, TextTable]:
+    """Recordings, channels that are not good, and findings, by name; a table without rows is left out."""
+    made = {"recordings": recordings_table(found), "channels": channels_table(found), "findings": findings_table(found)}
+    return {name: table for name, table in made.items() if table.rows}
+
+
+def recordings_table(found: DataQuality) -> TextTable:
+    """A row for each recording."""
+    rows = tuple(
+        (
+            report.name,
+            number(report.duration_s, 1),
+            f"{report.rate_hz:g}",
+            number(report.jitter, 3),
+            whole(sum(clock.gaps for clock in report.clocks)),
+            whole(sum(channel.missing for channel in report.channels)),
+            _count(report, "warning"),
+            report.verdict,
+        )
+        for report in found.reports
+    )
+    columns = (
+        ("Recording", ""), ("Length", "s"), ("Rate", "Hz"), ("Jitter", "steps"), ("Gaps", ""), ("Missing", "values"),
+        ("Warnings", ""), ("Verdict", ""),
+    )  # fmt: skip
+    return TextTable("Recordings", columns, rows)
+
+
+def channels_table(found: DataQuality) -> TextTable:
+    """Sensor facts of each channel, over all recordings: the worst of each."""
+    columns = (
+        ("Channel", ""), ("Unit", ""), ("Min", ""), ("Max", ""), ("Step", ""), ("Noise", ""), ("SNR", "dB"),
+        ("New", "Hz"), ("Stuck", "s"), ("At ends", ""), ("Verdict", "worst"),
+    )  # fmt: skip
+    names = list(dict.fromkeys(channel.name for report in found.reports for channel in report.channels))
+    rows = []
+    for name in names[:SHOWN_CHANNELS]:
+        facts = [channel for report in found.reports for channel in report.channels if channel.name == name]
+        snr = [channel.snr_db for channel in facts if channel.snr_db is not None]
+        worst = next(v for v in ("unusable", "check", "good") if any(channel.verdict == v for channel in facts))
+        rows.append(
+            (
+                name,
+                facts[0].unit,
+                _figure(min(channel.min for channel in facts)),
+                _figure(max(channel.max for channel in facts)),
+                _figure(max((channel.step for channel in facts if channel.step is not None), default=None)),
+                _figure(max(channel.noise for channel in facts) or None),
+                number(min(snr), 0) if snr else MISSING,
+                f"{min(channel.new_hz for channel in facts):.3g}",
+                number(max(channel.stuck_s for channel in facts), 1),
+                percent(max(channel.at_ends for channel in facts)),
+                worst,
+            )
+        )
+    return TextTable("Channels over all recordings", columns, tuple(rows))
+
+
+def findings_table(found: DataQuality) -> TextTable:
+    """Errors and warnings, equal ones of several recordings together, worst first; notes are in the JSON."""
+    grouped: dict[tuple[str, str, str, str], list[str]] = {_key(finding): [] for finding in found.findings}
+    for report in found.reports:
+        for finding in report.findings:
+            if finding.severity != "note":
+                grouped.setdefault(_key(finding), []).append(report.name)
+    rows = tuple(
+        (channel or ("Whole log" if names else "Data set"), severity, what, _where(names), advice)
+        for (severity, channel, what, advice), names in sorted(grouped.items(), key=lambda item: item[0][0])
+    )
+    columns = (("Channel", ""), ("", ""), ("Finding", ""), ("Where", ""), ("What to do", ""))
+    return TextTable("What to look at", columns, rows)
+
+
+def _key(finding: Finding) -> tuple[str, str, str, str]:
+    return finding.severity, finding.channel or "", finding.what, finding.advice
+
+
+def _count(report: QualityReport, severity: str) -> str:
+    return whole(sum(finding.severity == severity for finding in report.findings))
+
+
+def _where(names: list[str]) -> str:
+    return "several recordings" if not names else names[0] if len(names) == 1 else f"{len(names)} recordings"
+
+
+def _figure(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return MISSING
+    return number(value, 0) if abs(value) >= 1000 else f"{value:.3g}".replace("-", "−").replace("e−0", "e−")

@@ -1,0 +1,329 @@
+"""Read a run folder and state what it says as plain data: no HTML, no figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, StorageError
+from edp.report.common.wording import decimals_for, listed, number, percent
+from edp.report.run.predictability import limit_line, read_limit
+from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
+
+NETWORK = "network"
+TRUTH = "truth"
+MAKERS = {
+    "config.toml": "edp train",
+    "provenance.json": "edp train",
+    "history.jsonl": "edp train",
+    "scores.json": "edp evaluate",
+    "predictions.safetensors": "edp evaluate",
+    "footprint.json": "edp evaluate",
+}
+METRICS = ("mae", "rmse", "p95", "p99", "r2", "bias", "composite")
+
+
+@dataclass(frozen=True)
+class Target:
+    """One output of the model: `factor` takes its SI value to `unit`, the unit of the report."""
+
+    name: str
+    description: str
+    unit: str
+    factor: float
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a run folder holds; a part that is missing is None or empty, and `absent` names its file.
+
+    Attributes:
+        limit: the limit of predictability of the run's data, see `edp.report.run.predictability`.
+        foundation: errors on machines that were never seen, of a run over many machines, see
+            `edp.report.run.foundation`.
+        predictions: ``recording -> name -> array``; ``truth`` is (time, target), a model (time, horizon, target), SI.
+    """
+
+    folder: Path
+    config: str | None = None
+    provenance: Mapping[str, Any] | None = None
+    history: tuple[Mapping[str, Any], ...] = ()
+    scores: Mapping[str, Any] | None = None
+    footprint: Mapping[str, Any] | None = None
+    predictions: Mapping[str, Mapping[str, NDArray[np.floating]]] = field(default_factory=dict)
+    absent: tuple[str, ...] = ()
+    limit: Mapping[str, Any] | None = None
+    foundation: Mapping[str, Any] | None = None
+
+    @property
+    def targets(self) -> tuple[Target, ...]:
+        """The outputs, in the order of the arrays."""
+        rows = (self.scores or {}).get("targets", ())
+        return tuple(
+            Target(
+                row["name"], row.get("description") or row["name"], row.get("unit", ""), float(row.get("factor", 1.0))
+            )
+            for row in rows
+        )
+
+    @property
+    def horizons(self) -> tuple[int, ...]:
+        """Samples ahead, in the order of the arrays."""
+        return tuple(int(k) for k in (self.scores or {}).get("task", {}).get("horizons", ()))
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Samples per second, or None where the run does not say."""
+        task_rate = (self.scores or {}).get("task", {}).get("rate_hz")
+        rate = task_rate or (self.provenance or {}).get("data", {}).get("rate_hz")
+        return float(rate) if rate else None
+
+    @property
+    def models(self) -> dict[str, Mapping[str, Any]]:
+        """Scored models by name, the network first."""
+        models = dict((self.scores or {}).get("models", {}))
+        return {name: models[name] for name in sorted(models, key=lambda name: name != NETWORK)}
+
+    @property
+    def unit(self) -> str:
+        """The unit that all outputs share; empty where they differ, because then a mean over outputs has none."""
+        units = {target.unit for target in self.targets}
+        return units.pop() if len(units) == 1 else ""
+
+
+def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts:
+    """Read every part of a run folder that is there.
+
+    Args:
+        run_folder: the folder.
+        limit: file of the limit of predictability, or a folder with one; None looks beside the run's data.
+
+    Raises:
+        StorageError: the folder is missing, holds no part of a run, or a part is damaged.
+        DataError: the arrays of predictions do not fit the scored task.
+    """
+    folder = Path(run_folder)
+    if not folder.is_dir():
+        raise StorageError(f"no run folder at '{folder}'; give the folder that `edp train` wrote")
+    absent = tuple(name for name in MAKERS if not (folder / name).is_file())
+    if len(absent) == len(MAKERS):
+        raise StorageError(f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}")
+
+    def json_part(name: str) -> Any:
+        return None if name in absent else read_object(folder / name)
+
+    provenance = json_part("provenance.json")
+    facts = Facts(
+        folder=folder,
+        config=None if "config.toml" in absent else read_text(folder / "config.toml", SETTINGS_BYTES),
+        provenance=provenance,
+        history=() if "history.jsonl" in absent else read_history(folder / "history.jsonl"),
+        scores=json_part("scores.json"),
+        footprint=json_part("footprint.json"),
+        predictions={} if "predictions.safetensors" in absent else _read_predictions(folder),
+        absent=absent,
+        limit=read_limit(None if limit is None else Path(limit), provenance),
+        foundation=_read_foundation(folder),
+    )
+    _check_predictions(facts)
+    return facts
+
+
+def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
+    """Epochs of a history file; a last line that a kill cut off is left out.
+
+    Raises:
+        StorageError: another line than the last is not a JSON object.
+    """
+    lines = [(row, line) for row, line in enumerate(read_text(path, JSON_BYTES).splitlines(), 1) if line.strip()]
+    epochs: list[Mapping[str, Any]] = []
+    for place, (row, line) in enumerate(lines, 1):
+        try:
+            epoch = parse_json(line, f"'{path}' line {row}", finite=False)
+        except StorageError:
+            if place == len(lines):
+                break
+            raise
+        if not isinstance(epoch, dict):
+            raise StorageError(f"'{path}' line {row} holds {line[:40]!r}; each line must be one JSON object")
+        epochs.append(epoch)
+    return tuple(epochs)
+
+
+def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
+    """What `edp pretrain` found; None where the run is another."""
+    path = folder / "foundation.json"
+    if not path.is_file():
+        return None
+    found = read_object(path)
+    unseen = found.get("unseen")
+    if not {"label", "horizon", "data"} <= found.keys() or not {"contexts", "machines"} <= set(unseen or ()):
+        raise StorageError(f"'{path}' does not hold what `edp pretrain` writes; run that command once more")
+    return found
+
+
+def _read_predictions(folder: Path) -> dict[str, dict[str, NDArray[np.floating]]]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    path = folder / "predictions.safetensors"
+    try:
+        arrays = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise StorageError(f"cannot read '{path}': {error}; write it again with `edp evaluate {folder}`") from error
+    recordings: dict[str, dict[str, NDArray[np.floating]]] = {}
+    for key in sorted(arrays):
+        recording, _, name = key.rpartition("/")
+        recordings.setdefault(recording, {})[name] = arrays[key]
+    return {recording: parts for recording, parts in recordings.items() if TRUTH in parts}
+
+
+def _check_predictions(facts: Facts) -> None:
+    if facts.scores is None:
+        return
+    for recording, parts in facts.predictions.items():
+        truth = parts[TRUTH]
+        for name, array in parts.items():
+            wanted = (
+                (len(truth), len(facts.targets))
+                if name == TRUTH
+                else (
+                    len(truth),
+                    len(facts.horizons),
+                    len(facts.targets),
+                )
+            )
+            if array.shape != wanted:
+                raise DataError(
+                    f"predictions.safetensors, '{recording}/{name}' has shape {array.shape}, but scores.json asks for "
+                    f"{wanted}; run `edp evaluate {facts.folder}` again so that both come from one evaluation"
+                )
+
+
+def horizon_text(facts: Facts, samples: int) -> str:
+    """A horizon in milliseconds, or in samples where the rate is unknown."""
+    if facts.rate_hz is None:
+        return f"{samples} sample{'s' if samples != 1 else ''}"
+    return f"{1000 * samples / facts.rate_hz:g} ms"
+
+
+def main_horizon(facts: Facts) -> int | None:
+    """The longest horizon: the one the headline is about."""
+    return max(facts.horizons, default=None)
+
+
+def score(model: Mapping[str, Any], horizon: int, metric: str = "mae", output: str = "mean") -> float | None:
+    """One overall score of a model, or None where it was not computed."""
+    value = model.get("overall", {}).get(str(horizon), {}).get(output, {}).get(metric)
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def label_of(facts: Facts, name: str) -> str:
+    """How the report calls a model."""
+    return str(facts.models.get(name, {}).get("label") or name.replace("_", " "))
+
+
+def comparison_rows(facts: Facts, horizon: int | None = None) -> list[dict[str, Any]]:
+    """One row per scored model, best mean absolute error first, in report units.
+
+    Keys: `model`, `label`, `is_network`, each of `METRICS`, `change` (network's error against this model's, -0.45
+    is 45 % lower; None for the network itself), `outputs` (name -> MAE) and `seconds` of fitting.
+    """
+    samples = main_horizon(facts) if horizon is None else horizon
+    if samples is None:
+        return []
+    ours = score(facts.models.get(NETWORK, {}), samples)
+    rows: list[dict[str, Any]] = []
+    for name, model in facts.models.items():
+        mae = score(model, samples)
+        if mae is None:
+            continue
+        row: dict[str, Any] = {"model": name, "label": label_of(facts, name), "is_network": name == NETWORK}
+        row |= {metric: score(model, samples, metric) for metric in METRICS}
+        row["change"] = ours / mae - 1 if ours is not None and mae > 0 and name != NETWORK else None
+        row["outputs"] = {target.name: score(model, samples, output=target.name) for target in facts.targets}
+        row["seconds"] = model.get("seconds")
+        rows.append(row)
+    return sorted(rows, key=lambda row: row["mae"])
+
+
+def headline(facts: Facts) -> str:
+    """The verdict in one sentence: the network's mean error at the longest horizon, and the baselines'.
+
+    Outputs in different units have no common mean, so the sentence then speaks of the first output.
+    """
+    samples = main_horizon(facts)
+    rows = comparison_rows(facts)
+    if samples is None or not any(row["is_network"] for row in rows):
+        return f"This run has no scores yet; `edp evaluate {facts.folder}` makes them."
+    unit, what, key = facts.unit, "", "mean"
+    if not unit and facts.targets:
+        first = facts.targets[0]
+        unit, what, key = first.unit, f" in {first.description[:1].lower()}{first.description[1:]}", first.name
+    values = {row["model"]: score(facts.models[row["model"]], samples, output=key) for row in rows}
+    places = min(max(decimals_for(values.values(), significant=2), 1), 4)
+    parts = [f"{row['label']} {number(values[row['model']], places)}" for row in rows if not row["is_network"]]
+    shown = parts if len(parts) <= 4 else [*parts[:3], f"{len(parts) - 3} more above that"]
+    start = f"At {horizon_text(facts, samples)} ahead the network is off by {number(values[NETWORK], places)} {unit}"
+    return "; ".join([f"{start.rstrip()}{what} on average", *shown]) + "."
+
+
+def verdict_lines(facts: Facts) -> list[str]:
+    """What the headline means: against the best baseline, over the recordings, against the hardware budget."""
+    lines = []
+    rows = comparison_rows(facts)
+    baselines = [row for row in rows if row["change"] is not None]
+    if baselines:
+        best = baselines[0]
+        lower = best["change"] < 0
+        lines.append(
+            f"That is {percent(abs(best['change']))} {'lower' if lower else 'higher'} than the best baseline, "
+            f"{best['label']}{'' if lower else ': the network does not pay for itself here'}."
+        )
+        won, both = recordings_won(facts, best["model"])
+        if both:
+            lines.append(f"It is the better of the two on {won} of {both} test recordings.")
+    limit = limit_line(facts, main_horizon(facts))
+    if limit:
+        lines.append(limit)
+    checks = (facts.footprint or {}).get("verdict", [])
+    if checks:
+        over = [str(check["what"]) for check in checks if not check["fits"]]
+        name = (facts.footprint or {}).get("budget", {}).get("name") or "the controller"
+        verdict = f"exceeded in {listed(over)}" if over else "met on every count"
+        lines.append(f"Budget ({name}): {verdict}.")
+    return lines
+
+
+def recordings_won(facts: Facts, rival: str) -> tuple[int, int]:
+    """Recordings on which the network's mean error is below a rival's, and how many have both scores."""
+    samples = str(main_horizon(facts))
+
+    def errors(name: str) -> dict[str, float]:
+        scored = facts.models.get(name, {}).get("recordings", {})
+        found = {key: value.get(samples, {}).get("mean", {}).get("mae") for key, value in scored.items()}
+        return {key: value for key, value in found.items() if value is not None}
+
+    ours, theirs = errors(NETWORK), errors(rival)
+    both = ours.keys() & theirs.keys()
+    return sum(ours[key] < theirs[key] for key in both), len(both)
+
+
+def spread_text(facts: Facts) -> str:
+    """How the network's error spreads over the test recordings, as a sentence; empty where it was not computed."""
+    samples = main_horizon(facts)
+    spread = facts.models.get(NETWORK, {}).get("spread", {}).get(str(samples)) if samples is not None else None
+    if not spread or any(spread.get(key) is None for key in ("median", "q25", "q75", "min", "max")):
+        return ""
+    places = decimals_for(spread[key] for key in ("median", "q25", "q75"))
+    text = {key: number(spread[key], places) for key in ("median", "q25", "q75", "min", "max")}
+    return (
+        f"Over the test recordings the network's error has a median of {text['median']} {facts.unit}; half of them lie "
+        f"between {text['q25']} and {text['q75']}, the best at {text['min']} and the worst at {text['max']}."
+    )

@@ -1,0 +1,264 @@
+"""What each figure shows, as plain data: aligned, downsampled, binned. `plots` draws it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tsdownsample import MinMaxLTTBDownsampler
+
+from edp.report.run.facts import NETWORK, TRUTH, Facts, main_horizon, score
+
+WHOLE, EXCERPT = "whole", "excerpt"
+POINT_BUDGET = 250_000  # of all prediction traces together: about 2 MB of the page
+RECORDINGS_SHOWN, HORIZONS_SHOWN = 6, 4
+EXCERPT_SECONDS = 12.0
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One trace of the prediction figure.
+
+    Attributes:
+        horizon: Samples ahead; None for the truth, which every horizon shares.
+        target: Place of the output among the facts' targets.
+        x: (point,) seconds, or samples where the rate is unknown.
+        y: (point,) report units; NaN breaks the line.
+        start: First sample and `step`: set instead of `x` where every sample is shown.
+    """
+
+    recording: str
+    extent: str
+    model: str
+    horizon: int | None
+    target: int
+    y: Array
+    x: Array | None = None
+    start: float = 0.0
+    step: float = 1.0
+
+
+def horizons_shown(facts: Facts) -> list[int]:
+    """The horizons of the figures with a choice, shortest first: all, or a few with both ends."""
+    return some_of(sorted(facts.horizons), HORIZONS_SHOWN)
+
+
+def some_of(items: Sequence[int], most: int) -> list[int]:
+    """At most `most` of a sequence, evenly spread, both ends kept."""
+    if len(items) <= most:
+        return list(items)
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+
+def aligned(predicted: Array, horizon: int) -> Array:
+    """Move predictions to the time they speak of: row t holds what was said at t - horizon; NaN where nothing was.
+
+    Args:
+        predicted: (time, ...) prediction made at t for t + horizon.
+        horizon: Samples ahead, 0 or more.
+    """
+    moved = np.full_like(predicted, np.nan)
+    if horizon < len(predicted):
+        moved[horizon:] = predicted[: len(predicted) - horizon]
+    return moved
+
+
+def downsample(y: Array, points: int) -> NDArray[np.intp]:
+    """Indices of about `points` samples that keep the shape of a line, peaks included.
+
+    MinMaxLTTB on the finite samples; the first sample of each inner gap is kept too, so that a drawn line breaks there.
+    """
+    finite = np.flatnonzero(np.isfinite(y))
+    if len(finite) == 0:
+        return np.empty(0, dtype=np.intp)
+    gaps = finite[:-1][np.diff(finite) > 1] + 1
+    if len(finite) <= points:
+        kept = finite
+    else:
+        values = np.ascontiguousarray(y[finite], dtype=np.float64)
+        chosen = MinMaxLTTBDownsampler().downsample(finite.astype(np.float64), values, n_out=points)
+        kept = finite[chosen.astype(np.intp)]
+    return np.union1d(kept, gaps[:points]).astype(np.intp)
+
+
+def busiest_start(truth: Array, length: int) -> int:
+    """First sample of the stretch of `length` samples in which the outputs move most.
+
+    Args:
+        truth: (time, target); each output counts in units of its own standard deviation.
+        length: Samples in the stretch.
+    """
+    if len(truth) <= length:
+        return 0
+    values = np.nan_to_num(truth)
+    deviation = values.std(axis=0)
+    travel = (np.abs(np.diff(values, axis=0)) / np.where(deviation > 0, deviation, 1.0)).sum(axis=1)
+    run = np.concatenate([[0.0], np.cumsum(travel)])
+    return int(np.argmax(run[length - 1 :] - run[: len(run) - length + 1]))
+
+
+def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
+    """Truth and predictions of a few recordings: the whole of each, downsampled, and its busiest stretch, in full.
+
+    All traces together hold about `budget` points, so that the page stays small whatever the run holds.
+    """
+    recordings = sorted(facts.predictions)[:RECORDINGS_SHOWN]
+    horizons = horizons_shown(facts)
+    models = sum(len(facts.predictions[name]) - 1 for name in recordings)
+    traces = len(facts.targets) * (len(recordings) + models * len(horizons))
+    if traces == 0 or not horizons:
+        return []
+    points = int(np.clip(budget // (2 * traces), 200, 2000))
+    lines: list[Line] = []
+    for recording in recordings:
+        truth = facts.predictions[recording][TRUTH]
+        rate = facts.rate_hz or 1.0
+        length = min(round(EXCERPT_SECONDS * rate), points)
+        first = busiest_start(truth, length)
+        for model, horizon, values in _series(facts, recording, horizons):
+            for place, target in enumerate(facts.targets):
+                y = np.asarray(values[:, place] * target.factor, dtype=np.float32)
+                kept = downsample(y, points)
+                lines.append(Line(recording, WHOLE, model, horizon, place, y[kept], (kept / rate).astype(np.float32)))
+                cut = y[first : first + length]
+                lines.append(Line(recording, EXCERPT, model, horizon, place, cut, start=first / rate, step=1.0 / rate))
+    return lines
+
+
+def _series(facts: Facts, recording: str, horizons: Sequence[int]) -> list[tuple[str, int | None, Array]]:
+    """(model, horizon, (time, target)) of the truth, the baselines and last, so drawn on top, the network."""
+    parts = facts.predictions[recording]
+    series: list[tuple[str, int | None, Array]] = [(TRUTH, None, parts[TRUTH])]
+    for name in sorted(parts.keys() - {TRUTH}, key=lambda name: name == NETWORK):
+        for horizon in horizons:
+            series.append((name, horizon, aligned(parts[name][:, facts.horizons.index(horizon)], horizon)))
+    return series
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Shares of the residuals of one model, horizon and output, in equal bins.
+
+    Attributes:
+        centres: (bin,) report units.
+        share: (bin,) share of all residuals, so that what lies outside the bins counts too.
+        outside: Share of the residuals beyond the first and last bin.
+    """
+
+    model: str
+    horizon: int
+    target: int
+    centres: Array
+    share: Array
+    outside: float
+    mean: float
+    deviation: float
+
+
+def residual_histograms(facts: Facts, bins: int = 61) -> list[Histogram]:
+    """Prediction minus truth over the recordings kept, in bins that span 99 % of the network's residuals."""
+    found: list[Histogram] = []
+    models = {name for parts in facts.predictions.values() for name in parts} - {TRUTH}
+    order = sorted(models, key=lambda name: name != NETWORK)
+    for horizon in horizons_shown(facts):
+        for place, target in enumerate(facts.targets):
+            reach = 0.0
+            for model in order:
+                errors = _residuals(facts, model, horizon, place) * target.factor
+                if len(errors) == 0:
+                    continue
+                reach = reach or float(np.quantile(np.abs(errors), 0.99)) or 1e-9
+                counts, edges = np.histogram(errors, bins=bins, range=(-reach, reach))
+                share = counts / len(errors)
+                centres = (edges[:-1] + edges[1:]) / 2
+                outside = max(1.0 - float(share.sum()), 0.0)
+                mean, deviation = float(errors.mean()), float(errors.std())
+                found.append(Histogram(model, horizon, place, centres, share, outside, mean, deviation))
+    return found
+
+
+def _residuals(facts: Facts, model: str, horizon: int, place: int) -> Array:
+    parts = [recording for recording in facts.predictions.values() if model in recording]
+    column = facts.horizons.index(horizon)
+    errors = [aligned(part[model][:, column, place], horizon) - part[TRUTH][:, place] for part in parts]
+    joined = np.concatenate(errors).astype(np.float64) if errors else np.empty(0)
+    return joined[np.isfinite(joined)]
+
+
+def horizon_curves(facts: Facts) -> dict[str, list[tuple[float, float]]]:
+    """Mean absolute error of each model against the horizon: name -> (milliseconds or samples, report units)."""
+    scale = 1000.0 / facts.rate_hz if facts.rate_hz else 1.0
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for name, model in facts.models.items():
+        points = [(k * scale, score(model, k)) for k in sorted(facts.horizons)]
+        curve = [(x, mae) for x, mae in points if mae is not None]
+        if curve:
+            curves[name] = curve
+    return curves
+
+
+def speed_bands(facts: Facts, horizon: int) -> dict[str, list[dict[str, float | None]]]:
+    """Error of each model by speed band: name -> rows of `low`, `high`, `count`, `mae` (None in an empty band)."""
+    found: dict[str, list[dict[str, float | None]]] = {}
+    for name, model in facts.models.items():
+        rows = model.get("by_speed", {}).get(str(horizon), [])
+        if rows:
+            found[name] = [
+                {
+                    "low": row["low"],
+                    "high": row["high"],
+                    "count": row["count"],
+                    "mae": row.get("mae") if row["count"] else None,
+                }
+                for row in rows
+            ]
+    return found
+
+
+def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, list[float | None]]]:
+    """Recordings, the network's worst last, and each model's mean absolute error on them in that order."""
+
+    def mae(model: Mapping[str, Any], recording: str) -> float | None:
+        value = model.get("recordings", {}).get(recording, {}).get(str(horizon), {}).get("mean", {}).get("mae")
+        return None if value is None or not math.isfinite(value) else float(value)
+
+    scored = {name: model for name, model in facts.models.items() if model.get("recordings")}
+    lead = scored.get(NETWORK) or next(iter(scored.values()), {})
+    keys = [(mae(lead, recording), recording) for recording in lead.get("recordings", {})]
+    order = [recording for _, recording in sorted((value, key) for value, key in keys if value is not None)]
+    return order, {name: [mae(model, recording) for recording in order] for name, model in scored.items()}
+
+
+def learning_curves(facts: Facts) -> dict[str, list[float | None]]:
+    """Columns of the training history; `best` holds the epoch whose weights were kept, if the history says."""
+    names = ("epoch", "train_loss", "validation_loss", "validation_mae", "learning_rate")
+    columns: dict[str, list[float | None]] = {name: [] for name in (*names, "best")}
+    for place, row in enumerate(facts.history, 1):
+        for name in names:
+            value = row.get(name, place if name == "epoch" else None)
+            usable = isinstance(value, int | float) and math.isfinite(value)
+            columns[name].append(float(value) if usable else None)
+        if row.get("best"):
+            columns["best"] = [columns["epoch"][-1]]
+    return columns
+
+
+def log_ticks(values: Sequence[float | None]) -> list[float]:
+    """Ticks of a logarithmic axis at 1, 2 and 5 per decade, or 1 alone over many; none where a value is <= 0."""
+    known = [value for value in values if value is not None]
+    if not known or min(known) <= 0:
+        return []
+    low, high = math.floor(math.log10(min(known))), math.ceil(math.log10(max(known)))
+    steps = (1, 2, 5) if high - low <= 3 else (1,)
+    return [step * 10.0**decade for decade in range(low, high + 1) for step in steps]
+
+
+def headline_first(facts: Facts) -> list[int]:
+    """Horizons to choose from in the figures, the headline's first."""
+    main = main_horizon(facts)
+    return sorted(horizons_shown(facts), key=lambda k: (k != main, k))

@@ -1,0 +1,117 @@
+"""One offline HTML page from a run folder: plotly inlined once, no network, safe names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from edp.report.common import tables
+from edp.report.common.style import Plot
+from edp.report.common.templates import template
+from edp.report.common.wording import moment, unbroken
+from edp.report.run import facts as run
+from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
+from edp.report.run.plots import DOTS_AT_MOST, plots_of
+from edp.storage import write_bytes
+
+
+def build_report(
+    run_folder: str | Path,
+    output: str | Path | None = None,
+    title: str | None = None,
+    limit: str | Path | None = None,
+) -> Path:
+    """Write the report of a run as one HTML file that opens with no network.
+
+    Args:
+        run_folder: Folder that training and evaluation wrote; what is missing in it is named on the page.
+        output: Where to write; ``report.html`` in the run folder by default.
+        title: Heading of the page; the task's name by default.
+        limit: File of the limit of predictability; by default the one beside the run's data, where there is one.
+
+    Returns:
+        The file written.
+
+    Raises:
+        StorageError: the folder or one of its files cannot be read, or the page cannot be written.
+        DataError: predictions and scores do not belong together.
+    """
+    facts = run.read_facts(run_folder, limit)
+    target = Path(output) if output is not None else facts.folder / "report.html"
+    write_bytes(target, render(facts, title).encode("utf-8", "replace"))
+    return target
+
+
+def render(facts: run.Facts, title: str | None = None) -> str:
+    """The page's text."""
+    return template("page.html.jinja").render(**context(facts, title))
+
+
+def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
+    """Everything the template shows."""
+    plots = plots_of(facts)
+    task = (facts.scores or {}).get("task", {})
+    network = run.label_of(facts, run.NETWORK) if run.NETWORK in facts.models else ""
+    return {
+        "title": title or task.get("name") or facts.folder.resolve().name,
+        "network": network,
+        "run_name": facts.folder.resolve().name,
+        "created": moment((facts.provenance or {}).get("created")),
+        "headline": unbroken(run.headline(facts)),
+        "verdict": run.verdict_lines(facts),
+        "tiles": tables.key_figures(facts),
+        "comparisons": tables.comparison_tables(facts),
+        "outputs": tables.output_table(facts),
+        "intervals": tables.interval_table(facts),
+        "spread": run.spread_text(facts),
+        "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
+        "unseen": foundation_tables(facts),
+        "worst": tables.worst_recordings_table(facts),
+        **shown(plots),
+        "checks": tables.budget_checks(facts),
+        "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
+        "parts": tables.parts_table(facts),
+        "footprint": tables.footprint_rows(facts),
+        "provenance": tables.provenance_rows(facts),
+        "config": facts.config,
+        "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
+        "absent": facts.absent,
+    }
+
+
+def foundation_tables(facts: run.Facts) -> dict[str, tables.TextTable]:
+    """Machines that were never seen, of a run over many machines; empty for any other."""
+    found = facts.foundation
+    if found is None:
+        return {}
+    unit = facts.unit or "report units"
+    made = (parts_sheet(found), contexts_sheet(found, unit), machines_sheet(found, unit))
+    return {sheet.name: sheet.table() for sheet in made}
+
+
+def shown(plots: Mapping[str, Plot]) -> dict[str, Any]:
+    """What every page needs to show its plots offline: them, their data, the style and the scripts."""
+    return {
+        "plots": plots,
+        "specs": script_json([plot.spec() for plot in plots.values()]),
+        "style": Markup(asset("page.css")),
+        "script": Markup(asset("page.js")),
+        "plotly": Markup(get_plotlyjs()),
+    }
+
+
+def asset(name: str) -> str:
+    """A file of the page's own, as text."""
+    return resources.files("edp.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def script_json(value: Any) -> Markup:
+    """JSON that cannot end its script element, whatever names it holds."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))

@@ -1,0 +1,56 @@
+"""The limit of predictability of the data that a run learned from, as a line of its report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edp.errors import StorageError
+from edp.report.common.wording import number
+from edp.storage import read_json
+
+if TYPE_CHECKING:
+    from edp.report.run.facts import Facts
+
+FILE = "limit.json"
+KINDS = ("commands_unknown", "commands_known", "persistence")
+
+
+def read_limit(path: Path | None, provenance: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The limit in a file, or in the folder that the run's data came from; None where there is none.
+
+    Raises:
+        StorageError: the file that was named is missing, or a limit is damaged.
+    """
+    if path is None:
+        data = (provenance or {}).get("data", {})
+        source = Path(str((data.get("reader") or {}).get("path") or data.get("source") or ""))
+        path = source / FILE
+        if not source.is_dir() or not path.is_file():
+            return None
+    elif path.is_dir():
+        path = path / FILE
+    found = read_json(path)
+    complete = isinstance(found, dict) and {"unit", "rate_hz", "horizons", "targets", *KINDS} <= found.keys()
+    if not complete:
+        raise StorageError(f"'{path}' holds no limit of predictability; `edp simulate FOLDER --limit` writes one")
+    return dict(found)
+
+
+def limit_line(facts: Facts, samples: int | None) -> str:
+    """The limit at `samples` ahead in a sentence; empty where it is of other signals, or not known there."""
+    limit = facts.limit
+    if limit is None or samples is None or facts.rate_hz != limit["rate_hz"] or samples not in limit["horizons"]:
+        return ""
+    if [target.name for target in facts.targets] != list(limit["targets"]) or facts.unit != limit["unit"]:
+        return ""
+    row = list(limit["horizons"]).index(samples)
+    unknown = limit["commands_unknown"]
+    least, low, high = (number(unknown[key][row][-1], 2) for key in ("mae", "low", "high"))
+    known = number(limit["commands_known"]["mae"][row][-1], 2)
+    return (
+        f"The limit of predictability here is {least} {facts.unit} (95 %: {low} to {high}): even a predictor that "
+        f"knows the true state is off by that, for it knows neither the operator's next choices nor the noise to come; "
+        f"told the commands, it would be off by {known}."
+    )

@@ -1,0 +1,160 @@
+"""The tables of a screening's page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from edp.data.screening import ChannelVerdict, Flag, LagCurve, ScreeningResult
+from edp.report.common.tables import TextTable
+from edp.report.common.wording import MISSING, duration, number, percent, whole
+from edp.report.screening.views import lag_ranges
+
+FLAG_WORDS = {
+    "leak of the future": "leak of the future",
+    "delayed copy": "delayed copy",
+    "duplicate": "duplicate",
+    "per-file artefact": "artefact of a file",
+    "no relation": "no relation",
+    "unsteady relation": "unsteady relation",
+    "redundant": "redundant",
+    "missing values": "missing values",
+    "constant": "constant",
+}
+
+
+def kept_table(found: ScreeningResult) -> TextTable:
+    """The proposed channels by rank."""
+    return _choices(found, "Keep", True)
+
+
+def dropped_table(found: ScreeningResult) -> TextTable:
+    """The other channels by rank."""
+    return _choices(found, "Drop", False)
+
+
+def _choices(found: ScreeningResult, caption: str, keep: bool) -> TextTable:
+    groups = dict(zip(found.channels, found.groups))
+    rows = tuple(
+        (c.channel, groups.get(c.channel, MISSING), number(c.score, 2), _lag(found, c), c.reason)
+        for c in found.proposal.choices
+        if c.keep == keep
+    )
+    columns = (("Channel", ""), ("Kind of signal", ""), ("Score", "0 to 1"), ("Best lag", "samples"), ("Why", ""))
+    return TextTable(caption, columns, rows)
+
+
+def _lag(found: ScreeningResult, choice: ChannelVerdict) -> str:
+    """Best lag against the target that it goes best with."""
+    curves = [c for c in found.lags if c.channel == choice.channel and c.target != choice.channel]
+    if not curves:
+        return MISSING
+    best = max(curves, key=lambda curve: abs(curve.value))
+    text = number(best.best, 0, signed=True)
+    return text if best.certain else f"({text})"
+
+
+def flags_table(found: ScreeningResult) -> TextTable:
+    """What is wrong with channels, leaks of the future first."""
+    order = list(FLAG_WORDS)
+    ranked = sorted(found.flags, key=lambda flag: (_place(order, flag), flag.channel))
+    rows = tuple(
+        (
+            flag.channel,
+            FLAG_WORDS.get(str(flag.kind), str(flag.kind)),
+            flag.source or MISSING,
+            whole(flag.lag) if flag.source else MISSING,
+            flag.evidence,
+        )
+        for flag in ranked
+    )
+    columns = (("Channel", ""), ("What", ""), ("Of", ""), ("Lag", "samples"), ("Evidence", ""))
+    return TextTable("Flags", columns, rows)
+
+
+def _place(order: list[str], flag: Flag) -> int:
+    kind = str(flag.kind)
+    return order.index(kind) if kind in order else len(order)
+
+
+def ranges_table(found: ScreeningResult) -> TextTable:
+    """Best lags by kind of signal, in the form of the thesis's Table 4.2."""
+    rows = tuple(
+        (
+            row.group,
+            MISSING if row.low is None else f"{whole(row.low)} to {whole(row.high)}",
+            number(row.median, 1),
+            percent(row.leads),
+            f"{row.certain} of {row.curves}",
+        )
+        for row in lag_ranges(found)
+    )
+    columns = (
+        ("Kind of signal", ""), ("Best lags", "samples"), ("Median", "samples"), ("Leads", "share"),
+        ("Certain", "channels"),
+    )  # fmt: skip
+    return TextTable(
+        "Lags by kind of signal: each unflagged channel against the target that it goes best with", columns, rows
+    )
+
+
+def lags_table(found: ScreeningResult) -> TextTable:
+    """Best lag of each channel against each target, with the correlation there; brackets where it is not certain."""
+    rows = []
+    by_pair = {(curve.channel, curve.target): curve for curve in found.lags}
+    for channel in found.channels:
+        curves = [by_pair.get((channel, target)) for target in found.targets]
+        if any(curve is not None for curve in curves):
+            rows.append((channel, *(_cell(channel, curve) for curve in curves)))
+    columns = (("Channel", ""), *((target, "lag, correlation") for target in found.targets))
+    return TextTable("Lag and correlation against each target", columns, tuple(rows))
+
+
+def _cell(channel: str, curve: LagCurve | None) -> str:
+    if curve is None or curve.target == channel:
+        return MISSING
+    text = f"{number(curve.best, 0, signed=True)}, {number(curve.value, 2)}"
+    return text if curve.certain else f"({text})"
+
+
+def clusters_table(found: ScreeningResult) -> TextTable:
+    """Collinear channels."""
+    rows = tuple(
+        (cluster.representative, number(cluster.least, 2), ", ".join(cluster.members)) for cluster in found.clusters
+    )
+    columns = (("Speaks for all", ""), ("Least rank correlation", "of two members"), ("Members", ""))
+    return TextTable("Channels that go together", columns, rows)
+
+
+def trials_table(trials: Mapping[str, Any]) -> TextTable:
+    """Held-out error of one network on each feature set, as `edp.workflows.feature_selection.trials.Trials.to_json`
+    gives it.
+    """
+    horizons = list(trials["persistence"])
+    unit = str(trials["unit"])
+    rows = []
+    for trial in trials["trials"]:
+        cells = []
+        for horizon in horizons:
+            gap = (trial["difference"] or {}).get(horizon)
+            cells.append(number(trial["error"][horizon], 3))
+            cells.append(MISSING if gap is None else f"{number(gap['low'], 3, True)} to {number(gap['high'], 3, True)}")
+        rows.append((trial["name"], whole(len(trial["channels"])), whole(trial["parameters"]), *cells))
+    rows.append(
+        (
+            "persistence",
+            MISSING,
+            MISSING,
+            *(c for h in horizons for c in (number(trials["persistence"][h], 3), MISSING)),
+        )
+    )
+    columns: tuple[tuple[str, str], ...] = (("Feature set", ""), ("Channels", ""), ("Parameters", ""))
+    for horizon in horizons:
+        columns += ((f"MAE, {horizon} ahead", unit), ("Against the first", "95 % interval"))
+    return TextTable("Held-out error of one network on each set", columns, tuple(rows), frozenset({0}))
+
+
+def stages_table(found: ScreeningResult) -> TextTable:
+    """Where the time went."""
+    rows = tuple((stage, duration(seconds)) for stage, seconds in found.seconds.items())
+    return TextTable("Time of the stages", (("Stage", ""), ("Time", "")), rows)

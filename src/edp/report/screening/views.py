@@ -1,0 +1,251 @@
+"""What the pictures of a screening show, as plain arrays; `screening_plots` and `pictures` only draw it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.screening import GroupImportance, LagCurve, ScreeningResult, Stability, Value
+from edp.report.common.wording import short_label, short_labels
+
+Array = NDArray[np.float64]
+MEASURES = {
+    "spearman": "Spearman rank correlation",
+    "information": "Mutual information",
+    "pearson": "Pearson correlation",
+    "kendall": "Kendall rank correlation",
+}
+"""Measures of dependence, the thesis's two figures first."""
+METRICS = {**MEASURES, "lag": "Best lag"}
+UNITS = {"information": "nat", "lag": "samples"}
+MOST_CURVES = 16
+MOST_BARS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixView:
+    """One matrix of dependencies.
+
+    Attributes:
+        measure: key of `MEASURES`.
+        title: in words.
+        unit: of the entries, empty for a correlation.
+        names: of rows and columns.
+        values: shape ``(channel, channel)``; NaN is left white.
+        top: largest magnitude of the colours.
+        signed: whether colours run from -top to top.
+    """
+
+    measure: str
+    title: str
+    unit: str
+    names: tuple[str, ...]
+    values: Array
+    top: float
+    signed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class LagView:
+    """Lag curves of the channels that go best with a target, the best first."""
+
+    target: str
+    curves: tuple[LagCurve, ...]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One bar with its interval; `mark` is a value to compare it with (chance), NaN without one."""
+
+    label: str
+    value: float
+    low: float
+    high: float
+    mark: float = math.nan
+    kept: bool = False
+
+
+@dataclass(frozen=True)
+class BarView:
+    """Bars of one picture, the largest first, and how many more there are."""
+
+    key: str
+    target: str
+    title: str
+    bars: tuple[Bar, ...]
+    more: int
+
+
+@dataclass(frozen=True)
+class LagRangeView:
+    """A row of Table 4.2's form: where the best lags of a kind of signal lie, over channels whose lag is certain.
+
+    Attributes:
+        group: kind of signal.
+        low, high: smallest and largest best lag, None where none is certain.
+        median: of them.
+        leads: share of these channels that lead.
+        certain: how many they are.
+        curves: how many channels there are.
+    """
+
+    group: str
+    low: int | None
+    high: int | None
+    median: float | None
+    leads: float | None
+    certain: int
+    curves: int
+
+
+def matrix_views(found: ScreeningResult) -> tuple[MatrixView, ...]:
+    """The four matrices; mutual information without its diagonal, its colours up to the 99.5 % quantile."""
+    made = []
+    for measure, title in MEASURES.items():
+        values = np.array(getattr(found.matrices, measure), dtype=float)
+        signed = measure != "information"
+        top = 1.0
+        if not signed:
+            np.fill_diagonal(values, np.nan)
+            good = values[np.isfinite(values)]
+            top = max(float(np.quantile(good, 0.995)), 1e-3) if len(good) else 1.0
+        names = short_labels(found.matrices.names)
+        made.append(MatrixView(measure, title, UNITS.get(measure, ""), names, values, top, signed))
+    return tuple(made)
+
+
+def lag_views(found: ScreeningResult) -> tuple[LagView, ...]:
+    """For each target the curves of the channels that go best with it, itself left out."""
+    made = []
+    for target in found.targets:
+        curves = [c for c in found.lags if c.target == target and c.channel != target and math.isfinite(c.value)]
+        best = sorted(curves, key=lambda curve: -abs(curve.value))[:MOST_CURVES]
+        if best:
+            made.append(LagView(target, tuple(best)))
+    return tuple(made)
+
+
+def lag_ranges(found: ScreeningResult, within: Sequence[str] | None = None) -> tuple[LagRangeView, ...]:
+    """Where the best lags lie, by kind of signal, in Table 4.2's form.
+
+    Each channel counts once, against the target that it goes best with, itself left out; and it counts where that lag
+    is certain and inside the search.
+
+    Args:
+        found: the screening.
+        within: channels to look at; None takes all that no flag names.
+    """
+    flagged = {flag.channel for flag in found.flags}
+    names = [name for name in found.channels if name not in flagged] if within is None else list(within)
+    made = []
+    for group in dict.fromkeys(found.groups):
+        members = {name for name, own in zip(found.channels, found.groups) if own == group} & set(names)
+        curves = [curve for name in names if name in members and (curve := _strongest(found, name)) is not None]
+        certain = [curve.best for curve in curves if curve.certain and not curve.at_edge]
+        if not curves:
+            continue
+        if certain:
+            leads = float(np.mean(np.array(certain) < 0))
+            row = LagRangeView(
+                group, min(certain), max(certain), float(np.median(certain)), leads, len(certain), len(curves)
+            )
+        else:
+            row = LagRangeView(group, None, None, None, None, 0, len(curves))
+        made.append(row)
+    return tuple(made)
+
+
+def _strongest(found: ScreeningResult, channel: str) -> LagCurve | None:
+    """The curve of a channel against the target that it goes best with."""
+    curves = [c for c in found.lags if c.channel == channel != c.target and math.isfinite(c.value)]
+    return max(curves, key=lambda curve: abs(curve.value), default=None)
+
+
+def stability_views(found: ScreeningResult) -> tuple[BarView, ...]:
+    """For each metric and target the channels with the largest mean over the pieces; bars reach over a deviation."""
+    made = []
+    for metric, title in METRICS.items():
+        for target in found.targets:
+            entries = [
+                entry
+                for entry in found.stability
+                if entry.metric == metric
+                and entry.target == target
+                and entry.channel != target
+                and math.isfinite(entry.mean)
+            ]
+            if entries:
+                made.append(_stability(found, metric, target, title, entries))
+    return tuple(made)
+
+
+def _stability(found: ScreeningResult, metric: str, target: str, title: str, entries: Sequence[Stability]) -> BarView:
+    kept = set(found.proposal.kept)
+    ranked = sorted(entries, key=lambda entry: -abs(entry.mean))
+    bars = tuple(
+        Bar(
+            e.channel,
+            e.mean,
+            e.mean - e.deviation,
+            e.mean + e.deviation,
+            math.copysign(e.chance, e.mean),  # chance is a size; it stands on the bar's side
+            e.channel in kept,
+        )
+        for e in ranked[:MOST_BARS]
+    )
+    return BarView(metric, target, title, _told_apart(bars), max(0, len(ranked) - MOST_BARS))
+
+
+def _told_apart(bars: Sequence[Bar]) -> tuple[Bar, ...]:
+    """Bars under short labels, each its own."""
+    labels = short_labels(bar.label for bar in bars)
+    return tuple(replace(bar, label=label) for bar, label in zip(bars, labels, strict=True))
+
+
+def importance_views(found: ScreeningResult) -> tuple[BarView, ...]:
+    """Permutation importance by target, the mean of all first."""
+    kept = set(found.proposal.kept)
+    made = []
+    for target in ("all", *found.targets):
+        entries = [entry for entry in found.importance if entry.target == target]
+        ranked = sorted(entries, key=lambda entry: -entry.increase)
+        bars = tuple(
+            Bar(joined(e.members), e.increase, e.low, e.high, kept=bool(kept & set(e.members)))
+            for e in ranked[:MOST_BARS]
+        )
+        if bars:
+            made.append(
+                BarView(
+                    "importance", target, "Permutation importance", _told_apart(bars), max(0, len(ranked) - MOST_BARS)
+                )
+            )
+    return tuple(made)
+
+
+def value_views(found: ScreeningResult) -> tuple[BarView, ...]:
+    """What each channel's past adds to the pasts of all others, by target."""
+    kept = set(found.proposal.kept)
+    made = []
+    for target in found.targets:
+        entries: list[Value] = [entry for entry in found.values if entry.target == target]
+        ranked = sorted(entries, key=lambda entry: -entry.gain)
+        bars = tuple(Bar(e.channel, e.gain, e.low, e.high, kept=e.channel in kept) for e in ranked[:MOST_BARS])
+        if bars:
+            made.append(BarView("value", target, "Linear value", _told_apart(bars), max(0, len(ranked) - MOST_BARS)))
+    return tuple(made)
+
+
+def joined(members: Sequence[str]) -> str:
+    """A group by its first members."""
+    shown = ", ".join(map(short_label, members[:3]))
+    return shown if len(members) <= 3 else f"{shown} + {len(members) - 3}"
+
+
+def best_groups(found: ScreeningResult, count: int = 3) -> tuple[GroupImportance, ...]:
+    """The groups of the largest mean importance."""
+    entries = [entry for entry in found.importance if entry.target == "all"]
+    return tuple(sorted(entries, key=lambda entry: -entry.increase)[:count])

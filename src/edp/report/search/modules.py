@@ -1,0 +1,203 @@
+"""The tables of a study's modules: phases 2 and 3, in the form of the thesis's Table 4.5."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from edp.report.common.sheets import Column, Sheet, chance, figures
+from edp.report.common.wording import number
+from edp.report.search.facts import StudyFacts, known, of_phase, real
+
+GROUPS = {
+    "Structural gating": ("cylinder_gate", "temporal_difference"),
+    "Sequence architecture": (*("cross_cylinder_attention", "gru", "layer_norm_lstm", "multi_scale_tcn", "zoneout"),),
+    "Channel attention": ("attention_bridge", "global_average_pooling", "squeeze_excitation"),
+    "Physics constraint": ("physics_residual",),
+    "Output head": ("deeper_head", "glu_head", "stanh"),
+}
+"""The thesis's order of Table 4.5."""
+OTHER = "Other"
+
+
+def modules_sheets(study: StudyFacts) -> tuple[Sheet, ...]:
+    """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
+    if "screening" not in study.facts:
+        return ()
+    made = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
+    return tuple(sheet for sheet in made if sheet is not None)
+
+
+def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Group and module in the thesis's order, unknown ones behind."""
+    held = set(names)
+    known_ones = [(group, name) for group, own in GROUPS.items() for name in own if name in held]
+    listed = {name for _, name in known_ones}
+    return [*known_ones, *((OTHER, name) for name in names if name not in listed)]
+
+
+@of_phase("screening", ())
+def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet | None, ...]:
+    found = _evidence(study)
+    rows, marked = [], set()
+    for group, name in ordered(facts["registered"]):
+        effect = facts["modules"][name]
+        held = found.get(name)
+        tested = held is not None and held["change"] is not None
+        size = known(held["d_z"]["value"]) if held is not None and held["d_z"] else None
+        rows.append(
+            (
+                study.module(name),
+                group,
+                100 * real(effect["change"]),
+                100 * real(held["change"]) if held is not None and tested else None,
+                span(held) if held is not None and tested else None,
+                real(held["p"]) if held is not None and tested else None,
+                real(held["adjusted"]) if held is not None and tested else None,
+                size,
+                _verdict(study, name, held, name in facts["passed"]),
+            )
+        )
+        if held is not None and held["confirmed"]:
+            marked.add(len(rows) - 1)
+    columns = (
+        Column("Module"),
+        Column("Group"),
+        Column("Phase 2", "change, %", figures([], signed=True, decimals=2)),
+        Column("Phase 3", "change, %", figures([], signed=True, decimals=2)),
+        Column("95 % interval", "%"),
+        Column("p", "one-sided", chance),
+        Column("p", "adjusted", chance),
+        Column("d_z", "Cohen", figures([], signed=True, decimals=2)),
+        Column("Verdict"),
+    )
+    caption = (
+        f"Modules in phases 2 and 3; below zero is better, p is adjusted over all {len(facts['registered'])} modules"
+    )
+    return Sheet("modules", caption, columns, tuple(rows), frozenset(marked)), _tests(study), _effects(study)
+
+
+@of_phase("screening", None)
+def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+    """Main effects of the two-level design."""
+    rows = []
+    for _, name in ordered(facts["registered"]):
+        effect = facts["modules"][name]
+        shares = (100 * real(effect["change"]), 100 * real(effect["importance"]))
+        verdict = "goes on" if name in facts["passed"] else "stops"
+        rows.append((study.module(name), shares[0], real(effect["p"]), shares[1], verdict))
+    columns = (
+        Column("Module"),
+        Column("Change", "%", figures([], signed=True, decimals=2)),
+        Column("p", "one-sided", chance),
+        Column("Importance", "% of what is explained", figures([], decimals=0)),
+        Column("Verdict"),
+    )
+    caption = "Phase 2: main effects of the two-level design, on average over all other modules"
+    return Sheet("effects", caption, columns, tuple(rows))
+
+
+def _evidence(study: StudyFacts) -> dict[str, Mapping[str, Any]]:
+    facts = study.facts.get("confirmation", {})
+    return {held["module"]: held for held in facts.get("evidence", ())}
+
+
+def _verdict(study: StudyFacts, name: str, held: Mapping[str, Any] | None, passed: bool) -> str:
+    if not passed:
+        return "stopped"
+    if held is None:
+        return "not in phase 3" if "confirmation" in study.facts else "goes on"
+    if held["dropped_after"]:
+        return f"dropped after {held['dropped_after']} runs"
+    return "confirmed" if held["confirmed"] else "not confirmed"
+
+
+@of_phase("confirmation", None)
+def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+    """What other tests say of the modules that phase 3 tested."""
+    rows = []
+    for held in facts["evidence"]:
+        if held["change"] is None:
+            continue
+        tests = (known(held[name]) for name in ("p", "resampled_p", "paired_p", "mixed_p"))
+        rows.append(
+            (
+                study.module(held["module"]),
+                int(held["runs"]),
+                *tests,
+                span(held["d_z"], 1.0) if held["d_z"] else None,
+                None if held["stability"] is None else 100 * real(held["stability"]),
+            )
+        )
+    columns = (
+        Column("Module"),
+        Column("Runs"),
+        Column("Clustered t", "p, decides", chance),
+        Column("Resampled t", "p, Nadeau and Bengio", chance),
+        Column("Paired t", "p", chance),
+        Column("Mixed model", "p, eq. 2.22", chance),
+        Column("d_z", "95 % interval"),
+        Column("Runs won", "%", figures([], decimals=0)),
+    )
+    return Sheet("tests", "Other tests on the same trainings; all one-sided, not adjusted", columns, tuple(rows))
+
+
+@of_phase("screening", ())
+def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet | None, ...]:
+    evidence = study.facts.get("confirmation", {}).get("evidence", ())
+    metrics = list(dict.fromkeys(str(held["metric"]) for held in evidence))
+    by_cell = {(held["module"], held["metric"]): held for held in evidence}
+    confirmed = set(study.facts.get("confirmation", {}).get("confirmed", ()))
+    rows, every, marked = [], [], set()
+    for group, name in ordered(facts["registered"]):
+        held = by_cell.get((name, metrics[0])) if metrics else None
+        tests = _thesis_cells(held)
+        verdict = "stopped" if name not in facts["passed"] else "goes on"
+        if held is not None:
+            verdict = "confirmed" if name in confirmed else "not confirmed"
+        rows.append((study.module(name), group, known(facts["modules"][name]["gain"]), *tests, verdict))
+        if name in confirmed:
+            marked.add(len(rows) - 1)
+        for metric in metrics:
+            if (name, metric) in by_cell:
+                cell = by_cell[name, metric]
+                every.append((study.module(name), metric.upper(), real(cell["beta"]), *_thesis_cells(cell),
+                              "passed" if cell["passed"] else "not passed"))  # fmt: skip
+    tests_columns = (
+        Column("p", "as printed", chance),
+        Column("p", "mixed model", chance),
+        Column("p", "adjusted", chance),
+        Column("d_z", "Cohen", figures([], signed=True, decimals=2)),
+        Column("Runs won", "%", figures([], decimals=0)),
+    )
+    gain = Column("Δp₂", study.unit, figures([row[2] for row in rows], signed=True))
+    first = (Column("Module"), Column("Group"), gain, *tests_columns, Column("Verdict"))
+    shown = f"; tests on {metrics[0].upper()}, a module is confirmed on any metric" if metrics else ""
+    caption = f"Modules in phases 2 and 3, the thesis's procedure: better is Δp₂ > 0 and d_z < 0{shown}"
+    second = (
+        *(
+            Column("Module"),
+            Column("Metric"),
+            Column("β₁", study.unit, figures([row[2] for row in every], signed=True)),
+        ),
+        *(*tests_columns, Column("Gates")),
+    )
+    return (
+        Sheet("modules", caption, first, tuple(rows), frozenset(marked)),
+        Sheet("tests", "The thesis's gates on every metric", second, tuple(every)),
+    )
+
+
+def _thesis_cells(held: Mapping[str, Any] | None) -> tuple[float | None, ...]:
+    if held is None:
+        return (None,) * 5
+    tests = (real(held[name]) for name in ("printed_p", "p", "adjusted"))
+    return (*tests, known(held["d_z"]), 100 * real(held["stability"]))
+
+
+def span(held: Mapping[str, Any], scale: float = 100.0) -> str | None:
+    """An interval as text."""
+    if held.get("low") is None or held.get("high") is None:
+        return None
+    low, high = (number(scale * real(held[end]), 2, signed=True) for end in ("low", "high"))
+    return f"{low} to {high}"

@@ -1,0 +1,261 @@
+"""The tables of a study, in the form of the thesis's tables 4.3 to 4.8 where it has one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from edp.report.common.sheets import Column, Sheet, Value, chance, figures, plainly
+from edp.report.common.wording import duration, moment, number, percent, whole
+from edp.report.search.facts import StudyFacts, known, of_phase, real
+from edp.report.search.modules import modules_sheets, ordered, span
+from edp.report.search.smaller import smaller_sheet
+from edp.report.search.views import arm_views, titled
+
+
+def sheets(study: StudyFacts) -> dict[str, Sheet]:
+    """Every table that there are facts for, by name."""
+    made = (
+        variance_sheet(study),
+        features_sheet(study),
+        calibration_sheet(study),
+        *modules_sheets(study),
+        selection_sheet(study),
+        identifiers_sheet(study),
+        holdout_sheet(study),
+        smaller_sheet(study),
+        openings_sheet(study),
+        phases_sheet(study),
+    )
+    return {sheet.name: sheet for sheet in made if sheet is not None and sheet.rows}
+
+
+def variance_sheet(study: StudyFacts) -> Sheet | None:
+    """Table 4.3: mean error and its standard deviations, of MAE and of the composite score."""
+    rows = []
+    for arm in arm_views(study):
+        spreads = [value for s in (arm.mae, arm.composite) for value in (s.mean, s.split, s.seed)]
+        rows.append((arm.backbone, arm.features, *spreads))
+    if not rows:
+        return None
+    heads = [(f"{name}{part}", study.unit) for name in ("MAE", "Composite") for part in ("", ", σ split", ", σ seed")]
+    columns = (Column("Architecture"), Column("Features"), *_numbers(heads, [row[2:] for row in rows]))
+    facts = study.facts["isolation"]
+    seeds = f"{facts['seeds']} seed{'s' * (facts['seeds'] != 1)}"
+    caption = f"Variance by architecture and feature set: {facts['runs']} runs of {seeds} each"
+    marked = frozenset(place for place, row in enumerate(rows) if row[1] == facts["features"])
+    return Sheet("variance", caption, columns, tuple(rows), marked)
+
+
+def _numbers(heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[Value]]) -> tuple[Column, ...]:
+    """Columns of figures, each with a precision of its own."""
+    return tuple(Column(*head, figures(values)) for head, values in zip(heads, zip(*rows), strict=True))
+
+
+@of_phase("isolation", None)
+def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+    """The chosen feature set against the next best, by backbone; the best backbone with it against the others."""
+    rows: tuple[tuple[Value, ...], ...] = tuple(
+        (
+            titled(backbone),
+            f"{facts['features']} against {held['rival']}",
+            100 * real(held["change"]),
+            span(held),
+            real(held["p"]),
+        )
+        for backbone, held in facts["comparisons"].items()
+    )
+    # No p-value of these: which is the best was seen first.
+    rows += tuple(
+        (
+            titled(held["best"]),
+            f"against {titled(backbone)}, both {facts['features']}",
+            100 * real(held["change"]),
+            span(held),
+            None,
+        )
+        for backbone, held in facts["backbones"].items()
+    )
+    columns = (
+        Column("Architecture"),
+        Column("Compared"),
+        Column("Change of the score", "%", figures([row[2] for row in rows], signed=True, decimals=2)),
+        Column("95 % interval", "%"),
+        Column("p", "one-sided", chance),
+    )
+    return Sheet("features", "Feature sets and architectures on the same folds with the same seeds", columns, rows)
+
+
+@of_phase("calibration", None)
+def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+    """Table 4.4: scores of all questions of each architecture, and what the efficiency rule takes."""
+    rows = []
+    final = facts["final"]["scores"] if "final" in facts else {}
+    for backbone, held in facts["backbones"].items():
+        done = [trial for trial in held["trials"] if trial["score"] is not None]
+        scores = [real(trial["score"]) for trial in done]
+        errors = [value for trial in done if (value := known(trial["mae"])) is not None]
+        rows.append(
+            (
+                titled(backbone),
+                f"{len(done)} of {len(held['trials'])}",
+                *_spread(scores),
+                min(scores, default=None),
+                *_spread(errors),
+                real(held["score"]),
+                known(final.get(backbone)),
+                real(held["parameters"]),
+            )
+        )
+    heads = [
+        *(("Score, mean", study.unit), ("± σ", study.unit), ("Least", study.unit)),
+        *(("MAE, mean", study.unit), ("± σ", study.unit), ("Taken", study.unit)),
+        ("Taken, on all folds", study.unit),
+    ]
+    columns = (
+        *(Column("Architecture"), Column("Questions", "done")),
+        *_numbers(heads, [row[2:9] for row in rows]),
+        Column("Parameters", "of the taken", _count),
+    )
+    marked = frozenset(i for i, name in enumerate(facts["backbones"]) if name == facts["backbone"])
+    features = study.facts["isolation"]["features"]
+    caption = f"Questions of phase 1 with feature set {features}; taken is the smallest size that no larger one repays"
+    return Sheet("calibration", caption, columns, tuple(rows), marked)
+
+
+def _spread(values: Sequence[float]) -> tuple[float | None, float | None]:
+    if not values:
+        return None, None
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+def _count(value: Value) -> str:
+    return whole(value) if isinstance(value, int | float) else plainly(value)
+
+
+def selection_sheet(study: StudyFacts) -> Sheet | None:
+    """Table 4.6: how often each module was on among the questions of phases 4 and 5."""
+    on = {name: study.facts[name]["on"] for name in ("synthesis", "exploration") if name in study.facts}
+    names = list(dict.fromkeys(name for held in on.values() for name in held))
+    rows: list[tuple[str, list[float]]] = []
+    for name in names:
+        shares = [100 * real(held[name]) if name in held else 0.0 for held in on.values()]
+        rows.append((study.module(name), [*shares, float(np.mean(shares))]))
+    rows.sort(key=lambda row: (-row[1][-1], row[0]))
+    heads = {"synthesis": "Phase 4", "exploration": "Phase 5"}
+    columns = (
+        Column("Module"),
+        *(Column(heads[name], "%", figures([], decimals=1)) for name in on),
+        Column("Mean", "%", figures([], decimals=1)),
+    )
+    caption = "How often each module was on among the questions"
+    return Sheet("selection", caption, columns, tuple((module, *shares) for module, shares in rows))
+
+
+def identifiers(study: StudyFacts) -> dict[str, str]:
+    """Table 4.7: short names of the modules, in their order."""
+    return {name: f"M{place}" for place, (_, name) in enumerate(ordered(list(study.modules)), 1)}
+
+
+def identifiers_sheet(study: StudyFacts) -> Sheet | None:
+    """Table 4.7."""
+    rows = tuple((short, study.module(name), name) for name, short in identifiers(study).items())
+    columns = (Column("ID"), Column("Module"), Column("Name in settings"))
+    return Sheet("identifiers", "Module identifiers", columns, rows) if "synthesis" in study.facts else None
+
+
+@of_phase("synthesis", None)
+def holdout_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
+    """Table 4.8: baseline and winners; in brackets the change against the baseline."""
+    calibrated = study.facts["calibration"]
+    base = calibrated["backbones"][calibrated["backbone"]]
+    free = study.facts.get("exploration")
+    arms: list[tuple[Mapping[str, Any], Sequence[str]]] = [(base, ()), (facts["costs"], facts["modules"])]
+    if free is not None:
+        arms.append((free["costs"], free["modules"]))
+    short = identifiers(study)
+    sizes = [real(costs["parameters"]) for costs, _ in arms]
+    work = [real(costs["macs_tick"]) for costs, _ in arms]
+    test = facts["test"]
+    rows: list[tuple[Value, ...]] = [
+        ("Active modules", *(", ".join(short.get(name, name) for name in own) or "none" for _, own in arms)),
+        ("Parameters", *(_against(size, sizes[0], whole) for size in sizes)),
+        ("FP32 (MB)", *(number(4e-6 * size, 4) for size in sizes)),
+        ("MACs per tick", *(_against(value, work[0], whole) for value in work)),
+    ]
+    for key, name in {"composite": "Composite", "mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99"}.items():
+        values = [known(test[arm][key]) for arm in ("baseline", "synthesis")]
+        cells = [None if v is None else _against(v, values[0], lambda x: number(x, 3)) for v in values]
+        rows.append((f"{name} on test sessions ({study.unit})", *cells, *([None] * (free is not None))))
+    if free is not None:
+        fresh = [real(free["fresh"][arm]) for arm in ("synthesis", "exploration")]
+        cells = [number(fresh[0], 3), f"{number(fresh[1], 3)} ({percent(fresh[1] / fresh[0] - 1, True)} to phase 4)"]
+        rows.append((f"Composite on fresh folds ({study.unit})", None, *cells))
+    names = ("Baseline", "Winner of phase 4", "Winner of phase 5")[: len(arms)]
+    seeds = study.spec.get("run_seeds", "–")
+    caption = f"Baseline and winners; test scores are means of {seeds} seeds, in brackets the change to the baseline"
+    return Sheet("holdout", caption, (Column("Metric"), *(Column(name) for name in names)), tuple(rows))
+
+
+def _against(value: float, reference: float | None, show: Any) -> str:
+    """A value, and its change against the reference where it is another."""
+    if reference is None or value == reference or reference == 0:
+        return str(show(value))
+    return f"{show(value)} ({percent(value / reference - 1, signed=True)})"
+
+
+def openings_sheet(study: StudyFacts) -> Sheet | None:
+    """Every look at the test sessions."""
+    rows = tuple(
+        (
+            moment(held.get("time")),
+            str(held.get("why", "")),
+            len(held.get("judged", ())),
+            str(held.get("box", "")),
+        )
+        for held in study.openings
+    )
+    columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Box"))
+    return Sheet("openings", "Looks at the sessions set apart", columns, rows)
+
+
+def phases_sheet(study: StudyFacts) -> Sheet | None:
+    """Trainings and time of each phase, and their sums."""
+    rows: list[tuple[Value, ...]] = [
+        (p.heading, p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s, _status(study, p.name))
+        for p in study.phases
+    ]
+    sums = (
+        sum(counts)
+        for counts in zip(*((p.trainings, p.trained, p.pruned, p.failed, p.seconds, p.wall_s) for p in study.phases))
+    )
+    if rows:
+        rows.append(("All", *sums, None))
+    count = figures([], decimals=0)
+    columns = (
+        Column("Phase"),
+        Column("Asked for", "trainings", count),
+        Column("Ended", "trainings", count),
+        Column("Pruned", "trainings", count),
+        Column("Failed", "trainings", count),
+        Column("Training", "all workers", _time),
+        Column("By the clock", "", _time),
+        Column("State"),
+    )
+    caption = "Trainings and time by phase; one that an earlier phase asked for counts there"
+    return Sheet("phases", caption, columns, tuple(rows), frozenset({len(rows) - 1}))
+
+
+def _time(value: Value) -> str:
+    return duration(value) if isinstance(value, int | float) else plainly(value)
+
+
+def _status(study: StudyFacts, name: str) -> str:
+    if name in study.facts:
+        return "decided"
+    phase = study.phase(name)
+    if phase is None or not phase.began:
+        return "to come"
+    return study.state

@@ -1,0 +1,239 @@
+"""A study in sentences: what came out, what it took, and what it can and cannot show."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from edp.report.common.wording import duration, listed, number, percent, whole
+from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, real
+from edp.report.search.smaller import chosen_words
+from edp.report.search.views import titled
+
+
+def headline(study: StudyFacts) -> str:
+    """What came out, or how far it is."""
+    if "synthesis" in study.facts:
+        return _result(study)
+    decided = sum(phase.name in study.facts for phase in study.phases)
+    how = {"running": "is running", "finished": "ended early"}.get(study.state, f"was {study.state}")
+    done = _count(len(study.history), "training")
+    return f"The search {how}: {decided} of {len(study.phases)} phases are decided, {done} done."
+
+
+@of_phase("synthesis", "")
+def _result(study: StudyFacts, facts: Mapping[str, Any]) -> str:
+    ours, base = (known(facts["test"][arm]["composite"]) for arm in ("synthesis", "baseline"))
+    own = [study.module(name) for name in facts["modules"]]
+    names = listed(own) if len(own) <= 3 else f"{len(own)} modules"
+    if ours is None or base is None:
+        return "A final training failed, so that nothing can be said of the test sessions."
+    sessions = _count(len(study.test), "test session")
+    if ours < base:
+        change = percent(1 - ours / base)
+        return (
+            f"{f'With {names}' if own else 'Tuned anew, with no module,'} the network reaches {number(ours, 3)} "
+            f"{study.unit} on {sessions}, {change} below the baseline's {number(base, 3)}."
+        )
+    return (
+        f"Nothing better than the baseline was found: {number(base, 3)} {study.unit} on {sessions}, against "
+        f"{number(ours, 3)} with {names or 'no module'}."
+    )
+
+
+def verdict(study: StudyFacts) -> list[str]:
+    """What was decided, in short."""
+    made = [
+        _how_sure(study),
+        _features(study),
+        _baseline(study),
+        _confirmed(study),
+        _teacher(study),
+        chosen_words(study),
+    ]
+    if study.state != "finished":
+        where = next((phase for phase in study.phases if phase.name not in study.facts), None)
+        made.append(f"The search {'is' if study.state == 'running' else 'was'} {study.state}")
+        made[-1] += f" in {where.heading.lower()}" if where else ""
+        made[-1] += "." if study.state == "running" else "; the same command goes on with it."
+    return [line for line in made if line]
+
+
+@of_phase("synthesis", "")
+def _how_sure(study: StudyFacts, facts: Mapping[str, Any]) -> str:
+    gain = facts["test_gain"]
+    if gain is None:
+        return "With one seed or one test session there is no interval for that."
+    low, high = (percent(real(gain[end]), signed=True) for end in ("low", "high"))
+    unsure = "" if real(gain["high"]) < 0 or real(gain["low"]) > 0 else ", so chance alone may have done it"
+    return f"The 95 % interval of the change is {low} to {high}{unsure}."
+
+
+@of_phase("isolation", "")
+def _features(study: StudyFacts, facts: Mapping[str, Any]) -> str:
+    means = facts["mean_scores"]
+    if len(means) < 2:
+        return ""
+    sure = all(real(held["p"]) < real(study.spec["alpha"]) for held in facts["comparisons"].values())
+    return f"Feature set {facts['features']} goes on" + (
+        ", better with every backbone." if sure else ", though not every backbone shows that it is better."
+    )
+
+
+@of_phase("calibration", "")
+def _baseline(study: StudyFacts, facts: Mapping[str, Any]) -> str:
+    held = facts["backbones"][facts["backbone"]]
+    return f"The baseline is {titled(facts['backbone'])} with {whole(real(held['parameters']))} parameters."
+
+
+@of_phase("confirmation", "")
+def _confirmed(study: StudyFacts, facts: Mapping[str, Any]) -> str:
+    names = [study.module(name) for name in facts["confirmed"]]
+    registered = len(study.facts["screening"]["registered"])
+    if not names:
+        return f"None of {registered} modules is confirmed."
+    which = f": {listed(names)}" if len(names) <= 6 else ""
+    return f"{len(names)} of {registered} modules {'is' if len(names) == 1 else 'are'} confirmed{which}."
+
+
+@of_phase("exploration", "")
+def _teacher(study: StudyFacts, facts: Mapping[str, Any]) -> str:
+    change = percent(real(facts["change"]), signed=True)
+    if facts["teacher"] == "exploration":
+        return f"The free search of phase 5 found a better one still ({change} on fresh folds)."
+    return f"The free search of phase 5 found nothing that fresh folds bear out ({change})."
+
+
+def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, what."""
+    pruned = sum(held.status == "pruned" for held in study.history)
+    failed = sum(held.status not in ("done", "pruned") for held in study.history)
+    trained = sum(phase.seconds for phase in study.phases)
+    said = [f"{count} of them {what}" for count, what in ((pruned, "pruned"), (failed, "failed")) if count]
+    made = [(whole(len(study.history)), "", ", ".join(["trainings", *said]))]
+    if trained:
+        clock = duration(sum(phase.wall_s for phase in study.phases))
+        value, _, unit = duration(trained).partition(" ")
+        made.append((value, unit, f"of training, {clock} by the clock"))
+    if "confirmation" in study.facts:
+        confirmed, asked = study.facts["confirmation"]["confirmed"], study.facts["screening"]["registered"]
+        made.append((whole(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
+    looks = len(study.openings)
+    sealed = _count(len(study.test) + len(study.second), "session")
+    made.append((whole(looks), "", f"look{'s' * (looks != 1)} at {sealed} set apart"))
+    return made
+
+
+def caveats(study: StudyFacts) -> list[str]:
+    """What such trainings can and cannot show, from the settings of this study."""
+    spec = study.spec
+    updates, final = int(spec["updates"]), int(spec["final_updates"])
+    horizon = _count(int(spec["horizon"]), "sample")
+    made = [
+        f"Every comparison is between trainings of {_length(spec, updates)}, judged {horizon} ahead. It shows which "
+        "part learns more from so little: a part that pays only after long training is missed, and one that only "
+        "speeds up the start is favoured.",
+        f"Only the last trainings are longer ({_length(spec, final)}); they judge the whole network, not its single "
+        "modules."
+        if final > updates
+        else f"The last trainings are no longer ({_length(spec, final)}), so nothing is known of long ones.",
+        f"Sessions: {len(study.development)} that train and judge in turn, {len(study.test)} set apart"
+        + (f", {len(study.second)} more for phase 6" if study.second else "")
+        + ". Intervals and p-values speak of sessions like these, not of another machine.",
+        *_power(study),
+        "Modules are tried on one baseline with one feature set; on another network they may do otherwise.",
+        f"Winners were tuned further than the baseline ({_count(int(spec['joint_trials']), 'more question')} in phase "
+        f"4, {whole(int(spec['free_trials']))} in phase 5), so part of their gain may be tuning and not modules.",
+        "The best of many questions is the best partly by chance, so scores of winners on development sessions are too "
+        "good. Only test sessions and fresh folds count.",
+    ]
+    if study.mode == "thesis":
+        made.append(
+            "This study follows the thesis's tests, to be compared with it. They take splits that share "
+            "most of their training data as independent, and accept a module on any of four metrics, so they confirm "
+            "useless modules more often than their level says; conclusions want the sound mode."
+        )
+    return made
+
+
+def _length(spec: Mapping[str, Any], updates: int) -> str:
+    """How long a training is, in words."""
+    epochs = int(spec.get("epochs", 1))
+    if epochs == 1:
+        return f"{whole(updates)} updates"
+    each = f"{whole(updates // epochs)} updates" if updates else "one pass over the data"
+    return f"at most {epochs} epochs of {each}"
+
+
+def _power(study: StudyFacts) -> tuple[str, ...]:
+    return (_sound_power if study.mode == "sound" else _thesis_power)(study)
+
+
+@of_phase("planning", ())
+def _sound_power(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[str, ...]:
+    effect = percent(real(study.spec["least_effect"]))
+    runs, power, limit = int(facts["runs"]), real(facts["power"]), real(facts["limit"])
+    text = (
+        f"{runs} runs of each arm were planned to show an effect of {effect}, which they do with a probability of "
+        f"{number(power, 2)}: a module that is not confirmed is not shown to be useless."
+    )
+    if facts["enough"] is None:
+        text += f" No number of runs on these sessions could make that more than {number(limit, 2)}."
+    return (text,)
+
+
+@of_phase("planning", ())
+def _thesis_power(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[str, ...]:
+    effect = percent(real(study.spec["least_effect"]))
+    return (
+        f"{int(facts['runs'])} splits were planned to show an effect of {effect} by a formula that counts the spread "
+        "of seeds only; the spread between splits and sessions makes that too few.",
+    )
+
+
+def decided(study: StudyFacts) -> list[tuple[str, tuple[str, ...]]]:
+    """Each phase with what it decided and why, or how far it is."""
+    made = []
+    for phase in study.phases:
+        lines = study.sentences.get(phase.name)
+        if lines is None:
+            count = sum(held.phase == phase.name for held in study.history)
+            lines = (f"Under way: {_count(count, 'training')} done." if phase.began else "Has not begun.",)
+        made.append((phase.heading, _grouped(lines)))
+    return made
+
+
+def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
+    """Sentences on several names that say the same of each become one; minus signs are true ones."""
+    names: dict[str, list[str]] = {}
+    for line in lines:
+        name, colon, rest = line.partition(": ")
+        names.setdefault(rest if colon else line, []).append(name if colon else "")
+    made = [f"{', '.join(own)}: {rest}" if own[0] else rest for rest, own in names.items()]
+    return tuple(re.sub(r"(?<![\w-])-(?=\d)", "−", line) for line in made)
+
+
+def missing(study: StudyFacts, *names: str) -> str:
+    """That phases are not decided yet; empty where all are."""
+    absent = [NUMBERS[name] for name in names if name not in study.facts]
+    if not absent:
+        return ""
+    return f"Phase{'s' * (len(absent) > 1)} {listed(absent)} {'are' if len(absent) > 1 else 'is'} not decided yet."
+
+
+def settings(study: StudyFacts) -> list[tuple[str, str]]:
+    """Settings of the search as text."""
+    return [(key.replace("_", " "), _plain(value)) for key, value in study.spec.items()]
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, dict):
+        return "; ".join(f"{key}: {_plain(held)}" for key, held in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _count(many: int, what: str) -> str:
+    return f"{whole(many)} {what}{'s' * (many != 1)}"

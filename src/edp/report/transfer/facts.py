@@ -1,0 +1,234 @@
+"""What a transfer left on disk, as tables, key figures and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+
+from edp.errors import StorageError
+from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.report.common.wording import listed, number, percent
+from edp.storage import read_json
+
+RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 1
+TARGET, SOURCE, MEAN = "target", "source", "mean"
+SIGNIFICANT = 0.05
+"""Share of the MAE from which a bias is named."""
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Content of ``transfer.json`` and of the excerpts beside it.
+
+    Attributes:
+        held: plain values.
+        shown: truth and predictions of excerpts by ``NAME/truth`` and ``NAME/METHOD``, ``(time, horizon, target)``, SI.
+        folder: where they lie.
+    """
+
+    held: Mapping[str, Any]
+    shown: Mapping[str, NDArray[np.float32]]
+    folder: Path
+
+    @property
+    def horizons(self) -> list[str]:
+        """Look-aheads in samples, as keys of scores."""
+        return [str(horizon) for horizon in self.held["task"]["horizons"]]
+
+    @property
+    def targets(self) -> Sequence[Mapping[str, Any]]:
+        """Name, description, unit and factor of each target."""
+        held: Sequence[Mapping[str, Any]] = self.held["targets"]
+        return held
+
+    @property
+    def unit(self) -> str:
+        """The unit that all targets share."""
+        units = {target["unit"] for target in self.targets}
+        return units.pop() if len(units) == 1 else "mixed units"
+
+    @property
+    def methods(self) -> Mapping[str, Mapping[str, Any]]:
+        """All methods by name."""
+        held: Mapping[str, Mapping[str, Any]] = self.held["methods"]
+        return held
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of the methods that stand for before and after."""
+        return self.held["before"], self.held["method"]
+
+    @property
+    def worlds(self) -> list[str]:
+        """Where methods were judged: on the target, and on the source where its recordings are at hand."""
+        return list(self.methods[self.held["method"]]["worlds"])
+
+    def score(self, method: str, horizon: str, target: str = MEAN, world: str = TARGET) -> Mapping[str, Any]:
+        """Scores of a method."""
+        held: Mapping[str, Any] = self.methods[method]["worlds"][world][horizon][target]
+        return held
+
+    def gain(self, horizon: str) -> float:
+        """Share of the MAE of direct transfer that is gone."""
+        before, after = (float(self.score(name, horizon)["mae"]) for name in self.pair)
+        return 1 - after / before
+
+    def ahead(self, horizon: str) -> str:
+        """A horizon in words."""
+        return f"{1e3 * int(horizon) / self.held['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
+
+    def name(self, target: Mapping[str, Any]) -> str:
+        """What a target is called."""
+        return str(target["description"] or target["name"])
+
+
+def read_transfer(folder: str | Path) -> Transfer:
+    """What `edp finetune` wrote into a folder.
+
+    Raises:
+        StorageError: nothing, something of another version, or damaged excerpts.
+    """
+    file = Path(folder) / RESULT
+    if not file.is_file():
+        raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp finetune")
+    held = read_json(file)
+    if not isinstance(held, dict) or held.get("schema") != SCHEMA:
+        raise StorageError(f"'{file}' is of another version of EDP; run edp finetune again")
+    try:
+        shown = load_file(Path(folder) / SHOWN)
+    except (OSError, SafetensorError) as error:
+        raise StorageError(f"'{Path(folder) / SHOWN}' cannot be read ({error}); run edp finetune again") from error
+    return Transfer(held, shown, Path(folder))
+
+
+def sheets_of(facts: Transfer, horizon: str) -> list[Sheet]:
+    """The two tables of a horizon."""
+    return [pair_sheet(facts, horizon), method_sheet(facts, horizon)]
+
+
+def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
+    """A table in the form of Table 4.10: before and after, by target, with bias and skew."""
+    rows: list[tuple[Value, ...]] = []
+    for method in facts.pair:
+        for target in facts.targets:
+            found = facts.score(method, horizon, target["name"])
+            keys = ("mse", "mae", "r2", "p95", "p99", "bias", "skew")
+            rows.append((facts.methods[method]["label"], facts.name(target), *(found[key] for key in keys)))
+    unit = facts.unit
+    square = f"({unit})²" if unit != "mixed units" else unit
+    heads = (("MSE", square), ("MAE", unit), ("R²", ""), ("P95", unit), ("P99", unit), ("Bias", unit), ("Skew", ""))
+    shows = [figures([row[2 + place] for row in rows]) for place in range(len(heads))]
+    shows[2] = figures([], decimals=4)
+    for place in (5, 6):
+        shows[place] = figures([], signed=True, decimals=2)
+    columns = (
+        Column("Model variant"),
+        Column("Target"),
+        *(Column(head, of, show) for (head, of), show in zip(heads, shows, strict=True)),
+    )
+    after = frozenset(range(len(facts.targets), 2 * len(facts.targets)))
+    return Sheet(f"pair_k{horizon}", f"{facts.ahead(horizon)}, test part of the logs", columns, tuple(rows), after)
+
+
+def method_sheet(facts: Transfer, horizon: str) -> Sheet:
+    """All methods on the same ticks, least error first, in both worlds where both were judged."""
+    direct = float(facts.score(facts.held["before"], horizon)["mae"])
+    both = SOURCE in facts.worlds
+    rows: list[tuple[Value, ...]] = []
+    names = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
+    for name in names:
+        found = facts.score(name, horizon)
+        each = [facts.score(name, horizon, target["name"]) for target in facts.targets]
+        known = [row["r2"] for row in each if row["r2"] is not None]
+        rows.append(
+            (
+                facts.methods[name]["label"],
+                found["mae"],
+                100 * (found["mae"] / direct - 1),
+                min(known, default=None),
+                found["p95"],
+                found["p99"],
+                max((row["bias"] for row in each), key=abs),
+                facts.methods[name]["learned"],
+                *([facts.score(name, horizon, world=SOURCE)["mae"]] if both else []),
+            )
+        )
+    unit = facts.unit
+    columns = (
+        Column("Method"),
+        Column("MAE", unit, figures([row[1] for row in rows])),
+        Column("Against direct", "%", figures([], signed=True, decimals=1)),
+        Column("Least R²", "", figures([], decimals=4)),
+        Column("P95", unit, figures([row[4] for row in rows])),
+        Column("P99", unit, figures([row[5] for row in rows])),
+        Column("Largest bias", unit, figures([], signed=True, decimals=2)),
+        Column("Learned", "parameters", figures([], decimals=0)),
+        *([Column("MAE on the source", unit, figures([row[8] for row in rows]))] if both else []),
+    )
+    mark = frozenset({names.index(facts.held["method"])})
+    return Sheet(f"methods_k{horizon}", f"{facts.ahead(horizon)}, means over targets", columns, tuple(rows), mark)
+
+
+def headline(facts: Transfer) -> str:
+    """One sentence: what was gained."""
+    horizon = facts.horizons[-1]
+    before, after = (facts.score(name, horizon)["mae"] for name in facts.pair)
+    gain = facts.gain(horizon)
+    if not gain:
+        return "No epoch was better on the validation part than the source's network as it is, so that one is kept"
+    how = f"{percent(abs(gain))} {'less' if gain > 0 else 'more'}"
+    words = f"{number(after)} instead of {number(before)} {facts.unit}"
+    return f"{facts.methods[facts.held['method']]['label']}: {how} error than direct transfer, {words}"
+
+
+def verdict(facts: Transfer) -> list[str]:
+    """Sentences under the headline: R2 and bias of each target, the best rival, the source's world."""
+    horizon, method = facts.horizons[-1], facts.held["method"]
+    each = {facts.name(target): facts.score(method, horizon, target["name"]) for target in facts.targets}
+    known = listed(f"{number(row['r2'], 4)} ({name})" for name, row in each.items())
+    lines = [f"R² is {known}."]
+    leaning = [name for name, row in each.items() if abs(row["bias"]) > SIGNIFICANT * row["mae"]]
+    if leaning:
+        lines.append(f"The errors of {listed(leaning)} have a bias above {percent(SIGNIFICANT)} of their MAE.")
+    rivals = [name for name in facts.methods if name != method]
+    best = min(rivals, key=lambda name: facts.score(name, horizon)["mae"])
+    if facts.score(best, horizon)["mae"] < facts.score(method, horizon)["mae"]:
+        better = facts.methods[best]["label"]
+        lines.append(f"{better} has less: {number(facts.score(best, horizon)['mae'])} {facts.unit}.")
+    if SOURCE in facts.worlds:
+        was, now = (facts.score(name, horizon, world=SOURCE)["mae"] for name in facts.pair)
+        change = percent(now / was - 1, signed=True)
+        lines.append(f"On the source's own test part the error is {number(now)} {facts.unit}, {change}.")
+    return lines
+
+
+def caveats(facts: Transfer) -> list[str]:
+    """What the figures can and cannot show."""
+    minutes = facts.held["data"]["minutes"]
+    return [
+        f"Trained on {minutes['train']:.1f} min, epochs chosen on {minutes['validation']:.1f} min, judged on "
+        f"{minutes['test']:.1f} min: the end of each of {facts.held['data']['recordings']} logs, a gap of W + k apart.",
+        "The test part holds the conditions of the logs, not others: another soil, load or temperature is not in it.",
+        "One training each: differences of a percent between methods may be chance.",
+        *facts.held["notes"],
+    ]
+
+
+def tiles(facts: Transfer) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, meaning."""
+    horizon, (before, after) = facts.horizons[-1], facts.pair
+    was, now = facts.score(before, horizon), facts.score(after, horizon)
+    return [
+        (number(now["mae"]), facts.unit, f"MAE {facts.ahead(horizon)}"),
+        (number(was["mae"]), facts.unit, "MAE of direct transfer"),
+        (percent(facts.gain(horizon)), "", "less error"),
+        (number(now["p99"]), facts.unit, "99th percentile of the error"),
+        (f"{facts.held['data']['minutes']['train']:.1f}", "min", "of logs trained on"),
+    ]

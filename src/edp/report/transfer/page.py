@@ -1,0 +1,53 @@
+"""The report of a transfer: one offline HTML page, tables and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from edp.report.common.drawing import write_drawings
+from edp.report.common.sheets import Sheet, write_sheets
+from edp.report.common.templates import template
+from edp.report.common.wording import unbroken
+from edp.report.run.page import shown
+from edp.report.transfer import facts as words
+from edp.report.transfer.facts import Transfer, read_transfer
+from edp.report.transfer.plots import drawings, transfer_plots
+from edp.storage import write_bytes
+
+
+def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
+    """Write ``transfer.html``, ``tables/*.csv``, ``tables/*.md`` and ``pictures/*`` into the folder of `edp finetune`.
+
+    Returns:
+        The page.
+
+    Raises:
+        StorageError: the folder holds no transfer, or a file cannot be written.
+    """
+    facts = read_transfer(folder)
+    tables = [sheet for horizon in reversed(facts.horizons) for sheet in words.sheets_of(facts, horizon)]
+    page = facts.folder / "transfer.html"
+    write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
+    write_sheets(facts.folder / "tables", tables)
+    if pictures:
+        write_drawings(facts.folder / "pictures", drawings(facts))
+    return page
+
+
+def render(facts: Transfer, tables: list[Sheet]) -> str:
+    """The page's text."""
+    plots = transfer_plots(facts)
+    context: dict[str, Any] = {
+        "title": facts.folder.resolve().name,
+        "network": facts.held["network"],
+        "headline": unbroken(words.headline(facts)),
+        "verdict": words.verdict(facts),
+        "tiles": words.tiles(facts),
+        "caveats": words.caveats(facts),
+        "pairs": [sheet.table() for sheet in tables if sheet.name.startswith("pair")],
+        "methods": [sheet.table() for sheet in tables if sheet.name.startswith("methods")],
+        "both": words.SOURCE in facts.worlds,
+        **shown(plots),
+    }
+    return template("transfer.html.jinja").render(**context)

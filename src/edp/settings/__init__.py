@@ -1,0 +1,1 @@
+"""The machinery of settings: TOML to dataclasses and back, overrides, and ranges of numbers."""

@@ -1,0 +1,230 @@
+"""Settings as typed trees: TOML tables to dataclasses and back, every problem reported at once with the closest key.
+
+A field may hold a registered part: its table says with ``kind = "..."`` which one. A `SettingsTree` knows the
+registries by the names of these fields; `build` and `plain_tree` are those of a tree without registered parts.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pydantic
+
+from edp import storage
+from edp.errors import ConfigError, closest
+from edp.registry import Registry
+from edp.settings.bounds import shown
+
+Table = dict[str, Any]
+Parts = Mapping[str, Registry[type]]
+"""Registries by the name of the field that holds one of their parts."""
+T = typing.TypeVar("T")
+
+SHOWN_CHANGE = 200
+"""Of a ``--set``, in messages."""
+MOST_LISTED, MOST_KEY = 50, 100
+"""Problems that a message lists, and characters of a key that it repeats."""
+
+
+def read_toml(path: str | Path) -> Table:
+    """A settings file.
+
+    Raises:
+        ConfigError: it cannot be read, is beyond the bounds of `edp.storage.read_toml`, or is not TOML.
+    """
+    return storage.read_toml(path, error=ConfigError)
+
+
+def merged(base: Table, change: Mapping[str, Any]) -> Table:
+    """`base` with `change` laid over it; a table of another kind replaces the old one whole."""
+    result = dict(base)
+    for key, value in change.items():
+        old = result.get(key)
+        same = (
+            isinstance(old, dict) and isinstance(value, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+        )
+        result[key] = merged(old, value) if same and isinstance(old, dict) else value
+    return result
+
+
+def override(text: str) -> Table:
+    """The table that one ``key.path=value`` stands for; a value that is no TOML is a string.
+
+    Raises:
+        ConfigError: not of this form.
+    """
+    key, sign, value = text.partition("=")
+    if not sign or not key.strip():
+        raise ConfigError(f"--set '{text}': write key.path=value, for example training.epochs=10")
+    where = f"--set '{text[:SHOWN_CHANGE]}'"
+    try:
+        return storage.parse_toml(f"{key.strip()} = {value.strip()}", where, ConfigError)
+    except ConfigError:
+        return storage.parse_toml(f'{key.strip()} = "{value.strip()}"', where, ConfigError)
+
+
+class SettingsTree:
+    """Dataclasses from plain tables and plain tables from dataclasses.
+
+    Args:
+        parts: registries by the name of the field that holds one of their parts.
+        usual_kinds: by field, the kind that a table without ``kind`` means.
+    """
+
+    def __init__(self, parts: Parts | None = None, usual_kinds: Mapping[str, str] | None = None) -> None:
+        self.parts = dict(parts or {})
+        self.usual_kinds = dict(usual_kinds or {})
+
+    def plain(self, value: Any, name: str = "") -> Any:
+        """Nested plain values of a spec tree; registered parts carry their ``kind``; None is left out.
+
+        Args:
+            value: the spec, or a value of one.
+            name: of the field that holds it.
+        """
+        if name in self.parts and is_dataclass(value):
+            return {"kind": self.parts[name].name_of(value)} | self._plain_fields(value)
+        if name in self.parts and isinstance(value, tuple):
+            return [self.plain(item, name) for item in value]
+        if is_dataclass(value):
+            return self._plain_fields(value)
+        if isinstance(value, tuple | list):
+            return [self.plain(item) for item in value]
+        return str(value) if isinstance(value, Enum) else value
+
+    def _plain_fields(self, spec: Any) -> Table:
+        values = {entry.name: getattr(spec, entry.name) for entry in fields(spec)}
+        return {name: self.plain(value, name) for name, value in values.items() if value is not None}
+
+    def build(self, cls: type[T], table: Mapping[str, Any], where: str) -> T:
+        """A spec tree from a table; what the table leaves out, or holds as None, has its default.
+
+        Args:
+            cls: dataclass of the tree's root.
+            table: nested plain values.
+            where: how messages call the table.
+
+        Raises:
+            ConfigError: every problem found, with its key path and the closest known key.
+        """
+        problems: list[str] = []
+        spec = self._build(cls, table, "", problems)
+        if problems:
+            more = [f"and {len(problems) - MOST_LISTED:,} more"] if len(problems) > MOST_LISTED else []
+            listed = "\n  - ".join(problems[:MOST_LISTED] + more)
+            count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
+            raise ConfigError(f"settings {where}: {count}\n  - {listed}")
+        return typing.cast(T, spec)
+
+    def _build(self, cls: type, table: Any, path: str, problems: list[str]) -> Any:
+        if not isinstance(table, Mapping):
+            problems.append(f"{path}: expected a table, got {shown(table)}")
+            return None
+        hints = _hints(cls)
+        known = [entry.name for entry in fields(cls)]
+        before = len(problems)
+        for key in table:
+            if key not in known:
+                problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), known)}")
+        for entry in fields(cls):
+            required = entry.default is MISSING and entry.default_factory is MISSING
+            if required and table.get(entry.name) is None:
+                problems.append(f"'{_join(path, entry.name)}' is missing; it must be given")
+        values = {
+            name: self._value(name, hints[name], table[name], _join(path, name), problems)
+            for name in known
+            if table.get(name) is not None
+        }
+        if len(problems) > before:
+            return None
+        try:
+            return cls(**values)
+        except ConfigError as error:
+            problems.append(f"{path or 'top level'}: {error}")
+            return None
+
+    def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
+        if name in self.parts:
+            if typing.get_origin(hint) is tuple:
+                items = value if isinstance(value, list) else [value]
+                return tuple(self._part(name, item, f"{path}[{i}]", problems) for i, item in enumerate(items))
+            return self._part(name, value, path, problems)
+        choices = typing.get_args(hint) if typing.get_origin(hint) is not tuple else ()
+        table_type = hint if is_dataclass(hint) else next((c for c in choices if is_dataclass(c)), None)
+        if table_type is not None and (isinstance(value, Mapping) or table_type is hint):
+            return self._build(typing.cast(type, table_type), value, path, problems)
+        item_type = next(iter(typing.get_args(hint)), None) if typing.get_origin(hint) is tuple else None
+        if is_dataclass(item_type) and isinstance(value, list):
+            items = enumerate(value)
+            return tuple(self._build(typing.cast(type, item_type), v, f"{path}[{i}]", problems) for i, v in items)
+        if _truth_in(value) and bool not in _leaves(hint):
+            problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
+            return None
+        try:
+            return _adapter(hint).validate_python(value)
+        except pydantic.ValidationError as error:
+            first = error.errors()[0]
+            problems.append(f"{path} = {shown(value)}: {first['msg'][0].lower()}{first['msg'][1:]}")
+            return None
+
+    def _part(self, name: str, table: Any, path: str, problems: list[str]) -> Any:
+        registry = self.parts[name]
+        if isinstance(table, str):
+            table = {"kind": table}
+        if isinstance(table, Mapping) and name in self.usual_kinds:
+            table = {"kind": self.usual_kinds[name], **table}
+        if not isinstance(table, Mapping) or "kind" not in table:
+            problems.append(f'{path}: say which {registry.what} with kind = "..."{closest("", registry)}')
+            return None
+        if not isinstance(table["kind"], str):
+            problems.append(f"{path}.kind = {shown(table['kind'])}: the name of one must hold{closest('', registry)}")
+            return None
+        try:
+            cls = registry[_key(table["kind"])]
+        except ConfigError as error:
+            problems.append(f"{path}.kind: {error}")
+            return None
+        return self._build(cls, {key: value for key, value in table.items() if key != "kind"}, path, problems)
+
+
+# A search builds thousands of experiments, and making these took nine tenths of the time.
+_hints = cache(typing.get_type_hints)
+
+
+@cache
+def _adapter(hint: Any) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(hint, config=pydantic.ConfigDict(allow_inf_nan=False))
+
+
+@cache
+def _leaves(hint: Any) -> frozenset[Any]:
+    """The types that a hint is made of."""
+    inner = typing.get_args(hint)
+    return frozenset().union(*map(_leaves, inner)) if inner else frozenset((hint,))
+
+
+def _truth_in(value: Any) -> bool:
+    """Whether a value is or holds true or false, which Python counts as numbers."""
+    if isinstance(value, Mapping):
+        return any(map(_truth_in, value.values()))
+    return any(map(_truth_in, value)) if isinstance(value, list | tuple) else isinstance(value, bool)
+
+
+def _key(name: str) -> str:
+    """A key or name as messages repeat it."""
+    return name if len(name) <= MOST_KEY else f"{name[:MOST_KEY]}..."
+
+
+def _join(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key
+
+
+_PLAIN = SettingsTree()
+build = _PLAIN.build
+plain_tree = _PLAIN.plain

@@ -1,0 +1,278 @@
+"""Simulated data sets on disk: what is asked for, room for it, and writing it so that it can go on."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.errors import BusyError, ConfigError, EdpError, StorageError, closest
+from edp.logs import LAYOUTS, WriteOptions, known_suffixes, read_recording, write_recording
+from edp.recording import Recording
+from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.sim.plan import DataSetSpec, simulate_many
+from edp.sim.predictability import LimitJob, LimitSpec, find_limit, plan_limit
+from edp.sim.scenario import Scenario, plain
+from edp.sim.scenario_file import read_scenario_file
+from edp.storage import (
+    check_held,
+    check_writable,
+    hold,
+    make_folder,
+    read_json,
+    release,
+    remove_unfinished,
+    write_json,
+)
+
+MANIFEST = "data_set.json"
+LIMIT = "limit.json"
+LOCK = ".lock"
+BYTES_PER_VALUE = {".parquet": 3.0, ".csv": 10.0, ".mat": 3.0}
+"""Room a logged value takes, rounded up; measured on M22: 1.7, 8.0 and 2.1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOrder(DataSetSpec):
+    """A simulated data set and how it is written.
+
+    Attributes:
+        suffix: ending of the logs, which settles their format.
+        layout: layout of MAT files, a name in `edp.logs.LAYOUTS`; empty for the plain one.
+        truth: where the channels go that only a simulation knows, see `edp.logs.WriteOptions`; empty for ``apart``
+            in a layout that was asked for, else ``with`` the others.
+    """
+
+    suffix: str = ".parquet"
+    layout: str = ""
+    truth: str = ""
+
+    @staticmethod
+    def of(
+        scenario: str | Path | None = None, note: Callable[[str], None] | None = None, **changes: Any
+    ) -> SimulationOrder:
+        """The order of a scenario file, or the default one; `changes` that are not None replace its values.
+
+        What a change makes void in the file goes with it, and `note` is called with a sentence that says so: a layout
+        of MAT files once another format is asked for, a family once a machine is.
+
+        Raises:
+            ConfigError: a key or value that cannot be; file, key, value and bound are named.
+        """
+        values: dict[str, Any] = {}
+        if scenario is not None:
+            values, files = read_scenario_file(scenario)
+            values |= {key: value for key, value in files.items() if key != "format"}
+            if "format" in files:
+                values["suffix"] = suffix_of(files["format"])
+        given = {key: value for key, value in changes.items() if value is not None}
+        if given.get("family") and "machine" in given:
+            raise ConfigError(
+                f"machine = {given['machine']} and family = {given['family']}: a family takes the machine's place; "
+                "give one of the two"
+            )
+        for text in _leave_out(values, given):
+            if note is not None:
+                note(f"{text}; the scenario file's is left out")
+        values |= given
+        try:
+            order = SimulationOrder(**values)
+            order.files()
+        except EdpError as error:
+            raise ConfigError(str(error) if scenario is None else f"scenario file {scenario}: {error}") from error
+        return order
+
+    def files(self) -> WriteOptions:
+        """How the logs are written.
+
+        Raises:
+            EdpError: an ending without a format, an unknown layout, or one of another format.
+        """
+        if self.suffix not in known_suffixes():
+            hint = closest(self.suffix, known_suffixes())
+            raise ConfigError(f"there is no log format for the ending '{self.suffix}'{hint}")
+        if self.layout:
+            LAYOUTS[self.layout]
+            if self.suffix != ".mat":
+                raise ConfigError(f"layout '{self.layout}' is one of MAT files, not of '{self.suffix}'; ask for mat")
+        truth = self.truth or ("apart" if self.layout else "with")
+        return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
+
+
+def _leave_out(values: dict[str, Any], given: dict[str, Any]) -> Iterator[str]:
+    """Take out of a file's `values` what those given make void; says what, and why."""
+    suffix = given.get("suffix", ".mat")
+    if suffix != ".mat" and values.get("layout") and "layout" not in given:
+        yield f"layout '{values.pop('layout')}' is one of MAT files, and format {suffix[1:]} was asked for"
+    if "machine" in given and values.get("family"):
+        yield f"family of {values.pop('family')} machines, and machine {given['machine']} was asked for"
+    if not given.get("family", values.get("family", 0)):
+        values.pop("masses", None)
+        values.pop("scatter", None)
+
+
+def suffix_of(form: str) -> str:
+    """``parquet`` or ``.parquet`` to ``.parquet``."""
+    return f".{form.lstrip('.')}"
+
+
+def simulate_data_set(
+    out: str | Path,
+    order: SimulationOrder | None = None,
+    workers: int = 0,
+    on_done: Callable[[Recording, bool], None] | None = None,
+) -> list[Path]:
+    """Simulate a data set into a folder, a log each; logs already there from the same order are kept.
+
+    Args:
+        out: folder; it may hold nothing but an earlier part of the same data set.
+        order: what to simulate; an hour of machine M22 by default.
+        workers: processes; 0 for one a core.
+        on_done: called with each recording and whether it was there already.
+
+    Raises:
+        BusyError: another process simulates into the folder.
+        StorageError: the folder holds another data set, cannot be written, or its disk has not room enough.
+        ConfigError: an ending without a format, or a number out of range.
+    """
+    order = order or SimulationOrder()
+    suffix, files = order.suffix, order.files()
+    plan = order.scenarios()
+    folder = make_folder(out)
+    identity = identity_of(plan, files, suffix)
+    paths = [folder / f"{scenario.name}{suffix}" for scenario in plan]
+    with _alone(folder) as check:
+        bound = _bound(folder, identity)
+        missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
+        check_room(folder, missing, suffix)
+        if not bound:
+            write_json(folder / MANIFEST, identity)
+        absent = {scenario.name for scenario in missing}
+        for scenario, path in zip(plan, paths, strict=True):
+            if on_done is not None and scenario.name not in absent:
+                on_done(read_recording(path), True)
+        count = workers or os.cpu_count() or 1
+        for recording in simulate_many(missing, min(count, max(1, len(missing)))):
+            check()
+            write_recording(recording, folder / f"{recording.name}{suffix}", files)
+            if on_done is not None:
+                on_done(recording, False)
+    return paths
+
+
+def _bound(folder: Path, identity: dict[str, Any]) -> bool:
+    """Whether a folder is bound to an order; False where it is bound to none."""
+    manifest = folder / MANIFEST
+    if not os.path.lexists(manifest):
+        return False
+    if read_json(manifest) != identity:
+        raise StorageError(f"'{folder}' holds another simulated data set; nothing was changed: choose another folder")
+    return True
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[Callable[[], None]]:
+    """Hold a folder of logs; yields what sees that it is still held. Nothing of it stays.
+
+    Raises:
+        BusyError: another process simulates into it.
+    """
+    file = folder / LOCK
+    try:
+        lock = hold(file)
+    except BusyError as error:
+        holder = str(error).rpartition("process ")[2]
+        raise BusyError(f"process {holder} simulates into '{folder}'; wait for it, or choose another folder") from None
+    try:
+        remove_unfinished(folder)
+        yield lambda: check_held(file, lock)
+    finally:
+        release(file, lock)
+
+
+def find_data_set_limit(
+    folder: str | Path,
+    order: SimulationOrder,
+    spec: LimitSpec | None = None,
+    workers: int = 0,
+    on_done: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """The limit of predictability of a simulated data set, written beside its logs as ``limit.json``.
+
+    A limit that is there already from the same order and settings is kept.
+
+    Args:
+        folder: the folder of the data set.
+        order: what was simulated into it.
+        spec: moments, branches and horizons.
+        workers: processes; 0 for one a core.
+        on_done: called with how many recordings are done, and of how many.
+
+    Raises:
+        ConfigError: the recordings are too short.
+        StorageError: the folder cannot be written.
+    """
+    spec = spec or LimitSpec()
+    plan = order.scenarios()
+    key = _digest([identity_of(plan, WriteOptions()), asdict(spec)])
+    target = make_folder(folder) / LIMIT
+    if os.path.lexists(target):
+        kept = read_json(target)
+        if isinstance(kept, dict) and kept.get("key") == key:
+            return kept
+    check_writable(target.parent)
+    jobs, done = len(plan_limit(plan, spec)), 0
+
+    def count(job: LimitJob) -> None:
+        nonlocal done
+        done += 1
+        if on_done is not None:
+            on_done(done, jobs)
+
+    found = find_limit(plan, spec, min(workers or os.cpu_count() or 1, jobs), count) | {"key": key}
+    write_json(target, found)
+    return found
+
+
+def _digest(value: Any) -> str:
+    return hashlib.blake2b(json.dumps(value, sort_keys=True).encode(), digest_size=12).hexdigest()
+
+
+def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, Any]:
+    """What makes two simulated data sets the same, as JSON gives it back."""
+    identity: dict[str, Any] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
+    if files != WriteOptions():
+        identity["files"] = asdict(files)
+    if suffix != ".parquet":
+        identity["suffix"] = suffix
+    kept: dict[str, Any] = json.loads(json.dumps(identity))
+    return kept
+
+
+def bytes_needed(plan: Sequence[Scenario], suffix: str) -> int:
+    """Room that the logs of a plan take, rounded up."""
+    usual = len(TABLE_A1) + len(EXTRA_CHANNELS)
+    values = sum(s.samples * (usual + (len(GROUND_CHANNELS) if s.material else 0)) for s in plan)
+    return int(values * BYTES_PER_VALUE.get(suffix, max(BYTES_PER_VALUE.values())))
+
+
+def check_room(folder: Path, plan: Sequence[Scenario], suffix: str) -> None:
+    """Refuse a plan whose logs would not fit on the disk of `folder`.
+
+    Raises:
+        StorageError: not room enough.
+    """
+    needed, free = bytes_needed(plan, suffix), shutil.disk_usage(folder).free
+    if needed > free:
+        minutes = sum(s.duration_s for s in plan) / 60.0
+        raise StorageError(
+            f"minutes: {minutes:g} min as {suffix} need about {needed / 1e9:,.1f} GB, but the disk of '{folder}' has "
+            f"{free / 1e9:,.1f} GB free; simulate at most {minutes * free / needed:,.0f} min, or choose another folder"
+        )

@@ -1,0 +1,1 @@
+"""Machines: their parameters, the files that hold them, and families drawn around one."""

@@ -1,0 +1,315 @@
+"""What must hold of a machine before it is simulated; every message names file, key, value and bound."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from edp.errors import ConfigError
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import FLOW_SHARING, pack
+from edp.sim.physics import linkage
+
+CYLINDERS = ("boom", "arm", "bucket")
+BEYOND_STOPS = math.radians(4.0)
+"""How far beyond its stops a joint must still have a lever arm: impacts push it there."""
+LEAST_LEVER = 0.08
+"""Least lever arm |dx/dpsi| (m/rad) as a share of the stroke (m): below it an impact can turn the linkage over."""
+
+
+@dataclass(frozen=True)
+class ParameterBound:
+    """Limits of a number; `above` makes the lower one strict."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    whole: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Whether the value lies within."""
+        fits = (value > self.low if self.above else value >= self.low) and value <= self.high
+        return fits and (not self.whole or value == int(value))
+
+    def __str__(self) -> str:
+        text = "a whole number " if self.whole else ""
+        if math.isinf(self.high):
+            return f"{text}{'above' if self.above else 'at least'} {self.low:g}"
+        return f"{text}{f'above {self.low:g} and at most' if self.above else f'from {self.low:g} to'} {self.high:g}"
+
+
+ANY = ParameterBound()
+POSITIVE, NOT_NEGATIVE = ParameterBound(0.0, above=True), ParameterBound(0.0)
+SHARE, SOME_SHARE, DEAD = ParameterBound(0.0, 1.0), ParameterBound(0.0, 1.0, above=True), ParameterBound(0.0, 0.9)
+PUMP = ParameterBound(1.0, 2.0, whole=True)
+LENGTH, SMALL = ParameterBound(0.0, 30.0, above=True), ParameterBound(0.0, 1.0, above=True)
+FREQUENCY = ParameterBound(0.0, 500.0, above=True)
+BOUNDS: Mapping[str, ParameterBound] = {
+    "gravity": POSITIVE,
+    "bodies.length": LENGTH,
+    "bodies.mass": POSITIVE,
+    "bodies.inertia": POSITIVE,
+    "boom_cylinder.base_radius": LENGTH,
+    "boom_cylinder.rod_radius": LENGTH,
+    "boom_cylinder.offset_deg": ParameterBound(-360.0, 360.0),
+    "boom_cylinder.closed_length": LENGTH,
+    "arm_cylinder.base_radius": LENGTH,
+    "arm_cylinder.rod_radius": LENGTH,
+    "arm_cylinder.offset_deg": ParameterBound(-360.0, 360.0),
+    "arm_cylinder.closed_length": LENGTH,
+    "bucket_linkage.pivot_to_pin": LENGTH,
+    "bucket_linkage.rocker": LENGTH,
+    "bucket_linkage.link": LENGTH,
+    "bucket_linkage.lug": LENGTH,
+    "bucket_linkage.lug_angle": ParameterBound(-2 * math.pi, 2 * math.pi),
+    "bucket_linkage.closed_length": LENGTH,
+    "cylinders.count": ParameterBound(1.0, 4.0, whole=True),
+    "cylinders.bore": SMALL,
+    "cylinders.rod": SMALL,
+    "cylinders.stroke": LENGTH,
+    "cylinders.hose_volume": ParameterBound(0.0, 0.1),
+    "cylinders.dead_length": SMALL,
+    "cylinders.cushion_length": SMALL,
+    "cylinders.cushion_area": SOME_SHARE,
+    "cylinders.stop_stiffness": POSITIVE,
+    "cylinders.stop_damping": NOT_NEGATIVE,
+    "cylinders.piston_leakage": NOT_NEGATIVE,
+    "cylinders.spool_leakage": NOT_NEGATIVE,
+    "friction.coulomb_fraction": SOME_SHARE,
+    "friction.static_fraction": SOME_SHARE,
+    "friction.viscous": NOT_NEGATIVE,
+    "friction.stribeck_velocity": POSITIVE,
+    "friction.bristle_stiffness": POSITIVE,
+    "friction.bristle_damping": NOT_NEGATIVE,
+    "oil.bulk_modulus": POSITIVE,
+    "oil.air_fraction": ParameterBound(0.0, 0.2),
+    "oil.viscosity": SMALL,
+    "oil.temperature": ParameterBound(-40.0, 120.0),
+    "oil.tank_pressure": NOT_NEGATIVE,
+    "oil.heat_capacity": POSITIVE,
+    "oil.cooling": NOT_NEGATIVE,
+    "oil.ambient": ParameterBound(-60.0, 80.0),
+    "pumps.max_flow": SMALL,
+    "pumps.volumetric_efficiency": SOME_SHARE,
+    "pumps.power_limit": POSITIVE,
+    "pumps.min_displacement": SHARE,
+    "pumps.time_constant": POSITIVE,
+    "pumps.line_volume": SMALL,
+    "pumps.relief": POSITIVE,
+    "pumps.relief_slope": POSITIVE,
+    "pumps.bypass_closed_at": SOME_SHARE,
+    "valves.pilot_pressure": POSITIVE,
+    "valves.pilot_frequency": FREQUENCY,
+    "valves.spool_frequency": FREQUENCY,
+    "valves.conflux_spool_frequency": FREQUENCY,
+    "valves.dead_time": ParameterBound(0.0, 2.0),
+    "valves.conflux_extra_dead_time": ParameterBound(0.0, 2.0),
+    "valves.dead_band_extend": DEAD,
+    "valves.dead_band_retract": DEAD,
+    "valves.conflux_dead_band_extend": DEAD,
+    "valves.conflux_dead_band_retract": DEAD,
+    "valves.hysteresis": ParameterBound(0.0, 0.5),
+    "valves.lever_dead_zone": DEAD,
+    "valves.conflux_start": DEAD,
+    "valves.conflux_extend": SHARE,
+    "valves.conflux_retract": SHARE,
+    "valves.pump_demand_extend": SHARE,
+    "valves.pump_demand_retract": SHARE,
+    "valves.primary_pump": PUMP,
+    "valves.conflux_pump": PUMP,
+    "valves.check_leakage": SHARE,
+    "valves.port_relief_head": POSITIVE,
+    "valves.port_relief_rod": POSITIVE,
+    "valves.port_relief_slope": POSITIVE,
+    "bucket.width": LENGTH,
+    "bucket.capacity": ParameterBound(0.0, 100.0, above=True),
+    "bucket.floor_angle_deg": ParameterBound(-180.0, 180.0),
+    "bucket.floor_length": LENGTH,
+    "bucket.edge_area": SMALL,
+    "chassis.boom_foot_height": ParameterBound(-5.0, 30.0),
+    "chassis.pitch_inertia": POSITIVE,
+    "chassis.pitch_frequency": FREQUENCY,
+    "chassis.pitch_damping": ParameterBound(0.0, 2.0),
+    "chassis.lift_moment": POSITIVE,
+    "sensors.velocity": NOT_NEGATIVE,
+    "sensors.pressure": NOT_NEGATIVE,
+    "sensors.acceleration_bandwidth": POSITIVE,
+    "sensors.joint_rate_deg": NOT_NEGATIVE,
+    "sensors.joint_bias_walk_deg": NOT_NEGATIVE,
+    "sensors.angle_quantum_deg": NOT_NEGATIVE,
+    "sensors.pin_backlash": ParameterBound(0.0, 0.1),
+    "sensors.pressure_range": NOT_NEGATIVE,
+    "sensors.pressure_offset": SHARE,
+    "sensors.pressure_bits": ParameterBound(0.0, 32.0, whole=True),
+    "sensors.pressure_lag": ParameterBound(0.0, 10.0),
+    "sensors.pressure_drift": SHARE,
+    "sensors.can_period": ParameterBound(0.0, 10.0),
+    "sensors.can_latency": ParameterBound(0.0, 10.0),
+    "sensors.can_jitter": ParameterBound(0.0, 10.0),
+    "sensors.can_loss": SHARE,
+    "sensors.instance_seed": ParameterBound(0.0, 2.0**63, whole=True),
+}
+"""By `section.key`; a number without an entry must be finite."""
+FLOWING = ("meter_in_extend", "meter_in_retract", "meter_out_extend", "meter_out_retract")
+"""Ratings without which a cylinder could not move."""
+
+
+def check_machine(machine: Machine, where: str) -> None:
+    """Refuse a machine that cannot be simulated.
+
+    Raises:
+        ConfigError: a value is no number or out of bounds, or the linkage is impossible.
+    """
+    for section, key, kind, value in _leaves(machine):
+        place = f"machine file {where}{f' [{section}]' if section else ''}: {key}"
+        if kind in ("Rating", "Ratings"):
+            _check_ratings(value, key, place)
+        elif kind == "str":
+            if not isinstance(value, str):
+                raise ConfigError(f"{place} = {value!r} must be text")
+            if key == "flow_sharing" and value not in FLOW_SHARING:
+                raise ConfigError(f"{place} = {value!r} must be one of {', '.join(FLOW_SHARING)}")
+        else:
+            _check_numbers(value, kind, BOUNDS.get(f"{section}.{key}" if section else key, ANY), place)
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", machine.name):
+        raise ConfigError(
+            f"machine file {where}: name = {machine.name!r} must be letters, digits, - and _: recordings carry it"
+        )
+    _check_pairs(machine, where)
+    axes, plant = pack(machine)
+    for axis in range(2):
+        _check_triangle(axis, axes, plant, where)
+    _check_bucket(axes, plant, where)
+
+
+def _leaves(machine: Machine) -> Iterator[tuple[str, str, str, Any]]:
+    for field in fields(machine):
+        value = getattr(machine, field.name)
+        if is_dataclass(value):
+            for inner in fields(value):
+                yield field.name, inner.name, str(inner.type), getattr(value, inner.name)
+        else:
+            yield "", field.name, str(field.type), value
+
+
+def _check_numbers(value: Any, kind: str, bound: ParameterBound, place: str) -> None:
+    """A number, or the numbers of a list where the key's type is one."""
+    if kind not in ("float", "int") and isinstance(value, tuple):
+        for i, part in enumerate(value):
+            _check_number(part, bound, f"{place}[{CYLINDERS[i] if len(value) == 3 else i}]")
+    else:
+        _check_number(value, bound, place)
+
+
+def _check_number(value: Any, bound: ParameterBound, place: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigError(f"{place} = {value!r} must be a number")
+    if not math.isfinite(value) or not bound.holds(value):
+        raise ConfigError(f"{place} = {value!r} must be {bound if bound is not ANY else 'finite'}")
+
+
+def _check_ratings(value: Any, key: str, place: str) -> None:
+    if isinstance(value, tuple) and len(value) == 3:
+        for i, part in enumerate(value):
+            _check_ratings(part, key, f"{place}[{CYLINDERS[i]}]")
+        return
+    if not isinstance(value, tuple) or len(value) != 2:
+        raise ConfigError(f"{place} = {value!r} must be [L/min, bar]")
+    _check_number(value[0], POSITIVE if key in FLOWING else NOT_NEGATIVE, f"{place}, flow in L/min,")
+    _check_number(value[1], POSITIVE, f"{place}, pressure in bar,")
+
+
+def _check_pairs(machine: Machine, where: str) -> None:
+    """Bounds that one value sets another."""
+    cylinders, friction = machine.cylinders, machine.friction
+    for i, name in enumerate(CYLINDERS):
+        if cylinders.rod[i] >= cylinders.bore[i]:
+            raise ConfigError(
+                f"machine file {where} [cylinders]: rod[{name}] = {cylinders.rod[i]!r} m must be below "
+                f"bore[{name}] = {cylinders.bore[i]!r} m"
+            )
+        if 2.0 * cylinders.cushion_length[i] > cylinders.stroke[i]:
+            raise ConfigError(
+                f"machine file {where} [cylinders]: cushion_length[{name}] = {cylinders.cushion_length[i]!r} m must be "
+                f"at most half of stroke[{name}] = {cylinders.stroke[i]!r} m"
+            )
+    for key, (low, high) in (
+        ("pressure_offset", machine.sensors.pressure_offset),
+        ("can_latency", machine.sensors.can_latency),
+    ):
+        if low > high:
+            raise ConfigError(
+                f"machine file {where} [sensors]: {key} = [{low!r}, {high!r}] must list the smaller first"
+            )
+    if friction.static_fraction < friction.coulomb_fraction:
+        raise ConfigError(
+            f"machine file {where} [friction]: static_fraction = {friction.static_fraction!r} must be at least "
+            f"coulomb_fraction = {friction.coulomb_fraction!r}"
+        )
+
+
+def _check_triangle(axis: int, axes: Any, plant: Any, where: str) -> None:
+    name = CYLINDERS[axis]
+    base, rod = ((at.BOOM_BASE, at.BOOM_ROD), (at.ARM_BASE, at.ARM_ROD))[axis]
+    closed, stroke = float(axes[axis, at.CLOSED]), float(axes[axis, at.STROKE])
+    least, most = abs(plant[base] - plant[rod]), plant[base] + plant[rod]
+    if closed <= least:
+        raise ConfigError(
+            f"machine file {where} [{name}_cylinder]: closed_length = {closed:g} m must be above "
+            f"|base_radius - rod_radius| = {least:.4g} m, or the pins cannot come that close"
+        )
+    if closed + stroke >= most:
+        raise ConfigError(
+            f"machine file {where} [cylinders]: stroke[{name}] = {stroke:g} m with closed_length = {closed:g} m needs "
+            f"pins {closed + stroke:.4g} m apart; must be below base_radius + rod_radius = {most:.4g} m"
+        )
+    ends = [linkage.angle_at_stroke(axis, s, axes, plant) for s in (0.0, stroke)]
+    _check_levers(axis, min(ends), max(ends), axes, plant, where)
+
+
+def _check_bucket(axes: Any, plant: Any, where: str) -> None:
+    closed, stroke = float(axes[2, at.CLOSED]), float(axes[2, at.STROKE])
+    place = f"machine file {where} [bucket_linkage]"
+    psi, length = linkage.bucket_branch(closed, closed + stroke, plant)
+    if not len(psi):
+        raise ConfigError(
+            f"{place}: rocker = {plant[at.ROCKER]:g} m and link = {plant[at.LINK]:g} m cannot close the loop between "
+            f"rocker pivot and lug = {plant[at.LUG]:g} m at any bucket angle; rocker + link must be longer than the "
+            "pins are apart, |rocker - link| shorter"
+        )
+    if length[0] < closed + stroke or length[-1] > closed:
+        low, high = np.degrees((psi[0], psi[-1]))
+        raise ConfigError(
+            f"{place}: closed_length = {closed:g} m with stroke[bucket] = {stroke:g} m needs pins from {closed:g} to "
+            f"{closed + stroke:.4g} m apart; this linkage gives {length[-1]:.4g} to {length[0]:.4g} m (bucket angles "
+            f"{low:.0f} to {high:.0f} deg) before it cannot close or turns over; change closed_length, stroke, rocker "
+            "or link"
+        )
+    ends = [linkage.angle_at_stroke(2, s, axes, plant) for s in (0.0, stroke)]
+    _check_levers(2, min(ends), max(ends), axes, plant, where)
+
+
+def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, where: str) -> None:
+    """The lever arm must keep its sign and a least size some degrees beyond the stops."""
+    name = CYLINDERS[axis]
+    table = "bucket_linkage" if axis == 2 else f"{name}_cylinder"
+    psi = np.linspace(low - BEYOND_STOPS, high + BEYOND_STOPS, 241)
+    closes = linkage.bucket_closes(psi, plant) if axis == 2 else np.full(len(psi), True)
+    sign = 1.0 if axis == 0 else -1.0
+    levers = [sign * linkage.cylinder(axis, p, plant)[1] if ok else -math.inf for p, ok in zip(psi, closes)]
+    worst = int(np.argmin(levers))
+    least = LEAST_LEVER * float(axes[axis, at.STROKE])
+    if not levers[worst] >= least:
+        found = f"{levers[worst]:.3f} m/rad" if math.isfinite(levers[worst]) else "none, the loop cannot close"
+        raise ConfigError(
+            f"machine file {where} [{table}]: the lever arm of the {name} cylinder at joint angle "
+            f"{math.degrees(psi[worst]):.0f} deg is {found}; from 4 deg below to 4 deg above the working range "
+            f"({math.degrees(low):.0f} to {math.degrees(high):.0f} deg) it must keep its sign and be at least "
+            f"{least:.3f} m/rad ({LEAST_LEVER:g} of the stroke); change the pins, closed_length or stroke"
+        )

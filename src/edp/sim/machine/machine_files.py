@@ -1,0 +1,156 @@
+"""Machines by name or from a TOML file: reading, and refusing what cannot be simulated before the first step."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from edp.errors import ConfigError, closest
+from edp.sim.machine.family import MASSES_T, WIDEST, Draws, member_mass, member_name, scaled_machine
+from edp.sim.machine.machine import SECTIONS, Machine
+from edp.sim.machine.machine_checks import check_machine
+from edp.storage import SETTINGS_BYTES, parse_toml, read_text
+
+Section = TypeVar("Section")
+FAMILY = re.compile(
+    r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?(?:-X(\d(?:P\d{1,3})?))?"
+)
+"""A machine of a family, see `member_name`: it needs no file."""
+LISTS = {"Triple": 3, "Ratings": 3, "Rating": 2, "tuple[float, float]": 2}
+"""Length of a list by the type of its key."""
+
+
+def machine_names() -> tuple[str, ...]:
+    """Names of the machines that come with the package."""
+    files = resources.files("edp.sim").joinpath("machines").iterdir()
+    return tuple(sorted(f.name.removesuffix(".toml").upper() for f in files if f.name.endswith(".toml")))
+
+
+def load_machine(name: str) -> Machine:
+    """The machine of this name (upper or lower case; also a `member_name` of a family), or of this TOML file.
+
+    Raises:
+        ConfigError: no such machine (the closest name is offered) or file; or the file lacks or misnames a key, or
+            a value is out of its bounds, or the linkage is impossible: file, key, value and bound are named.
+    """
+    if name.lower().endswith(".toml"):
+        path = Path(name)
+        try:
+            changed = path.stat().st_mtime_ns
+        except OSError as error:
+            raise ConfigError(
+                f"machine file {name} cannot be read: {error.strerror}; give the path of a TOML file, "
+                f"or one of the names {', '.join(machine_names())}"
+            ) from error
+        return _from_file(path.resolve(), changed)
+    return _built_in(name.upper())
+
+
+@cache
+def _from_file(path: Path, changed: int) -> Machine:
+    """`changed` is the file's time stamp, so that an edited file is read anew."""
+    return parse_machine(read_text(path, SETTINGS_BYTES, f"machine file {path}", ConfigError), path.name)
+
+
+@cache
+def _built_in(name: str) -> Machine:
+    member = _member(name)
+    if member is not None:
+        return family_member(*member)
+    known = machine_names()
+    if name not in known:
+        raise ConfigError(f"unknown machine '{name}'{closest(name, known)}; or give the path of a .toml file")
+    source = resources.files("edp.sim").joinpath("machines").joinpath(f"{name.lower()}.toml")
+    return parse_machine(source.read_text(encoding="utf-8"), source.name)
+
+
+def _member(name: str) -> tuple[int, int, float, float, float] | None:
+    """Seed, index, range of masses (t) and scatter of a machine of a family, by its name; None for any other."""
+    found = FAMILY.fullmatch(name.upper())
+    if found is None:
+        return None
+    usual = (*MASSES_T, 1.0)
+    low, high, scatter = (
+        middle if text is None else float(text.replace("P", "."))
+        for text, middle in zip(found.group(3, 4, 5), usual, strict=True)
+    )
+    return int(found[1]), int(found[2]), low, high, scatter
+
+
+def known_mass(name: str) -> float | None:
+    """Operating weight (t) of a machine of a family; None for any other, whose file does not say it."""
+    member = _member(name)
+    return None if member is None else member_mass(*member[:4])
+
+
+def family_member(
+    seed: int, index: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1], scatter: float = 1.0
+) -> Machine:
+    """Machine `index` of the family of `seed`: M22 scaled to a mass from `low_t` to `high_t`, with scatter.
+
+    It is also `load_machine` of its `member_name`, such as "family-0-3" and "family-0-3-10-20-x2".
+
+    Raises:
+        ConfigError: the range of masses is empty or out of bounds, or the scatter is.
+    """
+    if not 0.0 < scatter <= WIDEST:
+        raise ConfigError(f"family with scatter = {scatter}; must be above 0 and at most {WIDEST:g}")
+    draws = Draws(np.random.default_rng([seed, 1 + index]), scatter)
+    mass = member_mass(seed, index, low_t, high_t)
+    name = member_name(seed, index, (low_t, high_t), scatter)
+    machine = scaled_machine(_built_in("M22"), mass, draws, name)
+    check_machine(machine, name)
+    return machine
+
+
+def machine_family(
+    count: int, seed: int, low_t: float = MASSES_T[0], high_t: float = MASSES_T[1], scatter: float = 1.0
+) -> tuple[Machine, ...]:
+    """`count` machines from `low_t` to `high_t`, each with its own scatter; the same seed gives the same machines."""
+    return tuple(family_member(seed, index, low_t, high_t, scatter) for index in range(count))
+
+
+def parse_machine(text: str, where: str) -> Machine:
+    """Read and check a machine from TOML text; `where` names the file in messages.
+
+    Raises:
+        ConfigError: not TOML, a key is missing or unknown, or a value cannot be (see `machine_checks`).
+    """
+    table = parse_toml(text, f"machine file {where}", ConfigError)
+    parts: dict[str, Any] = {
+        key: _section(SECTIONS[key], value, f"{where} [{key}]") if key in SECTIONS else value
+        for key, value in table.items()
+    }
+    machine = _section(Machine, parts, where)
+    check_machine(machine, where)
+    return machine
+
+
+def _section(kind: type[Section], table: Any, where: str) -> Section:
+    if not isinstance(table, dict):
+        raise ConfigError(f"machine file {where}: is {table!r}, expected a table of keys")
+    known = {field.name: str(field.type) for field in fields(kind)}  # type: ignore[arg-type]
+    for key in table:
+        if key not in known:
+            raise ConfigError(f"machine file {where}: unknown key '{key}'{closest(key, known)}")
+    missing = sorted(set(known) - set(table))
+    if missing:
+        raise ConfigError(f"machine file {where}: missing {', '.join(missing)}")
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        size = LISTS.get(known[key])
+        if size is not None and (not isinstance(value, list) or len(value) != size):
+            wanted = "boom, arm, bucket" if size == 3 else "two values"
+            raise ConfigError(f"machine file {where}: {key} = {value!r} must list {wanted}")
+        values[key] = _frozen(value)
+    return kind(**values)
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(part) for part in value) if isinstance(value, list) else value

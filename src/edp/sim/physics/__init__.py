@@ -1,0 +1,1 @@
+"""Equations of the machine: linkage, hydraulics, soil, heat, and their integration."""

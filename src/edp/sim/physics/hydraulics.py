@@ -1,0 +1,134 @@
+"""Orifices, checks, reliefs and leakage of one cylinder, and the stiffness of its oil."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.physics.jit import inlined
+
+Array = NDArray[np.float64]
+SMOOTH2 = 1e5**2
+"""Square of the pressure (Pa) below which an orifice turns laminar."""
+
+
+@inlined
+def orifice(dp: float) -> tuple[float, float]:
+    """Dp / (dp^2 + delta^2)^(1/4), which is sqrt(dp) smoothed over 1 bar, and its derivative."""
+    q2 = dp * dp + SMOOTH2
+    root = math.sqrt(math.sqrt(q2))
+    inverse = 1.0 / (q2 * root)
+    return dp * q2 * inverse, (q2 - 0.5 * dp * dp) * inverse
+
+
+@inlined
+def check_orifice(dp: float, leak: float) -> tuple[float, float]:
+    """An orifice behind a check valve: passes `leak` of the flow backwards."""
+    flow, slope = orifice(dp)
+    passed = leak if dp < 0.0 else 1.0
+    return passed * flow, passed * slope
+
+
+@inlined
+def stiffness(pressure: float, plant: Array) -> float:
+    """Effective bulk modulus (Pa) of oil with free air at a gauge pressure (Pa), isothermal."""
+    absolute = max(pressure + at.ATMOSPHERE, 1e4)
+    air = plant[at.AIR] * at.ATMOSPHERE
+    # (1 + a) / (1 / beta + a / p) with a = air / p, in one division
+    return plant[at.BULK_MODULUS] * absolute * (absolute + air) / (absolute * absolute + plant[at.BULK_MODULUS] * air)
+
+
+@inlined
+def port_flows(pressure: float, relief: float, leak: float, plant: Array) -> tuple[float, float]:
+    """Inflow (m^3/s) of one chamber through relief, make-up check and spool leakage, and its slope (<= 0)."""
+    flow, slope = -leak * (pressure - plant[at.TANK]), -leak
+    if pressure > relief:
+        flow -= plant[at.PORT_SLOPE] * (pressure - relief)
+        slope -= plant[at.PORT_SLOPE]
+    if pressure < plant[at.TANK]:
+        q, d = orifice(plant[at.TANK] - pressure)
+        flow += plant[at.ANTI_CAVITATION] * q
+        slope -= plant[at.ANTI_CAVITATION] * d
+    return flow, slope
+
+
+@inlined
+def section(area: float, supply: float, load: float, highest: float, leak: float) -> tuple[float, float, float]:
+    """Flow from a pump line through a load check into a chamber, and its slopes by pump pressure and by load.
+
+    `highest` is the pressure that a pressure-compensated section shows its pump instead of its own lower load.
+    """
+    if area <= 0.0:
+        return 0.0, 0.0, 0.0
+    q, d = check_orifice(supply - max(load, highest), leak)
+    return area * q, area * d, (area * d if load >= highest else 0.0)
+
+
+@inlined
+def drain(area: float, dp: float, leak: float) -> tuple[float, float]:
+    """Flow through an opening to tank or, behind a check, to the other chamber, and its slope."""
+    if area <= 0.0:
+        return 0.0, 0.0
+    q, d = check_orifice(dp, leak)
+    return area * q, area * d
+
+
+@inlined
+def cylinder_flows(
+    i: int,
+    pressures: tuple[float, float, float, float],
+    highest: tuple[float, float],
+    opened: Array,
+    axes: Array,
+    plant: Array,
+) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float, float, float, float]]:
+    """All flows of cylinder `i` at head, rod and both pump pressures (Pa).
+
+    Returns:
+        Net inflow of head and rod chamber and what is drawn from either pump, m^3/s; then the slopes: head by head,
+        rod by rod, either by the other, head by pump 1 and 2, rod by pump 1 and 2.
+    """
+    head, rod, pump_1, pump_2 = pressures
+    check, tank = plant[at.CHECK], plant[at.TANK]
+    spool_leak = axes[i, at.SPOOL_LEAK] * plant[at.THINNING]
+    leak = axes[i, at.PISTON_LEAK] * plant[at.THINNING]
+    h, h_h = port_flows(head, axes[i, at.RELIEF_HEAD], spool_leak, plant)
+    r, r_r = port_flows(rod, axes[i, at.RELIEF_ROD], spool_leak, plant)
+    head_1, h_1, h_load_1 = section(opened[i, at.HEAD_IN_1], pump_1, head, highest[0], check)
+    head_2, h_2, h_load_2 = section(opened[i, at.HEAD_IN_2], pump_2, head, highest[1], check)
+    rod_1, r_1, r_load_1 = section(opened[i, at.ROD_IN_1], pump_1, rod, highest[0], check)
+    rod_2, r_2, r_load_2 = section(opened[i, at.ROD_IN_2], pump_2, rod, highest[1], check)
+    head_out, h_out = drain(opened[i, at.HEAD_OUT], head - tank, 1.0)
+    rod_out, r_out = drain(opened[i, at.ROD_OUT], rod - tank, 1.0)
+    down, by_down = drain(opened[i, at.HEAD_TO_ROD], head - rod, check)
+    up, by_up = drain(opened[i, at.ROD_TO_HEAD], rod - head, check)
+    through, across = leak * (head - rod) + down - up, leak + by_down + by_up
+    flows = (h + head_1 + head_2 - head_out - through, r + rod_1 + rod_2 - rod_out + through)
+    slopes = (h_h - h_load_1 - h_load_2 - h_out - across, r_r - r_load_1 - r_load_2 - r_out - across, across)
+    return (*flows, head_1 + rod_1, head_2 + rod_2), (*slopes, h_1, h_2, r_1, r_2)
+
+
+@inlined
+def highest_load(m: int, state: Array, opened: Array) -> float:
+    """Largest pressure (Pa) among the chambers that pump `m` is open to; far below any where there is none."""
+    most = -1e9
+    for i in range(at.AXES):
+        if opened[i, at.HEAD_IN_1 + m] > 0.0:
+            most = max(most, state[at.HEAD + i])
+        if opened[i, at.ROD_IN_1 + m] > 0.0:
+            most = max(most, state[at.ROD + i])
+    return most
+
+
+@inlined
+def pump_outflow(pressure: float, bypass: float, plant: Array) -> tuple[float, float]:
+    """Flow (m^3/s) from a pump line through open centre and main relief, and its slope."""
+    q, d = orifice(pressure - plant[at.TANK])
+    flow, slope = bypass * q, bypass * d
+    if pressure > plant[at.PUMP_RELIEF]:
+        flow += plant[at.RELIEF_SLOPE] * (pressure - plant[at.PUMP_RELIEF])
+        slope += plant[at.RELIEF_SLOPE]
+    return flow, slope

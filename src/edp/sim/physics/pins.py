@@ -1,0 +1,101 @@
+"""Worn pins: the force through them, and how a joint moves against its cylinder within their play."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.physics import dynamics, friction, linkage
+from edp.sim.physics.jit import compiled
+
+Array = NDArray[np.float64]
+FILM = 4e5
+"""N s/m that the grease in a pin resists being squeezed; E: 12 pi mu L (R / c)^3 of a full journal, with mu 1 Pa s,
+L 0.1 m, R 35 mm and c 0.75 mm."""
+PARTS = 10
+"""Parts of a sample in which a crossing is followed."""
+
+
+@compiled
+def fill_levers(angles: Array, plant: Array, out: Array) -> None:
+    """Lever arms J = dx/dpsi in m/rad at joint angles, both of shape (time, 3)."""
+    for k in range(angles.shape[0]):
+        for i in range(at.AXES):
+            out[k, i] = linkage.cylinder(i, angles[k, i], plant)[1]
+
+
+@compiled
+def fill_loads(log: Array, axes: Array, plant: Array, force: Array, mass: Array) -> None:
+    """Force that each cylinder puts on its joint through the pins, N, and the mass it moves, M_ii / J^2, kg.
+
+    Hydraulic force less the seals' friction plus the end stop, as the plant has them; `force` and `mass` of shape
+    (time, 3) are filled.
+    """
+    for k in range(log.shape[0]):
+        arm, bucket = log[k, at.PSI + 1], log[k, at.PSI + 2]
+        c12, _, c13, _, c23, _ = dynamics.couplings(
+            math.cos(arm), math.sin(arm), math.cos(bucket), math.sin(bucket), axes
+        )
+        m11, _, _, m22, _, m33 = dynamics.mass_terms(c12, c13, c23, axes)
+        inertia = (m11, m22, m33)
+        for i in range(at.AXES):
+            v = log[k, at.LOG_VELOCITY + i]
+            drag = friction.lugre(v, log[k, at.BRISTLE + i], axes, i, axes[i, at.VISCOUS])[0]
+            stop = friction.end_stop(log[k, at.LOG_STROKE + i], v, axes, i)[0]
+            hydraulic = axes[i, at.HEAD_AREA] * log[k, at.HEAD + i] - axes[i, at.ROD_AREA] * log[k, at.ROD + i]
+            lever = linkage.cylinder(i, log[k, at.PSI + i], plant)[1]
+            force[k, i] = hydraulic - drag + stop
+            mass[k, i] = inertia[i] / (lever * lever)
+
+
+@compiled
+def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Array) -> None:
+    """Velocity of each joint against its cylinder in the play of its pins, m/s, shape (time, 3), into `out`.
+
+    A pin that pushes lies half of `width` (m) ahead of its bore. Once the force turns, no force passes until the play
+    is crossed: against a cylinder without play the joint is then accelerated by -force / mass, and held back by the
+    grease, `FILM`. It does not bounce.
+    The mean since the sample before, so that its sum is the way within the play.
+    """
+    part = step_s / PARTS
+    for i in range(force.shape[1]):
+        half = 0.5 * width[i]
+        place = -half if force[0, i] >= 0.0 else half
+        speed = 0.0
+        out[0, i] = 0.0
+        for k in range(1, force.shape[0]):
+            before = place
+            for n in range(PARTS):
+                share = (n + 0.5) / PARTS
+                pull = force[k - 1, i] + share * (force[k, i] - force[k - 1, i])
+                speed = (speed - pull / mass[k, i] * part) / (1.0 + FILM / mass[k, i] * part)
+                place += speed * part
+                if abs(place) >= half:
+                    place = half if place > 0.0 else -half
+                    speed = 0.0
+            out[k, i] = (place - before) / step_s
+
+
+def lever_arms(angles: Array, plant: Array) -> Array:
+    """Lever arms J = dx/dpsi in m/rad at joint angles, shape (time, 3)."""
+    out = np.empty_like(angles)
+    fill_levers(np.ascontiguousarray(angles), plant, out)
+    return out
+
+
+def play_velocity(force: Array, mass: Array, width: Array, step_s: float) -> Array:
+    """See `follow_play`; shape (time, 3)."""
+    out = np.zeros_like(force)
+    if width.any():
+        follow_play(force, mass, width, step_s, out)
+    return out
+
+
+def loads(log: Array, axes: Array, plant: Array) -> tuple[Array, Array]:
+    """Force through the pins and mass behind them; see `fill_loads`."""
+    force, mass = np.empty((len(log), at.AXES)), np.empty((len(log), at.AXES))
+    fill_loads(log, axes, plant, force, mass)
+    return force, mass

@@ -1,0 +1,248 @@
+"""The plant as a whole: its arrays, its state at rest, and running it sample by sample."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import dynamics, integrator, linkage, soil, terramechanics, thermal, valve
+from edp.sim.physics import terrain as earth
+from edp.sim.physics.jit import compiled
+from edp.sim.sensors import logbook
+
+Array = NDArray[np.float64]
+
+FINE = 4
+"""A step is cut in this many near the ends of the stroke, where cushions and stops are stiff."""
+RESTING_PRESSURE = 10e5
+Clock = tuple[int, float, float, Array]
+LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
+"""Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
+
+
+@compiled
+def near_end(row: Array, axes: Array) -> bool:
+    """Whether any cylinder of a logged sample runs into a cushion, or moves at a stop."""
+    for i in range(at.AXES):
+        v, stroke = row[at.LOG_VELOCITY + i], row[at.LOG_STROKE + i]
+        ahead = axes[i, at.STROKE] - stroke if v > 0.0 else stroke
+        braking = abs(v) > 1e-2 and ahead < axes[i, at.CUSHION_LENGTH] + 0.02 * abs(v)
+        touching = abs(v) > 1e-3 and min(stroke, axes[i, at.STROKE] - stroke) < 1e-3
+        if braking or touching:
+            return True
+    return False
+
+
+@compiled
+def run_samples(
+    state: Array,
+    valves: Array,
+    demands: Array,
+    times: tuple[Array, tuple[Clock, Clock]],
+    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
+    log: Array,
+    held: Array,
+) -> int:
+    """Run one sample per row of `log`; returns the number of clamped pressures.
+
+    `demands` holds past demands first: its last rows belong to `log`. `times` are delays in samples, and clocks: the
+    number of steps in a sample and the clock of one step, for coarse and for fine steps. `held` is scratch, one
+    value per spool.
+    """
+    first = demands.shape[0] - log.shape[0]
+    delays, clocks = times
+    axes, plant, work, ground = setup
+    time_s = clocks[0][0] * clocks[0][1]
+    in_soil = ground[0][terramechanics.ACTIVE] > 0.0
+    clamps = 0
+    for k in range(log.shape[0]):
+        logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k])
+        thermal.warm(log[k], axes, plant, time_s)
+        near, fine = False, near_end(log[k], axes)
+        if in_soil:
+            near, touching = earth.look(log[k], time_s, axes, ground)
+            fine = fine or touching
+        integrator.begin_sample(state, work)
+        steps, step_s, share, filters = clocks[1] if fine else clocks[0]
+        for n in range(steps):
+            for j in range(at.SPOOLS):
+                # whole samples of delay, plus the part of a sample that is left, at mid-step
+                when = first + k + (n + 0.5) / steps - delays[j]
+                held[j] = demands[max(int(np.floor(when)), 0), j]
+            clamps += integrator.step(state, valves, held, (step_s, share, filters), setup, near)
+    return clamps
+
+
+@compiled
+def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
+    """Lever positions of one sample, shape (3,), from targets: 2nd-order low-pass of limited rate; state in `hand`."""
+    omega = 2.0 * np.pi * LEVER_BANDWIDTH_HZ
+    for i in range(at.AXES):
+        pull = omega * omega * (target[i] - hand[i, 0]) - 2.0 * omega * hand[i, 1]
+        hand[i, 1] = min(max(hand[i, 1] + step_s * pull, -LEVER_RATE), LEVER_RATE)
+        hand[i, 0] += step_s * hand[i, 1]
+        out[i] = hand[i, 0]
+
+
+@compiled
+def shape_commands(
+    levers: Array,
+    hand: Array,
+    step_s: float,
+    past: Array,
+    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
+    demands: Array,
+    held: Array,
+) -> None:
+    """Spool demands of `levers`, shape (samples, 3), behind the `past` ones into `demands`; `past` is then brought up.
+
+    A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held` is scratch.
+    """
+    axes, plant, _, _ = setup
+    count = past.shape[0]
+    for k in range(count):
+        for j in range(at.SPOOLS):
+            demands[k, j] = past[k, j]
+    for k in range(levers.shape[0]):
+        lever = levers[k]
+        if step_s > 0.0:
+            lever = held[: at.AXES]
+            smooth_lever(levers[k], hand, step_s, lever)
+        valve.shape_demand(lever, axes, plant, demands[count + k])
+    for k in range(count):
+        for j in range(at.SPOOLS):
+            past[k, j] = demands[demands.shape[0] - count + k, j]
+
+
+def steps_per_sample(rate_hz: float, step_s: float) -> int:
+    """Whole number of integration steps that fill a sample.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    steps = round(1.0 / (rate_hz * step_s))
+    if steps < 1 or abs(steps * step_s * rate_hz - 1.0) > 1e-9:
+        raise ConfigError(
+            f"step_s = {step_s} s does not divide the sample time {1.0 / rate_hz} s of rate_hz = {rate_hz}; "
+            "choose a step such as 0.001 or 0.0005"
+        )
+    return steps
+
+
+class Plant:
+    """One machine in motion: levers in, logged samples out.
+
+    Args:
+        machine: the parameter set.
+        strokes: initial strokes as a share of each cylinder's stroke, shape (3,).
+        rate_hz: logging and command rate.
+        step_s: integration step; a whole number of them must fill a sample.
+        ground: what the bucket digs in; None in free air.
+
+    Raises:
+        ConfigError: the step does not divide the sample time.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        strokes: Array,
+        rate_hz: float = 100.0,
+        step_s: float = 1e-3,
+        ground: soil.Ground | None = None,
+    ) -> None:
+        steps = steps_per_sample(rate_hz, step_s)
+        self.machine = machine
+        self.rate_hz = rate_hz
+        self.axes, self.plant = pack(machine)
+        self.state = resting_state(strokes, self.axes, self.plant)
+        self.valves = np.zeros((at.SPOOLS, 5))
+        self.hand = np.zeros((at.AXES, 2))
+        self.work = integrator.new_work()
+        self._held = np.zeros(at.SPOOLS)
+        self._counts = np.zeros(1, dtype=np.int64)
+        self.ground = ground
+        self._ground = soil.no_ground() if ground is None else ground.arrays()
+        self._delays = valve.dead_times(machine) * rate_hz
+        self._past = int(np.ceil(self._delays.max())) + 1
+        self._demands = np.zeros((self._past, at.SPOOLS))
+        coarse, fine = ((n * steps, *integrator.clock_of(machine, step_s / n)) for n in (1, FINE))
+        self._clocks = coarse, fine
+
+    @property
+    def strokes(self) -> Array:
+        """Strokes as a share of each cylinder's stroke, shape (3,)."""
+        lengths = [linkage.cylinder(i, self.state[at.PSI + i], self.plant)[0] for i in range(at.AXES)]
+        return (np.array(lengths) - self.axes[:, at.CLOSED]) / self.axes[:, at.STROKE]
+
+    @property
+    def payload_kg(self) -> float:
+        """Soil in the bucket; 0 in free air."""
+        return 0.0 if self.ground is None else self.ground.payload_kg
+
+    @property
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """Every array that changes as time goes on, live: what to copy, and to write back to, for an exact restart."""
+        changing = (self.state, self.valves, self.hand, self._demands, self.axes, self.plant, self._counts)
+        return (*changing, *self._ground[3:])
+
+    @property
+    def finite(self) -> bool:
+        """Whether every state is a finite number; what once is not stays so."""
+        return math.isfinite(sum(self.state.tolist()))
+
+    @property
+    def clamps(self) -> int:
+        """Pressures lifted to the floor so far."""
+        return int(self._counts[0])
+
+    def run(self, levers: Array) -> Array:
+        """Run one sample per row of lever positions, shape (samples, 3), in [-1, 1]; returns the log.
+
+        The log has shape (samples, columns of `edp.sim.machine.layout`); row k is the state at the instant at which
+        lever k is applied.
+        """
+        return self._advance(levers, 0.0)
+
+    def follow(self, targets: Array) -> Array:
+        """Like `run`, with the operator's hand between targets and levers."""
+        return self._advance(targets, 1.0 / self.rate_hz)
+
+    def _advance(self, levers: Array, hand_s: float) -> Array:
+        """Run with levers that the hand smooths at steps of `hand_s`; 0 for levers as they are."""
+        setup = (self.axes, self.plant, self.work, self._ground)
+        samples = len(levers)
+        demands = np.empty((samples + self._past, at.SPOOLS))
+        log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
+        levers = np.ascontiguousarray(levers, dtype=float)
+        shape_commands(levers, self.hand, hand_s, self._demands, setup, demands, self._held)
+        times = (self._delays, self._clocks)
+        self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
+        return log
+
+
+def resting_state(strokes: Array, axes: Array, plant: Array) -> Array:
+    """State at rest in equilibrium at these strokes (shares of full), shape (STATES,)."""
+    state = np.zeros(at.STATES)
+    for i in range(at.AXES):
+        state[at.PSI + i] = linkage.angle_at_stroke(i, strokes[i] * axes[i, at.STROKE], axes, plant)
+    psi, load = state[at.PSI : at.PSI + 3], np.empty(3)
+    dynamics.gravity_torque(psi, axes, plant[at.GRAVITY], load)
+    for i in range(at.AXES):
+        force = load[i] / linkage.cylinder(i, psi[i], plant)[1]
+        head = (force + axes[i, at.ROD_AREA] * RESTING_PRESSURE) / axes[i, at.HEAD_AREA]
+        rod = RESTING_PRESSURE
+        if head < RESTING_PRESSURE:
+            head = RESTING_PRESSURE
+            rod = (axes[i, at.HEAD_AREA] * head - force) / axes[i, at.ROD_AREA]
+        state[at.HEAD + i], state[at.ROD + i] = head, rod
+    state[at.PUMP : at.PUMP + 2] = RESTING_PRESSURE
+    state[at.DISPLACEMENT : at.DISPLACEMENT + 2] = plant[at.MIN_DISPLACEMENT]
+    return state

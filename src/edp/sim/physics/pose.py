@@ -1,0 +1,120 @@
+"""Where the bucket is: tip pose from joint angles, and strokes that put the tip at a pose.
+
+The frame has its origin in the boom foot, x forward, y up. The attitude is the absolute angle of the line from the
+bucket pin to the tip.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.physics import linkage
+from edp.sim.physics.jit import compiled
+
+Array = NDArray[np.float64]
+
+# look[...]: what `look_at` writes
+STROKE, ANGLE, JOINT_RATE, SPEED, TIP = 0, 3, 6, 9, 12
+LOOK_VALUES = 15
+# reached[...]: what `reach` writes: stroke shares, joint angles, and 1 where the pose can be reached
+REACHED_STROKE, REACHED_ANGLE, REACHABLE = 0, 3, 6
+REACHED_VALUES = 7
+
+
+@compiled
+def look_at(state: Array, axes: Array, plant: Array, look: Array) -> None:
+    """Stroke shares, joint angles (rad), joint rates (rad/s), cylinder speeds (m/s) and tip pose (m, m, rad)."""
+    x = y = angle = 0.0
+    for i in range(at.AXES):
+        psi = state[at.PSI + i]
+        length, lever = linkage.cylinder(i, psi, plant)
+        look[STROKE + i] = (length - axes[i, at.CLOSED]) / axes[i, at.STROKE]
+        look[ANGLE + i] = psi
+        look[JOINT_RATE + i] = state[at.RATE + i]
+        look[SPEED + i] = lever * state[at.RATE + i]
+        angle += psi
+        x += axes[i, at.LENGTH] * math.cos(angle)
+        y += axes[i, at.LENGTH] * math.sin(angle)
+    look[TIP], look[TIP + 1], look[TIP + 2] = x, y, angle
+
+
+@compiled
+def reach(x: float, y: float, attitude: float, axes: Array, plant: Array, limits: Array, reached: Array) -> None:
+    """Strokes (shares of full) and joint angles of a tip pose with the elbow up, into `reached`.
+
+    `limits` is `joint_limits`. Where the pose lies outside the linkage, the nearest angles on the way there are given
+    and REACHABLE is 0.
+    """
+    boom, arm, bucket = axes[0, at.LENGTH], axes[1, at.LENGTH], axes[2, at.LENGTH]
+    pin_x, pin_y = x - bucket * math.cos(attitude), y - bucket * math.sin(attitude)
+    cosine = (pin_x * pin_x + pin_y * pin_y - boom * boom - arm * arm) / (2.0 * boom * arm)
+    fits = abs(cosine) <= 1.0
+    elbow = -math.acos(min(max(cosine, -1.0), 1.0))
+    first = math.atan2(pin_y, pin_x) - math.atan2(arm * math.sin(elbow), boom + arm * math.cos(elbow))
+    middle = 0.5 * (limits[2, 0] + limits[2, 1])
+    last = middle + (attitude - first - elbow - middle + math.pi) % (2.0 * math.pi) - math.pi
+    reached[REACHED_ANGLE], reached[REACHED_ANGLE + 1], reached[REACHED_ANGLE + 2] = first, elbow, last
+    for i in range(at.AXES):
+        psi = reached[REACHED_ANGLE + i]
+        if psi < limits[i, 0] - 1e-9 or psi > limits[i, 1] + 1e-9:
+            fits = False
+        psi = min(max(psi, limits[i, 0]), limits[i, 1])
+        length = linkage.cylinder(i, psi, plant)[0]
+        share = (length - axes[i, at.CLOSED]) / axes[i, at.STROKE]
+        reached[REACHED_STROKE + i] = min(max(share, 0.0), 1.0)
+    reached[REACHABLE] = 1.0 if fits else 0.0
+
+
+def joint_limits(axes: Array, plant: Array) -> Array:
+    """Joint angles (rad) at the ends of each stroke, lower first, shape (3, 2)."""
+    ends = [[linkage.angle_at_stroke(i, share * axes[i, at.STROKE], axes, plant) for share in (0, 1)] for i in range(3)]
+    return np.sort(np.array(ends), axis=1)
+
+
+def tip_pose(angles: Array, axes: Array) -> tuple[float, float, float]:
+    """Tip x and y (m) and attitude (rad) at joint angles, shape (3,)."""
+    absolute = np.cumsum(angles)
+    lengths = axes[:, at.LENGTH]
+    return float(lengths @ np.cos(absolute)), float(lengths @ np.sin(absolute)), float(absolute[2])
+
+
+class Kinematics:
+    """From strokes to tip poses and back, for one machine.
+
+    Args:
+        axes: of `parameters.pack`.
+        plant: the same.
+    """
+
+    def __init__(self, axes: Array, plant: Array) -> None:
+        self.axes, self.plant, self.limits = axes, plant, joint_limits(axes, plant)
+
+    def angles_at(self, strokes: Array) -> Array:
+        """Joint angles (rad, shape (3,)) at strokes (shares of full)."""
+        angles = [
+            linkage.angle_at_stroke(i, float(strokes[i]) * self.axes[i, at.STROKE], self.axes, self.plant)
+            for i in range(2)
+        ]
+        low, high = float(self.limits[2, 0]), float(self.limits[2, 1])
+        target = float(strokes[2]) * self.axes[2, at.STROKE] + self.axes[2, at.CLOSED]
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            if linkage.cylinder(2, middle, self.plant)[0] > target:
+                low = middle
+            else:
+                high = middle
+        return np.array([*angles, 0.5 * (low + high)])
+
+    def pose_at(self, strokes: Array) -> tuple[float, float, float]:
+        """Tip x, y (m) and attitude (rad) at strokes (shares of full)."""
+        return tip_pose(self.angles_at(strokes), self.axes)
+
+    def strokes_at(self, x: float, y: float, attitude: float) -> Array | None:
+        """Strokes (shares of full, shape (3,)) that put the tip there, or None where it cannot be."""
+        reached = np.empty(REACHED_VALUES)
+        reach(x, y, attitude, self.axes, self.plant, self.limits, reached)
+        return reached[:3] if reached[REACHABLE] > 0.5 else None

@@ -1,0 +1,195 @@
+"""Soil: materials read from `materials/<name>.toml`, and the ground of one recording."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, closest
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.physics import terramechanics
+from edp.storage import SETTINGS_BYTES, parse_toml, read_text
+
+Array = NDArray[np.float64]
+SPACING_M = 0.05
+BEYOND_M = 1.0
+"""How far the ground goes on beyond the machine's reach."""
+UNEVENNESS_M = 0.04
+
+
+@dataclass(frozen=True)
+class Material:
+    """One soil; SI units, angles in degrees. `cone_index` is a range from which each ground draws.
+
+    Attributes:
+        density: in the bank, kg/m^3.
+        bekker_exponent: n of p = (k_c / b + k_phi) z^n.
+        shear_length: Janosi's K.
+        swell: loose over bank volume.
+        roughness: spread of the logarithm of the resistance along the way.
+        roughness_length: length over which it varies, m.
+        sawtooth: share of the resistance lost when a chip breaks off.
+    """
+
+    name: str
+    description: str
+    density: float
+    cohesion: float
+    friction_deg: float
+    metal_friction_deg: float
+    adhesion: float
+    bekker_exponent: float
+    bekker_cohesive: float
+    bekker_frictional: float
+    shear_length: float
+    cone_index: tuple[float, float]
+    swell: float
+    repose_deg: float
+    roughness: float
+    roughness_length: float
+    stones_per_m: float
+    sawtooth: float
+
+
+BOUNDS: dict[str, tuple[float, float]] = {
+    "density": (500.0, 3500.0),
+    "cohesion": (0.0, 2e5),
+    "friction_deg": (0.0, 50.0),
+    "metal_friction_deg": (0.0, 40.0),
+    "adhesion": (0.0, 1e5),
+    "bekker_exponent": (0.1, 2.0),
+    "bekker_cohesive": (0.0, 1e7),
+    "bekker_frictional": (1e4, 1e9),
+    "shear_length": (1e-3, 0.2),
+    "swell": (1.0, 2.0),
+    "repose_deg": (10.0, 60.0),
+    "roughness": (0.0, 0.6),
+    "roughness_length": (0.02, 5.0),
+    "stones_per_m": (0.0, 10.0),
+    "sawtooth": (0.0, 0.9),
+}
+
+
+def material_names() -> tuple[str, ...]:
+    """Names of the materials that come with the package."""
+    files = resources.files("edp.sim").joinpath("materials").iterdir()
+    return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
+
+
+@cache
+def load_material(name: str) -> Material:
+    """The material of this name, or of a TOML file of one's own (a path that ends in ``.toml``).
+
+    Raises:
+        ConfigError: no such material (the closest name is offered), or a value is missing, unknown or out of bounds.
+    """
+    if name.endswith(".toml"):
+        return parse_material(read_text(name, SETTINGS_BYTES, f"material file {name}", ConfigError), name)
+    known = material_names()
+    if name not in known:
+        raise ConfigError(f"unknown material '{name}'{closest(name, known)}; there are {', '.join(known)}")
+    source = resources.files("edp.sim").joinpath("materials").joinpath(f"{name}.toml")
+    return parse_material(source.read_text(encoding="utf-8"), f"{name}.toml")
+
+
+def parse_material(text: str, where: str) -> Material:
+    """Read a material from TOML text; `where` names the file in messages.
+
+    Raises:
+        ConfigError: not TOML, or a value is missing, unknown or out of bounds.
+    """
+    table = parse_toml(text, f"material file {where}", ConfigError)
+    known = [field.name for field in fields(Material)]
+    for key in table:
+        if key not in known:
+            raise ConfigError(f"material file {where}: unknown key '{key}'{closest(key, known)}")
+    missing = [key for key in known if key not in table]
+    if missing:
+        raise ConfigError(f"material file {where}: missing {', '.join(missing)}")
+    for key, (low, high) in BOUNDS.items():
+        value = table[key]
+        if not _number(value) or not low <= value <= high:
+            raise ConfigError(f"material file {where}: {key} = {value!r} must be a number from {low:g} to {high:g}")
+    cone = table["cone_index"]
+    if not (isinstance(cone, list) and len(cone) == 2 and all(_number(v) for v in cone) and 0 < cone[0] <= cone[1]):
+        raise ConfigError(f"material file {where}: cone_index = {cone!r} must be [low, high] in Pa, 0 < low <= high")
+    values: dict[str, Any] = {**table, "cone_index": tuple(map(float, cone))}
+    return Material(**values)
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+class Ground:
+    """The ground before one machine: a height profile along its reach, the load in the bucket, and the soil's numbers.
+
+    Heights are of soil at bank density, so that the mass of soil in profile, heap and bucket stays the same.
+
+    Args:
+        material: what it is made of.
+        machine: whose bucket digs; gives the boom foot's height and the reach.
+        rng: draws unevenness, strength, stones and the course of the resistance, all of it at once.
+    """
+
+    spacing_m = SPACING_M
+    start_m = 0.0
+
+    def __init__(self, material: Material, machine: Machine, rng: np.random.Generator) -> None:
+        self.material = material
+        points = math.ceil((sum(machine.bodies.length) + BEYOND_M) / SPACING_M)
+        bends = rng.normal(0.0, UNEVENNESS_M, points // 20 + 2)
+        uneven = np.interp(np.arange(points) / 20.0, np.arange(len(bends)), bends)
+        self.heights: Array = uneven - machine.chassis.boom_foot_height
+        self.memory: Array = np.zeros(at.MEMORY)
+        self.numbers = terramechanics.pack_soil(material, machine, rng.uniform(*material.cone_index))
+        self.tables = terramechanics.cutting_table(material)
+        self.course = terramechanics.draw_course(material, rng)
+
+    @property
+    def payload_kg(self) -> float:
+        """Soil in the bucket."""
+        return float(self.memory[at.PAYLOAD])
+
+    @property
+    def mass_kg(self) -> float:
+        """All soil: profile (above 0 of the boom-foot frame counts positive), heap before the edge, bucket."""
+        profile = self.material.density * self.numbers[terramechanics.WIDTH] * SPACING_M * float(self.heights.sum())
+        return profile + float(self.memory[at.HEAP] + self.memory[at.PAYLOAD])
+
+    def height(self, x: float) -> float:
+        """Height (m above the boom foot) at a distance (m) in front of it."""
+        return float(terramechanics.height_at(x - self.start_m, self.heights))
+
+    def redraw(self, rng: np.random.Generator) -> None:
+        """Draw the resistance that is still to be met anew; what the edge is in now goes on from its present value."""
+        old = self.course.copy()
+        fresh = terramechanics.draw_course(self.material, rng)
+        count = len(old)
+        # The unit process forgets its present value over a few cells: fresh[0] is independent, so it is bridged.
+        here = int(self.memory[at.DISTANCE] / self.numbers[terramechanics.COURSE_STEP])
+        keep = np.exp(-np.arange(count) / 8.0)
+        ahead = (here + np.arange(count)) % count
+        self.course[ahead, 0] = keep * old[here % count, 0] + np.sqrt(1.0 - keep**2) * fresh[:, 0]
+        stone = (int(self.memory[at.DISTANCE] / terramechanics.STONE_STEP) + np.arange(count)) % count
+        inside = np.logical_and.accumulate(old[stone, 1] > 0.0)
+        self.course[stone, 1] = np.where(inside, old[stone, 1], fresh[:, 1])
+        dig = int(self.memory[at.DIGS]) % count
+        self.course[:, 2] = fresh[:, 2]
+        self.course[dig, 2] = old[dig, 2]
+
+    def arrays(self) -> tuple[Array, ...]:
+        """What the compiled code reads and writes: numbers, tables, course, heights, memory."""
+        return self.numbers, self.tables, self.course, self.heights, self.memory
+
+
+def no_ground() -> tuple[Array, ...]:
+    """Stand-in of `Ground.arrays` in free air."""
+    return np.zeros(terramechanics.NUMBERS), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(2), np.zeros(at.MEMORY)

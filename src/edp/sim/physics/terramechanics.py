@@ -1,0 +1,359 @@
+"""Forces of soil on the bucket: cutting, edge, heel and the chassis that gives way. What soil does in return: `earth`.
+
+Cutting follows the earthmoving equation of Reece and McKyes, heel contact Bekker's pressure-sinkage law with elastic
+unloading and Janosi's shear. Every force that depends on velocity opposes it or stands across it, so that soil never
+gives energy; directions are regularised over `CREEP`. The front's frame is the boom foot: x forward, y up.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.physics.jit import compiled, inlined
+from edp.sim.sensors import filters
+
+if TYPE_CHECKING:
+    from edp.sim.machine.machine import Machine
+    from edp.sim.physics.soil import Material
+
+Array = NDArray[np.float64]
+Ground = tuple[Array, ...]
+Four = tuple[float, float, float, float]
+# numbers[...]: soil and bucket
+(
+    ACTIVE, WIDTH, DENSITY, SWELL, COHESION, ADHESION, BEKKER, EXPONENT, SHEAR_LENGTH, CONE, STEEPEST, REPOSE,
+    ROUGHNESS, COURSE_STEP, SAWTOOTH, CAPACITY, FLOOR_COS, FLOOR_SIN, FLOOR_LENGTH, EDGE_AREA, LOAD_X, LOAD_Y,
+    BUCKET_MASS, BUCKET_X, BUCKET_Y, BUCKET_INERTIA, PITCH_INERTIA, PITCH_STIFFNESS, PITCH_DAMPING, LIFT_MOMENT,
+    UNLOADING, HEEL_DAMPING, HEAP_LIMIT, BEARING_LIMIT, METAL_COS, METAL_SIN,
+) = range(36)  # fmt: skip
+NUMBERS = 36
+# contact[...]: what one step needs; Jacobians of tip and heel hold one value per joint
+(ON, DRAG, ACROSS, EDGE, EDGE_X, EDGE_Y, NORMAL, NORMAL_DAMPING, SLIDE, DEPTH, HEEL_DEPTH) = range(11)
+TIP_JX, TIP_JY, HEEL_JX, HEEL_JY, PITCHED, POINTS, DAMPING = 11, 14, 17, 20, 23, 27, 31
+CONTACTS = 40
+GRAVITY = 9.81
+CREEP = 0.02
+"""Speed (m/s) over which the direction of soil forces is smoothed."""
+SPACING = 0.05
+STONE_STEP = 0.005
+COURSE = 8192
+LEAST_RAKE, MOST_RAKE = 10, 120
+LEAST_LEAN, MOST_LEAN = 0.17, 2.1
+"""Rake (rad) within which the direction of the cutting force follows it."""
+EDGE_DEPTH = 0.05
+"""Depth (m) at which the whole edge is in the ground."""
+HEEL_CONTACT = 0.2
+"""Length (m) of floor plate that bears on the ground; E."""
+DEEPEST = 1.2
+"""Depth (m) beyond which the cutting force stays: about the height of a bucket."""
+PIN_STIFFNESS = 1.2e7
+"""Stiffness (N/m) of the front behind the heel; E."""
+TURNING = 0.05
+"""Horizontal speed (m/s) over which the soil before the edge changes from one side to the other."""
+PUSHED_BACK = 0.5
+"""Share of the cutting force when the back of the bucket pushes loose soil away; E."""
+
+
+def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> tuple[float, float, float]:
+    """N_gamma, N_c and N_a of the earthmoving equation at the failure angle that minimises N_gamma."""
+    failure = np.radians(np.linspace(5.0, 85.0, 801))
+    rake, phi, delta = (math.radians(a) for a in (rake_deg, friction_deg, metal_deg))
+    cot_out = 1.0 / np.tan(failure + phi)
+    below = math.cos(rake + delta) + math.sin(rake + delta) * cot_out
+    wedge = 1.0 / math.tan(rake) + 1.0 / np.tan(failure)
+    weight = np.where((below > 1e-2) & (wedge > 0.0), wedge / (2.0 * np.maximum(below, 1e-2)), np.inf)
+    n = int(np.argmin(weight))
+    cohesion = (1.0 + cot_out[n] / math.tan(failure[n])) / below[n]
+    adhesion = (1.0 - cot_out[n] / math.tan(rake)) / below[n]
+    return float(weight[n]), float(cohesion), max(float(adhesion), 0.0)
+
+
+@cache
+def cutting_table(material: Material) -> Array:
+    """`cutting_factors` for every degree of rake, shape (181, 3); constant where no wedge of soil can form.
+
+    Shared by all grounds of a material: not to be changed.
+    """
+    # a wedge needs rake + failure angle + both frictions below 180 degrees
+    most = min(MOST_RAKE, 160.0 - material.friction_deg - material.metal_friction_deg)
+    angles = np.clip(np.arange(181), LEAST_RAKE, most)
+    return np.array([cutting_factors(a, material.friction_deg, material.metal_friction_deg) for a in angles])
+
+
+def draw_course(material: Material, rng: np.random.Generator) -> Array:
+    """How the resistance varies, shape (COURSE, 3), endless by wrapping around.
+
+    Columns: a unit Ornstein-Uhlenbeck process over travelled distance; force (N) of stones, half-sines of 20-80 mm
+    and 5-40 kN; strength of each dig, within 30 % of the mean.
+    """
+    course = np.zeros((COURSE, 3))
+    keep = math.exp(-1.0 / 8.0)
+    shocks = rng.normal(0.0, math.sqrt(1.0 - keep * keep), (COURSE, 1))
+    shocks[0] /= math.sqrt(1.0 - keep * keep)
+    course[:, 0] = filters.lfilter([1.0], [1.0, -keep], shocks)[:, 0]
+    for _ in range(rng.poisson(material.stones_per_m * STONE_STEP * COURSE)):
+        length = max(2, round(rng.uniform(0.02, 0.08) / STONE_STEP))
+        where = (int(rng.integers(COURSE)) + np.arange(length)) % COURSE
+        course[where, 1] += rng.uniform(5e3, 40e3) * np.sin(np.pi * (np.arange(length) + 0.5) / length)
+    course[:, 2] = rng.uniform(0.7, 1.3, COURSE)
+    return course
+
+
+def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
+    """Soil, bucket and chassis as numbers for the compiled code."""
+    bucket, chassis, bodies = machine.bucket, machine.chassis, machine.bodies
+    loose = material.density / material.swell
+    floor = math.radians(bucket.floor_angle_deg)
+    repose = math.tan(math.radians(material.repose_deg))
+    bekker = material.bekker_cohesive / bucket.width + material.bekker_frictional
+    bearing = bekker * bucket.width * HEEL_CONTACT
+    # E: unloads five times as stiffly as it loads to 5 cm, and no stiffer than steel plates and pins
+    unloading = min(5.0 * bearing * 0.05 ** (material.bekker_exponent - 1.0), PIN_STIFFNESS)
+    stiffness = chassis.pitch_inertia * (2.0 * math.pi * chassis.pitch_frequency) ** 2
+    heap_area = 0.5 * 0.4**2 / repose  # E: heaps before the edge stay below 0.4 m
+    values = {
+        ACTIVE: 1.0,
+        WIDTH: bucket.width,
+        DENSITY: material.density,
+        SWELL: material.swell,
+        COHESION: material.cohesion,
+        ADHESION: material.adhesion,
+        METAL_COS: math.cos(math.radians(material.metal_friction_deg)),
+        METAL_SIN: math.sin(math.radians(material.metal_friction_deg)),
+        BEKKER: bearing,
+        EXPONENT: material.bekker_exponent,
+        SHEAR_LENGTH: material.shear_length,
+        CONE: cone_index,
+        STEEPEST: repose + material.cohesion / (material.density * GRAVITY * 0.5),
+        REPOSE: repose,
+        ROUGHNESS: material.roughness,
+        COURSE_STEP: material.roughness_length / 8.0,
+        SAWTOOTH: material.sawtooth,
+        CAPACITY: bucket.capacity * loose,
+        FLOOR_COS: math.cos(floor),
+        FLOOR_SIN: math.sin(floor),
+        FLOOR_LENGTH: bucket.floor_length,
+        EDGE_AREA: bucket.edge_area,
+        LOAD_X: bucket.load_x,
+        LOAD_Y: bucket.load_y,
+        BUCKET_MASS: bodies.mass[2],
+        BUCKET_X: bodies.com_x[2],
+        BUCKET_Y: bodies.com_y[2],
+        BUCKET_INERTIA: bodies.inertia[2],
+        PITCH_INERTIA: chassis.pitch_inertia,
+        PITCH_STIFFNESS: stiffness,
+        PITCH_DAMPING: 2.0 * chassis.pitch_damping * math.sqrt(stiffness * chassis.pitch_inertia),
+        LIFT_MOMENT: chassis.lift_moment,
+        UNLOADING: unloading,
+        HEEL_DAMPING: 0.2 * math.sqrt(unloading * 2.0 * bodies.mass[2]),
+        HEAP_LIMIT: heap_area * bucket.width * loose,
+        BEARING_LIMIT: 0.25 * cone_index * bucket.width * HEEL_CONTACT,  # E: bearing capacity, a quarter of the cone's
+    }
+    numbers = np.zeros(NUMBERS)
+    numbers[list(values)] = list(values.values())
+    return numbers
+
+
+@inlined
+def height_at(x: float, heights: Array) -> float:
+    """Height (m) of the ground at `x`, linear between its points."""
+    place = min(max(x / SPACING, 0.0), heights.shape[0] - 1.000001)
+    k = int(place)
+    return heights[k] + (place - k) * (heights[k + 1] - heights[k])
+
+
+@compiled
+def cutting_force(depth: float, rake: float, surcharge: float, numbers: Array, table: Array) -> float:
+    """Force (N) of the earthmoving equation at a depth (m), a rake (rad) and a surcharge (Pa)."""
+    place = min(max(rake * 57.29577951308232, LEAST_RAKE), MOST_RAKE - 1e-9)
+    k = int(place)
+    part = place - k
+    weight = table[k, 0] + part * (table[k + 1, 0] - table[k, 0])
+    cohesion = table[k, 1] + part * (table[k + 1, 1] - table[k, 1])
+    adhesion = table[k, 2] + part * (table[k + 1, 2] - table[k, 2])
+    per_metre = (numbers[DENSITY] * GRAVITY * depth + 2.0 * surcharge) * weight
+    per_metre += numbers[COHESION] * cohesion + numbers[ADHESION] * adhesion
+    return numbers[WIDTH] * depth * per_metre
+
+
+@compiled
+def strength(numbers: Array, course: Array, memory: Array) -> tuple[float, float, float]:
+    """Factor on cutting, factor of this dig, and force of stones (N), at the distance travelled in soil."""
+    place = memory[at.DISTANCE] / numbers[COURSE_STEP]
+    k = int(place)
+    part = place - k
+    noise = (1.0 - part) * course[k % COURSE, 0] + part * course[(k + 1) % COURSE, 0]
+    dig = course[int(memory[at.DIGS]) % COURSE, 2]
+    saw = 1.0 - numbers[SAWTOOTH] * (1.0 - memory[at.CHIP])
+    stone = course[int(memory[at.DISTANCE] / STONE_STEP) % COURSE, 1]
+    return math.exp(numbers[ROUGHNESS] * noise) * saw * dig, dig, stone
+
+
+@compiled
+def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Array) -> None:
+    """Drag, the part across, and edge penetration at the tip in `c`, from depth and rake.
+
+    `inward`: 1 when the tip moves towards the machine, 0 when it moves away.
+    """
+    numbers, table, course, _, memory = ground
+    factor, dig, stone = strength(numbers, course, memory)
+    depth = c[DEPTH]
+    loose = numbers[DENSITY] / numbers[SWELL]
+    heap = math.sqrt(2.0 * numbers[REPOSE] * memory[at.HEAP] / (loose * numbers[WIDTH]))
+    rake = math.atan2(floor[1], floor[0])
+    force = inward * factor * cutting_force(depth, rake, 0.5 * loose * GRAVITY * heap, numbers, table)
+    back = 0.0
+    if inward < 1.0:
+        back = (1.0 - inward) * factor * cutting_force(depth, math.pi - rake, 0.0, numbers, table)
+    along, rise = floor
+    if rake < LEAST_LEAN or rake > MOST_LEAN:
+        lean = min(max(rake, LEAST_LEAN), MOST_LEAN)
+        along, rise = math.cos(lean), math.sin(lean)
+    # cosine and sine of the angle of the force, rake plus friction on metal
+    c[DRAG] = force * max(rise * numbers[METAL_COS] + along * numbers[METAL_SIN], 0.3) + inward * stone
+    c[DRAG] += PUSHED_BACK * back
+    c[ACROSS] = force * (along * numbers[METAL_COS] - rise * numbers[METAL_SIN])
+    c[EDGE] = dig * numbers[CONE] * numbers[EDGE_AREA] * min(depth / EDGE_DEPTH, 1.0)
+
+
+@compiled
+def engage_heel(numbers: Array, memory: Array, c: Array) -> None:
+    """Normal force and sliding friction of the floor plate's heel in `c`, from its depth."""
+    depth = c[HEEL_DEPTH]
+    bearing = min(numbers[BEKKER] * depth ** numbers[EXPONENT], numbers[BEARING_LIMIT])
+    elastic = numbers[UNLOADING] * (depth - memory[at.HEEL_SET])
+    if elastic > bearing:
+        memory[at.HEEL_SET] = depth - bearing / numbers[UNLOADING]
+        elastic = bearing
+    normal = max(elastic, 0.0)
+    c[NORMAL] = normal
+    c[NORMAL_DAMPING] = numbers[HEEL_DAMPING] if normal > 0.0 else 0.0
+    sheared = 1.0 - math.exp(-memory[at.SHEAR] / numbers[SHEAR_LENGTH])
+    stuck = numbers[ADHESION] * numbers[WIDTH] * HEEL_CONTACT if normal > 0.0 else 0.0
+    c[SLIDE] = (normal * numbers[METAL_SIN] / numbers[METAL_COS] + stuck) * sheared
+
+
+@compiled
+def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -> None:
+    """Positions, Jacobians and forces of this step in `c`; `angles`: cosine and sine of the absolute angles."""
+    numbers, _, _, heights, memory = ground
+    c1, s1, ca, sa, cb, sb = angles[0], angles[1], angles[2], angles[3], angles[4], angles[5]
+    elbow_x, elbow_y = axes[0, at.LENGTH] * c1, axes[0, at.LENGTH] * s1
+    pin_x, pin_y = elbow_x + axes[1, at.LENGTH] * ca, elbow_y + axes[1, at.LENGTH] * sa
+    tip_x, tip_y = pin_x + axes[2, at.LENGTH] * cb, pin_y + axes[2, at.LENGTH] * sb
+    # the floor plate runs from the edge back into the shell
+    floor_x = -(cb * numbers[FLOOR_COS] + sb * numbers[FLOOR_SIN])
+    floor_y = -(sb * numbers[FLOOR_COS] - cb * numbers[FLOOR_SIN])
+    heel_x, heel_y = tip_x + numbers[FLOOR_LENGTH] * floor_x, tip_y + numbers[FLOOR_LENGTH] * floor_y
+    pitch, pitch_rate = memory[at.PITCH], memory[at.PITCH_RATE]
+    c[POINTS], c[POINTS + 1] = tip_x - pitch * tip_y, tip_y + pitch * tip_x
+    c[POINTS + 2], c[POINTS + 3] = heel_x - pitch * heel_y, heel_y + pitch * heel_x
+    c[PITCHED], c[PITCHED + 1] = -tip_y * pitch_rate, tip_x * pitch_rate
+    c[PITCHED + 2], c[PITCHED + 3] = -heel_y * pitch_rate, heel_x * pitch_rate
+    c[TIP_JX], c[TIP_JX + 1], c[TIP_JX + 2] = -tip_y, elbow_y - tip_y, pin_y - tip_y
+    c[TIP_JY], c[TIP_JY + 1], c[TIP_JY + 2] = tip_x, tip_x - elbow_x, tip_x - pin_x
+    c[HEEL_JX], c[HEEL_JX + 1], c[HEEL_JX + 2] = -heel_y, elbow_y - heel_y, pin_y - heel_y
+    c[HEEL_JY], c[HEEL_JY + 1], c[HEEL_JY + 2] = heel_x, heel_x - elbow_x, heel_x - pin_x
+    c[EDGE_X], c[EDGE_Y] = -floor_x, -floor_y
+    c[ON] = c[DRAG] = c[ACROSS] = c[EDGE] = c[NORMAL] = c[NORMAL_DAMPING] = c[SLIDE] = 0.0
+    w1, w2, w3 = state[at.RATE], state[at.RATE + 1], state[at.RATE + 2]
+    vx = c[TIP_JX] * w1 + c[TIP_JX + 1] * w2 + c[TIP_JX + 2] * w3 + c[PITCHED]
+    # depth below the ground that the edge has not reached yet
+    inward = min(max(0.5 - 0.5 * vx / TURNING, 0.0), 1.0)
+    uncut = inward * height_at(c[POINTS] - 1.5 * SPACING, heights)
+    uncut += (1.0 - inward) * height_at(c[POINTS] + 1.5 * SPACING, heights)
+    c[DEPTH] = min(uncut - c[POINTS + 1], DEEPEST)
+    c[HEEL_DEPTH] = height_at(c[POINTS + 2], heights) - c[POINTS + 3]
+    if c[DEPTH] > 0.0:
+        c[ON] = 1.0
+        engage_edge(inward, ground, (floor_x, floor_y), c)
+    if c[HEEL_DEPTH] > 0.0:
+        c[ON] = 1.0
+        engage_heel(numbers, memory, c)
+    if c[ON] > 0.0:
+        hold(w1, w2, w3, c)
+        damp(c)
+
+
+@inlined
+def velocities(c: Array, w1: float, w2: float, w3: float) -> Four:
+    """Velocity of tip and heel, m/s, at these joint rates and the chassis' own."""
+    tip_x = c[TIP_JX] * w1 + c[TIP_JX + 1] * w2 + c[TIP_JX + 2] * w3 + c[PITCHED]
+    tip_y = c[TIP_JY] * w1 + c[TIP_JY + 1] * w2 + c[TIP_JY + 2] * w3 + c[PITCHED + 1]
+    heel_x = c[HEEL_JX] * w1 + c[HEEL_JX + 1] * w2 + c[HEEL_JX + 2] * w3 + c[PITCHED + 2]
+    heel_y = c[HEEL_JY] * w1 + c[HEEL_JY + 1] * w2 + c[HEEL_JY + 2] * w3 + c[PITCHED + 3]
+    return tip_x, tip_y, heel_x, heel_y
+
+
+@inlined
+def forces(c: Array, v: Four) -> Four:
+    """Force (N) of the ground on tip and on heel at their velocities, with the dampers of this step, see `hold`."""
+    into = c[EDGE] * (v[0] * c[EDGE_X] + v[1] * c[EDGE_Y])
+    fx = -c[DRAG] * v[0] - c[ACROSS] * v[1] - into * c[EDGE_X]
+    fy = -c[DRAG] * v[1] + c[ACROSS] * v[0] - into * c[EDGE_Y]
+    return fx, fy, -c[SLIDE] * v[2], c[NORMAL] - c[NORMAL_DAMPING] * v[3]
+
+
+@inlined
+def torques(c: Array, w1: float, w2: float, w3: float) -> tuple[float, float, float]:
+    """Joint torques (N m) of the ground at these joint rates."""
+    fx, fy, hx, hy = forces(c, velocities(c, w1, w2, w3))
+    return (
+        c[TIP_JX] * fx + c[TIP_JY] * fy + c[HEEL_JX] * hx + c[HEEL_JY] * hy,
+        c[TIP_JX + 1] * fx + c[TIP_JY + 1] * fy + c[HEEL_JX + 1] * hx + c[HEEL_JY + 1] * hy,
+        c[TIP_JX + 2] * fx + c[TIP_JY + 2] * fy + c[HEEL_JX + 2] * hx + c[HEEL_JY + 2] * hy,
+    )
+
+
+@compiled
+def hold(w1: float, w2: float, w3: float, c: Array) -> None:
+    """Turn forces of a size into dampers for one step, from the velocities at its beginning.
+
+    Force over speed stands still within a step: both stages of the integrator see the linear damper that its
+    Jacobian knows. A force that keeps its size while the velocity turns round is what ROS2 would amplify, by 2.4 a
+    step where soil is stiff against the mass of the bucket.
+    """
+    v = velocities(c, w1, w2, w3)
+    slow = 1.0 / math.sqrt(v[0] * v[0] + v[1] * v[1] + CREEP * CREEP)
+    c[DRAG] *= slow
+    c[ACROSS] *= slow
+    into = v[0] * c[EDGE_X] + v[1] * c[EDGE_Y]
+    c[EDGE] = c[EDGE] / math.sqrt(into * into + CREEP * CREEP) if into > 0.0 else 0.0
+    c[SLIDE] /= math.sqrt(v[2] * v[2] + CREEP * CREEP)
+    if c[NORMAL] < c[NORMAL_DAMPING] * v[3]:
+        c[NORMAL] = c[NORMAL_DAMPING] = 0.0  # leaves faster than the soil follows: it does not pull
+
+
+@compiled
+def damp(c: Array) -> None:
+    """Damping of the joints by the soil, N m s, into `c[DAMPING:]`, row by row: minus the Jacobian of `torques`."""
+    drag, edge, slide, across = c[DRAG], c[EDGE], c[SLIDE], c[ACROSS]
+    xx, xy, yy = drag + edge * c[EDGE_X] * c[EDGE_X], edge * c[EDGE_X] * c[EDGE_Y], drag + edge * c[EDGE_Y] * c[EDGE_Y]
+    for i in range(3):
+        for j in range(3):
+            ix, iy, jx, jy = c[TIP_JX + i], c[TIP_JY + i], c[TIP_JX + j], c[TIP_JY + j]
+            value = xx * ix * jx + xy * (ix * jy + iy * jx) + yy * iy * jy + across * (ix * jy - iy * jx)
+            value += slide * c[HEEL_JX + i] * c[HEEL_JX + j] + c[NORMAL_DAMPING] * c[HEEL_JY + i] * c[HEEL_JY + j]
+            c[DAMPING + 3 * i + j] = value
+
+
+@compiled
+def rock(h: float, numbers: Array, memory: Array, c: Array, force: Four, at_rest: float) -> None:
+    """Pitch of the chassis over one step: a spring on its tracks that gives way at the lifting moment."""
+    tip_x, tip_y, heel_x, heel_y = c[TIP_JY], -c[TIP_JX], c[HEEL_JY], -c[HEEL_JX]
+    moment = tip_x * force[1] - tip_y * force[0] + heel_x * force[3] - heel_y * force[2]
+    limit = numbers[LIFT_MOMENT]
+    moment -= min(max(numbers[PITCH_STIFFNESS] * memory[at.PITCH], -limit), limit)
+    # soil at the tip brakes the chassis too: implicit, with the drag of this step
+    own = c[DAMPING] * at_rest
+    gain = h / numbers[PITCH_INERTIA]
+    rate = memory[at.PITCH_RATE]
+    rate = (rate + gain * (moment + own * rate)) / (1.0 + gain * (numbers[PITCH_DAMPING] + own))
+    memory[at.PITCH_RATE] = rate
+    memory[at.PITCH] += h * rate

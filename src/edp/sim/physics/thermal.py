@@ -1,0 +1,48 @@
+"""Oil temperature: a thermal balance, and what follows it: bulk modulus, leakage, viscous friction."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.physics.jit import compiled
+
+Array = NDArray[np.float64]
+
+
+@compiled
+def set_temperature(celsius: float, plant: Array) -> None:
+    """Oil at this temperature: leakage goes with 1 / viscosity, viscous friction with the root of viscosity."""
+    plant[at.OIL_TEMPERATURE] = celsius
+    plant[at.BULK_MODULUS] = plant[at.BULK_AT_45] * (1.0 - 0.004 * (celsius - 45.0))
+    plant[at.THINNING] = math.exp(0.035 * (celsius - 40.0))
+    plant[at.VISCOUS_SHARE] = math.exp(-0.0175 * (celsius - 40.0))
+
+
+@compiled
+def losses(row: Array, axes: Array, plant: Array) -> float:
+    """Hydraulic power (W) that stays in the oil: what the pumps' shafts give less what the pistons take.
+
+    Args:
+        row: one logged sample.
+        axes: parameters of the cylinders.
+        plant: parameters of the plant.
+    """
+    power = 0.0
+    for m in range(2):
+        power += plant[at.MAX_FLOW] * row[at.DISPLACEMENT + m] * max(row[at.PUMP + m], 0.0)
+    for i in range(at.AXES):
+        force = axes[i, at.HEAD_AREA] * row[at.HEAD + i] - axes[i, at.ROD_AREA] * row[at.ROD + i]
+        power -= force * row[at.LOG_VELOCITY + i]
+    return power
+
+
+@compiled
+def warm(row: Array, axes: Array, plant: Array, time_s: float) -> None:
+    """Heat and cool the oil over `time_s`, and let its properties follow."""
+    celsius = plant[at.OIL_TEMPERATURE]
+    heat = losses(row, axes, plant) - plant[at.COOLING] * (celsius - plant[at.AMBIENT])
+    set_temperature(celsius + heat * time_s / plant[at.HEAT_CAPACITY], plant)

@@ -1,0 +1,123 @@
+"""Command path: ECU shaping, dead time, pilot and spool filters with play between them, and the openings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.physics.jit import compiled, inlined
+
+Array = NDArray[np.float64]
+PILOT_DAMPING = 0.9
+SPOOL_DAMPING = 1.0
+
+
+@compiled
+def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
+    """Lever positions in [-1, 1], shape (3,), to signed spool demands, shape (6,): primary, then conflux spools."""
+    zone, start = plant[at.LEVER_DEAD_ZONE], plant[at.CONFLUX_START]
+    for i in range(at.AXES):
+        size = min(max((abs(lever[i]) - zone) / (1.0 - zone), 0.0), 1.0)
+        second = min(max((size - start) / (1.0 - start), 0.0), 1.0)
+        sign = 1.0 if lever[i] >= 0.0 else -1.0
+        share = axes[i, at.CONFLUX_SHARE_EXTEND] if sign > 0 else axes[i, at.CONFLUX_SHARE_RETRACT]
+        out[i] = sign * size
+        out[i + 3] = sign * second * share
+
+
+def _oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:
+    """Exact transition of (error, rate) of a low-pass of damping <= 1 over one step, row by row, 4 values."""
+    omega = 2.0 * math.pi * frequency_hz
+    ringing = omega * math.sqrt(1.0 - damping * damping)
+    decay, fall = damping * omega, math.exp(-damping * omega * step_s)
+    cosine = math.cos(ringing * step_s)
+    sine = math.sin(ringing * step_s) / ringing if ringing > 0.0 else step_s
+    own, cross = fall * (cosine + decay * sine), fall * sine
+    return [own, cross, -omega * omega * cross, fall * (cosine - decay * sine)]
+
+
+def spool_filters(machine: Machine, step_s: float) -> Array:
+    """Transitions over `step_s` of pilot and spool, shape (6, 2, 4)."""
+    valves = machine.valves
+    pilots = valves.pilot_frequency * 2
+    spools = valves.spool_frequency + valves.conflux_spool_frequency
+    return np.array(
+        [
+            [_oscillator(pilot, PILOT_DAMPING, step_s), _oscillator(spool, SPOOL_DAMPING, step_s)]
+            for pilot, spool in zip(pilots, spools, strict=True)
+        ]
+    )
+
+
+def dead_times(machine: Machine) -> Array:
+    """Dead time of each spool's command, shape (6,), s."""
+    first = np.array(machine.valves.dead_time)
+    return np.concatenate((first, first + machine.valves.conflux_extra_dead_time))
+
+
+@inlined
+def pilot_half_step(demand: Array, filters: Array, hysteresis: float, valves: Array) -> None:
+    """Advance the pilots by half a step, then move the play operator's output."""
+    for j in range(at.SPOOLS):
+        error, rate = valves[j, at.PILOT] - demand[j], valves[j, at.PILOT_RATE]
+        pilot = demand[j] + filters[j, 0, 0] * error + filters[j, 0, 1] * rate
+        valves[j, at.PILOT] = pilot
+        valves[j, at.PILOT_RATE] = filters[j, 0, 2] * error + filters[j, 0, 3] * rate
+        valves[j, at.PLAY] = max(pilot - hysteresis, min(pilot + hysteresis, valves[j, at.PLAY]))
+
+
+@inlined
+def spool_half_step(filters: Array, valves: Array) -> None:
+    """Advance the spools by half a step towards the play operator's output."""
+    for j in range(at.SPOOLS):
+        play = valves[j, at.PLAY]
+        error, rate = valves[j, at.SPOOL] - play, valves[j, at.SPOOL_RATE]
+        valves[j, at.SPOOL] = play + filters[j, 1, 0] * error + filters[j, 1, 1] * rate
+        valves[j, at.SPOOL_RATE] = filters[j, 1, 2] * error + filters[j, 1, 3] * rate
+
+
+@inlined
+def opening(spool: float, dead_band: float) -> float:
+    """Share of the full area behind the dead band: r (0.25 + 0.75 r), fine control near closed."""
+    r = min(max((abs(spool) - dead_band) / (1.0 - dead_band), 0.0), 1.0)
+    return r * (0.25 + 0.75 * r)
+
+
+@inlined
+def cushion(distance: float, length: float, least: float) -> float:
+    """Share of the outflow area left at a distance (m) from the stop: a smoothstep down to `least`."""
+    r = min(max(distance / length, 0.0), 1.0)
+    return least + (1.0 - least) * r * r * (3.0 - 2.0 * r)
+
+
+@inlined
+def open_spools(valves: Array, stroke: Array, axes: Array, out: Array) -> None:
+    """Conductances of this step from spool positions and cushions, `out` shape (3, OPENINGS)."""
+    for i in range(at.AXES):
+        for n in range(at.OPENINGS):
+            out[i, n] = 0.0
+        spool, second = valves[i, at.SPOOL], valves[i + 3, at.SPOOL]
+        pump, second_pump = int(axes[i, at.PRIMARY_PUMP]), int(axes[i, at.CONFLUX_PUMP])
+        if second > 0.0:
+            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_EXTEND])
+            out[i, at.HEAD_IN_1 + second_pump] = axes[i, at.CONFLUX_EXTEND] * area
+        else:
+            area = opening(second, axes[i, at.CONFLUX_DEAD_BAND_RETRACT])
+            out[i, at.ROD_IN_1 + second_pump] = axes[i, at.CONFLUX_RETRACT] * area
+        length, least = axes[i, at.CUSHION_LENGTH], axes[i, at.CUSHION_AREA]
+        if spool > 0.0:
+            area = opening(spool, axes[i, at.DEAD_BAND_EXTEND])
+            left = area * cushion(axes[i, at.STROKE] - stroke[i], length, least)
+            out[i, at.HEAD_IN_1 + pump] = axes[i, at.IN_EXTEND] * area
+            out[i, at.ROD_OUT] = axes[i, at.OUT_EXTEND] * left
+            out[i, at.ROD_TO_HEAD] = axes[i, at.REGEN_EXTEND] * left
+        else:
+            area = opening(spool, axes[i, at.DEAD_BAND_RETRACT])
+            left = area * cushion(stroke[i], length, least)
+            out[i, at.ROD_IN_1 + pump] = axes[i, at.IN_RETRACT] * area
+            out[i, at.HEAD_OUT] = axes[i, at.OUT_RETRACT] * left
+            out[i, at.HEAD_TO_ROD] = axes[i, at.REGEN_RETRACT] * left

@@ -1,0 +1,229 @@
+"""The limit of predictability: how far off any predictor must be, found by branching moments of recordings.
+
+At a moment the whole simulation is kept. From there it runs on many times, each time with fresh randomness of the
+operator (what is done now goes on, how long it lasts and what follows is drawn anew), of the soil still to be met and
+of the sensors. Knowing the true state at that moment, and all the laws, the best guess of a later measured velocity is
+its median over these futures, which has the least mean absolute error of all guesses; that error is the limit. With
+the commands of the future given, only soil and sensors differ between the branches: the limit of a predictor that is
+told the commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError
+from edp.signals import TABLE_A1
+from edp.sim.machine import layout as at
+from edp.sim.plan import ordered
+from edp.sim.scenario import Scenario
+from edp.sim.sensors import sensors
+from edp.sim.simulate import Simulation
+
+Array = NDArray[np.float64]
+TARGETS = tuple(TABLE_A1)[:3]
+PAST = 40
+"""Samples of the past that sensors see before a branch: longer than any latency of the bus."""
+RESAMPLES = 2000
+CONFIDENCE = 0.95
+MOST_BRANCHES, MOST_MOMENTS = 4096, 100_000
+"""Bounds; the usual 32 branches of 240 moments take minutes."""
+KINDS = ("commands_unknown", "commands_known", "persistence")
+
+
+@dataclass(frozen=True)
+class LimitSpec:
+    """How the limit is estimated.
+
+    Attributes:
+        horizons: samples ahead, rising.
+        moments: how many moments are branched, spread over the recordings.
+        branches: futures from each; even.
+        recordings: at most so many of the recordings are used.
+        seed: root of the choice of moments and of all branches.
+
+    Raises:
+        ConfigError: a number is out of range.
+    """
+
+    horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
+    moments: int = 240
+    branches: int = 32
+    recordings: int = 40
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        rising = all(a < b for a, b in zip(self.horizons, self.horizons[1:], strict=False))
+        if not self.horizons or self.horizons[0] < 1 or not rising or self.horizons[-1] > 2000:
+            raise ConfigError(f"limit: horizons = {list(self.horizons)} must rise from at least 1 to at most 2000")
+        if not 4 <= self.branches <= MOST_BRANCHES or self.branches % 2:
+            raise ConfigError(f"limit: branches = {self.branches} must be even, from 4 to {MOST_BRANCHES}")
+        if not 2 <= self.moments <= MOST_MOMENTS or self.recordings < 1:
+            raise ConfigError(
+                f"limit: moments = {self.moments} must be from 2 to {MOST_MOMENTS}, "
+                f"recordings = {self.recordings} at least 1"
+            )
+
+
+@dataclass(frozen=True)
+class LimitJob:
+    """The moments of one recording."""
+
+    scenario: Scenario
+    moments: tuple[int, ...]
+    spec: LimitSpec
+    seed: int
+
+    @property
+    def label(self) -> str:
+        """Name of the recording."""
+        return self.scenario.label
+
+
+def least_mae(values: Array) -> Array:
+    """Least mean absolute error of any guess of values like these, shape (branch, ...), over the branches.
+
+    The mean distance from the samples' own median is too small, because the median was fitted to them; the mean
+    distance of each sample from the median of the others is too large, because that median is not the best guess. To
+    first order both miss by the same, 1 / (4 N f) with f the density at the median, so their mean is taken. For an
+    even number of sorted values it is the former plus a quarter of the gap in the middle.
+    """
+    ordered_values = np.sort(values, axis=0)
+    half = len(values) // 2
+    own = (ordered_values[half:].sum(axis=0) - ordered_values[:half].sum(axis=0)) / len(values)
+    found: Array = own + 0.25 * (ordered_values[half] - ordered_values[half - 1])
+    return found
+
+
+def branch_recording(job: LimitJob) -> Array:
+    """Errors at each moment of one recording, shape (moment, kind, horizon, target), m/s; kinds are `KINDS`."""
+    simulation, spec = Simulation(job.scenario), job.spec
+    root = np.random.SeedSequence(job.seed)
+    found = np.empty((len(job.moments), len(KINDS), len(spec.horizons), len(TARGETS)))
+    for n, (moment, seed) in enumerate(zip(job.moments, root.spawn(len(job.moments)), strict=True)):
+        simulation.run(moment - simulation.samples)
+        snapshot = simulation.snapshot()
+        past = simulation.log[-PAST:]
+        known = _futures(simulation, past, spec, seed.spawn(2)[0], known=True)
+        simulation.restore(snapshot)
+        unknown = _futures(simulation, past, spec, seed.spawn(2)[1], known=False)
+        simulation.restore(snapshot)
+        found[n, 0], found[n, 1] = least_mae(unknown[:, 1:]), least_mae(known[:, 1:])
+        found[n, 2] = np.abs(unknown[:, 1:] - unknown[:, :1]).mean(axis=0)
+    return found
+
+
+def _futures(simulation: Simulation, past: Array, spec: LimitSpec, seed: np.random.SeedSequence, known: bool) -> Array:
+    """Measured velocities now and at the horizons in each future, shape (branch, 1 + horizon, target), m/s."""
+    snapshot = simulation.snapshot()
+    length = spec.horizons[-1] + 1
+    rows = simulation.run(length)
+    commands = simulation.targets[-length:]
+    at_times = len(past) + np.array([0, *spec.horizons])
+    futures = np.empty((spec.branches, len(at_times), len(TARGETS)))
+    for b, branch in enumerate(seed.spawn(spec.branches)):
+        world, noise = branch.spawn(2)
+        # With commands known and no soil there is but one future; sensors alone differ.
+        if not known or simulation.plant.ground is not None:
+            simulation.restore(snapshot)
+            if known:
+                simulation.branch_soil(world)
+                rows = simulation.follow(commands)
+            else:
+                simulation.branch(world)
+                rows = simulation.run(length)
+        futures[b] = _measured(simulation, np.concatenate((past, rows)), noise)[at_times]
+    return futures
+
+
+def _measured(simulation: Simulation, log: Array, seed: np.random.SeedSequence) -> Array:
+    scenario = simulation.scenario
+    rng = np.random.default_rng(seed) if scenario.sensor_noise else None
+    found = sensors.measured_signals(log, simulation.machine, scenario.rate_hz, rng, log[:, at.LOG_OIL] + 273.15)
+    return found[:, : len(TARGETS)]
+
+
+def plan_limit(scenarios: Sequence[Scenario], spec: LimitSpec) -> list[LimitJob]:
+    """Which moments of which recordings are branched.
+
+    Raises:
+        ConfigError: the recordings are too short for the horizons.
+    """
+    rng = np.random.default_rng([spec.seed, 1])
+    count = min(len(scenarios), spec.recordings, spec.moments)
+    chosen = sorted(rng.permutation(len(scenarios))[:count].tolist())
+    jobs = []
+    for place, index in enumerate(chosen):
+        scenario = scenarios[index]
+        last = scenario.samples - spec.horizons[-1] - 1
+        share = spec.moments // count + (1 if place < spec.moments % count else 0)
+        if last < PAST + share:
+            raise ConfigError(
+                f"limit: '{scenario.label}' has {scenario.samples} samples, too few for {share} moments and a "
+                f"horizon of {spec.horizons[-1]}; take longer recordings, fewer moments or shorter horizons"
+            )
+        moments = PAST + rng.choice(last - PAST, share, replace=False)
+        jobs.append(LimitJob(scenario, tuple(sorted(moments.tolist())), spec, int(rng.integers(2**62))))
+    return jobs
+
+
+def find_limit(
+    scenarios: Sequence[Scenario],
+    spec: LimitSpec | None = None,
+    workers: int = 1,
+    on_done: Callable[[LimitJob], None] | None = None,
+) -> dict[str, Any]:
+    """The limit of predictability of a data set, as plain data in mm/s; the same for any number of workers.
+
+    Returns:
+        ``commands_unknown``, ``commands_known`` and ``persistence`` (the present value as the guess, at the same
+        moments), each with ``mae``, ``low`` and ``high`` (95 % by resampling whole recordings): a row a horizon, a
+        column for each of ``targets`` and one for their mean.
+
+    Raises:
+        ConfigError: the recordings are too short.
+        SimulationError: a simulation diverged.
+    """
+    spec = spec or LimitSpec()
+    jobs = plan_limit(scenarios, spec)
+    parts = []
+    for job, part in zip(jobs, ordered(branch_recording, jobs, workers), strict=True):
+        parts.append(1e3 * np.concatenate((part, part.mean(axis=-1, keepdims=True)), axis=-1))
+        if on_done is not None:
+            on_done(job)
+    low, high = _confidence(parts, np.random.default_rng([spec.seed, 2]))
+    mean = np.concatenate(parts).mean(axis=0)
+    tables = {
+        kind: {name: np.round(table[n], 5).tolist() for name, table in (("mae", mean), ("low", low), ("high", high))}
+        for n, kind in enumerate(KINDS)
+    }
+    return {
+        "schema": 1,
+        "unit": "mm/s",
+        "rate_hz": jobs[0].scenario.rate_hz,
+        "horizons": list(spec.horizons),
+        "targets": list(TARGETS),
+        "confidence": CONFIDENCE,
+        "moments": spec.moments,
+        "branches": spec.branches,
+        "recordings": len(jobs),
+        "seed": spec.seed,
+        **tables,
+    }
+
+
+def _confidence(parts: Sequence[Array], rng: np.random.Generator) -> tuple[Array, Array]:
+    """Percentile bounds of the mean by resampling recordings; moments, where there is one recording."""
+    units = parts if len(parts) > 1 else [moment[None] for moment in parts[0]]
+    sums = np.stack([unit.sum(axis=0) for unit in units])
+    counts = np.array([len(unit) for unit in units], dtype=float)
+    drawn = rng.multinomial(len(units), np.full(len(units), 1.0 / len(units)), RESAMPLES).astype(float)
+    means = np.einsum("ru,u...->r...", drawn, sums) / (drawn @ counts).reshape(-1, *[1] * (sums.ndim - 1))
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low, high = np.quantile(means, [tail, 1.0 - tail], axis=0)
+    return low, high

@@ -1,0 +1,1 @@
+"""What the machine's sensors, filters and buses make of the state."""

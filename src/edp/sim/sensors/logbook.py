@@ -1,0 +1,78 @@
+"""One logged sample: what is true at an instant, in the columns that `edp.sim.machine.layout` names."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine import layout as at
+from edp.sim.physics import linkage, pump
+from edp.sim.physics.jit import compiled
+
+Array = NDArray[np.float64]
+
+
+@compiled
+def write_events(state: Array, valves: Array, axes: Array, plant: Array, memory: Array, row: Array) -> None:
+    """Flags 0 or 1: relief, cavitation, regeneration, power limit, soil contact."""
+    relief = cavitation = regeneration = limited = 0.0
+    for i in range(at.AXES):
+        head, rod, spool = state[at.HEAD + i], state[at.ROD + i], valves[i, at.SPOOL]
+        if head > axes[i, at.RELIEF_HEAD] or rod > axes[i, at.RELIEF_ROD]:
+            relief = 1.0
+        if head < 0.0 or rod < 0.0:
+            cavitation = 1.0
+        arm_in = axes[i, at.REGEN_EXTEND] > 0.0 and spool > axes[i, at.DEAD_BAND_EXTEND] and rod > head
+        boom_down = axes[i, at.REGEN_RETRACT] > 0.0 and -spool > axes[i, at.DEAD_BAND_RETRACT] and head > rod
+        if arm_in or boom_down:
+            regeneration = 1.0
+    for m in range(2):
+        if state[at.PUMP + m] > plant[at.PUMP_RELIEF]:
+            relief = 1.0
+    first, second = pump.demand(valves, axes, plant)
+    power = plant[at.MAX_FLOW] * (first * state[at.PUMP] + second * state[at.PUMP + 1])
+    if power > plant[at.POWER_LIMIT]:
+        limited = 1.0
+    row[at.LOG_EVENTS + at.RELIEF] = relief
+    row[at.LOG_EVENTS + at.CAVITATION] = cavitation
+    row[at.LOG_EVENTS + at.REGENERATION] = regeneration
+    row[at.LOG_EVENTS + at.POWER_LIMITED] = limited
+    row[at.LOG_EVENTS + at.SOIL_CONTACT] = memory[at.TOUCHED]
+    memory[at.TOUCHED] = 0.0
+
+
+@compiled
+def write_tip(state: Array, axes: Array, row: Array) -> None:
+    """Bucket tip (m from the boom foot) and attitude (rad)."""
+    x = y = angle = 0.0
+    for i in range(at.AXES):
+        angle += state[at.PSI + i]
+        x += axes[i, at.LENGTH] * math.cos(angle)
+        y += axes[i, at.LENGTH] * math.sin(angle)
+    row[at.LOG_TIP], row[at.LOG_TIP + 1], row[at.LOG_TIP + 2] = x, y, angle
+
+
+@compiled
+def write_log(
+    state: Array, valves: Array, demand: Array, axes: Array, plant: Array, ground: tuple[Array, ...], row: Array
+) -> None:
+    """One sample: plant state, demands, strokes (m from closed), velocities (m/s), then what else is true."""
+    heights, memory = ground[3], ground[4]
+    for n in range(at.STATES):
+        row[n] = state[n]
+    for j in range(at.SPOOLS):
+        row[at.LOG_DEMAND + j] = demand[j]
+        row[at.LOG_SPOOL + j] = valves[j, at.SPOOL]
+    for i in range(at.AXES):
+        length, lever = linkage.cylinder(i, state[at.PSI + i], plant)
+        row[at.LOG_STROKE + i] = length - axes[i, at.CLOSED]
+        row[at.LOG_VELOCITY + i] = lever * state[at.RATE + i]
+    write_tip(state, axes, row)
+    row[at.LOG_FORCE], row[at.LOG_FORCE + 1] = memory[at.FORCE_X], memory[at.FORCE_Y]
+    row[at.LOG_PAYLOAD] = memory[at.PAYLOAD]
+    row[at.LOG_OIL] = plant[at.OIL_TEMPERATURE]
+    write_events(state, valves, axes, plant, memory, row)
+    for k in range(row.shape[0] - at.LOG_GROUND):
+        row[at.LOG_GROUND + k] = heights[(k * (heights.shape[0] - 1)) // (at.GROUND_POINTS - 1)]

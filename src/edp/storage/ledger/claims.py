@@ -1,0 +1,73 @@
+"""Trainings under way: claims of the processes that do them, and what they leave when they are done."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+from edp.errors import BusyError, StorageError
+from edp.storage.ledger.record import FINAL, RECORD_BYTES, Record
+from edp.storage.locks import hold, release
+from edp.storage.reading import read_bytes
+from edp.storage.writing import make_folder, write_bytes
+
+
+def claim(folder: str | Path, key: str) -> Claim:
+    """Claim a training for this process, for as long as it lives or until the claim is left.
+
+    Raises:
+        BusyError: another process trains it.
+    """
+    file = make_folder(Path(folder, "claims")) / f"{key}.lock"
+    try:
+        return Claim(file, hold(file))
+    except BusyError as error:
+        holder = str(error).rpartition("process ")[2]
+        raise BusyError(f"training {key} is claimed by process {holder}; it is not done twice") from None
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A training that this process does; leaving the block frees it."""
+
+    file: Path
+    stream: IO[str]
+
+    def __enter__(self) -> Claim:
+        """The claim itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Free the claim."""
+        release(self.file, self.stream)
+
+
+def free_dead_claims(folder: str | Path) -> None:
+    """Remove the claims of processes that were killed."""
+    for file in Path(folder, "claims").glob("*.lock"):
+        with contextlib.suppress(BusyError), claim(folder, file.stem):
+            pass
+
+
+def leave_arrival(folder: str | Path, record: Record) -> None:
+    """Keep what a worker found, in case that the coordinator is killed before it enters it into the ledger."""
+    write_bytes(Path(folder, "arrived", f"{record.key}.json"), record.to_bytes())
+
+
+def whole(file: Path) -> Record | None:
+    """The final record in a file, where it is one."""
+    try:
+        record = Record.from_bytes(read_bytes(file, RECORD_BYTES))
+    except (OSError, ValueError, KeyError, TypeError, StorageError):
+        return None
+    return record if record.key == file.stem and record.status in FINAL else None
+
+
+def known(folder: str | Path, key: str) -> Record | None:
+    """The final record of a training that the coordinator or a worker has left."""
+    return whole(Path(folder, "records", f"{key}.json")) or whole(Path(folder, "arrived", f"{key}.json"))

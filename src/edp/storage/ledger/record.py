@@ -1,0 +1,207 @@
+"""Records of trainings, addressed by the content of what decides their result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from enum import StrEnum
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.errors import ConfigError, NotFiniteError, StorageError
+from edp.storage.reading import object_with, parse_json
+
+SCHEMA = 1
+UNREAD = ("cli", "selection.py", "trials.py", "workflow.py", "report", "screening", "stats", "search")
+"""Rooms whose code decides no result of a training."""
+READ = ("search/jobs.py", "search/trainings.py")
+"""What of them does."""
+
+
+class TrainingStatus(StrEnum):
+    """How a training ended."""
+
+    DONE = "done"
+    FAILED = "failed"
+    """An error in the training; the same again would fail again."""
+    DIVERGED = "diverged"
+    """A loss or score was not finite; a comparison counts it as the worst, and leaves no pair out."""
+    OOM = "oom"
+    TIMEOUT = "timeout"
+    LOST = "lost"
+    """Its process was killed again and again; nothing is known of the training itself."""
+
+
+FINAL = frozenset(TrainingStatus) - {TrainingStatus.LOST}
+"""What is not tried again; a lost training is, when the search is started again."""
+
+
+def canonical(value: Any) -> str:
+    """One text for one value: JSON with sorted keys, in which 1, 1.0, true and "1" differ.
+
+    Raises:
+        NotFiniteError: a number is NaN or infinite, which equals nothing, not even itself.
+        ConfigError: a value or key that JSON would change, such as an array, a set or a number as a key.
+    """
+    _check_plain(value, "")
+    return json.dumps(value, sort_keys=True, allow_nan=False, separators=(",", ":"))
+
+
+def _check_plain(value: Any, where: str) -> None:
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise NotFiniteError(f"'{where or 'value'}' is {value}; give a finite number, or none")
+    elif isinstance(value, Mapping):
+        for name, part in value.items():
+            if not isinstance(name, str):
+                raise ConfigError(f"'{where or 'value'}' has the key {name!r}; keys must be text")
+            _check_plain(part, f"{where}.{name}" if where else name)
+    elif isinstance(value, list | tuple):
+        for number, part in enumerate(value):
+            _check_plain(part, f"{where}[{number}]")
+    elif value is not None and not isinstance(value, str | int):
+        kind = type(value).__name__
+        raise ConfigError(f"'{where or 'value'}' is of type {kind}; give text, numbers, true or false, lists or tables")
+
+
+def digest_of(value: Any) -> str:
+    """blake2b of the canonical text."""
+    return hashlib.blake2b(canonical(value).encode(), digest_size=16).hexdigest()
+
+
+@cache
+def code_version() -> str:
+    """Version of the package and blake2b of its source and tables, without what decides no result."""
+    state = hashlib.blake2b(digest_size=16)
+    root = Path(__file__).parents[1]
+    for file in sorted([*root.rglob("*.py"), *root.rglob("*.toml")]):
+        place = file.relative_to(root).as_posix()
+        if place.partition("/")[0] not in UNREAD or place in READ:
+            state.update(f"{place}\0".encode() + file.read_bytes() + b"\0")
+    return f"{__version__}+{state.hexdigest()}"
+
+
+@dataclass(frozen=True)
+class TrainingIdentity:
+    """Everything that decides what a training gives.
+
+    Attributes:
+        job: the function that trains, as ``package.module:name``.
+        config: settings of network, task and training.
+        split: which recordings train, validate and are scored.
+        seed: of everything that is drawn.
+        epochs: to train; a rung of a race is a training of its own.
+        code: see `code_version`.
+        data: hash of the recordings.
+        environment: versions, machine and threads (`edp.storage.runs.environment`).
+    """
+
+    job: str
+    config: Mapping[str, Any]
+    split: Mapping[str, Any]
+    seed: int
+    epochs: int
+    code: str
+    data: str
+    environment: Mapping[str, str]
+
+    @cached_property
+    def key(self) -> str:
+        """Content address.
+
+        Raises:
+            NotFiniteError: a NaN or infinite setting.
+            ConfigError: a setting that is no plain value.
+        """
+        return digest_of(asdict(self))
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Record:
+    """What became of one training.
+
+    Attributes:
+        identity: what decided it.
+        status: how it ended.
+        result: plain values with finite numbers, where it is done.
+        message: what went wrong, else empty.
+        measured: what differs from repeat to repeat: seconds, memory, worker, attempts.
+    """
+
+    identity: TrainingIdentity
+    status: TrainingStatus
+    result: Mapping[str, Any] | None = None
+    message: str = ""
+    measured: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """Key of the identity."""
+        return self.identity.key
+
+    def told(self) -> list[Any]:
+        """What an equal training says again, to the bit."""
+        return [self.key, str(self.status), self.result, self.message]
+
+    def to_bytes(self) -> bytes:
+        """JSON on one line: a checksum, and the record in the canonical form that it is of."""
+        body = canonical({"schema": SCHEMA, "key": self.key} | asdict(self))
+        return f'{{"checksum":"{_checksum(body.encode())}","record":{body}}}\n'.encode()
+
+    @staticmethod
+    def from_bytes(data: bytes) -> Record:
+        """The record.
+
+        Raises:
+            ValueError: cut off or changed.
+            StorageError: written by a later version, or nothing that any version writes.
+        """
+        plain = object_with(parse_json(body_of(data).decode(), "a record"), ("schema",), "a record")
+        if plain["schema"] != SCHEMA:
+            raise StorageError(f"a record of schema {plain['schema']} was written by a later version of EDP; update it")
+        object_with(plain, PARTS, "a record")
+        parts = [one.name for one in fields(TrainingIdentity)]
+        held = object_with(plain["identity"], parts, "a record's identity")
+        measured = object_with(plain["measured"], (), "a record's measured part")
+        if not isinstance(plain["key"], str) or not isinstance(plain["message"], str):
+            raise StorageError("a record is damaged: its key or message is no text")
+        if not isinstance(plain["result"], dict | None):
+            raise StorageError("a record is damaged: its result is no table")
+        identity = TrainingIdentity(**{name: held[name] for name in parts})
+        identity.__dict__["key"] = plain["key"]  # the checksum covers it, so it is not hashed again
+        return Record(identity, TrainingStatus(plain["status"]), plain["result"], plain["message"], measured)
+
+
+def body_of(data: bytes) -> bytes:
+    """The canonical text in a record's bytes, its checksum verified; reading it takes longer than this.
+
+    Raises:
+        ValueError: cut off or changed.
+    """
+    if data[HEAD - len(BEFORE) : HEAD] != BEFORE or data[-2:] != b"}\n":
+        raise ValueError("it is cut off or is no record")
+    body = data[HEAD:-2]
+    if data[len(START) : len(START) + 32] != _checksum(body).encode():
+        raise ValueError("its checksum does not fit")
+    return body
+
+
+PARTS = ("schema", "key", "identity", "status", "result", "message", "measured")
+"""Of a record in its file."""
+RECORD_BYTES = 16 * 2**20
+"""Most that the file of a record has; a result is some hundred numbers."""
+START, BEFORE = b'{"checksum":"', b'","record":'
+HEAD = len(START) + 32 + len(BEFORE)
+
+
+def _checksum(body: bytes) -> str:
+    return hashlib.blake2b(body, digest_size=16).hexdigest()

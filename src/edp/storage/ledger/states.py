@@ -1,0 +1,61 @@
+"""What a training that is not over yet goes on from: a file beside its record, checksummed, and not kept for ever."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+from edp.storage.reading import read_bytes
+from edp.storage.writing import write_bytes
+
+SUFFIX = ".state"
+START = b"edp state 1 "
+STATE_BYTES = 4 * 2**30
+"""Most that the file of a state has: weights and optimiser of a network of 300 million parameters."""
+
+
+@dataclass(frozen=True)
+class WithState:
+    """What the function of a training returns where another training goes on from its end.
+
+    Attributes:
+        result: plain values, as of any training.
+        state: to go on from; not part of the record.
+    """
+
+    result: Mapping[str, Any]
+    state: bytes
+
+
+def leave_state(folder: str | Path, key: str, state: bytes) -> None:
+    """Keep a state for the coordinator, which takes it over with the record of the training.
+
+    Raises:
+        StorageError: the disk is full or the folder cannot be written.
+    """
+    write_bytes(left_state(folder, key), _head(key, state) + state)
+
+
+def left_state(folder: str | Path, key: str) -> Path:
+    """The file in which `leave_state` keeps it."""
+    return Path(folder, "arrived", f"{key}{SUFFIX}")
+
+
+def read_state(file: str | Path) -> bytes | None:
+    """The state in a file; None where there is no file or it is no whole state of the training that it is named for."""
+    path = Path(file)
+    try:
+        data = read_bytes(path, STATE_BYTES)
+    except StorageError:
+        return None
+    size = len(_head("0" * 32, b""))
+    state = data[size:]
+    return state if data[:size] == _head(path.stem, state) else None
+
+
+def _head(key: str, state: bytes) -> bytes:
+    return START + f"{key} {hashlib.blake2b(state, digest_size=16).hexdigest()}\n".encode()

@@ -1,0 +1,296 @@
+"""The ledger on disk: one file a training, written by one coordinator at a time."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from edp.errors import BusyError, ConfigError, StorageError
+from edp.storage.ledger.claims import free_dead_claims, whole
+from edp.storage.ledger.record import FINAL, RECORD_BYTES, SCHEMA, Record, TrainingStatus, body_of, canonical, digest_of
+from edp.storage.ledger.states import SUFFIX, left_state, read_state
+from edp.storage.locks import check_held, hold
+from edp.storage.reading import read_bytes, read_object
+from edp.storage.writing import make_folder, remove_unfinished, storage_error, write_bytes, write_json
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A file that is no whole record."""
+
+    file: Path
+    why: str
+
+
+def read_records(folder: str | Path) -> tuple[dict[str, Record], list[Damage]]:
+    """All records of a ledger, whoever holds it, and the damaged files; nothing is changed."""
+    whole, damaged = _read(Path(folder, "records"))
+    return {key: _taken_apart(Path(folder, "records", f"{key}.json"), whole[key]) for key in whole}, damaged
+
+
+def _taken_apart(file: Path, data: bytes) -> Record:
+    try:
+        return Record.from_bytes(data)
+    except (ValueError, StorageError) as error:
+        raise StorageError(
+            f"'{file}' has the right checksum and is no record of this version: {error}; remove it to have that "
+            "training done again"
+        ) from error
+
+
+def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
+    """Bytes of the whole records by key, not yet taken apart: with ten thousand that is most of the time."""
+    found: dict[str, bytes] = {}
+    damaged = []
+    names = sorted(name for name in os.listdir(folder) if name.endswith(".json")) if folder.is_dir() else []
+    for name in names:
+        key, file = name[: -len(".json")], f"{folder}/{name}"
+        try:
+            data = read_bytes(file, RECORD_BYTES)
+            body = body_of(data)
+            if f'"schema":{SCHEMA},"status":"'.encode() not in body[-48:]:
+                Record.from_bytes(data)  # says which schema it is
+            if f'"key":"{key}"'.encode() not in body:
+                raise ValueError("it holds the record of another training")
+            found[key] = data
+        except (ValueError, KeyError, TypeError) as error:
+            damaged.append(Damage(Path(file), str(error)))
+        except StorageError as error:
+            if not os.path.lexists(file):  # set apart by its holder since it was listed
+                continue
+            if os.path.isfile(file):
+                raise
+            damaged.append(Damage(Path(file), str(error)))
+    return found, damaged
+
+
+@dataclass(frozen=True)
+class Opening:
+    """One look into a lock-box: who was judged, why, and when."""
+
+    box: str
+    judged: tuple[str, ...]
+    why: str
+    time: str
+
+
+def _opening(file: Path) -> Opening:
+    held = read_object(file, (part.name for part in fields(Opening)))
+    judged = held["judged"]
+    if not isinstance(judged, list) or not all(isinstance(key, str) for key in judged):
+        raise StorageError(f"'{file}' is damaged: judged must be a list of keys; restore it")
+    return Opening(str(held["box"]), tuple(judged), str(held["why"]), str(held["time"]))
+
+
+class Ledger:
+    """A ledger that this process, the coordinator, writes; a second one is refused.
+
+    Folders in it: ``records``, one file a training; ``arrived``, what workers left that is not entered yet; ``claims``,
+    trainings under way; ``states``, what trainings go on from that are not over yet; ``quarantine``, damaged files;
+    ``set_aside``, records of trainings to be tried again.
+
+    Args:
+        folder: made when absent.
+
+    Attributes:
+        damaged: what was set apart on opening; these trainings count as not done.
+
+    Raises:
+        BusyError: another process coordinates here; exit code 75.
+        StorageError: the folder cannot be used.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.path = make_folder(folder)
+        try:
+            self._lock = hold(self.path / ".lock")
+        except BusyError as error:
+            holder = str(error).rpartition("process ")[2]
+            raise BusyError(
+                f"'{self.path}' is coordinated by process {holder}; wait for it, stop it, or choose another folder"
+            ) from None
+        try:
+            for part in ("records", "arrived", "states"):
+                remove_unfinished(make_folder(self.path / part))
+            free_dead_claims(self.path)
+            self._enter_arrivals()
+            self._unread, self.damaged = _read(self.path / "records")
+            self._records: dict[str, Record] = {}
+            for damage in self.damaged:
+                self._move(damage.file, "quarantine")
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Ledger:
+        """The ledger itself; leaving the block lets another process coordinate."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Let go."""
+        self.close()
+
+    def close(self) -> None:
+        """Let another process coordinate."""
+        self._lock.close()
+
+    def __len__(self) -> int:
+        return len({*self._records, *self._unread})
+
+    def __iter__(self) -> Iterator[Record]:
+        """Records in the order of their keys."""
+        for key in list(self._unread):
+            self.get(key)
+        return iter([self._records[key] for key in sorted(self._records)])
+
+    def get(self, key: str) -> Record | None:
+        """What became of a training, lost ones too."""
+        if key in self._unread:
+            self._records[key] = _taken_apart(self.path / "records" / f"{key}.json", self._unread.pop(key))
+        return self._records.get(key)
+
+    def finished(self, key: str) -> Record | None:
+        """What became of a training that is not to be tried again."""
+        record = self.get(key)
+        return record if record is not None and record.status in FINAL else None
+
+    def put(self, record: Record) -> None:
+        """Enter a training, and the state that it left; on disk when this returns.
+
+        Raises:
+            StorageError: the disk is full (earlier records stay, nothing half written is left), or the ledger holds
+                another end of the same training.
+        """
+        check_held(self.path / ".lock", self._lock)
+        held = self.finished(record.key)
+        if held is not None and held.told() != record.told():
+            raise StorageError(
+                f"training {record.key} is in '{self.path}' as {held.status} and came again, {record.status}, with "
+                "another result; equal trainings must give equal results: is something not in its key?"
+            )
+        self._take_state(record.key)
+        if held is None:
+            write_bytes(self.path / "records" / f"{record.key}.json", record.to_bytes())
+            self._records[record.key] = record
+        (self.path / "arrived" / f"{record.key}.json").unlink(missing_ok=True)
+
+    def state(self, key: str) -> Path | None:
+        """The file with the state that a training left, where it is whole; a damaged one is set apart."""
+        file = self.path / "states" / f"{key}{SUFFIX}"
+        if not file.exists():
+            return None
+        if read_state(file) is None:
+            self._move(file, "quarantine")
+            return None
+        return file
+
+    def keep_states(self, keys: Collection[str]) -> None:
+        """Remove all states but those of some trainings; records stay."""
+        for file in (self.path / "states").glob(f"*{SUFFIX}"):
+            if file.stem not in keys:
+                file.unlink(missing_ok=True)
+
+    def digest(self) -> str:
+        """Hash over all results; what is measured, such as seconds, is left out."""
+        return digest_of([record.told() for record in self])
+
+    def set_aside(self, statuses: Collection[TrainingStatus]) -> int:
+        """Put records away so that their trainings are tried again, for example after a cap was raised; how many."""
+        chosen = [record.key for record in self if record.status in statuses]
+        for key in chosen:
+            self._move(self.path / "records" / f"{key}.json", "set_aside")
+            del self._records[key]
+        return len(chosen)
+
+    def bind(self, facts: Mapping[str, Any]) -> bool:
+        """Bind the ledger to what it is about, such as data and search space; True where it was so bound before.
+
+        Raises:
+            ConfigError: it is bound to something else; the message says in which part. Nothing is changed.
+        """
+        file = self.path / "about.json"
+        canonical(facts)
+        wanted = json.loads(json.dumps(facts))
+        if not file.exists():
+            write_json(file, wanted)
+            return False
+        held = read_object(file)
+        other = sorted(part for part in {*held, *wanted} if held.get(part) != wanted.get(part))
+        if other:
+            raise ConfigError(
+                f"'{self.path}' was begun with other {' and '.join(other)}; nothing was changed. Go on with the same "
+                "ones, or choose another folder"
+            )
+        return True
+
+    def open_box(self, box: str, judged: Sequence[str], why: str, again: bool = False) -> Opening:
+        """Record that held-out recordings are looked at; the same look again, after a stop, counts once.
+
+        Args:
+            box: name of the lock-box.
+            judged: keys of what is judged on it.
+            why: a sentence for the report.
+            again: allow a further look at other things; it is recorded, too, and weakens what the box can show.
+
+        Raises:
+            ConfigError: the box was opened before for something else.
+        """
+        before = self.openings(box)
+        for opening in before:
+            if opening.judged == tuple(judged):
+                return opening
+        if before and not again:
+            raise ConfigError(
+                f"lock-box '{box}' was opened on {before[0].time} ({before[0].why}) for other models; scores on it "
+                "would no longer be of unseen recordings. Judge on other recordings, or say that it is opened again"
+            )
+        opening = Opening(box, tuple(judged), why, time.strftime("%Y-%m-%dT%H:%M:%S%z"))
+        write_json(self.path / "openings" / f"{len(self.openings()) + 1:04d}.json", asdict(opening))
+        return opening
+
+    def openings(self, box: str | None = None) -> list[Opening]:
+        """Looks into one lock-box or all, oldest first."""
+        found = [_opening(file) for file in sorted((self.path / "openings").glob("*.json"))]
+        return [one for one in found if box in (None, one.box)]
+
+    def _enter_arrivals(self) -> None:
+        """Enter what workers had finished when the last coordinator was killed."""
+        for file in sorted((self.path / "arrived").glob("*.json")):
+            target = self.path / "records" / file.name
+            if whole(file) is None:
+                self._move(file, "quarantine")
+            elif whole(target) is None:  # absent, damaged or of a lost training
+                if os.path.lexists(target) and not target.is_file():
+                    self._move(target, "quarantine")
+                file.replace(target)
+            else:
+                file.unlink()
+        for file in (self.path / "arrived").glob(f"*{SUFFIX}"):
+            if whole(self.path / "records" / f"{file.stem}.json") is None:  # it will be trained again
+                file.unlink()
+            else:
+                self._take_state(file.stem)
+
+    def _take_state(self, key: str) -> None:
+        file = left_state(self.path, key)
+        try:
+            if file.exists():
+                file.replace(self.path / "states" / file.name)
+        except OSError as error:
+            raise storage_error(file, error, "move") from error
+
+    def _move(self, file: Path, folder: str) -> None:
+        target = make_folder(self.path / folder)
+        number = len(list(target.glob(f"{file.stem}.*")))
+        try:
+            file.replace(target / f"{file.stem}.{number}{file.suffix}")
+        except OSError as error:
+            raise storage_error(file, error, "move") from error

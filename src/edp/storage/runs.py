@@ -1,0 +1,136 @@
+"""Run folders: everything needed to repeat a training and to go on with it after a stop."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import sys
+import time
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from edp import __version__
+from edp.errors import BusyError, StorageError
+from edp.storage.locks import check_held, hold
+from edp.storage.reading import object_with, read_object
+from edp.storage.writing import make_folder, remove_unfinished, write_bytes, write_json
+
+RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
+
+
+def environment(threads: int) -> dict[str, str]:
+    """Versions and machine facts that can change a result; flat strings."""
+    facts = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
+    for name in RECORDED:
+        try:
+            facts[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            facts[name] = "absent"
+    return facts | {"threads": str(threads)}
+
+
+def run_key(config: Mapping[str, Any], data_digest: str) -> str:
+    """Content address of a run: equal settings, data and code version give an equal key."""
+    plain = {"config": config, "data": data_digest, "edp": __version__}
+    text = json.dumps(plain, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+class RunFolder:
+    """A folder that holds one run; locked while a process writes to it.
+
+    Args:
+        path: the folder; made when absent.
+
+    Raises:
+        BusyError: another process holds it.
+        StorageError: the folder cannot be made.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = make_folder(path)
+        try:
+            self._lock = hold(self.path / ".lock")
+        except BusyError as error:
+            holder = str(error).rpartition("process ")[2]
+            raise BusyError(
+                f"run folder '{self.path}' is in use by process {holder}; wait for it or choose another folder"
+            ) from None
+        remove_unfinished(self.path)
+
+    def __enter__(self) -> RunFolder:
+        """The folder itself; leaving the block frees the lock."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Free the lock."""
+        self._lock.close()
+
+    def file(self, name: str) -> Path:
+        """Path of a file in the folder."""
+        return self.path / name
+
+    def claim(self, key: str, config_text: str) -> bool:
+        """Bind the folder to a run; True when the same run was begun here before and can go on.
+
+        Raises:
+            StorageError: the folder holds a run with other settings, data or code version.
+        """
+        identity = self.file("run.json")
+        if identity.exists():
+            held = read_object(identity, ("key",))
+            if held["key"] != key:
+                raise StorageError(
+                    f"run folder '{self.path}' holds another run (other settings, data or version); nothing was "
+                    "changed. Choose another folder with --out, or remove this one"
+                )
+            return True
+        write_bytes(self.file("config.toml"), config_text.encode())
+        write_json(identity, {"schema": 1, "key": key, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")})
+        return False
+
+    def write_status(self, status: str, **facts: Any) -> None:
+        """Say where the run stands: ``running``, ``finished`` or ``diverged``, with facts that fit into JSON."""
+        check_held(self.file(".lock"), self._lock)
+        write_json(self.file("status.json"), {"status": status, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **facts})
+
+    def status(self) -> dict[str, Any]:
+        """Where the run stands; empty where nothing was written yet."""
+        held = self.file("status.json")
+        return read_object(held, ("status", "time")) if held.exists() else {}
+
+    def write_history(self, rows: list[dict[str, Any]]) -> None:
+        """Write all epochs so far, a JSON line each."""
+        check_held(self.file(".lock"), self._lock)
+        write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def read_provenance(folder: str | Path) -> dict[str, Any]:
+    """Where a run comes from, with all that the commands on a trained run need of it.
+
+    Raises:
+        StorageError: not a run folder, or its provenance is damaged.
+    """
+    file = Path(folder) / "provenance.json"
+    if not file.is_file():
+        raise StorageError(f"'{folder}' is not a run folder: it has no {file.name}; give the folder of edp train")
+    held = read_object(file, ("data", "seconds"))
+    data = object_with(held["data"], ("source", "reader", "digest"), f"'{file}', data,")
+    reader = object_with(data["reader"], ("path",), f"'{file}', data.reader,")
+    texts = {"data.reader.path": reader["path"], "data.digest": data["digest"], "data.source": data["source"]}
+    wrong = [name for name, value in texts.items() if not isinstance(value, str)]
+    wrong += [] if isinstance(held["seconds"], int | float) else ["seconds"]
+    if wrong:
+        raise StorageError(f"'{file}' is damaged: {', '.join(wrong)} is of another kind; restore it or train again")
+    return held
+
+
+def command_line() -> str:
+    """The command as a user would type it."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

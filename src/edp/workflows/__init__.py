@@ -1,0 +1,1 @@
+"""What users run, end to end: trainings, searches, compression, transfer, pre-training, adaptation, parity."""

@@ -1,0 +1,6 @@
+"""On-board adaptation of a run: fitted on its recordings, replayed on others."""
+
+from edp.workflows.adaptation.fit import adapt, fit_adaptation
+from edp.workflows.adaptation.replay import BINS, Replay, Replayed, motion_s, replay, replay_run
+
+__all__ = ["BINS", "Replay", "Replayed", "adapt", "fit_adaptation", "motion_s", "replay", "replay_run"]

@@ -1,0 +1,134 @@
+"""Fits the constants of an adaptation to a run's own recordings, and writes a run that has it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.errors import ConfigError, ExportError
+from edp.evaluation.controller import Budget
+from edp.ir.rls import Adaptation, AdaptationSpec
+from edp.ir.rls.constants import FEATURE_LIMIT
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
+from edp.signals import Kind
+from edp.storage import write_bytes, write_json
+from edp.storage.runs import RunFolder
+from edp.training import save_bundle
+from edp.workflows.adaptation.replay import replay
+from edp.workflows.train_evaluate import footprint_of, trained_run
+
+Rows = NDArray[np.float64]
+COPIED = ("config.toml", "history.jsonl")
+
+
+def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) -> tuple[Adaptation, dict[str, Any]]:
+    """Write a run whose network has an adaptation: it is exported with it and replayed with it.
+
+    Args:
+        run: run folder, in single precision or in whole numbers.
+        out: folder of the new run; one that `adapt` wrote is replaced.
+        spec: options.
+
+    Returns:
+        The adaptation, and what `replay_run` says of the run's test recordings.
+
+    Raises:
+        EdpError: not a run folder, a network whose predictions are not measured later, or a folder that holds another
+            run.
+    """
+    folder = Path(run)
+    bundle, _, provenance, data = trained_run(folder)
+    if (Path(out) / "run.json").exists():
+        raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
+    made = fit_adaptation(bundle.predictor, data, spec or AdaptationSpec())
+    with RunFolder(out) as target:
+        for name in COPIED:
+            if (folder / name).is_file():
+                write_bytes(target.file(name), (folder / name).read_bytes())
+        write_json(target.file("provenance.json"), provenance | {"adaptation": made.digest})
+        save_bundle(replace(bundle, adaptation=made), target.file("bundle"))
+        write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json(Budget()))
+        facts = replay(bundle.predictor, made, data.test).to_json(data.task, data.target_kinds)
+        write_json(target.file("adaptation.json"), facts)
+    return made, facts
+
+
+def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -> Adaptation:
+    """Scales, directions and units of an adaptation.
+
+    Directions are the leading principal components of the training inputs, standardised, without the targets
+    themselves, which are features of their own. Units are the spread of the network's errors on the validation part.
+
+    Raises:
+        ConfigError: a target is no input, so that it is not known whether a prediction came true; a horizon of 0; or
+            more directions than inputs.
+    """
+    task = data.task
+    hidden = [name for name in task.targets if name not in task.inputs]
+    if hidden:
+        raise ConfigError(
+            f"{', '.join(hidden)} is predicted, but not measured on board: no input of the network; nothing tells "
+            "whether a prediction came true, so it cannot adapt"
+        )
+    columns = tuple(task.inputs.index(name) for name in task.targets)
+    inputs = np.concatenate([part.inputs for part in data.train]).astype(np.float64)
+    offset, scale = inputs.mean(axis=0), _widths(inputs)
+    present = inputs[:, list(columns)]
+    middle = np.where([kind is Kind.VELOCITY for kind in data.target_kinds], 0.0, np.median(present, axis=0))
+    change, unit = _of_predictions(predictor, data.validation)
+    arrays = {
+        "offset": offset,
+        "scale": scale,
+        "directions": _directions((inputs - offset) / scale, columns, spec.rank),
+        "middle": middle,
+        "spread": _widths(present),
+        "change": change,
+        "unit": unit,
+    }
+    found = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in arrays.items()}
+    return Adaptation(spec=spec, rate_hz=task.rate_hz, horizons=task.horizons, columns=columns, **found)
+
+
+def _widths(rows: Rows) -> Rows:
+    """Standard deviations; 1 where nothing moves."""
+    found = rows.std(axis=0)
+    return np.where(found > 1e-9 * (1.0 + np.abs(rows).max(axis=0)), found, 1.0)
+
+
+def _directions(scaled: Rows, columns: Sequence[int], rank: int) -> Rows:
+    """Leading principal components ``(rank, inputs)``, each of them scaled to a spread of 1."""
+    cut = np.clip(scaled, -FEATURE_LIMIT, FEATURE_LIMIT)
+    cut[:, list(columns)] = 0.0
+    possible = int((cut.std(axis=0) > 0).sum())
+    if rank > possible:
+        raise ConfigError(f"adaptation: rank = {rank}, but only {possible} inputs besides the targets move; lower it")
+    values, vectors = np.linalg.eigh(np.cov(cut, rowvar=False))
+    chosen = np.argsort(values)[::-1][:rank]
+    axes = vectors[:, chosen] / np.sqrt(values[chosen])
+    signs = np.sign(axes[np.abs(axes).argmax(axis=0), range(rank)])
+    return np.asarray((axes * signs).T)
+
+
+def _of_predictions(predictor: Predictor, parts: Sequence[Series]) -> tuple[Rows, Rows]:
+    """Spread of predicted changes and of errors ``(horizon, target)``."""
+    skip, horizons = predictor.spec.window, predictor.task.horizons
+    changes: list[list[Rows]] = [[] for _ in horizons]
+    errors: list[list[Rows]] = [[] for _ in horizons]
+    for predicted, series in zip(stream_predictions(predictor, parts), parts, strict=True):
+        for h, k in enumerate(horizons):
+            made = predicted[skip : series.samples - k, h].astype(np.float64)
+            changes[h].append(made - series.targets[skip : series.samples - k])
+            errors[h].append(made - series.targets[skip + k :])
+    return _spreads(changes), _spreads(errors)
+
+
+def _spreads(parts: list[list[Rows]]) -> Rows:
+    return np.stack([_widths(np.concatenate(of)) for of in parts])

@@ -1,0 +1,166 @@
+"""Recordings through a network and its adaptation, tick by tick, as they would have been on board."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.errors import BundleError, DataError
+from edp.ir.rls import Adaptation, RlsCorrector, RlsState, RlsStatus
+from edp.logs.source import DataSource
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
+from edp.signals import KINDS, Kind
+from edp.training import load_bundle
+
+BINS = (0.0, 10.0, 30.0, 60.0)
+"""Seconds of motion from which errors are gathered, each up to the next."""
+Rows = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """One recording.
+
+    Attributes:
+        name: of the recording.
+        base: what the network predicts ``(time, horizon, target)``, SI units.
+        adapted: the same, corrected.
+        motion_s: seconds of motion before each tick ``(time,)``.
+        status: what the adaptation did at each tick ``(time,)``.
+        targets: what was measured ``(time, target)``, SI units.
+    """
+
+    name: str
+    base: Rows
+    adapted: Rows
+    motion_s: NDArray[np.float64]
+    status: NDArray[np.int64]
+    targets: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Recordings with the errors that count: ticks behind a whole window whose truth is known.
+
+    Attributes:
+        recordings: each of them.
+        horizons: ticks ahead.
+        skip: ticks of the start that do not count.
+        learned: at the end.
+    """
+
+    recordings: list[Replayed]
+    horizons: tuple[int, ...]
+    skip: int
+    learned: RlsState
+
+    def errors(self, of: str, horizon: int) -> list[tuple[Rows, NDArray[np.float64]]]:
+        """Absolute errors ``(tick, target)`` of ``base`` or ``adapted``, with the seconds of motion before each."""
+        place, found = self.horizons.index(horizon), []
+        for part in self.recordings:
+            made = getattr(part, of)[self.skip : len(part.targets) - horizon, place]
+            error = np.abs(made - part.targets[self.skip + horizon :])
+            found.append((error, part.motion_s[self.skip : len(part.targets) - horizon]))
+        return found
+
+    def mae(self, of: str, horizon: int, low: float = 0.0, high: float = np.inf) -> NDArray[np.float64] | None:
+        """MAE of each target ``(target,)`` from `low` to `high` seconds of motion, SI units; None without ticks."""
+        held = [error[(at >= low) & (at < high)] for error, at in self.errors(of, horizon)]
+        rows = np.concatenate(held)
+        return rows.mean(axis=0, dtype=np.float64) if len(rows) else None
+
+    def to_json(self, task: Task, kinds: Sequence[Kind]) -> dict[str, Any]:
+        """MAE by horizon and time in motion, in the units of reports, and how often the adaptation was taken back."""
+        facts = [KINDS[kind] for kind in kinds]
+        factors = np.array([fact.report_factor for fact in facts])
+        ends = [*BINS[1:], np.inf]
+        rows = []
+        for k in self.horizons:
+            for low, high in zip(BINS, ends, strict=True):
+                base, adapted = (self.mae(of, k, low, high) for of in ("base", "adapted"))
+                if base is not None and adapted is not None:
+                    values = {"base": list(base * factors), "adapted": list(adapted * factors)}
+                    rows.append({"horizon": k, "from_s": low, "to_s": None if np.isinf(high) else high, **values})
+        status = np.concatenate([part.status for part in self.recordings])
+        return {
+            "schema": 1,
+            "recordings": [part.name for part in self.recordings],
+            "targets": [{"name": n, "unit": f.report_unit} for n, f in zip(task.targets, facts, strict=True)],
+            "mae": rows,
+            "fallback": float((status == RlsStatus.FALLBACK).mean()),
+            "taught": int((status == RlsStatus.LEARNING).sum()),
+        }
+
+
+def motion_s(adaptation: Adaptation, targets: Rows) -> NDArray[np.float64]:
+    """Seconds of motion before each tick ``(time,)``, as the adaptation counts motion."""
+    moving = (np.abs(targets - adaptation.middle) > adaptation.rest).any(axis=1)
+    return np.concatenate([[0.0], np.cumsum(moving)[:-1]]) / adaptation.rate_hz
+
+
+def replay(
+    predictor: Predictor,
+    adaptation: Adaptation,
+    series: Sequence[Series],
+    carry: bool = False,
+    learn: bool = True,
+    on_recording: Callable[[str, int, int], None] | None = None,
+) -> Replay:
+    """Run recordings one after the other through a network and its adaptation.
+
+    Args:
+        predictor: the network; it starts anew with each recording.
+        adaptation: how it is corrected.
+        series: the recordings.
+        carry: keep what was learned from one recording to the next, as on one machine; else each starts from nothing.
+        learn: False freezes the adaptation.
+        on_recording: called with name, how many are done and of how many.
+
+    Raises:
+        DataError: no recording is longer than start-up and horizon.
+    """
+    skip = predictor.spec.window
+    if not any(part.samples > skip + adaptation.reach for part in series):
+        raise DataError(
+            f"no recording is longer than {skip + adaptation.reach} ticks, which start-up and horizon take; give longer"
+        )
+    adapter, made = RlsCorrector(adaptation), []
+    for done, (part, base) in enumerate(zip(series, stream_predictions(predictor, series), strict=True)):
+        if on_recording is not None:
+            on_recording(part.name, done, len(series))
+        adapter.interrupt()
+        if not carry:
+            adapter.reset()
+        adapted, status = np.empty_like(base), np.zeros(len(base), dtype=np.int64)
+        for tick, (x, y) in enumerate(zip(part.inputs, base, strict=True)):
+            adapted[tick], status[tick] = adapter.step(x, y, fresh=tick + 1 >= skip, learn=learn)
+        made.append(Replayed(part.name, base, adapted, motion_s(adaptation, part.targets), status, part.targets))
+    return Replay(made, adaptation.horizons, skip, adapter.learned)
+
+
+def replay_run(
+    run: str | Path,
+    source: DataSource,
+    carry: bool = False,
+    learn: bool = True,
+    on_recording: Callable[[str, int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Replay logs through a run that `edp adapt` wrote; see `replay`.
+
+    Raises:
+        EdpError: a run without adaptation, or logs that do not go with its network.
+    """
+    bundle = load_bundle(run)
+    if bundle.adaptation is None:
+        raise BundleError(f"'{run}' has no adaptation; edp adapt {run} --out FOLDER makes a run that has one")
+    series = [bundle.task.series(recording) for recording in source.read()]
+    found = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording)
+    return found.to_json(bundle.task, bundle.target_kinds)

@@ -1,0 +1,109 @@
+"""Orders of smaller networks as plain values, and the bench that carries them out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.networks.narrow import student, width_of
+from edp.networks.predictor import ModelSpec, Predictor
+from edp.training.fit import fit
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import TrainingStrategy
+from edp.workflows.compression.distillation import Distillation, DistillationSpec
+from edp.workflows.compression.pruning import prune
+from edp.workflows.compression.qat import QuantisationAware, RoundingSpec
+
+# Training with rounded numbers goes on from a trained network: shorter, and in smaller steps.
+TUNING_EPOCHS, TUNING_RATE = 1 / 3, 1 / 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressionRequest:
+    """A training that makes a smaller network of a teacher.
+
+    Attributes:
+        name: of the network.
+        units: its width; that of the teacher keeps all of it.
+        levels: convolution levels; None as `student` chooses.
+        pruned: begin with what pruning leaves of the teacher, which needs all its levels.
+        distillation: the objective.
+        rounding: what is rounded in training, which goes on from `of`.
+        of: the order whose network a rounded training goes on from; None for the teacher itself.
+    """
+
+    name: str
+    units: int
+    levels: int | None = None
+    pruned: bool = False
+    distillation: DistillationSpec = field(default_factory=DistillationSpec)
+    rounding: RoundingSpec | None = None
+    of: CompressionRequest | None = None
+
+    def model(self, teacher: ModelSpec) -> ModelSpec:
+        """The network's settings."""
+        if self.of is not None:
+            return self.of.model(teacher)
+        if self.units == width_of(teacher) and self.rounding is not None:
+            return teacher
+        channels = getattr(teacher.backbone, "channels", None)
+        every = None if channels is None else len(channels)
+        return student(teacher, self.units, every if self.pruned else self.levels)
+
+    def training(self, spec: TrainingSpec) -> TrainingSpec:
+        """How it is trained, where a network is trained with `spec`."""
+        if self.rounding is None:
+            return spec
+        return tuning(spec)
+
+    def lesson(
+        self, teachers: Sequence[Predictor], data: Prepared, start: Predictor | None, further: Sequence[Series] = ()
+    ) -> TrainingStrategy:
+        """What the training has besides its data; `start` is the network of `of`.
+
+        Raises:
+            ConfigError: teachers that contradict one another, or a network that cannot be pruned.
+        """
+        narrow = prune(teachers[0], self.model(teachers[0].spec), data.train) if self.pruned else None
+        lesson = Distillation(teachers, self.distillation, further, narrow)
+        if self.rounding is None:
+            return lesson
+        return QuantisationAware(teachers[0] if start is None else start, lesson, self.rounding)
+
+
+def tuning(spec: TrainingSpec) -> TrainingSpec:
+    """A third of the epochs, and a fifth of the learning rate where the optimiser has one."""
+    optimizer: Any = spec.optimizer
+    if any(entry.name == "learning_rate" for entry in fields(optimizer)):
+        optimizer = replace(optimizer, learning_rate=TUNING_RATE * optimizer.learning_rate)
+    return replace(spec, epochs=max(1, round(TUNING_EPOCHS * spec.epochs)), optimizer=optimizer)
+
+
+class Bench:
+    """A teacher, data and how to train; what is ordered twice is trained once.
+
+    Args:
+        teacher: the trained network.
+        data: series to train on and to choose epochs by; the test part is not touched.
+        training: how a network is trained.
+    """
+
+    def __init__(self, teacher: Predictor, data: Prepared, training: TrainingSpec) -> None:
+        self.teacher, self.data, self.training = teacher, data, training
+        self._made: dict[CompressionRequest, Predictor] = {}
+
+    def network(self, order: CompressionRequest) -> Predictor:
+        """The network of an order, trained now or before."""
+        if order not in self._made:
+            start = None if order.of is None else self.network(order.of)
+            self._made[order] = self.train(order, start)
+        return self._made[order]
+
+    def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
+        """Carry out an order; `start` is the network that it goes on from."""
+        lesson = order.lesson([self.teacher], self.data, start)
+        spec = order.training(self.training)
+        return fit(self.data, order.model(self.teacher.spec), spec, lesson=lesson).predictor

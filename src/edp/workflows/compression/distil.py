@@ -1,0 +1,157 @@
+"""From a run to a run of a smaller network that learned from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from edp.config.experiment import Experiment, load_experiment, plain_tree
+from edp.data.frozen import frozen_before, frozen_of, keep_frozen, refuse_frozen
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.data.unlabelled import unlabelled
+from edp.errors import ConfigError, StorageError
+from edp.logs.source import DataSource
+from edp.networks.losses import LOSSES
+from edp.networks.predictor import Predictor
+from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, whole
+from edp.storage.runs import read_provenance
+from edp.training import Bundle, TrainingProgress, load_bundle
+from edp.training.bundle import weights_digest
+from edp.training.strategy import TrainingStrategy
+from edp.workflows.compression.bench import CompressionRequest
+from edp.workflows.compression.distillation import DistillationSpec
+from edp.workflows.compression.qat import RoundingSpec
+from edp.workflows.train_evaluate import StrategyFactory, train
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistilSpec:
+    """What is made of a run.
+
+    Attributes:
+        units: width of the student.
+        levels: convolution levels; None for one less than the teacher has.
+        pruned: begin with what pruning leaves of the teacher.
+        distillation: the objective.
+        teachers: run folders or bundles of further teachers.
+        further: where recordings without truth are; the student learns what the teachers say of them.
+        changes: settings of the training that differ from the run's, as ``key.path=value``.
+    """
+
+    units: int
+    levels: int | None = None
+    pruned: bool = False
+    distillation: DistillationSpec = field(default_factory=DistillationSpec)
+    teachers: tuple[str, ...] = ()
+    further: DataSource | None = None
+    changes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_bounds("distil", self, units=whole(1, MOST_UNITS), levels=whole(1, MOST_LEVELS))
+
+
+def distil(
+    run: str | Path,
+    spec: DistilSpec,
+    out: str | Path,
+    source: DataSource | None = None,
+    on_event: Callable[[TrainingProgress], None] | None = None,
+) -> Bundle:
+    """Train a student of a run and write a run folder; an interrupted one goes on where it stopped.
+
+    Args:
+        run: run folder of the teacher.
+        spec: what is made of it.
+        out: run folder of the student.
+        source: recordings to learn on; by default those of the run.
+        on_event: called with progress.
+
+    Raises:
+        EdpError: not a run, a student that is no smaller, teachers that contradict one another, other data or settings
+            in `out`.
+    """
+    teacher, experiment, own = read_run(run, spec.changes)
+    if spec.pruned and spec.levels is not None:
+        raise ConfigError("a pruned student keeps all levels of its teacher; leave out the levels, or the pruning")
+    order = CompressionRequest(
+        name="student", units=spec.units, levels=spec.levels, pruned=spec.pruned, distillation=spec.distillation
+    )
+    model = order.model(teacher.spec)
+    if model == teacher.spec:
+        raise ConfigError(f"a student of {spec.units} units is the teacher itself; take fewer units or levels")
+    teachers = [teacher, *(load_bundle(path).predictor for path in spec.teachers)]
+    frozen = frozen_sessions(run, experiment)
+    series, digests = _unlabelled(teacher, spec.further, frozen)
+    facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
+
+    def lesson(data: Prepared) -> TrainingStrategy:
+        return order.lesson(teachers, data, None, series)
+
+    made = replace(experiment, model=model)
+    return train(source or own, made, out, on_event, StrategyFactory(facts, lesson, frozen))
+
+
+def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, Experiment, DataSource]:
+    """Network, settings and recordings of a run, or of the run that a bundle lies in.
+
+    Raises:
+        EdpError: not a run folder.
+    """
+    folder = _run_folder(run)
+    bundle = load_bundle(folder)
+    for name in ("config.toml", "provenance.json"):
+        if not (folder / name).is_file():
+            raise StorageError(
+                f"'{folder}' is not a run folder: it has no {name}, which says how the network was trained; give the "
+                "folder of edp train"
+            )
+    experiment = load_experiment(folder / "config.toml", None, changes)
+    before = load_experiment(folder / "config.toml", None)
+    if experiment.task != before.task or experiment.model != bundle.predictor.spec:
+        raise ConfigError(
+            "settings of the task or the model cannot be changed here: a student has those of its teacher"
+        )
+    keep_frozen(before.split, experiment.split)
+    return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder)["data"]["reader"])
+
+
+def frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:
+    """Names by digest of the sessions that stay frozen for what comes of a run: of its split and of runs before it."""
+    return frozen_before(read_provenance(_run_folder(run))) | frozen_of(experiment.split)
+
+
+def _run_folder(run: str | Path) -> Path:
+    """The folder of a run, or of the run that a bundle lies in."""
+    folder = Path(run)
+    inside = (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file()
+    return folder.parent if inside else folder
+
+
+def order_facts(order: CompressionRequest) -> dict[str, Any]:
+    """Plain values that decide what an order teaches."""
+    plain = asdict(order.distillation) | {"soft": _loss(order.distillation)}
+    rounding: RoundingSpec | None = order.rounding
+    return {
+        "units": order.units,
+        "levels": order.levels,
+        "pruned": order.pruned,
+        "distillation": plain,
+        "rounding": None if rounding is None else asdict(rounding),
+    }
+
+
+def _loss(spec: DistillationSpec) -> Any:
+    """The soft loss with its name; a loss that is not registered, such as the softmax form, by its class."""
+    name = next((key for key, kind in LOSSES.items() if kind is type(spec.soft)), type(spec.soft).__name__)
+    return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}
+
+
+def _unlabelled(
+    teacher: Predictor, source: DataSource | None, frozen: dict[str, str]
+) -> tuple[list[Series], list[str]]:
+    recordings = [] if source is None else source.read()
+    refuse_frozen(recordings, frozen, "the student would learn from it")
+    return [unlabelled(teacher.task, entry) for entry in recordings], [entry.digest for entry in recordings]

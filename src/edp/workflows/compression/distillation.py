@@ -1,0 +1,181 @@
+"""Distillation: a network learns from the truth and from what larger networks say of the same ticks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.errors import ConfigError, DataError
+from edp.networks.losses import Huber, LossSpec, Prediction, masked_loss
+from edp.networks.losses.base import POINT
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_hidden, stream_predictions
+from edp.settings.bounds import MOST_UNITS, MOST_WEIGHT, WEIGHT, below, check_bounds, span, whole
+from edp.training.objective import Objective
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import BatchContext
+from edp.training.warm_start import check_same_ends, continue_from
+from edp.workflows.compression.hints import Components, hint_error
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftmaxDivergence:
+    """The literal form of eq. 2.23: ``T^2 KL(softmax(teacher / T) || softmax(student / T))`` over the outputs.
+
+    Predictions are no logits. The softmax over the outputs of a horizon forgets what they have in common: a student
+    that is wrong by the same amount everywhere has no loss. It is here for comparison; the truth has to hold the level.
+
+    Attributes:
+        temperature: T, in standard deviations of the targets.
+
+    Raises:
+        ConfigError: temperature is not positive.
+    """
+
+    outputs: ClassVar[tuple[str, ...]] = (POINT,)
+
+    temperature: float = 2.0
+
+    def __post_init__(self) -> None:
+        check_bounds("softmax divergence", self, temperature=WEIGHT)
+
+    def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
+        """Terms of the divergence times the number of outputs, so that their mean is the divergence."""
+        student = torch.log_softmax(answer.center / self.temperature, dim=-1)
+        teacher = torch.log_softmax(target / self.temperature, dim=-1)
+        scale = self.temperature**2 * target.shape[-1]
+        return scale * teacher.exp() * (teacher - student)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillationSpec:
+    """The dual objective (eq. 2.23): ``truth * hard + (1 - truth) * soft + hint * hidden``.
+
+    Attributes:
+        truth: alpha, weight of the truth; 0 learns from the teachers alone.
+        soft: what is made small between student and teachers: a loss of point predictions, or `SoftmaxDivergence`.
+        hint: weight of the hidden-feature hint; 0 for none.
+        components: principal components of the teachers' hidden features that the hint compares.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    truth: float = 0.5
+    soft: LossSpec = field(default_factory=Huber)
+    hint: float = 0.0
+    components: int = 16
+
+    def __post_init__(self) -> None:
+        if not below(0.0, 1.0).holds(self.truth):
+            raise ConfigError(
+                f"distillation: truth = {self.truth}; 0 <= truth < 1 must hold (with 1 there is no teacher: train)"
+            )
+        check_bounds("distillation", self, hint=span(0.0, MOST_WEIGHT), components=whole(1, MOST_UNITS))
+
+
+class Distillation:
+    """A lesson of teachers: what they say of each tick is found once, as a stream from the start of its recording.
+
+    Several teachers say the mean of their predictions in SI units. They may differ from the student and from one
+    another in everything but inputs, targets, horizons and rate. Where an augmentation changes the inputs, the student
+    sees the changed ones and learns what the teachers said of the recorded ones.
+
+    Args:
+        teachers: trained networks.
+        spec: the objective.
+        further: series without truth, see `edp.data.unlabelled`; the student learns what the teachers say of them.
+        start: a network of the student's own specs to begin with, for example a pruned one.
+
+    Raises:
+        ConfigError: no teacher, or teachers that read or predict different things.
+    """
+
+    def __init__(
+        self,
+        teachers: Sequence[Predictor],
+        spec: DistillationSpec | None = None,
+        further: Sequence[Series] = (),
+        start: Predictor | None = None,
+    ) -> None:
+        if not teachers:
+            raise ConfigError("distillation: no teacher; give at least one trained network")
+        self.teachers, self.spec, self.further, self.start = list(teachers), spec or DistillationSpec(), further, start
+        for number, teacher in enumerate(self.teachers[1:], start=2):
+            check_same_ends(teacher.task, self.teachers[0].task, f"teacher {number}", "teacher 1")
+        task = self.teachers[0].task
+        self.said = len(task.horizons) * len(task.targets)
+        self.components: Components | None = None
+
+    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+        """All series with their lesson: a mark whether there is truth, predictions in SI units, hidden components."""
+        check_same_ends(task, self.teachers[0].task, "the student", "the teacher")
+        if self.spec.hint and self.components is None:
+            self.components = Components.fitted((self._hidden(part) for part in known), self.spec.components)
+        marked = [(part, True) for part in known] + [(part, False) for part in self.further]
+        return [self._taught(part, truth) for part, truth in marked]
+
+    def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
+        """Copy the start's weights and scaling, where there is one; refuse a hint that batches are too small for."""
+        if self.spec.hint:
+            chunks = spec.chunks
+            ticks = chunks.batch * (chunks.length if chunks.regime == "chunk" else 1)
+            width = int(net.forward_features(*_one_tick(net))[2].shape[-1])
+            if ticks < 4 * width:
+                raise ConfigError(
+                    f"distillation: a batch has {ticks} ticks with a loss, too few to compare {width} hidden features "
+                    f"with the teachers' (hint = {self.spec.hint}); {4 * width} or more must hold: take larger batches "
+                    "or hint = 0"
+                )
+        if self.start is None:
+            return False
+        continue_from(net, self.start)
+        return True
+
+    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+        """The dual objective of a batch; ticks without truth count for the teachers only."""
+        spec, teacher_targets = self.spec, moment.teacher_targets
+        labelled = moment.valid & (teacher_targets[..., 0] > 0.5)
+        said = teacher_targets[..., 1 : 1 + self.said].unflatten(-1, moment.future.shape[2:])
+        target = objective.code.encode(said, moment.features)
+        loss = (1.0 - spec.truth) * masked_loss(spec.soft, moment.answer, target, moment.valid, objective.weights)
+        if spec.truth:
+            loss = loss + spec.truth * objective.evaluate(moment.answer, moment.future, moment.features, labelled)
+        if spec.hint:
+            loss = loss + spec.hint * hint_error(moment.hidden, teacher_targets[..., 1 + self.said :], moment.valid)
+        return loss
+
+    def end(self, net: Predictor) -> None:
+        """Nothing was done to the network but to its weights."""
+
+    def _taught(self, part: Series, truth: bool) -> Series:
+        answers = [stream_predictions(teacher, [part])[0] for teacher in self.teachers]
+        mean = np.mean(np.stack(answers), axis=0, dtype=np.float64).reshape(part.samples, -1)
+        if not np.isfinite(mean).all():
+            raise DataError(
+                f"distillation: a teacher's prediction for '{part.name}' is not finite; look at the recording with "
+                "edp inspect"
+            )
+        columns = [np.full((part.samples, 1), truth), mean]
+        if self.components is not None:
+            columns.append(self.components.project(self._hidden(part)))
+        # What stands in the place of targets without truth may be no number, and NaN times a mask of zero is NaN.
+        targets = part.targets if truth else np.zeros_like(part.targets)
+        return replace(part, targets=targets, teacher_targets=np.concatenate(columns, axis=1).astype(np.float32))
+
+    def _hidden(self, part: Series) -> NDArray[np.float32]:
+        """Hidden features of all teachers side by side, ``(time, width)``."""
+        return np.concatenate([stream_hidden(teacher, [part])[0] for teacher in self.teachers], axis=1)
+
+
+def _one_tick(net: Predictor) -> tuple[Tensor, object]:
+    x = torch.zeros(1, 1, len(net.task.inputs))
+    return x, net.initial_state(1, x)

@@ -1,0 +1,123 @@
+"""One smaller network in one number format, judged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from edp.data.prepared import Prepared
+from edp.evaluation.controller import Budget
+from edp.evaluation.judge import score_predictions
+from edp.stats.pareto import pareto
+from edp.workflows.compression.bench import CompressionRequest
+from edp.workflows.compression.formats.base import FORMATS, Deployed, ResourceUsage
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A row of the search.
+
+    Attributes:
+        name: of the network and its format.
+        way: how it was made, in words.
+        number_format: a name of `FORMATS`.
+        taken: what it takes of the controller.
+        over: limits that it exceeds: what it takes, and what is granted.
+        scores: on the validation part in its format, by horizon: ``mae`` and ``composite``, report units.
+        before: the same in float32.
+        error: MAE over the teacher's in float32, the mean over horizons.
+        run: folder of the network's run.
+    """
+
+    name: str
+    way: str
+    number_format: str
+    taken: ResourceUsage
+    over: Mapping[str, tuple[int, int]]
+    scores: Mapping[str, Mapping[str, float]]
+    before: Mapping[str, Mapping[str, float]]
+    error: float
+    run: str
+
+    @property
+    def fits(self) -> bool:
+        """Whether it fits the budget."""
+        return not self.over
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        label = FORMATS[self.number_format].label
+        return vars(self) | {"taken": vars(self.taken), "fits": self.fits, "label": label}
+
+
+@dataclass(frozen=True, eq=False)
+class CompressionResult:
+    """What a search came to.
+
+    Attributes:
+        teacher: the teacher in float32.
+        rows: all networks in all formats, in the order in which they were made.
+        front: places of the rows that no other one betters in error, cycles and bytes of parameters.
+        chosen: place of the row that fits with the least error; None where none fits.
+        box: scores of teacher and chosen on recordings that took part in no choice, by horizon.
+        notes: what was left out, and why.
+    """
+
+    teacher: Judged
+    rows: list[Judged]
+    front: list[int]
+    chosen: int | None
+    box: Mapping[str, Any] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+
+    @property
+    def best(self) -> Judged | None:
+        """The chosen row."""
+        return None if self.chosen is None else self.rows[self.chosen]
+
+
+def measure(deployed: Deployed, data: Prepared, skip: int) -> dict[str, dict[str, float]]:
+    """Mean absolute error and composite score on ``data.test`` by horizon, the mean over outputs, report units."""
+    overall = score_predictions(deployed.predict(data.test), data, skip)["overall"]
+    return {
+        horizon: {key: float(found["mean"][key]) for key in ("mae", "composite")} for horizon, found in overall.items()
+    }
+
+
+def on_validation(data: Prepared) -> Prepared:
+    """The same data with the validation part in the place of the test part."""
+    return replace(data, test=data.validation)
+
+
+def relative(scores: Mapping[str, Mapping[str, float]], teacher: Mapping[str, Mapping[str, float]]) -> float:
+    """MAE over that of the teacher, the mean over horizons."""
+    return float(np.mean([scores[horizon]["mae"] / max(row["mae"], 1e-30) for horizon, row in teacher.items()]))
+
+
+def choose(rows: Sequence[Judged]) -> tuple[list[int], int | None]:
+    """The front of error, cycles and bytes, and of what fits the row with the least error (of equals the cheapest)."""
+    points = [(row.error, row.taken.cycles[2], row.taken.parameter_bytes) for row in rows]
+    fitting = [place for place, row in enumerate(rows) if row.fits]
+    best = min(fitting, key=lambda place: points[place], default=None)
+    return pareto(points), best
+
+
+def way_of(order: CompressionRequest) -> str:
+    """How an order makes its network, in words."""
+    levels = "pruned and distilled" if order.pruned else "distilled"
+    if order.rounding is None:
+        return levels
+    begun = "teacher" if order.of is None else way_of(order.of)
+    return f"{begun}, trained on rounded"
+
+
+def deployed_row(
+    name: str, order: CompressionRequest | None, deployed: Deployed, scores: tuple[Any, Any], budget: Budget, run: str
+) -> Judged:
+    """A row without its error, which needs the teacher; `scores` are in its format and in float32."""
+    way = "teacher" if order is None else way_of(order)
+    over = deployed.taken.over(budget)
+    return Judged(name, way, deployed.number_format, deployed.taken, over, scores[0], scores[1], float("nan"), run)

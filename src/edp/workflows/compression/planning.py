@@ -1,0 +1,194 @@
+"""Which smaller networks a search makes, and a budget that no network of this kind meets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.errors import ConfigError, ExportError
+from edp.evaluation.controller import Budget
+from edp.networks.narrow import student, width_of
+from edp.networks.predictor import ModelSpec, Predictor, build_model
+from edp.training.bundle import blank_scaler
+from edp.workflows.compression.bench import CompressionRequest
+from edp.workflows.compression.formats.base import FORMATS, ResourceUsage, taken
+from edp.workflows.compression.pruning import check_pruning
+from edp.workflows.compression.variants import rounded_order
+
+STEP = 4  # widths are multiples of it: what kernels compute at a time
+WAYS = ("distilled", "pruned")  # and the better one is trained on with rounded numbers
+SHARES = (1.0, 0.5, 0.25)  # of the widest that fits: the front below it
+
+
+@dataclass(frozen=True)
+class CompressionPlan:
+    """What is to be made.
+
+    Attributes:
+        orders: the ways to each width, widest first.
+        formats: in which a network can be.
+        notes: what was left out, and why.
+    """
+
+    orders: Mapping[int, tuple[CompressionRequest, ...]]
+    formats: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def rounds(self) -> bool:
+        """Whether training with rounded numbers is of use."""
+        return any(FORMATS[name].rounded for name in self.formats)
+
+    @property
+    def trainings(self) -> int:
+        """How many there are."""
+        return sum(len(ways) + self.rounds for ways in self.orders.values())
+
+    def tuned(self, best: CompressionRequest) -> list[CompressionRequest]:
+        """What is made of the better way of a width."""
+        return [rounded_order(best)] if self.rounds else []
+
+
+def make_plan(
+    teacher: Predictor,
+    budget: Budget,
+    units: Sequence[int] = (),
+    formats: Sequence[str] = (),
+    ways: Sequence[str] = WAYS,
+    shares: Sequence[float] = SHARES,
+) -> CompressionPlan:
+    """Plan a search: the widest network that fits in each format, and its halves and quarters.
+
+    Args:
+        teacher: the network; its weights need not be trained.
+        budget: what the controller grants.
+        units: widths to make; none given, they are planned.
+        formats: names of number formats; none given, all.
+        ways: some of `WAYS`.
+        shares: of the widest that fits; each plans a width.
+
+    Raises:
+        ConfigError: an unknown format or way, a width that is none, or a budget that no network of this kind meets.
+    """
+    full = width_of(teacher.spec)
+    unknown = [way for way in ways if way not in WAYS]
+    if unknown or not ways:
+        raise ConfigError(f"ways = {', '.join(unknown) or 'none'}; some of {', '.join(WAYS)} must hold")
+    wrong = [width for width in units if not 1 <= width <= full]
+    if wrong:
+        raise ConfigError(
+            f"units = {', '.join(map(str, wrong))}; 1 <= units <= {full}, those of the teacher, must hold"
+        )
+    possible = [width for width in sorted({1, 2, full, *range(STEP, full, STEP)}) if width <= full]
+    possible = [width for width in possible if not _why_not(teacher, _narrow(teacher.spec, width))]
+    able, notes = _able(teacher, possible[0], formats or list(FORMATS))
+    fitting = {name: _widest(teacher, name, budget, possible) for name in able}
+    if not any(fitting.values()):
+        raise ConfigError(_refusal(teacher, budget, able, possible[0]))
+    for name, width in fitting.items():
+        if not width:
+            notes.append(f"no width fits the budget in {FORMATS[name].label}")
+    tops = set(fitting.values()) - {0}
+    goals = {max(tops) * share for share in shares}
+    widths = set(units) or tops | {max([width for width in possible if width <= goal] or tops) for goal in goals}
+    orders = {width: _orders(teacher, width, ways, notes) for width in sorted(widths - {full}, reverse=True)}
+    return CompressionPlan(orders, tuple(able), tuple(dict.fromkeys(notes)))
+
+
+def _orders(teacher: Predictor, width: int, ways: Sequence[str], notes: list[str]) -> tuple[CompressionRequest, ...]:
+    """The ways to a network of this width; why there are no others is noted."""
+    both = {
+        "distilled": CompressionRequest(name=f"u{width}", units=width),
+        "pruned": CompressionRequest(name=f"p{width}", units=width, pruned=True),
+    }
+    orders = [order for way, order in both.items() if way in ways]
+    try:
+        check_pruning(teacher.spec, _narrow(teacher.spec, width))
+    except ConfigError as error:
+        notes.append(str(error))
+        orders = [both["distilled"]]
+    why = {order: _why_not(teacher, order.model(teacher.spec)) for order in orders}
+    notes += [f"{way.name} is left out: {reason}" for way, reason in why.items() if reason]
+    able = tuple(way for way, reason in why.items() if not reason)
+    if not able:
+        raise ConfigError("; ".join(reason for reason in why.values() if reason))
+    return able
+
+
+def _why_not(teacher: Predictor, model: ModelSpec) -> str:
+    """Why a network of these settings cannot be built; empty where it can."""
+    try:
+        _untrained(model, teacher.task)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def _able(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The formats that have a form for every part of the network, and why the others have none."""
+    net = _untrained(_narrow(teacher.spec, least), teacher.task)
+    drawn = np.random.default_rng(0).normal(size=(2 * net.spec.window, len(net.task.inputs))).astype(np.float32)
+    series = [Series("drawn", drawn, np.zeros((len(drawn), len(net.task.targets)), dtype=np.float32))]
+    able, notes = [], []
+    for name in formats:
+        try:
+            FORMATS[name]().predictions(net, series)
+        except ExportError as error:
+            notes.append(f"number format '{name}' is left out: {error}")
+        else:
+            able.append(name)
+    if not able:
+        raise ConfigError("; ".join(notes))
+    return able, notes
+
+
+def _narrow(model: ModelSpec, units: int) -> ModelSpec:
+    """A student with all levels of the teacher."""
+    channels = getattr(model.backbone, "channels", None)
+    return student(model, units, None if channels is None else len(channels))
+
+
+def _untrained(model: ModelSpec, task: Task) -> Predictor:
+    return build_model(task, model, blank_scaler(task), seed=0)
+
+
+def _taken(teacher: Predictor, units: int, name: str, budget: Budget) -> ResourceUsage:
+    return taken(_untrained(_narrow(teacher.spec, units), teacher.task), name, budget)
+
+
+def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]) -> int:
+    """The widest network that fits; 0 for none."""
+    low, high = 0, len(widths)  # those before `low` fit, those from `high` on do not
+    while low < high:
+        middle = (low + high) // 2
+        if _taken(teacher, widths[middle], name, budget).over(budget):
+            high = middle
+        else:
+            low = middle + 1
+    return widths[low - 1] if low else 0
+
+
+def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str], least_width: int) -> str:
+    """What the nearest network takes, and what the limits would have to be."""
+    least = {name: _taken(teacher, least_width, name, budget) for name in formats}
+
+    def worst(name: str) -> float:
+        return max(value / limit for value, limit in least[name].over(budget).values())
+
+    nearest = min(formats, key=worst)
+    over = least[nearest].over(budget)
+    granted = ", ".join(f"{limit} = {pair[1]:,}" for limit, pair in over.items())
+    needed = ", ".join(f"{limit} = {pair[0]:,}" for limit, pair in over.items())
+    return (
+        f"budget '{budget.name}': {granted} can be met by no width of this network in any number format. The nearest "
+        f"that would work is one of {'a single unit' if least_width == 1 else f'{least_width} units'} in "
+        f"{FORMATS[nearest].label}, with {needed}: raise these limits to that at least, leave out blocks, or read "
+        "fewer channels"
+    )
+
+
+__all__ = ["CompressionPlan", "make_plan"]

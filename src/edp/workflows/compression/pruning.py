@@ -1,0 +1,210 @@
+"""Structured pruning: a narrower network of the same parts that keeps the most important features of a trained one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from edp.data.series import Series
+from edp.errors import ConfigError
+from edp.networks.backbones import RecurrentBackbone
+from edp.networks.blocks import BLOCKS, CylinderGate, MultiScaleTcn, TemporalDifference
+from edp.networks.blocks.base import BlockSlot
+from edp.networks.cells import CELLS
+from edp.networks.convolution import CausalConv, ConvolutionStack, TemporalBlock
+from edp.networks.heads import Heads
+from edp.networks.initial import INITIAL_STATES, ZeroState
+from edp.networks.predictor import ModelSpec, Predictor
+from edp.training.bundle import blank_scaler
+from edp.workflows.compression.taylor import FeatureImportance, importance
+
+GATES = {"lstm": 4, "gru": 3, "min_gru": 2}
+"""Recurrent layers that can be pruned, and how many rows of their matrices belong to a unit."""
+
+
+def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> Predictor:
+    """A network of the specs `model` made of the most important features of `predictor`; fine-tune it afterwards.
+
+    Channels of each convolution, units of each recurrent layer and hidden features of each head are kept by what they
+    are worth on `series` (`importance`). Levels whose residual path has no weights keep the same channels.
+
+    Args:
+        predictor: a trained network.
+        model: its own specs with smaller widths, for example ``student(predictor.spec, units, levels=all of them)``.
+        series: data with truth, usually those it was trained on.
+
+    Raises:
+        ConfigError: a part that cannot be pruned, or specs that are not narrower ones of the same network.
+    """
+    check_pruning(predictor.spec, model)
+    small = Predictor(predictor.task, model, blank_scaler(predictor.task)).eval()
+    worth = importance(predictor, series)
+    with torch.no_grad():
+        for name in ("front", "code", "output", "activation", "bypass", "physics"):
+            part = getattr(small, name)
+            if part is not None:
+                part.load_state_dict(getattr(predictor, name).state_dict())
+        features = torch.arange(len(predictor.task.features.features))
+        kept = _backbone(predictor.backbone, small.backbone, features, worth)
+        if small.gate is not None:
+            for own, its in zip(small.gate.parameters(), predictor.gate.parameters(), strict=True):  # type: ignore[union-attr]
+                own.copy_(its[:, kept])
+        _heads(predictor.heads, small.heads, kept, worth.hidden)
+    return small
+
+
+def _backbone(big: nn.Module, small: nn.Module, kept: Tensor, worth: FeatureImportance) -> Tensor:
+    """Copy what is kept; the features kept of the representation."""
+    if isinstance(big, ConvolutionStack) and isinstance(small, ConvolutionStack):
+        return _stack(big, small, kept, worth)
+    if not isinstance(big, RecurrentBackbone) or not isinstance(small, RecurrentBackbone):
+        pairs = list(zip(_children(big, "branches"), _children(small, "branches"), strict=True))
+        return _side_by_side([(_backbone(one, other, kept, worth), _width(one)) for one, other in pairs])
+    if big.encoder is not None and small.encoder is not None:
+        kept = _backbone(big.encoder, small.encoder, kept, worth)
+    units = kept
+    for layer, narrow in zip(_children(big.recurrent, "layers"), _children(small.recurrent, "layers"), strict=True):
+        units = _best(worth.sites[layer], _units(narrow))
+        _recurrent(layer, narrow, kept, units)
+        kept = units
+    small.pooling.score.weight.copy_(big.pooling.score.weight[:, units])
+    small.pooling.score.bias.copy_(big.pooling.score.bias)
+    return _side_by_side([(units, big.pooling.units)] * (2 + len(big.extras)))
+
+
+def _stack(big: ConvolutionStack, small: ConvolutionStack, kept: Tensor, worth: FeatureImportance) -> Tensor:
+    pairs = list(zip(big._blocks(), small._blocks(), strict=True))
+    for place, (block, narrow) in enumerate(pairs):
+        if block.shortcut is None and narrow.shortcut is None:
+            out = kept
+        else:
+            total = worth.sites[block].clone()
+            for later, other in pairs[place + 1 :]:  # what follows without weights on its path keeps the same channels
+                if later.shortcut is not None or other.shortcut is not None:
+                    break
+                total += worth.sites[later]
+            out = _best(total, len(narrow.second.bias))
+        inner = _best(worth.sites[block.first], len(narrow.first.bias))
+        _convolution(block.first, narrow.first, kept, inner)
+        _convolution(block.second, narrow.second, inner, out)
+        _shortcut(block, narrow, kept, out)
+        kept = out
+    return kept
+
+
+def _convolution(big: CausalConv, small: CausalConv, kept: Tensor, out: Tensor) -> None:
+    weight = big.weight()[out][:, kept]
+    norm = weight.flatten(1).norm(dim=1)
+    small.gain.copy_(norm)
+    # A direction of length zero would divide by zero; with a gain of zero any other one gives the same weights.
+    small.direction.copy_(torch.where(norm[:, None, None] > 0, weight, torch.ones_like(weight)))
+    small.bias.copy_(big.bias[out])
+
+
+def _shortcut(big: TemporalBlock, small: TemporalBlock, kept: Tensor, out: Tensor) -> None:
+    if small.shortcut is None:
+        return
+    if big.shortcut is None:  # channels passed on as they were: ones where a channel is kept on both sides
+        small.shortcut.weight.copy_((out[:, None] == kept[None, :]).to(small.shortcut.weight))
+        small.shortcut.bias.zero_()
+    else:
+        small.shortcut.weight.copy_(big.shortcut.weight[out][:, kept])
+        small.shortcut.bias.copy_(big.shortcut.bias[out])
+
+
+def _recurrent(big: nn.Module, small: nn.Module, kept: Tensor, units: Tensor) -> None:
+    """Matrices with one row a unit for each gate; those of the state have a column a unit, the others one an input."""
+    full = _units(big)
+    for (name, its), own in zip(big.named_parameters(), small.parameters(), strict=True):
+        rows = torch.cat([units + gate * full for gate in range(its.shape[0] // full)])
+        own.copy_(its[rows] if its.ndim == 1 else its[rows][:, units if "_hh" in name else kept])
+
+
+def _heads(big: Heads, small: Heads, kept: Tensor, worth: Sequence[Tensor]) -> None:
+    """Each output keeps hidden features of its own."""
+    for output in range(big.outputs):
+        into = kept
+        for layer in range(len(big.weights)):
+            if layer < len(big.units):
+                best = _best(worth[layer][output], small.widths[layer + 1])
+                factor = big.units[layer].factor
+                out = torch.cat([best + half * big.widths[layer + 1] for half in range(factor)])
+            else:
+                best = out = torch.arange(big.weights[layer].shape[2])
+            small.weights[layer][output].copy_(big.weights[layer][output][into][:, out])
+            small.biases[layer][output].copy_(big.biases[layer][output][out])
+            into = best
+
+
+def _best(worth: Tensor, count: int) -> Tensor:
+    """The `count` most important features, in their order."""
+    return torch.sort(torch.argsort(worth, descending=True, stable=True)[:count]).values
+
+
+def _side_by_side(parts: Sequence[tuple[Tensor, int]]) -> Tensor:
+    """Places of kept features in a concatenation of parts of the given full widths."""
+    starts = [sum(width for _, width in parts[:place]) for place in range(len(parts))]
+    return torch.cat([kept + start for (kept, _), start in zip(parts, starts, strict=True)])
+
+
+def _children(module: nn.Module, name: str) -> list[nn.Module]:
+    return list(getattr(module, name))
+
+
+def _width(stack: nn.Module) -> int:
+    return len(stack._blocks()[-1].second.bias)  # type: ignore[operator]
+
+
+def _units(layer: nn.Module) -> int:
+    return int(layer.cell.hidden_size if hasattr(layer, "cell") else layer.units)  # type: ignore[union-attr, arg-type]
+
+
+def check_pruning(big: ModelSpec, small: ModelSpec) -> None:
+    """Refuse what cannot be pruned, and specs that are not narrower ones of the same network.
+
+    Raises:
+        ConfigError: every reason.
+    """
+    reasons = []
+    cell = getattr(big.backbone, "cell", None)
+    if cell is not None and CELLS.name_of(cell) not in GATES:
+        reasons.append(f"a recurrent layer '{CELLS.name_of(cell)}' (those of {', '.join(GATES)} can be pruned)")
+    initial = getattr(big.backbone, "initial", None)
+    if initial is not None and not isinstance(initial, ZeroState):
+        reasons.append(f"the initial state '{INITIAL_STATES.name_of(initial)}' (only 'zero' can)")
+    for block in big.blocks:
+        gate = isinstance(block, CylinderGate) and block.form == "diagonal"
+        beside = getattr(block, "slot", None) is BlockSlot.BYPASS
+        if not gate and not beside and not isinstance(block, MultiScaleTcn | TemporalDifference):
+            reasons.append(f"the block '{BLOCKS.name_of(block)}'")
+    if reasons:
+        raise ConfigError(f"pruning: no rule for {'; '.join(reasons)}; distil a student instead")
+    reasons += _differences(big, small)
+    if reasons:
+        raise ConfigError(f"pruning: {'; '.join(reasons)}; give the network's own specs with smaller widths")
+
+
+def _differences(big: ModelSpec, small: ModelSpec) -> list[str]:
+    names = [name for name in ("units", "channels") if hasattr(big.backbone, name)]
+    if type(big.backbone) is not type(small.backbone):
+        return ["another backbone"]
+    same = {name: getattr(big.backbone, name) for name in names}
+    widened = replace(
+        small,
+        backbone=replace(small.backbone, **same),  # type: ignore[type-var]
+        head=replace(small.head, hidden=big.head.hidden),  # type: ignore[type-var]
+    )
+    if widened != big:
+        return ["the specs differ in more than widths"]
+    pairs = [("head.hidden", (big.head.hidden,), (small.head.hidden,))]
+    for name in names:
+        full, narrow = getattr(big.backbone, name), getattr(small.backbone, name)
+        pairs.append((name, full, narrow) if name == "channels" else (name, (full,), (narrow,)))
+    found = []
+    for name, full, narrow in pairs:
+        if len(full) != len(narrow) or any(n > f for f, n in zip(full, narrow, strict=False)):
+            found.append(f"{name} = {narrow} is not narrower than {full}, level by level")
+    return found

@@ -1,0 +1,95 @@
+"""Quantisation-aware training: a network is trained on while it computes with rounded numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.errors import ConfigError
+from edp.networks.predictor import Predictor
+from edp.training.objective import Objective
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import BatchContext, TrainingStrategy
+from edp.training.warm_start import continue_from
+from edp.workflows.compression.rounding import NetworkRounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundingSpec:
+    """What is rounded in training; weights have 8 bits, with a step for each output.
+
+    Attributes:
+        activation_bits: of what convolutions, recurrent and linear layers read: 16, 8 (an experiment), or 0 for none.
+        recurrent: False leaves the matrices of recurrent layers in float, as the thesis does (3.3.7).
+
+    Raises:
+        ConfigError: other bits.
+    """
+
+    activation_bits: int = 16
+    recurrent: bool = True
+
+    def __post_init__(self) -> None:
+        if self.activation_bits not in (0, 8, 16):
+            raise ConfigError(f"rounding: activation_bits = {self.activation_bits}; 16, 8 or 0 must hold")
+
+
+class QuantisationAware:
+    """A lesson that goes on from a trained network with rounded weights and activations (straight-through gradients).
+
+    The network is validated rounded, and the start is a candidate itself. What training leaves is an ordinary float
+    network whose rounded weights lie on their grid: to round them again, with a step for each output, changes nothing.
+
+    Args:
+        start: a trained network; the training must be of its own specs.
+        lesson: teachers, see `Distillation`; None learns from the truth alone.
+        spec: what is rounded.
+    """
+
+    def __init__(
+        self, start: Predictor, lesson: TrainingStrategy | None = None, spec: RoundingSpec | None = None
+    ) -> None:
+        self.start, self.lesson, self.spec = start, lesson, spec or RoundingSpec()
+        self._known: Sequence[Series] = ()
+        self._rounding: NetworkRounding | None = None
+
+    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+        """The training series with what the teachers say of them, where there are any."""
+        self._known = known
+        return list(known) if self.lesson is None else self.lesson.series(task, known)
+
+    def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
+        """Go on from the start, rounded; ranges of activations are found on the training series.
+
+        Raises:
+            ConfigError: the start has other specs.
+        """
+        if self.lesson is not None:
+            self.lesson.begin(net, spec)
+        continue_from(net, self.start)
+        self._rounding = NetworkRounding(net, self.spec.activation_bits, self.spec.recurrent)
+        self._rounding.install(self._known)
+        return True
+
+    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+        """The loss of the teachers' lesson.
+
+        Raises:
+            ConfigError: there are no teachers.
+        """
+        if self.lesson is None:
+            raise ConfigError("quantisation-aware training: series carry a lesson, but there is no teacher; give one")
+        return self.lesson.loss(objective, moment)
+
+    def end(self, net: Predictor) -> None:
+        """Leave an ordinary network with rounded weights."""
+        if self._rounding is not None:
+            self._rounding.remove()
+            self._rounding.keep()
+            self._rounding = None
+        if self.lesson is not None:
+            self.lesson.end(net)

@@ -1,0 +1,49 @@
+"""A run in whole numbers, as a run of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from edp.errors import ExportError
+from edp.export.c.sizes import constant_bytes
+from edp.networks.integer import integer_predictor
+from edp.networks.running import mean_error
+from edp.storage import write_bytes, write_json
+from edp.storage.runs import RunFolder
+from edp.training import save_bundle
+from edp.workflows.train_evaluate import trained_run
+
+
+def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str, float]:
+    """Write a run in W8A16: it is judged, reported and exported in whole numbers.
+
+    Formats and weights are chosen on the inputs of the training part; the errors are of the validation part.
+
+    Args:
+        run: run folder of a float network.
+        out: folder of the new run; one that holds such a run already is replaced.
+        ticks: about how many ticks of the training part run through the whole network.
+
+    Returns:
+        ``float`` and ``integer``: MAE over horizons and targets in SI units; ``bytes``: of the constants of its C code.
+
+    Raises:
+        EdpError: not a run folder, a network without a form in whole numbers or in them already, or a folder that
+            holds another run.
+    """
+    folder = Path(run)
+    bundle, _, provenance, data = trained_run(folder)
+    if bundle.predictor.number_format != "float32":
+        raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
+    if (Path(out) / "run.json").exists():
+        raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
+    made = integer_predictor(bundle.predictor, data.train, ticks)
+    found = {name: mean_error(one, data.validation) for name, one in (("float", bundle.predictor), ("integer", made))}
+    with RunFolder(out) as target:
+        for name in ("config.toml", "history.jsonl", "footprint.json"):
+            if (folder / name).is_file():
+                write_bytes(target.file(name), (folder / name).read_bytes())
+        write_json(target.file("provenance.json"), provenance | {"number_format": made.number_format})
+        save_bundle(replace(bundle, predictor=made, scores={}), target.file("bundle"))
+    return found | {"bytes": float(constant_bytes(made.integers, bundle.adaptation))}

@@ -1,0 +1,354 @@
+"""The best network that a controller can run: width, pruning, number formats and training with rounded numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from edp.config.experiment import Experiment, experiment_toml, plain_tree
+from edp.data.frozen import SECOND_BOX, ByFrozen
+from edp.data.prepared import Prepared
+from edp.errors import ExportError
+from edp.evaluation.controller import Budget
+from edp.logs.source import DataSource
+from edp.networks.narrow import width_of
+from edp.networks.predictor import Predictor
+from edp.settings.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, whole
+from edp.signals import KINDS
+from edp.storage import make_folder, read_object, write_json
+from edp.storage.ledger import Ledger
+from edp.storage.runs import RunFolder, run_key
+from edp.training import TrainingProgress, load_bundle
+from edp.training.bundle import weights_digest
+from edp.training.strategy import TrainingStrategy
+from edp.workflows.compression.bench import Bench, CompressionRequest
+from edp.workflows.compression.distil import frozen_sessions, order_facts, read_run
+from edp.workflows.compression.formats.base import FORMATS, Deployed, deploy
+from edp.workflows.compression.judged import (
+    CompressionResult,
+    Judged,
+    choose,
+    deployed_row,
+    measure,
+    on_validation,
+    relative,
+)
+from edp.workflows.compression.planning import WAYS, CompressionPlan, make_plan
+from edp.workflows.compression.variants import VARIANTS, CompressedCandidate
+from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
+
+BOX = "test"
+THESIS_VARIANTS = {"A_u32": 32, "A_u64": 64, "B_LPTQ": 64, "C_QAT": 0, "C_u64_QAT": 64}
+"""Width of the students of Table 4.9; 0 where the teacher keeps its own."""
+RESULT = "compression.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressionSearchSpec:
+    """What is searched.
+
+    Attributes:
+        budget: what the controller grants.
+        units: widths; none given, they are planned from the budget.
+        formats: number formats; none given, all.
+        ways: how each width is made, some of `edp.workflows.compression.planning.WAYS`.
+        thesis: also make the variants of Table 4.9 that are narrower than the teacher.
+        again: open the lock-box again for another choice, which weakens what it can show; it is recorded.
+        changes: settings of the trainings that differ from the run's, as ``key.path=value``.
+    """
+
+    budget: Budget
+    units: tuple[int, ...] = ()
+    formats: tuple[str, ...] = ()
+    ways: tuple[str, ...] = WAYS
+    thesis: bool = False
+    again: bool = False
+    changes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_count("compress", "units", self.units, MOST_NAMES)
+        check_bounds("compress", self, units=whole(1, MOST_UNITS))
+
+
+@dataclass(frozen=True)
+class CompressionCallbacks:
+    """Called on the way.
+
+    Attributes:
+        on_note: with a sentence.
+        on_training: with the name of a training, how many came before it and how many there are, and its event.
+    """
+
+    on_note: Callable[[str], None] = lambda text: None
+    on_training: Callable[[str, int, int, TrainingProgress], None] = lambda name, done, count, event: None
+
+
+class DiskBench(Bench):
+    """A bench whose trainings are runs in a folder; finished ones are read, unfinished ones go on.
+
+    Args:
+        teacher: the trained network.
+        data: series to train on.
+        experiment: settings of the teacher's run.
+        source: where the recordings are.
+        folder: for the runs.
+        watchers: called on the way.
+    """
+
+    def __init__(
+        self,
+        teacher: Predictor,
+        data: Prepared,
+        experiment: Experiment,
+        source: DataSource,
+        folder: Path,
+        watchers: CompressionCallbacks,
+    ) -> None:
+        super().__init__(teacher, data, experiment.training)
+        self.frozen: Mapping[str, str] = {}
+        self.experiment, self.source, self.folder, self.watchers = experiment, source, folder, watchers
+        self.done, self.count = 0, 0
+
+    def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
+        """Carry out an order as a run, or read the run."""
+        facts = order_facts(order) | {"teachers": [weights_digest(self.teacher)]}
+        facts |= {"start": None if start is None else weights_digest(start)}
+        run = self.folder / order.name
+        done, self.done = self.done, self.done + 1
+        status = read_object(run / "status.json", ("status",))["status"] if (run / "status.json").is_file() else ""
+        if status == "finished":
+            bundle = load_bundle(run)
+            if bundle.provenance.get("lesson") == facts:
+                return bundle.predictor
+
+        def lesson(data: Prepared) -> TrainingStrategy:
+            return order.lesson([self.teacher], data, start)
+
+        model, training = order.model(self.teacher.spec), order.training(self.training)
+        made = replace(self.experiment, model=model, training=training)
+        tell = self.watchers.on_training
+        teaching = StrategyFactory(facts, lesson, self.frozen)
+        return train(
+            self.source, made, run, lambda event: tell(order.name, done, self.count, event), teaching, self.data
+        ).predictor
+
+
+def search(
+    run: str | Path,
+    spec: CompressionSearchSpec,
+    out: str | Path,
+    source: DataSource | None = None,
+    watchers: CompressionCallbacks | None = None,
+) -> CompressionResult:
+    """Make smaller networks of a run, judge them in their formats, and choose the best that fits a budget.
+
+    Choices rest on the validation part. The test part is opened once, for the chosen network and the teacher; that is
+    recorded in the folder. For a run of a model search it is the second lock-box of the search, and the look is
+    recorded in its ledger, too. The same call goes on after a stop, and trains nothing twice.
+
+    Args:
+        run: run folder of the teacher.
+        spec: what is searched.
+        out: folder of the search, with a run for each network.
+        source: recordings to learn, choose and judge on; by default those of the run.
+        watchers: called on the way.
+
+    Raises:
+        EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a lock-box that was
+            opened for another choice.
+    """
+    teacher, experiment, own = read_run(run, spec.changes)
+    plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.ways)
+    told = watchers or CompressionCallbacks()
+    for note in plan.notes:
+        told.on_note(note)
+    frozen = frozen_sessions(run, experiment)
+    data = prepare_data(source or own, experiment, frozen)
+    box = _box_of(source or own, experiment, data)
+    settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
+    key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
+    with RunFolder(out) as folder:
+        folder.claim(key, experiment_toml(experiment))
+        bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), told)
+        bench.frozen = frozen
+        court = _Evaluator(bench, spec.budget, Path(run), box.data)
+        rows, notes = _rows(bench, court, plan, spec)
+        front, chosen = choose(rows)
+        found = CompressionResult(court.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
+        if found.best is not None:
+            found = replace(found, box=_open_box(found, court, folder, box, spec.again))
+        seen = box.seen(found.box.get("openings", ())) or _seen(Path(run), source, own, box)
+        write_json(folder.file(RESULT), _plain(found, spec, data, seen, len(box.data.test)))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """The recordings that are looked at once.
+
+    Attributes:
+        data: they are its test part.
+        name: of the lock-box.
+        study: folder of the model search that set it apart and records each look; None where none did, or it is gone.
+        known: whether a model search judged on it already.
+    """
+
+    data: Prepared
+    name: str = BOX
+    study: Path | None = None
+    known: bool = False
+
+    def seen(self, openings: Sequence[Mapping[str, Any]]) -> bool:
+        """Whether other networks were judged on it before these."""
+        return self.known or len(openings) > 1
+
+
+def _box_of(source: DataSource, experiment: Experiment, data: Prepared) -> _Box:
+    """The second lock-box of the model search that a run comes from, else the test part."""
+    split = experiment.split
+    if not isinstance(split, ByFrozen):
+        return _Box(data)
+    there = {recording.digest for recording in source.read()}
+    if not any(session.digest in there for session in split.second):
+        return _Box(data, known=any(session.digest in there for session in split.test))
+    study = Path(split.study)
+    recorded = split.study and (study / "study.json").is_file() and (study / "ledger" / "about.json").is_file()
+    opened = prepare_data(source, replace(experiment, split=split.opened()))
+    return _Box(opened, SECOND_BOX, study if recorded else None)
+
+
+def _rows(
+    bench: DiskBench, court: _Evaluator, plan: CompressionPlan, spec: CompressionSearchSpec
+) -> tuple[list[Judged], list[str]]:
+    """Every network in every format that it can be in, and what could not be."""
+    names = _variants(bench) if spec.thesis else []
+    bench.count = plan.trainings + len(names)
+    rows, notes = [], []
+
+    def judge(order: CompressionRequest | None, network: Predictor, formats: Sequence[str]) -> None:
+        for name in formats:
+            try:
+                rows.append(court.judged(order, network, name))
+            except ExportError as error:
+                notes.append(f"{'teacher' if order is None else order.name} in {FORMATS[name].label}: {error}")
+
+    judge(None, bench.teacher, plan.formats)
+    for orders in plan.orders.values():
+        made = {order: bench.network(order) for order in orders}
+        for order, network in made.items():
+            judge(order, network, plan.formats)
+        plain = {order: court.float_error(network) for order, network in made.items()}
+        for order in plan.tuned(min(plain, key=plain.__getitem__)):
+            judge(order, bench.network(order), [name for name in plan.formats if FORMATS[name].rounded])
+    for name in names:
+        make = VARIANTS[name]
+        rows.append(court.variant(make(bench)))
+    return rows, notes
+
+
+def _variants(bench: Bench) -> list[str]:
+    """Variants whose students are narrower than the teacher."""
+    full = width_of(bench.teacher.spec)
+    return [name for name, units in THESIS_VARIANTS.items() if units < full]
+
+
+class _Evaluator:
+    """Judges networks on the validation part, and at the end two on the lock-box: the test part of `box`."""
+
+    def __init__(self, bench: DiskBench, budget: Budget, run: Path, box: Prepared) -> None:
+        self.bench, self.budget, self.box = bench, budget, box
+        self.data, self.skip = on_validation(bench.data), bench.teacher.spec.window
+        self.deployed: dict[str, tuple[Deployed, Predictor]] = {}
+        self._float: dict[int, dict[str, dict[str, float]]] = {}
+        self.run = run
+        plain = self._row("teacher", None, bench.teacher, "float32")
+        self.teacher = replace(plain, error=1.0)
+
+    def judged(self, order: CompressionRequest | None, network: Predictor, number_format: str) -> Judged:
+        """A network in a format."""
+        name = f"{'teacher' if order is None else order.name} {FORMATS[number_format].label}"
+        row = self._row(name, order, network, number_format)
+        return replace(row, error=relative(row.scores, self.teacher.scores))
+
+    def variant(self, candidate: CompressedCandidate) -> Judged:
+        """A variant of the thesis under its name, with bytes counted as the thesis counts them."""
+        row = self._row(
+            candidate.name, candidate.order, candidate.network, candidate.number_format, candidate.parameter_bytes
+        )
+        return replace(row, error=relative(row.scores, self.teacher.scores))
+
+    def float_error(self, network: Predictor) -> float:
+        """Error in float32, over the teacher's."""
+        return relative(self._plain(network), self.teacher.scores)
+
+    def on_box(self, row: Judged) -> dict[str, dict[str, float]]:
+        """Scores on the lock-box."""
+        return measure(self.deployed[row.name][0], self.box, self.skip)
+
+    def key(self, row: Judged) -> str:
+        """What is judged: weights and format."""
+        return f"{weights_digest(self.deployed[row.name][1])} {row.number_format}"
+
+    def _plain(self, network: Predictor) -> dict[str, dict[str, float]]:
+        if id(network) not in self._float:
+            made = deploy(network, "float32", self.bench.data.train, self.budget)
+            self._float[id(network)] = measure(made, self.data, self.skip)
+        return self._float[id(network)]
+
+    def _row(
+        self,
+        name: str,
+        order: CompressionRequest | None,
+        network: Predictor,
+        number_format: str,
+        stored: int | None = None,
+    ) -> Judged:
+        made = deploy(network, number_format, self.bench.data.train, self.budget, stored)
+        self.deployed[name] = made, network
+        before = self._plain(network)
+        scores = before if number_format == "float32" else measure(made, self.data, self.skip)
+        run = self.run if order is None else self.bench.folder / order.name
+        return deployed_row(name, order, made, (scores, before), self.budget, str(run))
+
+
+def _open_box(found: CompressionResult, court: _Evaluator, folder: RunFolder, box: _Box, again: bool) -> dict[str, Any]:
+    """Judge teacher and chosen on the lock-box, once; the look is recorded before it is taken."""
+    pair = {"teacher": found.teacher, "chosen": found.best}
+    keys = [court.key(row) for row in pair.values() if row is not None]
+    why = "the network chosen by edp compress, and its teacher"
+    ledgers = [folder.file("ledger")] if box.study is None else [box.study / "ledger", folder.file("ledger")]
+    openings: list[dict[str, Any]] = []
+    for place in ledgers:  # that of the search first: it knows of looks from other folders
+        with Ledger(place) as ledger:
+            opening = ledger.open_box(box.name, keys, why, again)
+            openings = openings or [asdict(one) for one in ledger.openings(box.name)]
+    scores = {name: court.on_box(row) for name, row in pair.items() if row is not None}
+    error = relative(scores["chosen"], scores["teacher"])
+    return {"name": box.name, "opened": opening.time, "openings": openings, "scores": scores, "error": error}
+
+
+def _seen(run: Path, source: DataSource | None, own: DataSource, box: _Box) -> bool:
+    """Whether the lock-box is the test part and was judged before, by ``edp evaluate``."""
+    same = box.name == BOX and (source is None or source.to_plain() == own.to_plain())
+    return same and (run / "scores.json").is_file()
+
+
+def _plain(
+    found: CompressionResult, spec: CompressionSearchSpec, data: Prepared, seen: bool, sealed: int
+) -> dict[str, Any]:
+    units = sorted({KINDS[kind].report_unit for kind in data.target_kinds})
+    return {
+        "schema": 1,
+        "budget": asdict(spec.budget),
+        "task": {"horizons": list(data.task.horizons), "rate_hz": data.task.rate_hz},
+        "unit": units[0] if len(units) == 1 else "mixed units",
+        "recordings": {"train": len(data.train), "validation": len(data.validation), "test": sealed},
+        "teacher": found.teacher.to_json(),
+        "rows": [row.to_json() for row in found.rows],
+        "front": found.front,
+        "chosen": found.chosen,
+        "box": dict(found.box) | {"seen_before": seen},
+        "notes": list(found.notes),
+    }

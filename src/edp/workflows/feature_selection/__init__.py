@@ -1,0 +1,1 @@
+"""Selection of channels by trainings with and without them."""

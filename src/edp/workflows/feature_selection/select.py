@@ -1,0 +1,293 @@
+"""From recordings to a defended feature set on disk: quality, screening, proposal, page, pictures, trials on wish."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from edp.config.experiment import Experiment, FeatureSettings, TaskSettings
+from edp.data.feature_files import set_text
+from edp.data.features import FEATURE_SETS, FeatureSet
+from edp.data.screening import FlagKind, OnProgress, ScreeningResult, ScreeningSpec, screen
+from edp.errors import DataError, closest
+from edp.logs import DataQuality, Repair, common_channels, open_log
+from edp.logs.formats.base import is_truth
+from edp.logs.resolve import resolve
+from edp.logs.source import DataSource
+from edp.recording import Recording
+from edp.report import build_screening_page, write_pictures
+from edp.signals import VOCABULARY, SignalMap
+from edp.storage import check_writable, make_folder, write_bytes, write_json
+from edp.storage.runs import command_line
+from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
+
+PROPOSED, DIFFERENCES, ALL = "proposed", "proposed + differences", "all candidates"
+_MOST_DROPPED = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionOrder:
+    """What is asked of a selection.
+
+    Attributes:
+        spec: options of the screening.
+        exclude: channels that are no candidates.
+        truth: whether what only a simulation knows may be a candidate.
+        pictures: whether pictures are written.
+        experiment: settings of the trainings that try the sets; None for no trials.
+        trials: random sets and seeds of the trials.
+        sets: further feature sets to try, by name.
+    """
+
+    spec: ScreeningSpec = field(default_factory=ScreeningSpec)
+    exclude: tuple[str, ...] = ()
+    truth: bool = False
+    pictures: bool = True
+    experiment: Experiment | None = None
+    trials: TrialSpec = field(default_factory=TrialSpec)
+    sets: Mapping[str, str | FeatureSettings] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listeners:
+    """Who hears of the progress.
+
+    Attributes:
+        on_log: a log is read: path, number from 1, how many.
+        on_progress: a stage of the screening, and the share of it all that is done.
+        on_trial: a training: see `edp.workflows.feature_selection.trials`.
+    """
+
+    on_log: Callable[[Path, int, int], None] | None = None
+    on_progress: OnProgress | None = None
+    on_trial: OnTrial | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What a selection found and wrote.
+
+    Attributes:
+        found: the screening.
+        quality: of the recordings.
+        notes: what a reader must know of how the data were read.
+        sets: the feature sets by name, the proposed one first.
+        files: by what they are: ``page``, ``screening``, ``quality``, ``settings``, ``sets``, and where there are such,
+            ``map``, ``pictures``, ``trials``.
+        trials: errors of the sets, where they were tried.
+    """
+
+    found: ScreeningResult
+    quality: DataQuality
+    notes: tuple[str, ...]
+    sets: dict[str, FeatureSettings]
+    files: dict[str, Path]
+    trials: Trials | None = None
+
+    @property
+    def map(self) -> Path | None:
+        """The signal map that a training needs to read these channels, where it needs one."""
+        return self.files.get("map")
+
+
+def select_features(
+    source: DataSource, out: str | Path, order: SelectionOrder | None = None, listeners: Listeners | None = None
+) -> Selection:
+    """Screen a data set and write what it proposes.
+
+    Args:
+        source: where the recordings are. Without a signal map every column of numbers is read.
+        out: folder of all that is written.
+        order: what is asked.
+        listeners: who hears of the progress.
+
+    Raises:
+        EdpError: the recordings cannot be read as they are, or nothing can be told from them.
+    """
+    order, listeners = order or SelectionOrder(), listeners or Listeners()
+    folder = check_writable(out)
+    mapped = source if source.signal_map is not None or _lists_maps(source) else _taken_whole(source)
+    quality = mapped.inspect(listeners.on_log)
+    recordings, notes = _read(mapped, quality)
+    spec, more = _candidates(recordings[0], order)
+    found = screen(recordings, spec, listeners.on_progress)
+    notes += more
+    sets = _sets(found, recordings[0])
+    files = _write(folder, found, quality, sets)
+    needed = _needed_map(source, found, recordings[0])
+    if needed is not None:
+        files["map"] = folder / "map.toml"
+        write_bytes(files["map"], needed.encode())
+    trials = _tried(mapped, folder, (order, found, sets), listeners.on_trial)
+    if trials is not None:
+        files["trials"] = folder / "trials"
+    if order.pictures:
+        write_pictures(found, folder / "pictures")
+        files["pictures"] = folder / "pictures"
+    title = source.path.resolve().stem
+    tried = None if trials is None else trials.to_json()
+    files["page"] = build_screening_page(found, folder / "report.html", title, quality, tried, notes)
+    return Selection(found, quality, tuple(notes), sets, files, trials)
+
+
+def _lists_maps(source: DataSource) -> bool:
+    """Whether a data-set file says itself how its logs are read."""
+    return source.path.suffix == ".toml" and any(log.signal_map is not None for log in source.logs())
+
+
+def _taken_whole(source: DataSource) -> DataSource:
+    return replace(source, signal_map=SignalMap(others=True))
+
+
+def _read(source: DataSource, quality: DataQuality) -> tuple[list[Recording], list[str]]:
+    """The recordings with the channels that all of them hold; missing values of candidates are kept as such."""
+    repair = source.repair or Repair()
+    lenient = replace(source, repair=replace(repair, nan="keep") if repair.nan == "refuse" else repair)
+    recordings = common_channels(lenient.read())
+    common = set(recordings[0].channel_names)
+    seen = {channel.name: None for report in quality.reports for channel in report.channels}
+    lost = [name for name in seen if name not in common]
+    notes = []
+    if lost:
+        notes.append(f"Only some recordings hold {_some(lost)}: left out.")
+    holes = [
+        name
+        for name in recordings[0].channel_names
+        if any(c.missing for report in quality.reports for c in report.channels if c.name == name)
+    ]
+    if holes and repair.nan == "refuse":
+        notes.append(f"Missing values in {_some(holes)}: left out; a repair (nan=hold) would let them be judged.")
+    return recordings, notes
+
+
+def _candidates(first: Recording, order: SelectionOrder) -> tuple[ScreeningSpec, list[str]]:
+    """The spec with its candidates named, and notes on what is no candidate."""
+    spec = order.spec
+    for name in order.exclude:
+        if name not in first.channel_names:
+            raise DataError(f"cannot exclude '{name}': no such channel{closest(name, first.channel_names)}")
+    chosen = [name for name in spec.candidates or first.channel_names if name not in order.exclude]
+    notes = []
+    if not order.truth and not spec.candidates:
+        hidden = [name for name in chosen if is_truth(name) and name not in spec.targets]
+        chosen = [name for name in chosen if name not in hidden]
+        if hidden:
+            notes.append(f"{len(hidden)} channels that only a simulation knows are no candidates (--truth takes them).")
+    return replace(spec, candidates=tuple(chosen)), notes
+
+
+def _sets(found: ScreeningResult, first: Recording) -> dict[str, FeatureSettings]:
+    """The proposed set with the targets in it, as the delta mode needs them; with pressure changes; the usual sets."""
+    kept = found.proposal.kept
+    channels = (*(target for target in found.targets if target not in kept), *kept)
+    proposed = FeatureSettings(name=PROPOSED, channels=channels)
+    sets = {PROPOSED: proposed}
+    differences = with_differences(proposed, first, DIFFERENCES)
+    if differences.derived:
+        sets[DIFFERENCES] = differences
+    sets[ALL] = FeatureSettings(name=ALL, channels=found.channels)
+    for name, usual in FEATURE_SETS.items():
+        if all(channel in first.channel_names for channel in usual.inputs):
+            sets[name] = FeatureSettings(name=name, channels=usual.channels, derived=usual.derived, hidden=usual.hidden)
+    return sets
+
+
+def _write(
+    folder: Path, found: ScreeningResult, quality: DataQuality, sets: Mapping[str, FeatureSettings]
+) -> dict[str, Path]:
+    """Everything but page and pictures."""
+    files = {name: folder / f"{name}.json" for name in ("screening", "quality")}
+    write_json(files["screening"], {"schema": 1, "command": command_line()} | found.to_json())
+    write_json(files["quality"], {"schema": 1} | quality.to_json())
+    files["sets"] = make_folder(folder / "sets")
+    for name, features in sets.items():
+        text = _proposal_text(found, features) if name == PROPOSED else set_text(_plain(features))
+        write_bytes(files["sets"] / f"{_file_name(name)}.toml", text.encode())
+    files["settings"] = folder / "settings.toml"
+    write_bytes(files["settings"], _settings_text(found).encode())
+    return files
+
+
+def _plain(features: FeatureSettings) -> FeatureSet:
+    return FeatureSet(features.name, features.channels, features.derived, features.hidden)
+
+
+def _proposal_text(found: ScreeningResult, features: FeatureSettings) -> str:
+    """The proposed set with the reason beside each channel, and below what was dropped and why."""
+    reasons = {choice.channel: choice.reason for choice in found.proposal.choices}
+    for target in found.targets:
+        if target not in found.proposal.kept:
+            reasons[target] = "a target: its present value, which mode = 'delta' needs"
+    head = [
+        f"Proposed by edp screen: {len(features.channels)} of {len(found.channels)} channels, most useful first.",
+        "edp train DATA --set task.features=THIS_FILE",
+    ]
+    dropped = [choice for choice in found.proposal.choices if not choice.keep and choice.channel not in found.targets]
+    tail = [f"dropped: {choice.channel}: {choice.reason}" for choice in dropped[:_MOST_DROPPED]]
+    return set_text(_plain(features), head, reasons, tail)
+
+
+def _settings_text(found: ScreeningResult) -> str:
+    """Settings of a training on the proposed set, to lay over a preset."""
+    table = {
+        "task": {"features": "sets/proposed.toml", "targets": list(found.targets), "horizons": [found.horizon]},
+        "model": {"window": found.proposal.window},
+    }
+    why = " ".join(found.proposal.window_reason.split())
+    return f"# Settings for a training on what edp screen proposed.\n# window: {why}\n\n{tomli_w.dumps(table)}"
+
+
+def _needed_map(source: DataSource, found: ScreeningResult, first: Recording) -> str | None:
+    """A signal map of the proposed channels, where a training without one would not read them."""
+    if source.signal_map is not None or _lists_maps(source):
+        return None
+    names = tuple(dict.fromkeys((*found.targets, *found.proposal.kept)))
+    known = []
+    for log in source.logs():
+        wanted, problems = resolve(open_log(log.path, SignalMap()), SignalMap())
+        known.append(() if problems else tuple(entry.channel.name for entry in wanted))
+    if all(set(names) <= set(own) and own == known[0] for own in known):
+        return None
+    entries: dict[str, Any] = {}
+    for name in names:
+        kind = first.channels[first.index(name)].kind
+        usual = VOCABULARY.get(name)
+        entries[name] = {"column": name} | ({} if usual is not None and usual.kind == kind else {"kind": str(kind)})
+    return "# The channels that edp screen proposed, under the names of the files.\n\n" + tomli_w.dumps(
+        {"channels": entries}
+    )
+
+
+def _tried(
+    source: DataSource,
+    folder: Path,
+    found: tuple[SelectionOrder, ScreeningResult, Mapping[str, FeatureSettings]],
+    on_trial: OnTrial | None,
+) -> Trials | None:
+    order, screening, sets = found
+    if order.experiment is None:
+        return None
+    experiment = replace(order.experiment, task=trial_task(order.experiment.task, screening))
+    asked: dict[str, str | FeatureSettings] = {**sets, **order.sets}
+    leaks = {flag.channel for flag in screening.flags if flag.kind is FlagKind.LEAK}
+    barred = tuple(sorted(leaks | set(order.trials.barred)))  # a random set with a leak would look best of all
+    return try_feature_sets(
+        source, experiment, asked, folder / "trials", replace(order.trials, barred=barred), on_trial
+    )
+
+
+def trial_task(task: TaskSettings, found: ScreeningResult) -> TaskSettings:
+    """The task of the trials: the screening's targets and horizon."""
+    return replace(task, targets=found.targets, horizons=(found.horizon,))
+
+
+def _some(names: Sequence[str], count: int = 6) -> str:
+    return ", ".join(names) if len(names) <= count else f"{', '.join(names[:count])} and {len(names) - count} more"
+
+
+def _file_name(name: str) -> str:
+    return "_".join("".join(c if c.isalnum() else " " for c in name).split())

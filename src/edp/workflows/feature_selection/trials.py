@@ -1,0 +1,318 @@
+"""Trials of feature sets: one network trained on each set with equal settings and judged on the same recordings.
+
+What a feature set is for is the error of the model that reads it, so a proposal is held to that: beside all channels,
+the usual sets, and sets of the same size drawn at random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from edp.config.experiment import Experiment, FeatureSettings
+from edp.data.features import FEATURE_SETS, Derived
+from edp.data.task import TargetMode
+from edp.errors import ConfigError, closest
+from edp.logs.source import DataSource
+from edp.networks.streaming import parameters_of
+from edp.recording import Recording
+from edp.settings.bounds import SEED, check_bounds, check_count, whole
+from edp.signals import Kind
+from edp.storage import make_folder, read_object, write_json
+from edp.training import Bundle, TrainingProgress
+from edp.workflows.train_evaluate import evaluate, train
+
+Sets = Mapping[str, str | FeatureSettings]
+OnTrial = Callable[[str, int, int, TrainingProgress | None], None]
+FILE = "trials.json"
+COVERAGE = 0.95
+MOST_SETS = 1_000
+"""Random sets, or seeds: each of them is a training."""
+_DRAWS = 20
+"""Draws for one random set that is not there already."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialSpec:
+    """Which trainings are made beside those of the given sets.
+
+    Attributes:
+        random: sets drawn at random from the channels, of the size of the first given set.
+        draw: seed of the draw.
+        barred: channels that random sets must not hold; leaks of the future, with which any set looks good.
+        seeds: a training for each set with each of these seeds.
+    """
+
+    random: int = 3
+    draw: int = 0
+    barred: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = (0,)
+
+    def __post_init__(self) -> None:
+        check_bounds("trials", self, random=whole(0, MOST_SETS), draw=SEED, seeds=SEED)
+        check_count("trials", "seeds", self.seeds, MOST_SETS)
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ConfigError(f"trials: seeds = {list(self.seeds)}; at least one seed, each once, must hold")
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """How much larger an error is than that of the first set, in the report unit, with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class FeatureSetTrial:
+    """One feature set, judged.
+
+    Attributes:
+        name: of the set.
+        channels: logged channels that it reads.
+        features: what the network sees, derived channels included.
+        parameters: trainable numbers of the network.
+        error: mean absolute error by horizon, mean over targets, seeds and ticks of the held-out recordings.
+        by_seed: the same for each seed.
+        difference: to the first set by horizon, paired over the held-out recordings; None for the first set, and
+            where there is one recording only.
+        seconds: of training, all seeds.
+    """
+
+    name: str
+    channels: tuple[str, ...]
+    features: int
+    parameters: int
+    error: dict[str, float]
+    by_seed: dict[str, tuple[float, ...]]
+    difference: dict[str, PairedDifference] | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Trials:
+    """All of them, in the order given.
+
+    Attributes:
+        trials: the first one is what the others are compared with.
+        persistence: error of taking the present value, by horizon.
+        unit: report unit of the errors.
+        held_out: names of the recordings that judged.
+        notes: sets that could not be tried, and why; channels that had to be added.
+    """
+
+    trials: tuple[FeatureSetTrial, ...]
+    persistence: dict[str, float]
+    unit: str
+    held_out: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values: the content of ``trials.json``."""
+        return {"schema": 1, **asdict(self)}
+
+
+def try_feature_sets(
+    source: DataSource,
+    experiment: Experiment,
+    sets: Sets,
+    out: str | Path,
+    spec: TrialSpec | None = None,
+    on_trial: OnTrial | None = None,
+) -> Trials:
+    """Train the experiment's network on every set with its budget, and judge all on the held-out recordings.
+
+    Trainings that are in the folder already are kept; one that was interrupted goes on.
+
+    Args:
+        source: where the recordings are.
+        experiment: settings of all trainings; only features and seed change.
+        sets: by name, a name as in ``task.features`` or a table; the first one is what the others are compared with.
+        out: folder of the run folders and of ``trials.json``.
+        spec: random sets and seeds.
+        on_trial: called with the set, how many trainings are done and of how many, and each event of the training.
+
+    Raises:
+        EdpError: nothing that can be tried, or a training failed; what was finished stays.
+    """
+    spec = spec or TrialSpec()
+    first = source.read()[0]
+    chosen, notes = _usable(sets, experiment, first)
+    if not chosen:
+        raise ConfigError("no feature set can be tried: " + "; ".join(notes))
+    drawn = _drawn(chosen, experiment, first, spec)
+    if len(drawn) < spec.random:
+        notes.append(f"{len(drawn)} of {spec.random} random sets were drawn: there are no others of this size")
+    chosen |= drawn
+    folder = make_folder(out)
+    total, done = len(chosen) * len(spec.seeds), 0
+    found: dict[str, list[_Finished]] = {}
+    for name, features in chosen.items():
+        for seed in spec.seeds:
+            settings = replace(
+                experiment,
+                task=replace(experiment.task, features=features),
+                training=replace(experiment.training, seed=seed),
+            )
+
+            def tell(event: TrainingProgress | None, name: str = name, done: int = done) -> None:
+                if on_trial is not None:
+                    on_trial(name, done, total, event)
+
+            tell(None)
+            run = folder / f"{_slug(name)}_seed{seed}"
+            bundle = train(source, settings, run, tell)
+            evaluate(run, baselines=["persistence"])
+            found.setdefault(name, []).append(_Finished.of(bundle, run))
+            done += 1
+    trials = _compared(found, notes, experiment.task.horizons)
+    write_json(folder / FILE, trials.to_json())
+    return trials
+
+
+def with_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:
+    """The set with the change of each of its cylinder pressures since the tick before, as FG2 has them (eq. 3.1)."""
+    known = {entry.source for entry in settings.derived}
+    wanted = [c for c in settings.channels if c not in known]
+    pressures = [c for c in wanted if recording.channels[recording.index(c)].kind is Kind.PRESSURE]
+    added = tuple(Derived(f"d{c}", c, "difference", Kind.PRESSURE) for c in pressures)
+    return replace(settings, name=name, derived=settings.derived + added)
+
+
+def _usable(sets: Sets, experiment: Experiment, first: Recording) -> tuple[dict[str, str | FeatureSettings], list[str]]:
+    """Sets whose channels are all there, with the targets in them where the mode needs them, and notes on the rest."""
+    notes: list[str] = []
+    chosen: dict[str, str | FeatureSettings] = {}
+    for name, features in sets.items():
+        if isinstance(features, str) and features != "all" and features not in FEATURE_SETS:
+            raise ConfigError(f"there is no feature set '{features}'{closest(features, [*FEATURE_SETS, 'all'])}")
+        if isinstance(features, FeatureSettings) and experiment.task.mode is TargetMode.DELTA:
+            features, added = _with_targets(features, experiment.task.targets)
+            if added:
+                notes.append(
+                    f"{name}: {', '.join(added)} added, because mode = 'delta' needs the targets' present values"
+                )
+        inputs = _inputs(features, first)
+        missing = [channel for channel in inputs if channel not in first.channel_names]
+        if missing:
+            notes.append(f"{name} was not tried: the recordings lack {', '.join(missing)}")
+        else:
+            chosen[name] = features
+    return chosen, notes
+
+
+def _inputs(features: str | FeatureSettings, first: Recording) -> tuple[str, ...]:
+    if isinstance(features, FeatureSettings):
+        return features.channels + features.hidden
+    return first.channel_names if features == "all" else FEATURE_SETS[features].inputs
+
+
+def _with_targets(features: FeatureSettings, targets: Sequence[str]) -> tuple[FeatureSettings, list[str]]:
+    derived = {entry.name for entry in features.derived}
+    added = [target for target in targets if target not in features.channels and target not in derived]
+    return replace(features, channels=(*added, *features.channels)), added
+
+
+def _drawn(
+    chosen: Mapping[str, str | FeatureSettings], experiment: Experiment, first: Recording, spec: TrialSpec
+) -> dict[str, str | FeatureSettings]:
+    """Sets of random channels, as many as the first set has, none like it or another drawn one.
+
+    In delta mode the targets are always among them.
+    """
+    first_inputs = _inputs(next(iter(chosen.values())), first)
+    size = len(first_inputs)
+    always = experiment.task.targets if experiment.task.mode is TargetMode.DELTA else ()
+    free = [name for name in first.channel_names if name not in {*always, *spec.barred}]
+    rng = np.random.default_rng(spec.draw)
+    drawn: dict[str, str | FeatureSettings] = {}
+    known = {frozenset(first_inputs)}
+    for _ in range(_DRAWS * spec.random):
+        picked = sorted(rng.choice(len(free), max(0, min(size - len(always), len(free))), replace=False))
+        channels = (*always, *(free[i] for i in picked))
+        if frozenset(channels) not in known:
+            known.add(frozenset(channels))
+            name = f"random {len(drawn) + 1}"
+            drawn[name] = FeatureSettings(name=name, channels=channels)
+        if len(drawn) == spec.random:
+            break
+    return drawn
+
+
+def _slug(name: str) -> str:
+    """A name that any file system takes."""
+    return "".join(c if c.isalnum() else "_" for c in name)
+
+
+@dataclass(frozen=True)
+class _Finished:
+    """What a finished run says of itself."""
+
+    channels: tuple[str, ...]
+    features: int
+    parameters: int
+    seconds: float
+    scores: dict[str, Any]
+
+    @staticmethod
+    def of(bundle: Bundle, run: Path) -> _Finished:
+        return _Finished(
+            bundle.task.inputs,
+            len(bundle.task.features.features),
+            parameters_of(bundle.predictor),
+            float(bundle.provenance["seconds"]),
+            read_object(run / "scores.json", ("models", "targets")),
+        )
+
+
+def _compared(found: Mapping[str, Sequence[_Finished]], notes: Sequence[str], horizons: Sequence[int]) -> Trials:
+    """The table from the kept scores."""
+    ahead = [str(horizon) for horizon in horizons]
+    names = list(found)
+    by_recording = {name: _recordings(found[name], ahead) for name in names}
+    trials = []
+    for name in names:
+        models = [run.scores["models"]["network"] for run in found[name]]
+        by_seed = {h: tuple(float(m["overall"][h]["mean"]["mae"]) for m in models) for h in ahead}
+        difference = None
+        if name != names[0] and len(by_recording[name][ahead[0]]) > 1:
+            difference = {h: _difference(by_recording[name][h], by_recording[names[0]][h]) for h in ahead}
+        one = found[name][0]
+        trials.append(
+            FeatureSetTrial(
+                name,
+                one.channels,
+                one.features,
+                one.parameters,
+                {h: float(np.mean(values)) for h, values in by_seed.items()},
+                by_seed,
+                difference,
+                sum(run.seconds for run in found[name]),
+            )
+        )
+    scores = found[names[0]][0].scores
+    persistence = {h: float(scores["models"]["persistence"]["overall"][h]["mean"]["mae"]) for h in ahead}
+    units = {target["unit"] for target in scores["targets"]}
+    unit = units.pop() if len(units) == 1 else "mixed units"
+    return Trials(tuple(trials), persistence, unit, tuple(by_recording[names[0]][ahead[0]]), tuple(notes))
+
+
+def _recordings(runs: Sequence[_Finished], ahead: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Error by horizon and recording, mean over seeds."""
+    each = [run.scores["models"]["network"]["recordings"] for run in runs]
+    return {h: {name: float(np.mean([one[name][h]["mean"]["mae"] for one in each])) for name in each[0]} for h in ahead}
+
+
+def _difference(ours: Mapping[str, float], reference: Mapping[str, float]) -> PairedDifference:
+    """Paired over recordings, with Student's t."""
+    gaps = np.array([ours[name] - reference[name] for name in reference])
+    mean = float(gaps.mean())
+    reach = float(stats.t.ppf(0.5 + COVERAGE / 2, len(gaps) - 1)) * float(gaps.std(ddof=1)) / math.sqrt(len(gaps))
+    return PairedDifference(mean, mean - reach, mean + reach)

@@ -1,0 +1,20 @@
+"""One golden recording through every form of a network: does each say what PyTorch says, and how fast?"""
+
+import edp.workflows.parity.forms  # noqa: F401, enters them
+from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Ran, Row
+from edp.workflows.parity.compare import compare, golden_case, recorded_case
+from edp.workflows.parity.consent import WHAT, from_own_run
+
+__all__ = [
+    "FORMS",
+    "WHAT",
+    "Broken",
+    "Missing",
+    "ParityCase",
+    "Ran",
+    "Row",
+    "compare",
+    "from_own_run",
+    "golden_case",
+    "recorded_case",
+]

@@ -1,0 +1,185 @@
+"""Forms of a network that can be run here: the registry, and what a form does."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from edp.export.golden import SHARE, Rows, stream
+from edp.registry import Registry
+from edp.training.bundle import Bundle
+
+NAME = "predictor"
+ROUNDS = 3
+
+
+class Missing(Exception):
+    """A form that cannot be run on this computer; the text says what it needs."""
+
+
+class Broken(Exception):
+    """A form that did not build, or ended badly; the text says how."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParityCase:
+    """What every form is given.
+
+    Attributes:
+        bundle: the trained network.
+        inputs: golden recording ``(tick, input)``, SI units.
+        wanted: what PyTorch streams from it, ``(tick, number)``: predictions, then lower and upper bounds, SI units.
+        allowed: how far a form may be from that, ``(number,)``.
+        interpreters: Python programs with another ONNX Runtime.
+    """
+
+    bundle: Bundle
+    inputs: Rows
+    wanted: Rows
+    allowed: Rows
+    interpreters: tuple[str, ...] = ()
+
+    @property
+    def window(self) -> int:
+        """Ticks of a window."""
+        return int(self.bundle.predictor.spec.window)
+
+    def last_windows(self, count: int) -> tuple[list[Rows], Rows]:
+        """Windows at the end of the recording, and what PyTorch predicts from each alone, ``(window, number)``."""
+        ends = range(max(self.window, len(self.inputs) - count + 1), len(self.inputs) + 1)
+        windows = [np.ascontiguousarray(self.inputs[end - self.window : end]) for end in ends]
+        return windows, np.concatenate([stream(self.bundle.predictor, window)[-1:] for window in windows])
+
+
+@dataclass(frozen=True, eq=False)
+class Ran:
+    """What a form made of the golden recording.
+
+    Attributes:
+        found: its numbers ``(row, number)``, SI units.
+        seconds: for a tick; for a window where it computes windows.
+        wanted: what they are compared with, where that is not PyTorch's stream.
+        allowed: how far they may be from it ``(number,)``; the case's where it is None.
+        note: a remark for the table.
+    """
+
+    found: Rows
+    seconds: float
+    wanted: Rows | None = None
+    allowed: Rows | None = None
+    note: str = ""
+
+
+class Form(Protocol):
+    """A form in which a network can be run; its registered class takes no arguments."""
+
+    title: ClassVar[str]
+
+    def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
+        """Export into `folder`, which is empty, and run.
+
+        Returns:
+            Runs with a remark for the title, empty for the only one; several where there are several versions.
+
+        Raises:
+            ExportError: the network has no such form; the reason is shown.
+            Missing: a program or package is not there.
+            Broken: what was exported does not build, or ended badly.
+        """
+        ...
+
+
+FORMS: Registry[type[Form]] = Registry("form")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    Attributes:
+        form: name in the registry.
+        title: for people.
+        verdict: ``same``, ``different``, ``failed``, ``refused`` (no such form of this network) or ``not run``.
+        why: of the last three.
+        largest: difference, in what is allowed; of numbers that must be equal, how many differ.
+        mean: difference, in the same.
+        tolerance: `edp.export.golden.SHARE`, which `tolerance` explains, or ``bits``.
+        microseconds: for a tick (a window).
+        note: a remark.
+    """
+
+    form: str
+    title: str
+    verdict: str
+    why: str = ""
+    largest: float | None = None
+    mean: float | None = None
+    tolerance: str = ""
+    microseconds: float | None = None
+    note: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return dict(vars(self))
+
+
+def held(form: str, title: str, case: ParityCase, ran: Ran) -> Row:
+    """Compare what a form found with what is wanted."""
+    wanted = case.wanted if ran.wanted is None else ran.wanted
+    allowed = case.allowed if ran.allowed is None else ran.allowed
+    found = np.asarray(ran.found, dtype=np.float64)
+    rest = {"microseconds": 1e6 * ran.seconds, "note": ran.note}
+    if found.shape != wanted.shape:
+        why = f"shape {found.shape} instead of {wanted.shape}"
+        return Row(form, title, "different", why, **rest)  # type: ignore[arg-type]
+    apart = np.abs(found - wanted)
+    exact = not allowed.any()
+    share = (found != wanted).astype(float) if exact else apart / allowed
+    share = np.where(np.isfinite(found), share, np.inf)
+    largest = float(share.sum() if exact else share.max())
+    same = largest == 0.0 if exact else largest <= 1.0
+    said = "bits" if exact else f"{SHARE:.0e}"
+    verdict = "same" if same else "different"
+    return Row(form, title, verdict, "", largest, float(share.mean()), said, **rest)  # type: ignore[arg-type]
+
+
+def need(program: str, package: str) -> str:
+    """Path of a program.
+
+    Raises:
+        Missing: it is not there.
+    """
+    found = shutil.which(program)
+    if found is None:
+        raise Missing(f"needs {program} (Debian package {package})")
+    return found
+
+
+def called(command: Sequence[object], folder: Path, feed: bytes = b"") -> bytes:
+    """Standard output of a program.
+
+    Raises:
+        Broken: it failed; the text ends with what it said last.
+    """
+    done = subprocess.run([str(part) for part in command], cwd=folder, input=feed, capture_output=True)
+    if done.returncode:
+        said = (done.stdout + done.stderr).decode(errors="replace").strip()[-600:]
+        raise Broken(f"{Path(str(command[0])).name} ended with {done.returncode}: {said}")
+    return done.stdout
+
+
+def timed(run: Callable[[], Rows]) -> tuple[Rows, float]:
+    """What a run gives, and the least seconds of some rounds."""
+    spent = []
+    for _ in range(ROUNDS):
+        began = time.perf_counter()
+        found = run()
+        spent.append(time.perf_counter() - began)
+    return found, min(spent)

@@ -1,0 +1,78 @@
+"""The table of `edp parity`."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from edp.data.unlabelled import unlabelled
+from edp.errors import DataError, ExportError
+from edp.export.golden import Rows, random_inputs, stream, tolerance
+from edp.logs.source import DataSource
+from edp.training.bundle import Bundle
+from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Row, held
+
+
+def golden_case(bundle: Bundle, ticks: int = 400, seed: int = 0) -> ParityCase:
+    """Smooth random inputs in the usual range of each channel.
+
+    Raises:
+        DataError: fewer ticks than the window.
+    """
+    return _case(bundle, random_inputs(bundle.predictor, ticks, seed))
+
+
+def recorded_case(bundle: Bundle, source: DataSource, ticks: int = 400) -> ParityCase:
+    """The first ticks of the first recording of a source.
+
+    Raises:
+        DataError: a channel is missing or not finite, another rate, or fewer ticks than the window.
+    """
+    series = unlabelled(bundle.task, source.read()[0])
+    return _case(bundle, np.ascontiguousarray(series.inputs[:ticks], dtype=np.float32))
+
+
+def _case(bundle: Bundle, inputs: Rows) -> ParityCase:
+    predictor = bundle.predictor
+    if len(inputs) < predictor.spec.window:
+        raise DataError(
+            f"golden recording: {len(inputs)} ticks; it must hold at least a window, {predictor.spec.window}: give "
+            "more ticks or a longer recording"
+        )
+    wanted = stream(predictor, inputs)
+    return ParityCase(bundle, inputs, wanted, tolerance(predictor, inputs, wanted))
+
+
+def compare(
+    case: ParityCase,
+    forms: Sequence[str] = (),
+    interpreters: Sequence[str] = (),
+    on_row: Callable[[Row], None] = lambda row: None,
+) -> list[Row]:
+    """Run every form, or those named, and compare each with PyTorch.
+
+    Raises:
+        ConfigError: an unknown form.
+    """
+    case = replace(case, interpreters=tuple(interpreters))
+    rows: list[Row] = []
+    for name in forms or list(FORMS):
+        form = FORMS[name]()
+        with tempfile.TemporaryDirectory() as temporary:
+            try:
+                runs = form.run(case, Path(temporary))
+                made = [held(name, f"{form.title}{more and ', '}{more}", case, ran) for more, ran in runs]
+            except ExportError as error:
+                made = [Row(name, form.title, "refused", str(error))]
+            except Missing as error:
+                made = [Row(name, form.title, "not run", str(error))]
+            except Broken as error:
+                made = [Row(name, form.title, "failed", str(error))]
+        for row in made:
+            on_row(row)
+        rows += made
+    return rows

@@ -1,0 +1,5 @@
+"""Forms that `edp parity` runs: a file each."""
+
+from edp.workflows.parity.forms import c_code, casadi, fmu, matlab, onnx_runtime, ros2, ticks
+
+__all__ = ["c_code", "casadi", "fmu", "matlab", "onnx_runtime", "ros2", "ticks"]

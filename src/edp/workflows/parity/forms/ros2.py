@@ -1,0 +1,49 @@
+"""The plain part of the ROS 2 package: the C code through ctypes, one tick a call."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from edp.export.escape import python_literal
+from edp.export.ros2 import Ros2Target
+from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
+
+PROGRAM = '''
+"""Streams rows of JSON through the package's core: argv has the rounds."""
+import json, sys, time
+from predictor_ros.core import Core
+
+rows, core, least = json.load(sys.stdin), Core(), float("inf")
+for _ in range(int(sys.argv[1])):
+    core.reset()
+    found = []
+    began = time.perf_counter()
+    for row in rows:
+        core.step(row)
+        found.append([core.result(meaning) for meaning in core.results])
+    least = min(least, time.perf_counter() - began)
+print(json.dumps([found, least / len(rows)]))
+'''
+
+
+@FORMS.register("ros2")
+class Ros2Core:
+    """``edp export --to ros2``: what the node calls, without ROS."""
+
+    title: ClassVar[str] = "ROS 2 package, core"
+
+    def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
+        """See `edp.workflows.parity.base.Form`."""
+        compiler = need("cc", "gcc libc6-dev")
+        Ros2Target().write(case.bundle, NAME, folder)
+        (folder / "run.py").write_text(PROGRAM)
+        called([sys.executable, "-c", f"from {NAME}_ros.core import build; build({python_literal(compiler)})"], folder)
+        said = json.loads(called([sys.executable, "run.py", ROUNDS], folder, json.dumps(case.inputs.tolist()).encode()))
+        found = [np.concatenate([np.ravel(part) for part in tick]) for tick in said[0]]
+        return [("", Ran(np.array(found, np.float32), said[1]))]

@@ -1,0 +1,30 @@
+"""What a method of pretraining is, and their registry."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+from edp.networks.predictor import Predictor
+from edp.registry import Registry
+from edp.training.strategy import TrainingStrategy
+from edp.workflows.pretraining.spec import MetaSpec
+
+
+class Pretraining(Protocol):
+    """A way to train one network over many machines."""
+
+    label: ClassVar[str]
+    """How tables call it."""
+    episodic: ClassVar[bool]
+    """Whether it adapts to machines within an update; the others walk carried chunks."""
+
+    def lesson(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
+        """What the training has beside its data; None for nothing.
+
+        Raises:
+            ConfigError: options that the method has no use for.
+        """
+        ...
+
+
+PRETRAININGS: Registry[type[Pretraining]] = Registry("pretraining")

@@ -1,0 +1,23 @@
+"""Joint training: all machines alike, states carried for long, so that the network identifies a machine as it runs."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from edp.networks.predictor import Predictor
+from edp.training.strategy import TrainingStrategy
+from edp.training.warm_start import WarmStart
+from edp.workflows.pretraining.methods.base import PRETRAININGS
+from edp.workflows.pretraining.spec import MetaSpec
+
+
+@PRETRAININGS.register("joint")
+class Joint:
+    """Minimise the mean error over all machines."""
+
+    label: ClassVar[str] = "Joint"
+    episodic: ClassVar[bool] = False
+
+    def lesson(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
+        """The start, where there is one."""
+        return None if start is None else WarmStart(start, unfreeze=False)

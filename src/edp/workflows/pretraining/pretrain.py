@@ -1,0 +1,147 @@
+"""One network over many machines: trained on some, chosen on others, judged on machines that it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.config.experiment import Experiment
+from edp.data.episodes import by_machine
+from edp.data.frozen import frozen_before
+from edp.data.prepared import Prepared
+from edp.data.splits import ByMachine
+from edp.errors import BundleError, ConfigError
+from edp.evaluation.context import Contexts, context_errors
+from edp.logs.source import DataSource
+from edp.networks.predictor import Predictor
+from edp.storage import write_json
+from edp.training import TrainingProgress, load_bundle
+from edp.training.bundle import weights_digest
+from edp.workflows.pretraining.methods import PRETRAININGS
+from edp.workflows.pretraining.spec import MetaSpec
+from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
+
+RESULT = "foundation.json"
+CARRIED_S = 60.0
+"""How long joint training carries a stream where the settings leave it open: what is to be identified takes time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pretrain:
+    """How one network is trained over many machines.
+
+    Attributes:
+        method: name of a registered method.
+        meta: the inner loop, of methods that have one.
+        start: run folder or bundle to begin with; None begins at random.
+
+    Raises:
+        ConfigError: an unknown method.
+    """
+
+    method: str = "joint"
+    meta: MetaSpec = field(default_factory=MetaSpec)
+    start: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        _ = PRETRAININGS[self.method]
+
+
+def pretrain(
+    source: DataSource,
+    experiment: Experiment,
+    order: Pretrain,
+    out: str | Path,
+    on_event: Callable[[TrainingProgress], None] | None = None,
+    on_step: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
+    """Train one network over many machines and judge it on others; the same call goes on after a stop.
+
+    What comes out is a run like any other, with ``foundation.json`` beside it.
+
+    Args:
+        source: recordings that know their machine.
+        experiment: the settings, with a split by machine.
+        order: the method.
+        out: run folder.
+        on_event: called with progress of the training.
+        on_step: called with a sentence before each step of the judgement.
+
+    Returns:
+        The content of ``foundation.json``: machines of each part and errors by context on those that test.
+
+    Raises:
+        EdpError: recordings without machine, too few machines, or settings that do not go with the method.
+        Diverged: the loss was not finite any more.
+    """
+    if not isinstance(experiment.split, ByMachine):
+        raise ConfigError(
+            "pretraining holds out whole machines, but the settings divide the recordings otherwise; set "
+            'split.kind = "machines"'
+        )
+    method = PRETRAININGS[order.method]()
+    begun, frozen = (None, {}) if order.start is None else _start(order.start)
+    lesson = method.lesson(order.meta, begun)
+    data = prepare_data(source, experiment, frozen)
+    experiment = _carrying(experiment, method.episodic, data.task.rate_hz)
+    teaching = None
+    if lesson is not None:
+        facts: dict[str, Any] = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
+        facts |= {"meta": asdict(order.meta)} if method.episodic else {}
+        made = lesson
+        teaching = StrategyFactory(facts, lambda prepared: made, frozen)
+    network = train(source, experiment, out, on_event, teaching, data).predictor
+    if on_step is not None:
+        on_step("judging on machines that were never seen")
+    found = context_errors(network, data.test, data.target_kinds)
+    result = _result(order, experiment, data, found)
+    write_json(Path(out) / RESULT, result)
+    return result
+
+
+def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:
+    """A network to begin with, and names by digest of sessions that stay frozen for what comes of it.
+
+    Raises:
+        BundleError: not a bundle, or one of a network in whole numbers.
+    """
+    bundle = load_bundle(path)
+    predictor = bundle.predictor
+    if predictor.number_format != "float32":
+        raise BundleError(f"'{path}' is a network in {predictor.number_format}, which cannot be trained on")
+    return predictor, frozen_before(bundle.provenance)
+
+
+def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experiment:
+    """With streams carried for a minute, where chunks are walked and the settings leave it open."""
+    chunks = experiment.training.chunks
+    if episodic or chunks.carried or chunks.regime == "window":
+        return experiment
+    carried = max(1, round(CARRIED_S * rate_hz / chunks.length))
+    return replace(experiment, training=replace(experiment.training, chunks=replace(chunks, carried=carried)))
+
+
+def _result(order: Pretrain, experiment: Experiment, data: Prepared, found: Contexts) -> dict[str, Any]:
+    parts = {part: by_machine(getattr(data, part)) for part in ("train", "validation", "test")}
+    return {
+        "schema": 1,
+        "edp": __version__,
+        "method": order.method,
+        "label": PRETRAININGS[order.method].label,
+        "meta": asdict(order.meta) if PRETRAININGS[order.method].episodic else None,
+        "horizon": data.task.horizons[0],
+        "rate_hz": data.task.rate_hz,
+        "carried": experiment.training.chunks.carried,
+        "data": {
+            part: {
+                "machines": len(owned),
+                "recordings": len(getattr(data, part)),
+                "minutes": round(sum(s.samples for s in getattr(data, part)) / data.task.rate_hz / 60, 2),
+            }
+            for part, owned in parts.items()
+        },
+        "unseen": found.to_json(),
+    }

@@ -1,0 +1,44 @@
+"""What is set of a pretraining over many machines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.settings.bounds import MOST_BATCH, RATE, check_bounds, whole
+
+MOST_STEPS = 1_000
+"""Of adaptation: the gradient goes through all of them, and each keeps its copy of the weights."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetaSpec:
+    """The inner loop of the meta-learners; what trains over all machines jointly has none.
+
+    Attributes:
+        inner_rate: learning rate of a step of adaptation.
+        inner_steps: steps of adaptation to a machine.
+        shots: pieces (``training.chunks.length``) of a machine that are adapted on, and as many that judge.
+        head_only: adapt the head alone (ANIL, Raghu et al. 2020, arXiv 1909.09157).
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    inner_rate: float = 0.5
+    inner_steps: int = 3
+    shots: int = 4
+    head_only: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "pretraining",
+            self,
+            inner_rate=RATE,
+            inner_steps=whole(1, MOST_STEPS),
+            shots=whole(1, MOST_BATCH),
+        )
+
+    @property
+    def steps(self) -> tuple[float, ...]:
+        """The rate of each step."""
+        return (self.inner_rate,) * self.inner_steps

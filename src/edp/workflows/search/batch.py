@@ -1,0 +1,50 @@
+"""Trainings through the ledger: what it holds is not done again; an executor does the rest, entered at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+from edp.storage.ledger import Ledger, Record
+from edp.workflows.search.executor import Executor, Job
+
+
+def complete(
+    ledger: Ledger, executor: Executor, jobs: Iterable[Job], on_record: Callable[[Record, bool], None] | None = None
+) -> dict[str, Record]:
+    """The records of all jobs by key, in the order of the jobs.
+
+    Args:
+        ledger: of the study; each training is on disk before `on_record` hears of it.
+        executor: does what the ledger does not hold; jobs of others that it runs must not come back meanwhile.
+        jobs: equal ones are done once.
+        on_record: called with each record and whether it was trained now.
+
+    Raises:
+        StorageError: a record could not be written; what ran is stopped, and what was entered stays.
+    """
+    tell = on_record or (lambda record, trained: None)
+    wanted = {job.key: job for job in jobs}
+    found: dict[str, Record] = {}
+    waiting: set[str] = set()
+    try:
+        for key, job in wanted.items():
+            held = ledger.finished(key)
+            if held is not None:
+                found[key] = held
+                tell(held, False)
+            else:
+                executor.submit(replace(job, folder=str(ledger.path)))
+                waiting.add(key)
+        while waiting:
+            record = executor.wait_any()
+            if record is None:
+                raise RuntimeError(f"the executor gave up {len(waiting)} trainings without a word")
+            waiting.discard(record.key)
+            ledger.put(record)
+            found[record.key] = record
+            tell(record, True)
+    finally:
+        for key in waiting:
+            executor.cancel(key)
+    return {key: found[key] for key in wanted}

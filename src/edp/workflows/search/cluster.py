@@ -1,0 +1,259 @@
+"""Trainings on a Ray cluster: the only door to Ray. On every node a training runs through the pool of one machine.
+
+Only the coordinator writes the ledger; a node needs this version of EDP and the recordings under the same path.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import socket
+import tempfile
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from edp.errors import ConfigError, LostError
+from edp.storage import write_bytes
+from edp.storage.ledger import Record, TrainingStatus, code_version, left_state
+from edp.storage.runs import environment
+from edp.workflows.search.executor import RETRIES, START, ClosedAtExit, Job, ended, refuse_twice
+from edp.workflows.search.local import LocalPool
+
+NAMESPACE = "edp"
+HOUR_S = 3600.0
+PROBE_S = 5.0
+_pool: dict[int, LocalPool] = {}
+"""Of a process of Ray, which does one training after the other: its worker stays warm between them."""
+
+
+class RayPool(ClosedAtExit):
+    """Runs jobs on the nodes of a Ray cluster; see `edp.workflows.search.executor.Executor`.
+
+    Caps on time and memory, and retries of a training whose process is killed, are those of `LocalPool`, which runs on
+    the node; a training whose node or Ray worker is lost starts again elsewhere.
+
+    Args:
+        address: of the cluster, for example ``10.0.0.1:6379``, or ``auto``.
+        threads: of each training, and cores that it takes.
+        retries: how often a training whose node or worker is lost starts again.
+        open_cluster: take a cluster without a token at an address that other computers may reach.
+
+    Raises:
+        ConfigError: Ray is missing, the cluster cannot be reached or is open, or a node has other code or versions.
+    """
+
+    def __init__(self, address: str, threads: int = 1, retries: int = RETRIES, open_cluster: bool = False) -> None:
+        if not open_cluster:
+            check_closed(address)
+        self.ray = _ray()
+        self.threads, self.retries = threads, retries
+        _reach(self.ray, address)
+        self._function = self.ray.remote(num_cpus=threads, max_retries=retries)(_perform_there)
+        self._jobs: dict[str, Job] = {}
+        self._refs: dict[Any, str] = {}
+        self._ready: deque[Record] = deque()
+        try:
+            self._check_nodes()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def workers(self) -> int:
+        """How many trainings the cores of the cluster hold side by side now."""
+        return max(1, int(self.ray.cluster_resources().get("CPU", 1.0)) // self.threads)
+
+    def submit(self, job: Job) -> None:
+        """Take a job; see `Executor.submit`."""
+        refuse_twice(job, self._jobs)
+        self._jobs[job.key] = job
+        # The ledger may not be reachable from a node, and only the coordinator writes it: states travel with the job.
+        where = dict(job.where)
+        file = Path(where.pop(START)) if START in where else None
+        start = None if file is None else (file.name, file.read_bytes())
+        sent = replace(job, folder=None, where=where)
+        reference = self._function.options(name=job.key).remote(sent, self.threads, start)
+        self._refs[reference] = job.key
+
+    def running(self) -> list[str]:
+        """Keys of the jobs that are with the cluster, at most as many as it has room for."""
+        return list(self._refs.values())[: self.workers]
+
+    def wait_any(self, timeout_s: float | None = None) -> Record | None:
+        """The next training that ended; see `Executor.wait_any`."""
+        if not self._ready:
+            if not self._refs:
+                return None
+            done, _ = self.ray.wait(list(self._refs), num_returns=1, timeout=timeout_s)
+            if not done:
+                return None
+            self._hear(done[0])
+        record = self._ready.popleft()
+        del self._jobs[record.key]
+        return record
+
+    def cancel(self, key: str) -> None:
+        """Stop a job; see `Executor.cancel`."""
+        if self._jobs.pop(key, None) is None:
+            return
+        self._ready = deque(record for record in self._ready if record.key != key)
+        for reference in [one for one, held in self._refs.items() if held == key]:
+            del self._refs[reference]
+            with contextlib.suppress(Exception):  # a node that is gone has nothing to cancel
+                self.ray.cancel(reference, force=True)
+
+    def close(self) -> None:
+        """Stop everything and leave the cluster, which goes on."""
+        for key in list(self._jobs):
+            self.cancel(key)
+        self.ray.shutdown()
+
+    def _hear(self, reference: Any) -> None:
+        job = self._jobs[self._refs.pop(reference)]
+        errors = self.ray.exceptions
+        try:
+            data, state = self.ray.get(reference)
+            record = Record.from_bytes(data)
+            if state is not None and job.folder is not None:
+                write_bytes(left_state(job.folder, job.key), state)
+        except errors.OutOfMemoryError as error:
+            record = ended(job, TrainingStatus.OOM, f"the node was out of memory: {_line(error)}")
+        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.ObjectLostError) as error:
+            record = ended(
+                job, TrainingStatus.LOST, f"its node or worker was lost {self.retries + 1} times: {_line(error)}"
+            )
+        except errors.RaySystemError as error:
+            raise LostError(
+                f"the cluster does not answer any more: {_line(error)}. What is done is kept; start the cluster again "
+                "and give the same command"
+            ) from error
+        self._ready.append(record)
+
+    def _check_nodes(self) -> None:
+        """Every node has this code and these versions: a key says so of each record, so it must be true."""
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        asked = {}
+        for node in self.ray.nodes():
+            if node["Alive"] and node["Resources"].get("CPU", 0.0) >= self.threads:
+                strategy = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+                remote = self.ray.remote(num_cpus=self.threads, scheduling_strategy=strategy)(_state_there)
+                asked[f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"] = remote.remote(self.threads)
+        if not asked:
+            raise ConfigError(f"the cluster has no node with {self.threads} free cores; add one, or take fewer threads")
+        here, errors, answered = _state_there(self.threads), self.ray.exceptions, 0
+        for name, reference in asked.items():
+            try:
+                there = self.ray.get(reference, timeout=HOUR_S)
+            except (errors.TaskUnschedulableError, errors.NodeDiedError):
+                continue  # it was killed a moment ago, and the cluster had not noticed; nothing will run there
+            except errors.RayError as error:
+                raise ConfigError(
+                    f"node {name} cannot run EDP: {_line(error)}; install the same version of it there"
+                ) from error
+            answered += 1
+            other = sorted(part for part in here if here[part] != there.get(part))
+            if other:
+                told = ", ".join(f"{part} {there.get(part)} (here {here[part]})" for part in other)
+                raise ConfigError(f"node {name} has other code or versions: {told}; install the same there")
+        if not answered:
+            raise ConfigError("no node of the cluster answers; start one, then give the same command again")
+
+
+def _perform_there(job: Job, threads: int, start: tuple[str, bytes] | None) -> tuple[bytes, bytes | None]:
+    """Do a training in a process of Ray on some node: through a pool of one, whose process stays for the next.
+
+    Args:
+        job: to do.
+        threads: of it.
+        start: name and content of the file of the state that it goes on from.
+
+    Returns:
+        The record, and the file of the state that it left, both as they are in a ledger.
+    """
+    pool = _pool.get(threads)
+    if pool is None:
+        pool = _pool[threads] = LocalPool(1, threads)
+    with tempfile.TemporaryDirectory(prefix="edp-training-") as folder:  # stands for the ledger
+        where = dict(job.where)
+        if start is not None:
+            file = Path(folder, start[0])
+            file.write_bytes(start[1])
+            where[START] = str(file)
+        pool.submit(replace(job, folder=folder, where=where))
+        try:
+            record = pool.wait_any()
+        finally:
+            pool.cancel(job.key)
+        if record is None:
+            raise RuntimeError("the pool of a node gave a training up without a word")
+        left = left_state(folder, job.key)
+        return record.to_bytes(), left.read_bytes() if left.exists() else None
+
+
+def _state_there(threads: int) -> dict[str, str]:
+    return {"code": code_version(), **environment(threads)}
+
+
+def _ray() -> Any:
+    try:
+        import ray
+    except ImportError as error:
+        raise ConfigError(
+            "a cluster needs Ray, which is not installed; pip install 'excavator-dynamics-predictor[cluster]' here and "
+            "on every node, or take --workers"
+        ) from error
+    return ray
+
+
+def check_closed(address: str) -> None:
+    """Refuse a cluster at which anybody in the network may run code.
+
+    Ray listens on all interfaces and, without a token, runs what any client sends. A cluster that checks tokens turns
+    away a client without one, so a client that is set up without a token can only ever reach an open cluster.
+
+    Args:
+        address: of the cluster; ``auto`` may lead anywhere.
+
+    Raises:
+        ConfigError: the address is not loopback, and Ray's token authentication is off here.
+    """
+    if _is_loopback(address.rpartition(":")[0] or address) or os.environ.get("RAY_AUTH_MODE", "").lower() == "token":
+        return
+    raise ConfigError(
+        f"the cluster at '{address}' is used without a token: whoever reaches it can run code on its nodes. Start its "
+        "nodes with RAY_AUTH_MODE=token and RAY_AUTH_TOKEN, and set both here; or give --open-cluster where nobody "
+        "else is in that network"
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _reach(ray: Any, address: str) -> None:
+    advice = (
+        "Start one (ray start --head; ray start --address=HOST:PORT on the other nodes) and give its address; where it "
+        "asks for a token, set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN here, too"
+    )
+    host, _, port = address.rpartition(":")
+    if host and port.isdigit():  # Ray itself tries for minutes
+        try:
+            socket.create_connection((host, int(port)), PROBE_S).close()
+        except OSError as error:
+            raise ConfigError(f"nothing answers at '{address}': {_line(error)}. {advice}") from error
+    try:
+        ray.init(address=address, namespace=NAMESPACE, log_to_driver=False, configure_logging=False)
+    except Exception as error:  # Ray raises a dozen kinds, from ConnectionError to plain RuntimeError
+        raise ConfigError(f"there is no Ray cluster at '{address}': {_line(error)}. {advice}") from error
+
+
+def _line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text[:300] + ("..." if len(text) > 300 else "")

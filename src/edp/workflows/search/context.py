@@ -1,0 +1,239 @@
+"""What the phases of a search stand on: sessions set apart, folds, orders and what came of them."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.config.experiment import Table
+from edp.errors import ConfigError, DataError, closest
+from edp.stats.folds import repeated_folds, repeated_splits
+from edp.workflows.search.modules import with_modules
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.space import WIDTHS, Candidate
+from edp.workflows.search.trainings import TrainingRequest
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of an order.
+
+    Attributes:
+        order: what was to be trained.
+        status: ``done``, or how it ended.
+        result: of `edp.workflows.search.trainings.train_order`, where it is done.
+        message: what went wrong.
+    """
+
+    order: TrainingRequest
+    status: str
+    result: Mapping[str, Any] | None = None
+    message: str = ""
+
+    def score(self, session: str, horizon: int, name: str = "composite") -> float:
+        """A score on one session; NaN where the training did not end well, which counts as the worst."""
+        if self.result is None:
+            return float("nan")
+        return float(self.result["sessions"][session][str(horizon)][name])
+
+    def mean(self, horizon: int, name: str = "composite") -> float:
+        """A score, mean over the judging sessions; NaN where the training did not end well."""
+        return float(np.mean([self.score(session, horizon, name) for session in self.order.judged]))
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a phase found and decided.
+
+    Attributes:
+        phase: its name.
+        facts: plain values that later phases and the report read.
+        sentences: what was decided and why.
+    """
+
+    phase: str
+    facts: Mapping[str, Any]
+    sentences: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values that JSON has: a number that is not finite becomes none."""
+        return {"phase": self.phase, "facts": _finite(self.facts), "sentences": list(self.sentences)}
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class SearchContext:
+    """What all phases share; nothing in it changes while a search runs but what was decided.
+
+    Attributes:
+        spec: the settings of the search.
+        base: settings of the network and its training from which everything starts (`settings_of`).
+        source: where the recordings are, plain.
+        development: names of the sessions that train and judge in all phases.
+        test: names of the sessions set apart.
+        channels: of the recordings.
+        unit: of the scores, for sentences.
+        second: names of the sessions of the second lock-box; none without phase 6.
+        decided: what earlier phases decided, by name.
+    """
+
+    spec: SearchSpec
+    base: Table
+    source: Mapping[str, Any]
+    development: tuple[str, ...]
+    test: tuple[str, ...]
+    channels: tuple[str, ...] = ()
+    unit: str = "mm/s"
+    decided: Mapping[str, Decision] = field(default_factory=dict)
+    second: tuple[str, ...] = ()
+
+    @property
+    def validation(self) -> tuple[str, ...]:
+        """Development sessions that judge where the others train: those of the first run; two at least are left."""
+        chosen = [name for name, judges in zip(self.development, self.folds(1)[0], strict=True) if judges]
+        return tuple(chosen[: max(1, len(self.development) - 2)])
+
+    @property
+    def training(self) -> tuple[str, ...]:
+        """The other development sessions."""
+        return tuple(name for name in self.development if name not in self.validation)
+
+    def folds(self, runs: int) -> NDArray[np.bool_]:
+        """Which development sessions each run is judged on, ``(run, session)``; more runs have the same first ones.
+
+        Repeated folds; in the thesis's mode independent draws of as many sessions as a fold has.
+        """
+        sessions, folds = len(self.development), self.spec.folds
+        if self.spec.mode == "thesis":
+            return repeated_splits(sessions, max(1, round(sessions / folds)), runs, self.spec.seed)
+        return repeated_folds(sessions, folds, -(-runs // folds), self.spec.seed)[:runs]
+
+    def shaped(self, settings: Table) -> Table:
+        """Settings with the widths that this search gives its networks."""
+        return WIDTHS[self.spec.widths](settings)
+
+    def network(self, settings: Table, names: Sequence[str] = (), options: Candidate | None = None) -> Table:
+        """Settings with modules and toggles added, and the widths of this search."""
+        return with_modules(settings, names, self.channels, options, self.shaped)
+
+    def orders(self, settings: Table, runs: Sequence[int], seed: int = 0) -> list[TrainingRequest]:
+        """An order for each run: the same folds and, for common random numbers, the same seeds for every arm.
+
+        Trainings of several epochs are validated by the sessions that judge them, as in the thesis.
+
+        Args:
+            settings: of the arm.
+            runs: their numbers, from 0.
+            seed: number of the seed within a run.
+        """
+        mask = self.folds(max(runs) + 1)
+        names = np.array(self.development)
+        return [
+            TrainingRequest(
+                settings,
+                self.source,
+                tuple(names[~mask[run]].tolist()),
+                tuple(names[mask[run]].tolist()),
+                self.seed("run", run, seed),
+                self.spec.updates,
+                **self.several(tuple(names[mask[run]].tolist())),
+            )
+            for run in runs
+        ]
+
+    def several(self, validation: tuple[str, ...]) -> dict[str, Any]:
+        """What an order of several epochs says beside; nothing of one epoch."""
+        if self.spec.epochs == 1:
+            return {}
+        return {"epochs": self.spec.epochs, "patience": self.spec.patience, "validation": validation}
+
+    def seed(self, *parts: object) -> int:
+        """A seed of its own for each purpose, from the root."""
+        text = " ".join(map(str, (self.spec.seed, *parts)))
+        return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big") >> 1
+
+    def table(self, outcomes: Sequence[Outcome], name: str = "composite") -> Array:
+        """Scores ``(run, session)`` of runs 0, 1, ...; NaN where a run is not judged on a session, or failed."""
+        place = {session: column for column, session in enumerate(self.development)}
+        scores = np.full((len(outcomes), len(place)), np.nan)
+        for row, outcome in enumerate(outcomes):
+            for session in outcome.order.judged:
+                scores[row, place[session]] = outcome.score(session, self.spec.horizon, name)
+        return scores
+
+
+def set_apart(
+    sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Development sessions, test sessions, and those of the second lock-box: of each family its share, drawn once.
+
+    Args:
+        sessions: names in order.
+        families: what kind of session each is, so that tests hold all kinds; may be empty.
+        spec: share and seed.
+
+    Raises:
+        ConfigError: a session that is to be set apart is not there, or is named for both lock-boxes.
+        DataError: too few sessions for the folds.
+    """
+    for part, named in (("test", spec.test), ("second", spec.second)):
+        strange = [name for name in named if name not in sessions]
+        if strange:
+            raise ConfigError(
+                f"search: {part} names '{strange[0]}', and there is no such session{closest(strange[0], sessions)}"
+            )
+    both = sorted(set(spec.test) & set(spec.second))
+    if both:
+        raise ConfigError(f"search: {', '.join(both)} is named in test and in second; each must be in one of them")
+    free = [name for name in sessions if name not in spec.second]
+    named = tuple(name for name in sessions if name in spec.test)
+    test = named or _drawn(free, families, [spec.seed, 0x7E57], max(1, round(spec.test_share * len(sessions))))
+    rest = [name for name in free if name not in test]
+    second: tuple[str, ...] = ()
+    if spec.compression.on:
+        count = max(1, round(spec.second_share * len(sessions)))
+        named = tuple(name for name in sessions if name in spec.second)
+        second = named or _drawn(rest, families, [spec.seed, 0x7E58], count)
+    development = tuple(name for name in sessions if name not in (*test, *second))
+    fold = -(-len(development) // spec.folds)
+    if len(development) < max(spec.folds, 3) or len(development) - fold < 2:
+        less = "a smaller test_share" + (", --set search.compression.on=false" if second else "")
+        raise DataError(
+            f"{len(sessions)} sessions came: {len(test)} are set apart as test"
+            + (f", {len(second)} for phase 6" if second else "")
+            + f", and {len(development)} are left for {spec.folds} folds, "
+            f"which must leave two to train; give more recordings, {less}, or another number of folds"
+        )
+    return development, test, second
+
+
+def _drawn(sessions: Sequence[str], families: Mapping[str, str], seed: list[int], wanted: int) -> tuple[str, ...]:
+    rng = np.random.default_rng(seed)
+    if wanted >= len(sessions):
+        return tuple(sessions)
+    kinds: dict[str, list[str]] = {}
+    for name in sessions:
+        kinds.setdefault(families.get(name, ""), []).append(name)
+    queues = [list(rng.permutation(names)) for names in kinds.values()]
+    # Largest remainder: every kind gives its share, the rest comes from those with the largest part left over.
+    shares = [len(queue) * wanted / len(sessions) for queue in queues]
+    taken = [int(share) for share in shares]
+    for which in sorted(range(len(queues)), key=lambda i: taken[i] - shares[i])[: wanted - sum(taken)]:
+        taken[which] += 1
+    chosen = {str(name) for queue, count in zip(queues, taken, strict=True) for name in queue[:count]}
+    return tuple(name for name in sessions if name in chosen)

@@ -1,0 +1,111 @@
+"""What runs trainings: jobs in, typed ends out. The local pool and the cluster answer to the same three calls."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self
+
+from edp.errors import ConfigError
+from edp.storage.ledger import Record, TrainingIdentity, TrainingStatus
+
+START = "start"
+RETRIES = 2
+"""How often a training whose process was killed starts again before it counts as lost."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A training to be done.
+
+    The function ``identity.job`` is called as ``function(identity, where)`` and returns plain values, or these with a
+    state (`edp.storage.ledger.WithState`). What decides its result is in `identity`, so that its key covers it.
+
+    Attributes:
+        identity: what to train.
+        where: what the function needs and the result does not depend on, such as where the recordings lie. Under
+            `START` the file of a state that it may go on from (`edp.storage.ledger.read_state`).
+        seconds: cap on its time, from the call of the function on.
+        memory_mb: cap on the memory of its process.
+        folder: of the ledger; where given, the process claims the training there and leaves its record, and its state.
+    """
+
+    identity: TrainingIdentity
+    where: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float | None = None
+    memory_mb: float | None = None
+    folder: str | None = None
+
+    @property
+    def key(self) -> str:
+        """Key of the training."""
+        return self.identity.key
+
+
+class Executor(Protocol):
+    """Runs jobs side by side."""
+
+    @property
+    def workers(self) -> int:
+        """How many jobs run side by side."""
+        ...
+
+    def submit(self, job: Job) -> None:
+        """Take a job; it starts when a worker is free, in the order of submission.
+
+        Raises:
+            ConfigError: the same training was submitted and has not come back.
+        """
+        ...
+
+    def wait_any(self, timeout_s: float | None = None) -> Record | None:
+        """The next training that ended, or None when the time is over or nothing is under way."""
+        ...
+
+    def cancel(self, key: str) -> None:
+        """Stop a job or take it from the queue; nothing is told of it any more."""
+        ...
+
+    def running(self) -> list[str]:
+        """Keys of the jobs under way; the others that were submitted wait."""
+        ...
+
+    def close(self) -> None:
+        """Stop everything."""
+        ...
+
+    def __enter__(self) -> Self:
+        """The executor itself."""
+        ...
+
+    def __exit__(self, *_: object) -> None:
+        """Stop everything."""
+        ...
+
+
+class ClosedAtExit:
+    """What both pools do at the end of a ``with`` block: they stop everything."""
+
+    def close(self) -> None:
+        """Stop everything."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        """The pool itself; leaving the block stops it."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop everything."""
+        self.close()
+
+
+def ended(job: Job, status: TrainingStatus, message: str, **measured: Any) -> Record:
+    """The record of a job that could not say itself how it ended."""
+    return Record(job.identity, status, None, message, {"host": os.uname().nodename, **measured})
+
+
+def refuse_twice(job: Job, under_way: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` where a training is under way already."""
+    if job.key in under_way:
+        raise ConfigError(f"training {job.key} was submitted twice; wait for it, equal trainings give equal results")

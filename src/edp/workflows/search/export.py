@@ -1,0 +1,73 @@
+"""A copy of a study's questions and answers for optuna-dashboard; the ledger stays the only truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+from edp.report import read_study
+from edp.workflows.search.plan import space_of
+from edp.workflows.search.space import Choice, Range, Space
+from edp.workflows.search.study import Told, ToldTrial, write_journal
+
+JOURNAL = "optuna.journal"
+NO_VALUES = ("number", "values", "modules", "score", "statuses", "rungs", "pruned")
+
+
+def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Path, list[str]]:
+    """Write the studies of phases 1, 4 and 5 as a journal of Optuna: ``optuna-dashboard FILE`` shows them.
+
+    Args:
+        folder: of the study.
+        path: of the journal; default ``optuna.journal`` in the folder. Another file there is replaced.
+
+    Returns:
+        The file, and the names of the studies in it.
+
+    Raises:
+        StorageError: no study, none of these phases has ended, or the file cannot be written.
+    """
+    held = read_study(folder)
+    file = Path(folder, JOURNAL) if path is None else Path(path)
+    studies = told(held)
+    if not studies:
+        raise StorageError(
+            f"'{folder}' has asked no questions yet: phase 1 (calibration) has not ended; go on with edp search, then "
+            "export again"
+        )
+    write_journal(file, studies)
+    return file, [study.name for study in studies]
+
+
+def told(held: Mapping[str, Any]) -> list[Told]:
+    """The studies of phases 1, 4 and 5 that have ended."""
+    space = space_of(held["spec"]["space"])
+    found = []
+    for decision in held["decisions"]:
+        phase, facts = decision["phase"], decision["facts"]
+        if phase == "calibration":
+            for backbone, own in facts["backbones"].items():
+                found.append(_told(f"{phase} {backbone}", own["trials"], space, [], held))
+        elif phase in ("synthesis", "exploration"):
+            options = {key: Choice(tuple(values)) for key, values in facts.get("options", {}).items()}
+            found.append(_told(phase, facts["trials"], {**space, **options}, list(facts["on"]), held))
+    return found
+
+
+def _told(
+    name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], held: Mapping[str, Any]
+) -> Told:
+    cost, score = held["spec"]["cost"], f"composite, {held['unit']}"
+    full: dict[str, Range] = dict(space) | {module: Choice((0, 1)) for module in modules}
+    objectives = (score,) if cost == "none" else (score, cost)
+    rows = []
+    for trial in trials:
+        values = dict(trial["values"]) | {module: int(module in trial.get("modules", ())) for module in modules}
+        found = trial["score"]
+        answer = None if found is None else [found] if cost == "none" else [found, trial[cost]]
+        known = {key: value for key, value in trial.items() if key not in NO_VALUES}
+        reports = {int(step): float(value) for step, value in trial.get("rungs", ())}
+        rows.append(ToldTrial(values, answer, known, reports, bool(trial.get("pruned"))))
+    return Told(name, full, rows, objectives)

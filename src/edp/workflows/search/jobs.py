@@ -1,0 +1,72 @@
+"""Orders of a search as jobs for an executor: what decides a result is in the identity, the rest is beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+from edp.storage.ledger import TrainingIdentity, WithState, code_version, read_state
+from edp.storage.runs import environment
+from edp.workflows.search.executor import START, Job
+from edp.workflows.search.smaller import make_smaller
+from edp.workflows.search.trainings import TrainingRequest, experiment_of, train_part
+
+
+def job_of(
+    order: TrainingRequest, data: str, threads: int = 1, seconds: float | None = None, memory_mb: float | None = None
+) -> Job:
+    """The job that does an order.
+
+    Args:
+        order: what to train.
+        data: hash of the recordings that it names; where they lie is no part of the key.
+        threads: of the training, whatever its settings say; the pool pins as many.
+        seconds: cap on its time.
+        memory_mb: cap on the memory of its process.
+
+    Raises:
+        ConfigError: settings that cannot be built, or an unknown machine.
+    """
+    settings = {**order.settings, "training": {**order.settings.get("training", {}), "threads": threads}}
+    config: dict[str, Any] = {"settings": settings, "updates": order.updates}
+    sessions = {"train": list(order.train), "judged": list(order.judged)}
+    if order.epochs > 1:
+        config |= {"epochs": order.epochs, "patience": order.patience}
+        sessions["validation"] = list(order.validation)
+    if order.until is not None:
+        config["until"] = order.until
+    if order.recipe is not None:
+        config["recipe"] = order.recipe
+    if settings.get("model", {}).get("physics"):
+        physics = experiment_of(order).model.physics
+        config["machine"] = None if physics is None else physics.digest()  # its file may change, and its name stays
+    identity = TrainingIdentity(
+        f"{__name__}:train",
+        config,
+        sessions,
+        order.seed,
+        order.epochs,
+        code_version(),
+        data,
+        _environment(threads),
+    )
+    return Job(identity, {"source": dict(order.source)}, seconds, memory_mb)
+
+
+_environment = cache(environment)  # looking up versions takes as long as a record
+
+
+def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any] | WithState:
+    """Do the order; what differs from repeat to repeat is left to the record's measures.
+
+    Where the file of a state cannot be read any more, it is trained from the beginning.
+
+    Raises:
+        EdpError: as `edp.workflows.search.trainings.train_part`.
+    """
+    plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
+    part = train_part if identity.config.get("recipe") is None else make_smaller
+    found, state = part(plain, read_state(where[START]) if START in where else None)
+    del found["seconds"]
+    return found if state is None else WithState(found, state)

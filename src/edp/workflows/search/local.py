@@ -1,0 +1,262 @@
+"""A supervised pool of processes on this machine.
+
+Each worker is a fresh interpreter on a socket of its own. When one dies, only its training starts again; the pools of
+the standard library and joblib fail everything that waits. A worker dies with the pool, however that ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import IO, Any
+
+from edp.errors import ConfigError
+from edp.storage.ledger import Record, TrainingStatus
+from edp.workflows.search.executor import RETRIES, ClosedAtExit, Job, ended, refuse_twice
+from edp.workflows.search.worker import BEGUN
+
+TICK_S = 0.1
+"""Between looks at the memory of a training; without a cap the pool sleeps until something happens."""
+START_S = 300.0
+"""What a process may take until the function of its training is called."""
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+SHOWN_OUTPUT = 2000
+PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """A job, which start of it this is, and whether its process must not have done others."""
+
+    job: Job
+    attempt: int = 1
+    fresh: bool = False
+
+
+class _Worker:
+    """One process and the job that it does."""
+
+    def __init__(self, threads: int) -> None:
+        ours, theirs = socket.socketpair()
+        self.connection = Connection(ours.detach())
+        self.output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
+        pinned = {name: str(threads) for name in THREADS}
+        places = os.pathsep.join(place for place in sys.path if place)
+        command = [sys.executable, "-P", "-m", "edp.workflows.search.worker", str(theirs.fileno()), str(os.getpid())]
+        try:
+            self.process = subprocess.Popen(
+                command,
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=self.output,
+                stderr=self.output,
+                env=os.environ | pinned | {"PYTHONPATH": places},
+                start_new_session=True,  # Ctrl-C is for the coordinator, which ends its workers in order
+            )
+        finally:
+            theirs.close()
+        self.used = self.begun = False
+        self.turn: _Turn | None = None
+        self.deadline = float("inf")
+
+    def give(self, turn: _Turn) -> None:
+        self.connection.send((turn.job.identity, dict(turn.job.where), turn.job.folder))
+        self.turn, self.begun, self.deadline = turn, False, time.monotonic() + START_S
+
+    def now(self) -> _Turn:
+        """What it is doing."""
+        if self.turn is None:
+            raise RuntimeError("an idle worker was taken for a busy one")
+        return self.turn
+
+    def resident_mb(self) -> float:
+        """Memory of the process; 0 when it is gone."""
+        try:
+            return int(Path(f"/proc/{self.process.pid}/statm").read_bytes().split()[1]) * PAGE / 2**20
+        except (OSError, IndexError):
+            return 0.0
+
+    def said(self) -> str:
+        """The end of what the process printed."""
+        size = self.output.seek(0, os.SEEK_END)
+        self.output.seek(max(0, size - SHOWN_OUTPUT))
+        return self.output.read().decode(errors="replace").strip()
+
+    def end(self) -> None:
+        """Kill the process and what it started."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+        self.connection.close()
+        self.output.close()
+
+
+class LocalPool(ClosedAtExit):
+    """Runs jobs in processes of this machine; see `edp.workflows.search.executor.Executor`.
+
+    Use it from one thread that lives as long as the pool: on Linux a worker dies with the thread that started it.
+
+    Args:
+        workers: processes; they start when there is something to do.
+        threads: of each training; another number gives other bits, so it belongs into the key.
+        retries: how often a training whose process was killed starts again.
+    """
+
+    def __init__(self, workers: int, threads: int = 1, retries: int = RETRIES) -> None:
+        if workers < 1 or threads < 1:
+            raise ConfigError(
+                f"a pool of {workers} workers with {threads} threads each cannot do anything; give 1 or more"
+            )
+        self.workers, self.threads, self.retries = workers, threads, retries
+        self._thread = threading.get_ident()
+        self._idle: list[_Worker] = []
+        self._busy: dict[str, _Worker] = {}
+        self._queue: deque[_Turn] = deque()
+        self._jobs: dict[str, Job] = {}
+        self._ready: deque[Record] = deque()
+
+    def submit(self, job: Job) -> None:
+        """Take a job; see `Executor.submit`."""
+        refuse_twice(job, self._jobs)
+        if job.memory_mb is not None and sys.platform != "linux":
+            raise ConfigError("a cap on memory needs Linux; leave memory_mb out here")
+        self._jobs[job.key] = job
+        self._queue.append(_Turn(job))
+        self._start()
+
+    def running(self) -> list[str]:
+        """Keys of the jobs under way."""
+        return list(self._busy)
+
+    def processes(self) -> list[int]:
+        """Process ids of the workers, busy ones first."""
+        return [worker.process.pid for worker in [*self._busy.values(), *self._idle]]
+
+    def wait_any(self, timeout_s: float | None = None) -> Record | None:
+        """The next training that ended; see `Executor.wait_any`."""
+        until = float("inf") if timeout_s is None else time.monotonic() + timeout_s
+        while not self._ready:
+            if not self._busy:
+                return None
+            left = until - time.monotonic()
+            if left < 0:
+                return None
+            self._watch(left)
+            self._start()
+        record = self._ready.popleft()
+        del self._jobs[record.key]
+        return record
+
+    def cancel(self, key: str) -> None:
+        """Stop a job; see `Executor.cancel`."""
+        if self._jobs.pop(key, None) is None:
+            return
+        self._queue = deque(turn for turn in self._queue if turn.job.key != key)
+        self._ready = deque(record for record in self._ready if record.key != key)
+        worker = self._busy.pop(key, None)
+        if worker is not None:
+            worker.end()
+        self._start()
+
+    def close(self) -> None:
+        """Stop everything; jobs that have not come back are dropped."""
+        for worker in [*self._busy.values(), *self._idle]:
+            worker.end()
+        self._queue.clear()
+        self._jobs.clear()
+        self._busy.clear()
+        self._idle.clear()
+        self._ready.clear()
+
+    def _start(self) -> None:
+        """Give waiting jobs to free workers."""
+        if threading.get_ident() != self._thread:
+            raise RuntimeError("a LocalPool is used from the thread that made it; its workers would die with this one")
+        while self._queue and len(self._busy) < self.workers:
+            turn = self._queue[0]
+            if turn.fresh and self._idle:
+                self._idle.pop().end()
+            worker = self._idle.pop() if self._idle and not turn.fresh else _Worker(self.threads)
+            try:
+                worker.give(turn)
+            except OSError:  # killed while it was idle
+                worker.end()
+                continue
+            self._queue.popleft()
+            self._busy[turn.job.key] = worker
+
+    def _watch(self, left: float) -> None:
+        """Wait for a message, a death or a cap, at most `left` seconds."""
+        now = time.monotonic()
+        nearest = min(worker.deadline for worker in self._busy.values()) - now
+        capped = any(self._jobs[key].memory_mb for key in self._busy)
+        pause = max(0.0, min(left, nearest, TICK_S if capped else 1.0))
+        by_connection: dict[Any, _Worker] = {worker.connection: worker for worker in self._busy.values()}
+        for connection in wait(list(by_connection), pause):
+            self._hear(by_connection[connection])
+        for worker in list(self._busy.values()):
+            self._hold_to_caps(worker)
+
+    def _hear(self, worker: _Worker) -> None:
+        """Take a message of a busy worker, or its death."""
+        turn = worker.now()
+        try:
+            message = worker.connection.recv_bytes()
+        except (EOFError, OSError):
+            self._died(worker)
+            return
+        if message == BEGUN:
+            limit = turn.job.seconds
+            worker.begun, worker.deadline = True, float("inf") if limit is None else time.monotonic() + limit
+            return
+        record = Record.from_bytes(message)
+        del self._busy[turn.job.key]
+        self._ready.append(replace(record, measured={**record.measured, "attempts": turn.attempt}))
+        worker.turn, worker.used, worker.deadline = None, True, float("inf")
+        self._idle.append(worker)
+
+    def _hold_to_caps(self, worker: _Worker) -> None:
+        """Kill what is over a cap; a process that did jobs before may hold their memory, so a fresh one decides."""
+        turn, job = worker.now(), worker.now().job
+        if time.monotonic() > worker.deadline:
+            if not worker.begun:
+                self._died(worker)
+                return
+            status, message = TrainingStatus.TIMEOUT, f"it took longer than {job.seconds:g} s"
+        elif job.memory_mb is not None and worker.resident_mb() > job.memory_mb:
+            status, message = TrainingStatus.OOM, f"it took more than {job.memory_mb:g} MB of memory"
+        else:
+            return
+        self._drop(worker)
+        if status is TrainingStatus.OOM and worker.used:
+            self._queue.appendleft(replace(turn, fresh=True))
+        else:
+            self._ready.append(ended(job, status, message, attempts=turn.attempt))
+
+    def _died(self, worker: _Worker) -> None:
+        """Start a training whose process ended again, or give it up."""
+        turn, said = worker.now(), worker.said()
+        self._drop(worker)
+        if turn.attempt <= self.retries:
+            self._queue.appendleft(replace(turn, attempt=turn.attempt + 1))
+            return
+        code = worker.process.returncode
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        message = f"its process ended {turn.attempt} times, last by {how}" + (f": {said}" if said else "")
+        self._ready.append(ended(turn.job, TrainingStatus.LOST, message, attempts=turn.attempt))
+
+    def _drop(self, worker: _Worker) -> None:
+        """End a busy worker; another one takes its place when there is something to do."""
+        del self._busy[worker.now().job.key]
+        worker.end()

@@ -1,0 +1,272 @@
+"""The modules that a search may add to a network: the fourteen of the thesis's Table 4.5, each a change of settings."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any, TypeAlias, cast
+
+from edp.config.experiment import Experiment, Table, build, merged, plain_tree
+from edp.errors import ConfigError
+from edp.networks.blocks import BLOCKS, BlockSpec
+from edp.networks.heads import GluHead
+from edp.networks.losses import Correlation
+from edp.networks.predictor import check_combination
+from edp.registry import Registry
+from edp.workflows.search.space import Choice, Value
+
+
+@dataclass(frozen=True)
+class Module:
+    """One optional part of a network.
+
+    Attributes:
+        title: what the thesis calls it.
+        change: settings laid over the baseline's.
+        block: a block that is appended to the baseline's; None for none.
+        options: values worth searching where the module is on, by the place of the setting: keys joined by points, or
+            the name of an option of the block.
+        alter: changes settings in place, where what changes depends on them; None for nothing.
+    """
+
+    title: str
+    change: Mapping[str, Any] = field(default_factory=dict)
+    block: Mapping[str, Any] | None = None
+    options: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    alter: Callable[[Table], None] | None = None
+
+
+MODULES: Registry[Module] = Registry("module")
+TOGGLES: Registry[Module] = Registry("toggle")
+"""Parts of the training that thesis Table 4.6 lists among what phases 4 and 5 may switch on; no module of Table 4.5."""
+
+Shape: TypeAlias = Callable[[Table], Table]
+"""Gives settings the widths that follow from others (`edp.workflows.search.space.WIDTHS`)."""
+
+
+def _block(name: str, title: str, **fixed: Any) -> None:
+    free = {key: values for key, values in cast(type[BlockSpec], BLOCKS[name]).space.items() if key not in fixed}
+    MODULES.register(name)(Module(title, block={"kind": name, **fixed}, options=free))
+
+
+def _change(
+    name: str, title: str, part: str, change: Mapping[str, Any], options: Mapping[str, Sequence[Any]] | None = None
+) -> None:
+    placed = {f"model.{part}.{key}": values for key, values in (options or {}).items()}
+    MODULES.register(name)(Module(title, {"model": {part: change}}, options=placed))
+
+
+_block("cylinder_gate", "Cyl Gate Diagonal", form="diagonal")
+_block("temporal_difference", "Temporal Diff")
+_block("cross_cylinder_attention", "Cross Cyl Attn")
+_change("gru", "GRU Backbone", "backbone", {"cell": {"kind": "gru"}})
+_change("layer_norm_lstm", "LayerNorm LSTM", "backbone", {"cell": {"kind": "layer_norm_lstm"}})
+_block("multi_scale_tcn", "Multiscale TCN")
+_change("zoneout", "Zoneout", "backbone", {"zoneout": 0.1}, {"zoneout": (0.05, 0.1, 0.2)})
+_block("attention_bridge", "Attention Bridge")
+_block("global_average_pooling", "Global Avg Pool")
+_block("squeeze_excitation", "Squeeze-Excitation")
+_change("physics_residual", "Physics Residual", "physics", {"kind": "force"})
+_change("deeper_head", "Deeper Head", "head", {"layers": 2}, {"layers": (2, 3)})
+_change("glu_head", "GLU Head", "head", {"kind": "glu"}, {"hidden": GluHead.space["hidden"]})
+_change("stanh", "STanh Activation", "activation", {"kind": "stanh"})
+
+
+def _correlation(settings: Table) -> None:
+    """The term with its own weight, unless the training has one."""
+    terms = settings["training"].get("terms", [])
+    if all(term["kind"] != "correlation" for term in terms):
+        settings["training"]["terms"] = [*terms, *plain_tree((Correlation(),), "terms")]
+
+
+def _focal(settings: Table) -> None:
+    """The loss, weighted by the size of the error; below the quadratic one no threshold of the Huber loss comes."""
+    loss = settings["training"]["loss"]
+    if loss["kind"] != "focal":
+        settings["training"]["loss"] = {"kind": "focal", "gamma": 2.0, "delta": loss.get("delta", NO_THRESHOLD)}
+
+
+NO_THRESHOLD = 1e6
+"""Standard deviations of the target: errors that do not occur, so that the focal form of the squared error results."""
+
+TOGGLES.register("swa")(Module("SWA", {"training": {"average": {"kind": "swa"}}}))
+TOGGLES.register("correlation_loss")(Module("Correlation Loss", alter=_correlation))
+TOGGLES.register("focal_loss")(Module("Focal Loss", alter=_focal))
+
+
+def part_of(name: str) -> Module:
+    """A module, or a toggle.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    return TOGGLES[name] if name in TOGGLES else MODULES[name]
+
+
+def title_of(name: str) -> str:
+    """What the thesis calls a module or a toggle."""
+    return part_of(name).title
+
+
+def with_modules(
+    settings: Table,
+    names: Iterable[str],
+    channels: Sequence[str] = (),
+    options: Mapping[str, Value] | None = None,
+    shape: Shape | None = None,
+) -> Table:
+    """Settings with these modules added, in the order of the registry, so that equal sets give equal settings.
+
+    Args:
+        settings: a whole experiment as plain tables (`edp.config.experiment.plain_tree`).
+        names: registered modules and toggles.
+        channels: of the recordings, for the feature set ``all``.
+        options: values of `options_of` for some of the modules; those that a module has anyway change nothing.
+        shape: gives the result its widths, before the options.
+
+    Raises:
+        ConfigError: an unknown module or option, or modules that contradict one another or the network; every reason.
+    """
+    wanted = set(names)
+    reasons = conflicts(settings, wanted, channels)
+    if reasons:
+        raise ConfigError("modules: " + "; ".join(reasons))
+    made = _added(settings, wanted)
+    if shape is not None:
+        made = shape(made)
+    for name in (name for name in MODULES if name in wanted):
+        for key, option in _options(settings, name, shape).items():
+            label = (options or {}).get(key, option.present)
+            if label not in option.values:
+                raise ConfigError(f"modules: {key} = {label!r}; one of {list(option.values)} must hold")
+            if label != option.present:
+                option.put(made, option.values[label])
+    return made
+
+
+def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[str, Choice]:
+    """What may be varied of a module where it is on, as dimensions ``module.option``.
+
+    Args:
+        settings: to which the module would be added; what it would have there is one of the values.
+        name: of the module, or of a toggle, which has none.
+        shape: as in `with_modules`.
+    """
+    found = {key: tuple(option.values) for key, option in _options(settings, name, shape).items()}
+    return {key: Choice(values) for key, values in found.items() if len(values) > 1}
+
+
+def present_options(settings: Table, names: Iterable[str], shape: Shape | None = None) -> dict[str, Value]:
+    """What these modules have of their options where nothing is chosen."""
+    return {key: option.present for name in names for key, option in _options(settings, name, shape).items()}
+
+
+@dataclass(frozen=True)
+class _Option:
+    """A setting of a module: its values by the label that a sampler sees, the label of the present one, where it is."""
+
+    values: Mapping[Value, Any]
+    present: Value
+    keys: tuple[str, ...]
+    kind: str | None
+
+    def put(self, settings: Table, value: Any) -> None:
+        """Set it, in place."""
+        held = settings
+        if self.kind is not None:
+            held = next(block for block in settings["model"]["blocks"] if block["kind"] == self.kind)
+        for key in self.keys[:-1]:
+            held = held[key]
+        held[self.keys[-1]] = list(value) if isinstance(value, tuple) else value
+
+
+def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str, _Option]:
+    module, made = part_of(name), {}
+    plain = plain_tree(build(Experiment, _added(settings, {name}), f"with {name}"))
+    if shape is not None:
+        plain = shape(plain)
+    for place, values in module.options.items():
+        keys, held = tuple(place.split(".")), plain
+        kind = None if module.block is None else str(module.block["kind"])
+        if kind is not None:
+            held = next(block for block in plain["model"]["blocks"] if block["kind"] == kind)
+        for key in keys:
+            held = held[key]
+        present = _label(held)
+        labelled = {_label(value): value for value in values}
+        if present not in labelled:
+            labelled = {present: held, **labelled}
+        made[f"{name}.{keys[-1]}"] = _Option(labelled, present, keys, kind)
+    return made
+
+
+def _label(value: Any) -> Value:
+    """What a sampler can hold: a list as text."""
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value))
+    held: Value = value
+    return held
+
+
+def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = ()) -> list[str]:
+    """Why these modules cannot be used together on this network; empty where they can.
+
+    Two modules contradict one another where they set the same value differently, and all of them where the parts of
+    the network say so.
+
+    Raises:
+        ConfigError: an unknown module.
+    """
+    wanted = set(names)
+    chosen = [(name, part_of(name)) for name in sorted(wanted)]
+    reasons = []
+    for (one, first), (other, second) in combinations(chosen, 2):
+        mine, theirs = dict(_leaves(first.change)), dict(_leaves(second.change))
+        both = sorted(".".join(path) for path in mine.keys() & theirs.keys() if mine[path] != theirs[path])
+        if both:
+            reasons.append(f"'{one}' and '{other}' both set {', '.join(both)}; keep one of them")
+    if reasons:
+        return reasons
+    try:
+        experiment = build(Experiment, _added(settings, wanted), "with " + (", ".join(sorted(wanted)) or "no modules"))
+        task = experiment.task.resolve(100.0, channels, physics=experiment.model.physics)
+        check_combination(task, experiment.model)
+    except ConfigError as error:
+        return [str(error)]
+    return []
+
+
+def fitting(settings: Table, channels: Sequence[str] = ()) -> tuple[str, ...]:
+    """Modules that this network can have, in the order of the registry, and does not have already."""
+    free = (name for name in MODULES if _added(settings, {name}) != settings)
+    return tuple(name for name in free if not conflicts(settings, (name,), channels))
+
+
+def contradicting(settings: Table, names: Iterable[str], channels: Sequence[str] = ()) -> frozenset[frozenset[str]]:
+    """Pairs of modules that fit alone, but not together."""
+    pairs = combinations(sorted(set(names)), 2)
+    return frozenset(frozenset(pair) for pair in pairs if conflicts(settings, pair, channels))
+
+
+def _added(settings: Table, names: set[str]) -> Table:
+    made = copy.deepcopy(settings)
+    for name, module in (*MODULES.items(), *TOGGLES.items()):
+        if name not in names:
+            continue
+        made = merged(made, copy.deepcopy(dict(module.change)))
+        if module.block is not None and dict(module.block) not in made["model"]["blocks"]:
+            held = [block for block in made["model"]["blocks"] if block["kind"] != module.block["kind"]]
+            made["model"]["blocks"] = [*held, dict(module.block)]
+        if module.alter is not None:
+            module.alter(made)
+    return made
+
+
+def _leaves(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, (*path, key))
+        else:
+            yield (*path, key), value

@@ -1,0 +1,133 @@
+"""What a search hands on: which sessions stay frozen, and the networks of phase 6 as runs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.config.experiment import Experiment, experiment_toml
+from edp.data.frozen import ByFrozen, Session
+from edp.data.prepared import Prepared, prepare
+from edp.evaluation.controller import Budget
+from edp.evaluation.footprint import footprint
+from edp.logs.source import DataSource
+from edp.networks.predictor import Predictor
+from edp.storage import make_folder, write_json
+from edp.storage.runs import RunFolder, command_line, environment, run_key
+from edp.training import make_bundle, save_bundle
+from edp.workflows.search.context import SearchContext
+from edp.workflows.search.phases.compression import NAME
+from edp.workflows.search.smaller import TEACHER, Recipe, network_of
+from edp.workflows.search.trainings import TrainingRequest, experiment_of
+
+FOLDER, CHOSEN = "networks", "chosen"
+
+
+def frozen_split(folder: Path, ground: SearchContext, digests: Mapping[str, str]) -> ByFrozen:
+    """The sessions of a search by their content, for every command after it.
+
+    Args:
+        folder: of the study.
+        ground: with the sessions set apart.
+        digests: of all sessions by name.
+    """
+
+    def known(names: tuple[str, ...]) -> tuple[Session, ...]:
+        return tuple(Session(name=name, digest=digests[name]) for name in names)
+
+    return ByFrozen(
+        test=known(ground.test),
+        second=known(ground.second),
+        validation=known(ground.validation),
+        train=known(ground.training),
+        study=str(folder.resolve()),
+    )
+
+
+def network_name(order: TrainingRequest) -> str:
+    """``teacher`` for the teacher in single precision, else ``chosen``."""
+    recipe = Recipe.from_json(order.recipe or {})
+    return TEACHER if (recipe.units, recipe.final) == (None, "float32") else CHOSEN
+
+
+def write_networks(
+    folder: Path,
+    source: DataSource,
+    ground: SearchContext,
+    split: ByFrozen,
+    made: Mapping[str, tuple[TrainingRequest, Mapping[str, Any]]],
+) -> dict[str, Path]:
+    """Write the networks that were judged on the second lock-box as runs, once phase 6 has decided.
+
+    Args:
+        folder: of the study.
+        source: where the recordings are.
+        ground: with the decisions.
+        split: of the runs.
+        made: order and result by name of the network.
+
+    Returns:
+        Folder of each run; none before phase 6 has decided. Without one of its own the chosen network is the teacher.
+
+    Raises:
+        EdpError: recordings that cannot be read any more, or a folder that cannot be written.
+    """
+    if NAME not in ground.decided or not made:
+        return {}
+    recordings = source.read()
+    written: dict[str, Path] = {}
+    for name, (order, result) in made.items():
+        recipe = Recipe.from_json(order.recipe or {})
+        experiment = replace(recipe.experiment(experiment_of(order)), split=split)
+        first = recordings[0]
+        task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
+        data = prepare(recordings, task, split, experiment.model.window)
+        network = network_of(result["weights"], task, experiment.model)
+        written[name] = folder / FOLDER / name
+        _write_run(written[name], network, experiment, data, _provenance(source, experiment, data, recipe))
+    return written
+
+
+def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: Prepared, facts: dict[str, Any]) -> None:
+    make_folder(folder)
+    key = run_key({"experiment": experiment_toml(experiment), "made by": facts["search"]}, data.digest)
+    with RunFolder(folder) as run:
+        run.claim(key, experiment_toml(experiment))
+        write_json(run.file("provenance.json"), facts)
+        write_json(run.file("footprint.json"), footprint(network).to_json(Budget()))
+        save_bundle(make_bundle(network, data, facts), run.file("bundle"))
+        run.write_status("finished")
+
+
+def _provenance(source: DataSource, experiment: Experiment, data: Prepared, recipe: Recipe) -> dict[str, Any]:
+    rate = data.task.rate_hz
+
+    def part(name: str) -> dict[str, Any]:
+        series = getattr(data, name)
+        hours = sum(entry.samples for entry in series) / rate / 3600
+        return {"recordings": len(series), "hours": round(hours, 4), "names": [entry.name for entry in series]}
+
+    split = experiment.split
+    return {
+        "edp_version": __version__,
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": command_line(),
+        "seed": experiment.training.seed,
+        "environment": environment(experiment.training.threads),
+        "regime": experiment.training.chunks.regime,
+        "seconds": 0.0,
+        "device": experiment.training.device,
+        "search": {"phase": NAME, "recipe": recipe.to_json()},
+        "data": {
+            "source": str(source.path),
+            "reader": source.to_plain(),
+            "rate_hz": rate,
+            **{name: part(name) for name in ("train", "validation", "test")},
+            "digest": data.digest,
+            "frozen": split.frozen if isinstance(split, ByFrozen) else {},
+        },
+    }

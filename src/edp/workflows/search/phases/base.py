@@ -1,0 +1,255 @@
+"""What a phase is, and what several of them do: ask a study, train its questions, tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from edp.config.experiment import Table
+from edp.errors import ConfigError
+from edp.registry import Registry
+from edp.stats.clustered import MeanTest
+from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.space import Choice, Range, Space, apply
+from edp.workflows.search.study import Study, Trial
+from edp.workflows.search.trainings import TrainingRequest, costs_of
+
+Course = Generator[list[TrainingRequest], list[Outcome], Decision]
+"""Yields orders that may be done side by side, is sent their outcomes in the same order, and returns a decision."""
+
+
+class PhaseSpec(Protocol):
+    """A phase: a pure function of the ground and of what came of its orders; it does nothing else.
+
+    Attributes:
+        title: for progress and reports.
+    """
+
+    title: str
+
+    def run(self, ground: SearchContext) -> Course:
+        """The trainings that it needs, batch by batch, and what follows from them."""
+        ...
+
+    def trainings(self, ground: SearchContext) -> int:
+        """How many it will order at most, as far as is known now; for the time left, and for nothing else."""
+        ...
+
+
+PHASES: Registry[PhaseSpec] = Registry("phase")
+"""In the order in which they run."""
+
+
+@dataclass(frozen=True)
+class AnsweredQuestion:
+    """A question of a study and what came of it.
+
+    Attributes:
+        trial: the question.
+        settings: the experiment that it stands for.
+        costs: analytic costs of its network, by name; none where its values make no network.
+        score: mean over its runs; None where it was not trained for its costs, was pruned, or failed.
+        outcomes: of its runs, of their last parts; none where it was not trained.
+        rungs: means over its runs at steps before the end.
+        pruned: whether it was ended at the last of these.
+    """
+
+    trial: Trial
+    settings: Table
+    costs: dict[str, float]
+    score: float | None
+    outcomes: tuple[Outcome, ...]
+    rungs: Mapping[int, float] = field(default_factory=dict)
+    pruned: bool = False
+
+    def course(self) -> dict[str, Any]:
+        """Its rungs as plain values; nothing where it had none."""
+        if not self.rungs:
+            return {}
+        return {"rungs": [[step, value] for step, value in self.rungs.items()], "pruned": self.pruned}
+
+
+@dataclass(frozen=True)
+class Quest:
+    """A study with what its questions mean.
+
+    Attributes:
+        study: which asks.
+        settings: the experiment that a question stands for.
+        trials: how many questions.
+    """
+
+    study: Study
+    settings: Callable[[Trial], Table]
+    trials: int
+
+
+@dataclass
+class _Asked:
+    """A question of a batch while it is trained.
+
+    Attributes:
+        place: of its quest.
+        trial, settings, costs: see `AnsweredQuestion`.
+        orders: whole trainings, one a run; none where it is not trained.
+        outcomes: of the last part of each.
+        rungs: means over runs, by the step of the rung.
+        pruned: whether it ended at the last of these.
+    """
+
+    place: int
+    trial: Trial
+    settings: Table
+    costs: dict[str, float]
+    orders: list[TrainingRequest]
+    outcomes: tuple[Outcome, ...] = ()
+    rungs: dict[int, float] = field(default_factory=dict)
+    pruned: bool = False
+
+
+def answer_all(
+    ground: SearchContext, quests: list[Quest], stops: Sequence[int] = ()
+) -> Generator[list[TrainingRequest], list[Outcome], list[list[AnsweredQuestion]]]:
+    """Ask all quests side by side, a batch each at a time, until each has all its answers.
+
+    A question whose costs exceed the limits, or whose network cannot be, is told so and not trained.
+
+    Args:
+        ground: of the search.
+        quests: that are asked.
+        stops: steps at which trainings of a batch are judged and may end early. All of a batch are judged by what was
+            told of earlier batches, in the order of their numbers, so that who trained them has no say.
+    """
+    spec = ground.spec
+    answers: list[list[AnsweredQuestion]] = [[] for _ in quests]
+    while any(len(have) < quest.trials for have, quest in zip(answers, quests, strict=True)):
+        batch = [
+            _asked(ground, place, trial, quest.settings(trial))
+            for place, quest in enumerate(quests)
+            for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[place])))
+        ]
+        alive = batch
+        for number, stop in enumerate([*stops, None]):
+            earlier = tuple(stops[:number])
+            some = [[replace(order, until=stop, stops=earlier) for order in one.orders] for one in alive]
+            outcomes = iter((yield [order for orders in some for order in orders]))
+            for one, orders in zip(alive, some, strict=True):
+                one.outcomes = tuple(next(outcomes) for _ in orders)
+            if stop is None:
+                break
+            alive = [one for one in alive if _goes_on(ground, quests[one.place].study, one, stop)]
+            if not alive:
+                break
+        for one in batch:
+            score = None if one.pruned else mean_of(ground, one.outcomes)
+            answer = AnsweredQuestion(one.trial, one.settings, one.costs, score, one.outcomes, one.rungs, one.pruned)
+            answers[one.place].append(answer)
+            tell(ground, quests[one.place].study, answer)
+    return answers
+
+
+def _asked(ground: SearchContext, place: int, trial: Trial, settings: Table) -> _Asked:
+    spec = ground.spec
+    costs = _costs(settings, ground)
+    fits = bool(costs) and all(costs[name] <= most for name, most in spec.limits.items())
+    return _Asked(place, trial, settings, costs, ground.orders(settings, range(spec.trial_runs)) if fits else [])
+
+
+def _goes_on(ground: SearchContext, study: Study, one: _Asked, stop: int) -> bool:
+    """Whether a question is trained beyond a rung: it ended well there, and is not hopeless."""
+    found = mean_of(ground, one.outcomes)
+    if found is None:
+        return False
+    one.rungs[stop] = found
+    if ground.spec.pruner != "none":
+        study.report(one.trial.number, stop, found)
+        one.pruned = study.hopeless(one.trial.number)
+    return not one.pruned
+
+
+def _costs(settings: Table, ground: SearchContext) -> dict[str, float]:
+    try:
+        return costs_of(settings, ground.channels)
+    except ConfigError:  # values that are each in their range, and make no network together
+        return {}
+
+
+def possible(ground: SearchContext, space: Space, arm: Table) -> tuple[Space, list[str]]:
+    """The part of a space in which every value makes a network of this arm, and in words what was left out."""
+    kept: dict[str, Range] = {}
+    notes = []
+    for name, held in space.items():
+        if not isinstance(held, Choice):
+            kept[name] = held
+            continue
+        fit = tuple(value for value in held.options if _costs(ground.shaped(apply(arm, {name: value})), ground))
+        out = [str(value) for value in held.options if value not in fit]
+        if len(fit) > 1:
+            kept[name] = Choice(fit)
+        if out:
+            left = f"{', '.join(map(str, fit))} stay" if len(fit) > 1 else "it keeps its own"
+            notes.append(f"{name} {', '.join(out)} cannot be with a window of {arm['model']['window']}; {left}")
+    return kept, notes
+
+
+def tell(ground: SearchContext, study: Study, answer: AnsweredQuestion) -> None:
+    """Pass an answer on to its study."""
+    spec = ground.spec
+    bounds = [answer.costs[name] / most - 1.0 if answer.costs else 1.0 for name, most in sorted(spec.limits.items())]
+    values = None
+    if answer.score is not None:
+        values = [answer.score] if spec.cost == "none" else [answer.score, answer.costs[spec.cost]]
+    study.tell(answer.trial.number, values, bounds, answer.pruned)
+
+
+def new_study(
+    ground: SearchContext,
+    name: str,
+    space: Space,
+    flags: Sequence[str] = (),
+    barred: frozenset[frozenset[str]] = frozenset(),
+) -> Study:
+    """A study under the costs and limits of this search, with a root of its own."""
+    spec = ground.spec
+    objectives = 1 if spec.cost == "none" else 2
+    root = ground.seed("study", name)
+    return Study(space, root, spec.sampler, tuple(flags), barred, objectives, len(spec.limits), spec.pruner)
+
+
+def said_of_pruned(ground: SearchContext, answers: Sequence[AnsweredQuestion]) -> list[str]:
+    """A sentence on the questions that were ended at a rung; none where none was."""
+    pruned = [answer for answer in answers if answer.pruned]
+    if not pruned:
+        return []
+    saved = sum(1.0 - max(answer.rungs) / ground.spec.length for answer in pruned)
+    share = saved / max(1, sum(bool(answer.outcomes) for answer in answers))
+    return [
+        f"{len(pruned)} of {len(answers)} questions were ended at a rung as worse than the median there, which spared "
+        f"{100 * share:.0f} % of the steps."
+    ]
+
+
+def best(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
+    """The answer with the lowest score; None where none was trained to its end."""
+    done = [answer for answer in answers if answer.score is not None]
+    return min(done, key=lambda answer: (answer.score, answer.trial.number), default=None)
+
+
+def mean_of(ground: SearchContext, outcomes: Sequence[Outcome], name: str = "composite") -> float | None:
+    """A score, mean over outcomes; None where there is none, or one did not end well."""
+    values = [outcome.mean(ground.spec.horizon, name) for outcome in outcomes]
+    return float(np.mean(values)) if values and np.isfinite(values).all() else None
+
+
+def changed(test: MeanTest, reference: float) -> dict[str, float]:
+    """A test of a mean difference as shares of a reference: change, its 95 % interval and the one-sided p-value."""
+    low, high = test.interval()
+    return {
+        "change": float(test.mean) / reference,
+        "low": float(low) / reference,
+        "high": float(high) / reference,
+        "p": float(test.p),
+    }

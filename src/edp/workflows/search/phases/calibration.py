@@ -1,0 +1,169 @@
+"""Phase 1: rates, width, depth and loss of each backbone, and the baseline of all later phases (thesis 3.3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edp.config.experiment import Table
+from edp.errors import DataError
+from edp.stats.efficiency import SizeScore, most_efficient
+from edp.stats.paired import fill_worst
+from edp.stats.pareto import pareto
+from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.phases.base import (
+    PHASES,
+    AnsweredQuestion,
+    Course,
+    Quest,
+    answer_all,
+    best,
+    mean_of,
+    new_study,
+    possible,
+    said_of_pruned,
+)
+from edp.workflows.search.phases.isolation import arm_settings, lowest_against_others
+from edp.workflows.search.space import Choice, Space, applicable, apply
+
+
+class Calibration:
+    """Phase 1."""
+
+    title = "calibration"
+
+    def trainings(self, ground: SearchContext) -> int:
+        """Every question of every backbone, were none too costly, and the final between them."""
+        spec = ground.spec
+        final = spec.folds if spec.mode == "sound" and len(spec.backbones) > 1 else 0
+        return len(spec.backbones) * (spec.trials * spec.trial_runs + final)
+
+    def run(self, ground: SearchContext) -> Course:
+        """All backbones side by side: every size in turn, then what the sampler asks; the best of each on all folds."""
+        features = ground.spec.feature_sets[ground.decided["isolation"].facts["features"]]
+        arms = {backbone: arm_settings(ground.base, backbone, features) for backbone in ground.spec.backbones}
+        spaces = {name: possible(ground, applicable(ground.spec.space, arm), arm) for name, arm in arms.items()}
+        quests = [_quest(ground, name, arm, spaces[name][0]) for name, arm in arms.items()]
+        answers = yield from answer_all(ground, quests, ground.spec.stops)
+        notes = [f"{name}: {note}." for name, (_, some) in spaces.items() for note in some]
+        asked = dict(zip(arms, answers, strict=True))
+        chosen = {name: picked for name, own in asked.items() if (picked := _efficient(own)) is not None}
+        final: list[Outcome] = []
+        # One fold may be easy for one of them; the thesis decides by it.
+        if ground.spec.mode == "sound" and len(chosen) > 1:
+            runs = range(ground.spec.folds)
+            final = yield [order for picked in chosen.values() for order in ground.orders(picked.settings, runs)]
+        return self.decide(ground, asked, chosen, final, notes)
+
+    def decide(
+        self,
+        ground: SearchContext,
+        answers: dict[str, list[AnsweredQuestion]],
+        chosen: dict[str, AnsweredQuestion],
+        final: Sequence[Outcome],
+        notes: list[str],
+    ) -> Decision:
+        """Of each backbone the smallest size that no larger one repays; of these the lowest score in the final."""
+        facts: dict[str, Any] = {"backbones": {}}
+        sentences = list(notes)
+        for backbone, own in answers.items():
+            picked = chosen.get(backbone)
+            if picked is None:
+                sentences.append(f"{backbone}: no training of {len(own)} ended well; it is left out.")
+                continue
+            facts["backbones"][backbone] = _plain(ground, picked) | {"trials": [_plain(ground, held) for held in own]}
+            lowest = best(own)
+            size = f"{picked.costs['parameters']:,.0f}"
+            text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} {ground.unit} with {size} parameters"
+            if lowest is not None and lowest is not picked:
+                size = f"{lowest.costs['parameters']:,.0f}"
+                text += f"; the lowest, {lowest.score:.3g}, has {size} and does not repay the difference"
+            sentences += [f"{text}.", *(f"{backbone}: {said}" for said in said_of_pruned(ground, own))]
+        if not chosen:
+            raise DataError(
+                "phase 1: no training of any backbone ended well; see the messages of the trainings, and lower the "
+                "learning rates of the space or loosen the limits"
+            )
+        scores = {name: picked.score or 0.0 for name, picked in chosen.items()}
+        if final:
+            facts["final"] = _final(ground, list(chosen), final)
+            scores = facts["final"]["scores"]
+            listed = ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
+            against = "".join(
+                f"; {held['best']} against {name} {100 * held['change']:+.2f} % ({100 * held['low']:+.2f} to "
+                f"{100 * held['high']:+.2f} %)"
+                for name, held in facts["final"]["against"].items()
+            )
+            sentences.append(f"Each on all {ground.spec.folds} folds: {listed} {ground.unit}{against}.")
+        winner = min(scores, key=lambda name: scores[name])
+        facts |= {"backbone": winner, "baseline": dict(chosen[winner].trial.values)}
+        facts["settings"] = chosen[winner].settings
+        sentences.append(f"The baseline of all later phases is {winner}.")
+        if ground.spec.cost != "none":
+            facts["front"] = {name: _front(ground, own) for name, own in answers.items()}
+        return Decision("calibration", facts, tuple(sentences))
+
+
+def _quest(ground: SearchContext, backbone: str, arm: Table, space: Space) -> Quest:
+    spec = ground.spec
+    study = new_study(ground, f"calibration {backbone}", space)
+    sizes = space.get("units")
+    for _ in range(spec.warm_rounds):
+        for size in sizes.options if isinstance(sizes, Choice) else ():
+            study.suggest({"units": size})
+    return Quest(study, lambda trial: ground.shaped(apply(arm, trial.values)), spec.trials)
+
+
+def _final(ground: SearchContext, backbones: list[str], outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Mean score of each backbone over the folds, and the lowest against each of the others."""
+    mask = ground.folds(ground.spec.folds)
+    parts = np.split(np.arange(len(outcomes)), len(backbones))
+    raw = np.stack([ground.table([outcomes[place] for place in part]) for part in parts])
+    tables = dict(zip(backbones, fill_worst(raw, mask), strict=True))
+    scores = {name: float(held[mask].mean()) for name, held in tables.items()}
+    return {"runs": ground.spec.folds, "scores": scores, "against": lowest_against_others(tables, mask)}
+
+
+def _efficient(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
+    """The best answer of the size that the efficiency rule chooses (`edp.stats.efficiency`)."""
+    by_size: dict[float, AnsweredQuestion] = {}
+    for answer in answers:
+        if answer.score is None:
+            continue
+        held = by_size.get(answer.costs["parameters"])
+        if held is None or held.score is None or answer.score < held.score:
+            by_size[answer.costs["parameters"]] = answer
+    if not by_size:
+        return None
+    candidates = [SizeScore(f"{size:,.0f}", size, answer.score or 0.0) for size, answer in by_size.items()]
+    return by_size[most_efficient(candidates).parameters]
+
+
+def _front(ground: SearchContext, answers: list[AnsweredQuestion]) -> list[dict[str, Any]]:
+    done = [answer for answer in answers if answer.score is not None]
+    kept = pareto([(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done])
+    return [_plain(ground, done[place]) for place in kept]
+
+
+def _plain(ground: SearchContext, answer: AnsweredQuestion) -> dict[str, Any]:
+    return {
+        "number": answer.trial.number,
+        "values": dict(answer.trial.values),
+        "score": answer.score,
+        "mae": None if answer.pruned else mean_of(ground, answer.outcomes, "mae"),
+        **answer.costs,
+        "statuses": [outcome.status for outcome in answer.outcomes],
+        **answer.course(),
+    }
+
+
+def _values(answer: AnsweredQuestion) -> str:
+    return ", ".join(
+        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in answer.trial.values.items()
+    )
+
+
+PHASES.register("calibration")(Calibration())

@@ -1,0 +1,233 @@
+"""Phase 6: the teacher at length, smaller networks of it, and one look at the second lock-box (thesis 3.3.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from edp.config.experiment import Experiment, Table, build
+from edp.errors import ConfigError
+from edp.networks.narrow import width_of
+from edp.networks.predictor import build_model
+from edp.stats.pareto import pareto
+from edp.training.bundle import blank_scaler
+from edp.workflows.compression import FORMATS
+from edp.workflows.compression.judged import relative, way_of
+from edp.workflows.compression.planning import CompressionPlan, make_plan
+from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.phases.base import PHASES, Course
+from edp.workflows.search.smaller import Recipe
+from edp.workflows.search.trainings import TrainingRequest
+
+NAME = "compression"
+Row = dict[str, Any]
+
+
+@dataclass
+class _Made:
+    """A network and what came of it."""
+
+    recipe: Recipe
+    outcome: Outcome
+
+    @property
+    def error(self) -> float:
+        """MAE in float32, the mean over horizons; infinite where it was not trained to its end."""
+        held = self.outcome.result
+        if held is None:
+            return float("inf")
+        return sum(float(scores["mae"]) for scores in held["plain"].values()) / len(held["plain"])
+
+
+class CompressionPhase:
+    """Phase 6. Networks are compared on development sessions that do not train; the second lock-box chooses nothing."""
+
+    title = NAME
+
+    def trainings(self, ground: SearchContext) -> int:
+        """Teacher, at most three networks a width, and teacher and choice once more on the second lock-box."""
+        spec = ground.spec.compression
+        if not spec.on:
+            return 0
+        if "exploration" in ground.decided:
+            try:
+                return plan_of(ground, teacher_settings(ground)).trainings + 3
+            except ConfigError:
+                return 1
+        widths = len(spec.units) or len(spec.shares) + len(spec.formats or FORMATS) - 1
+        return 3 * widths + 3
+
+    def run(self, ground: SearchContext) -> Course:
+        """Teacher; students of each width; the better of each with rounded numbers; the choice on the lock-box."""
+        if not ground.spec.compression.on:
+            yield from ()
+            return Decision(NAME, {"on": False}, ("Left out: search.compression.on is false.",))
+        settings = teacher_settings(ground)
+        (first,) = yield [order_of(ground, settings, recipe_of(ground))]
+        teacher = _Made(recipe_of(ground), first)
+        if first.result is None:
+            return _nothing(
+                ground, f"The teacher's training at length did not end well ({first.message or first.status})."
+            )
+        try:
+            plan = plan_of(ground, settings)
+        except ConfigError as error:
+            return _nothing(ground, f"No network was made: {error}.")
+        made = [teacher]
+        recipes = [recipe_of(ground, order.units, order.pruned) for ways in plan.orders.values() for order in ways]
+        outcomes = yield [order_of(ground, settings, recipe) for recipe in recipes]
+        made += map(_Made, recipes, outcomes)
+        if plan.rounds:
+            better = [replace(_better(made, units).recipe, rounded=True) for units in plan.orders]
+            outcomes = yield [order_of(ground, settings, recipe) for recipe in better]
+            made += map(_Made, better, outcomes)
+        rows = rows_of(ground, teacher, made)
+        chosen = chosen_of(rows)
+        if chosen is None:
+            return self.decide(ground, plan, rows, None, ())
+        final = [replace(recipe_of(ground), final="float32"), _final(ground, rows[chosen])]
+        outcomes = yield [order_of(ground, settings, recipe, ground.second) for recipe in final]
+        return self.decide(ground, plan, rows, chosen, outcomes)
+
+    def decide(
+        self,
+        ground: SearchContext,
+        plan: CompressionPlan,
+        rows: list[Row],
+        chosen: int | None,
+        outcomes: Sequence[Outcome],
+    ) -> Decision:
+        """The network with the least error among those that fit, and what the second lock-box says of it."""
+        points = [(row["error"], row["taken"]["cycles"][2], row["taken"]["parameter_bytes"]) for row in rows]
+        budget = ground.spec.compression.budget
+        facts: dict[str, Any] = {
+            "on": True,
+            "budget": recipe_of(ground).to_json()["budget"],
+            "sessions": {"train": list(ground.training), "validation": list(ground.validation)},
+            "second": list(ground.second),
+            "rows": rows,
+            "front": pareto(points),
+            "chosen": chosen,
+            "notes": list(plan.notes),
+            "box": None,
+        }
+        sentences = [f"{len(rows)} networks and formats were compared on {', '.join(ground.validation)}."]
+        if chosen is None:
+            return Decision(NAME, facts, (*sentences, f"None of them fits the budget '{budget.name}'."))
+        row = rows[chosen]
+        sentences.append(
+            f"Chosen for '{budget.name}': {row['name']} with {row['taken']['parameter_bytes']:,} bytes of parameters "
+            f"and {row['taken']['cycles'][2]:,} cycles a tick; its error there is {100 * (row['error'] - 1):+.1f} % "
+            "against the teacher's."
+        )
+        formats = ("float32", row["format"])
+        held = [o.result["formats"].get(f) if o.result is not None else None for o, f in zip(outcomes, formats)]
+        if None in held or not held:
+            sentences.append("A network could not be judged on the second lock-box.")
+            return Decision(NAME, facts, tuple(sentences))
+        scores = {who: one["scores"] for who, one in zip(("teacher", "chosen"), held, strict=True) if one is not None}
+        error = relative(scores["chosen"], scores["teacher"])
+        facts["box"] = {"scores": scores, "error": error}
+        sentences.append(
+            f"On the second lock-box ({', '.join(ground.second)}), opened for these two alone: "
+            f"{100 * (error - 1):+.1f} % against the teacher's error."
+        )
+        return Decision(NAME, facts, tuple(sentences))
+
+
+def teacher_settings(ground: SearchContext) -> Table:
+    """Settings of the winner of the search."""
+    settings: Table = ground.decided["exploration"].facts["teacher_settings"]
+    return settings
+
+
+def recipe_of(ground: SearchContext, units: int | None = None, pruned: bool = False) -> Recipe:
+    """A recipe under the settings of this search."""
+    spec = ground.spec.compression
+    steps = spec.updates or ground.spec.final_updates
+    return Recipe(steps, spec.formats or tuple(FORMATS), spec.budget, ground.validation, units, pruned)
+
+
+def order_of(ground: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
+    """The order that makes a network of a recipe and judges it, by default on the sessions that compare."""
+    return TrainingRequest(
+        settings,
+        ground.source,
+        ground.training,
+        tuple(judged) or ground.validation,
+        ground.seed(NAME),
+        ground.spec.final_updates,
+        recipe=recipe.to_json(),
+        **ground.several(ground.validation),
+    )
+
+
+def plan_of(ground: SearchContext, settings: Table) -> CompressionPlan:
+    """Which networks are made.
+
+    Raises:
+        ConfigError: a budget that no network of this kind meets.
+    """
+    spec = ground.spec.compression
+    experiment = build(Experiment, settings, "of the search")
+    task = experiment.task.resolve(100.0, ground.channels, experiment.model.physics)
+    network = build_model(task, experiment.model, blank_scaler(task), seed=0)
+    units = [width for width in spec.units if width <= width_of(experiment.model)]
+    return make_plan(network, spec.budget, units, spec.formats, shares=spec.shares)
+
+
+def _better(made: Sequence[_Made], units: int) -> _Made:
+    """Of the networks of a width the one with the least error in float32."""
+    return min((one for one in made if one.recipe.units == units), key=lambda one: one.error)
+
+
+def rows_of(ground: SearchContext, teacher: _Made, made: Sequence[_Made]) -> list[Row]:
+    """Every network in every format that it can be in, in the order in which they were made."""
+    rows: list[Row] = []
+    base = teacher.outcome.result or {}
+    for one in made:
+        held = one.outcome.result
+        if held is None:
+            continue
+        order = one.recipe.order()
+        for name, found in held["formats"].items():
+            rows.append(
+                {
+                    "name": f"{one.recipe.name} {FORMATS[name].label}",
+                    "way": "teacher" if order is None else way_of(order),
+                    "units": one.recipe.units,
+                    "pruned": one.recipe.pruned,
+                    "rounded": one.recipe.rounded,
+                    "format": name,
+                    "taken": found["taken"],
+                    "over": found["over"],
+                    "scores": found["scores"],
+                    "before": held["plain"],
+                    "error": relative(found["scores"], base["plain"]),
+                }
+            )
+    return rows
+
+
+def chosen_of(rows: Sequence[Row]) -> int | None:
+    """Place of the row that fits with the least error, of equals the cheapest; None where none fits."""
+    fitting = [place for place, row in enumerate(rows) if not row["over"]]
+    return min(
+        fitting,
+        key=lambda i: (rows[i]["error"], rows[i]["taken"]["cycles"][2], rows[i]["taken"]["parameter_bytes"]),
+        default=None,
+    )
+
+
+def _final(ground: SearchContext, row: Row) -> Recipe:
+    return replace(recipe_of(ground, row["units"], row["pruned"]), rounded=row["rounded"], final=row["format"])
+
+
+def _nothing(ground: SearchContext, why: str) -> Decision:
+    facts = {"on": True, "rows": [], "front": [], "chosen": None, "notes": [why], "box": None}
+    facts |= {"second": list(ground.second), "budget": recipe_of(ground).to_json()["budget"]}
+    return Decision(NAME, facts, (why, "The second lock-box stays closed."))
+
+
+PHASES.register(NAME)(CompressionPhase())

@@ -1,0 +1,130 @@
+"""Phase 3: modules against the baseline over repeated folds (thesis 3.3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from edp.config.experiment import Table
+from edp.stats.checks import Mask
+from edp.stats.clustered import clustered_t
+from edp.stats.confirm import ModuleEvidence, Rule, confirm
+from edp.stats.paired import fill_worst
+from edp.stats.race import LOOKS, Look
+from edp.stats.thesis_confirm import ThesisEvidence, thesis_confirm
+from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
+from edp.workflows.search.modules import MODULES
+from edp.workflows.search.phases.base import PHASES, Course
+from edp.workflows.search.phases.screening import baseline_of
+
+METRICS = ("mae", "rmse", "p95", "p99")
+
+
+class Confirmation:
+    """Phase 3. Sound: a race with a clustered test; thesis: splits and seeds with a mixed model."""
+
+    title = "confirmation"
+
+    def trainings(self, ground: SearchContext) -> int:
+        """Were nothing dropped at a look; before the screening, with half of the modules."""
+        spec, decided = ground.spec, ground.decided
+        arms = len(decided["screening"].facts["passed"]) if "screening" in decided else len(MODULES) // 2
+        runs = int(decided["planning"].facts["runs"]) if "planning" in decided else spec.most_runs
+        return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
+
+    def run(self, ground: SearchContext) -> Course:
+        """Trainings of the mode, and what is confirmed."""
+        passed = list(ground.decided["screening"].facts["passed"])
+        if not passed:
+            yield from ()
+            return Decision("confirmation", {"confirmed": [], "evidence": []}, ("No module passed the screening.",))
+        base = baseline_of(ground)[0]
+        arms = [base, *(ground.network(base, [name]) for name in passed)]
+        return (yield from (_thesis if ground.spec.mode == "thesis" else _sound)(ground, passed, arms))
+
+
+def _sound(ground: SearchContext, passed: list[str], arms: list[Table]) -> Course:
+    """Look by look; what a look drops is not trained any more."""
+    runs = int(ground.decided["planning"].facts["runs"])
+    looks = tuple(look for look in LOOKS if look.runs < runs)
+    mask = ground.folds(runs)
+    scores = np.full((len(arms), runs, len(ground.development)), np.nan)
+    alive = list(range(len(arms)))
+    start = 0
+    for stop in (*(look.runs for look in looks), runs):
+        outcomes = yield [order for arm in alive for order in ground.orders(arms[arm], range(start, stop))]
+        for place, arm in enumerate(alive):
+            own = outcomes[place * (stop - start) : (place + 1) * (stop - start)]
+            scores[arm, start:stop] = ground.table(own)
+        start = stop
+        filled = fill_worst(scores[alive, :stop], mask[:stop])
+        if stop < runs:
+            hopeless = _hopeless(filled, mask[:stop], stop, looks)
+            alive = [0, *(arm for arm, out in zip(alive[1:], hopeless, strict=True) if not out)]
+        if len(alive) == 1:
+            break
+    found = confirm(
+        scores[:, :start],
+        passed,
+        ground.decided["screening"].facts["registered"],
+        mask[:start],
+        Rule(alpha=ground.spec.alpha, least_gain=ground.spec.least_gain, looks=looks),
+    )
+    return _decision([_plain(held) for held in found], [held.module for held in found if held.confirmed], _texts(found))
+
+
+def _hopeless(filled: Array, mask: Mask, stop: int, looks: Sequence[Look]) -> list[bool]:
+    """Which modules the look after `stop` runs drops."""
+    level = next(look.drop_above for look in looks if look.runs == stop)
+    seen = mask.any(axis=0)
+    p = clustered_t((filled[1:] - filled[0])[..., seen], mask[:, seen]).p
+    return [bool(value > level) for value in np.atleast_1d(p)]
+
+
+def _thesis(ground: SearchContext, passed: list[str], arms: list[Table]) -> Course:
+    runs, seeds = int(ground.decided["planning"].facts["runs"]), ground.spec.run_seeds
+    outcomes = yield [
+        order for arm in arms for seed in range(seeds) for order in ground.orders(arm, range(runs), seed=seed)
+    ]
+    scores = _by_metric(ground, outcomes, len(arms), seeds, runs)
+    found = thesis_confirm(scores, passed, METRICS, ground.spec.alpha)
+    confirmed = [name for name in passed if any(held.confirmed for held in found if held.module == name)]
+    texts = [_thesis_text(name, [held for held in found if held.module == name]) for name in passed]
+    return _decision([asdict(held) for held in found], confirmed, texts)
+
+
+def _by_metric(ground: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
+    """``(metric, arm, split, seed)``; a failed training has the worst of its metric."""
+    rows = [[outcome.mean(ground.spec.horizon, metric) for outcome in outcomes] for metric in METRICS]
+    scores = np.array(rows).reshape(len(METRICS), arms, seeds, runs).swapaxes(2, 3)
+    for own in scores:
+        own[~np.isfinite(own)] = np.nanmax(np.where(np.isfinite(own), own, np.nan))
+    return scores
+
+
+def _decision(evidence: list[dict[str, Any]], confirmed: list[str], texts: list[str]) -> Decision:
+    head = f"Confirmed: {', '.join(MODULES[name].title for name in confirmed) or 'no module'}."
+    return Decision("confirmation", {"confirmed": confirmed, "evidence": evidence}, (head, *texts))
+
+
+def _plain(held: ModuleEvidence) -> dict[str, Any]:
+    return asdict(held)
+
+
+def _texts(found: Sequence[ModuleEvidence]) -> list[str]:
+    return [f"{MODULES[held.module].title}: {held.reason}." for held in found]
+
+
+def _thesis_text(name: str, found: Sequence[ThesisEvidence]) -> str:
+    best = min(found, key=lambda held: held.adjusted)
+    verdict = "confirmed" if any(held.confirmed for held in found) else "not confirmed"
+    return (
+        f"{MODULES[name].title}: {verdict}; on {best.metric} adjusted p {best.adjusted:.2g}, d_z {best.d_z:.2f}, "
+        f"wins {100 * best.stability:.0f} %."
+    )
+
+
+PHASES.register("confirmation")(Confirmation())

@@ -1,0 +1,83 @@
+"""Phase 5: all modules at once, from the winner of phase 4 on (thesis 3.3.6, eq. 3.43)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edp.stats.clustered import clustered_t
+from edp.stats.paired import fill_worst
+from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.modules import fitting, options_of, title_of
+from edp.workflows.search.phases.base import PHASES, Course, changed
+from edp.workflows.search.phases.joint import ask_together, winner_of
+from edp.workflows.search.phases.screening import baseline_of
+
+
+class Exploration:
+    """Phase 5. Its winner is held against that of phase 4 on folds that no earlier phase has used."""
+
+    title = "exploration"
+
+    def trainings(self, ground: SearchContext) -> int:
+        """The questions, and both winners on fresh folds."""
+        return ground.spec.free_trials * ground.spec.trial_runs + 2 * len(fresh_runs(ground))
+
+    def run(self, ground: SearchContext) -> Course:
+        """Ask about all modules and options of those that are on; then both winners on fresh folds, same seeds."""
+        spec = ground.spec
+        base = baseline_of(ground)[0]
+        free = fitting(base, ground.channels)
+        earlier = ground.decided["synthesis"].facts
+        starts = [(earlier["values"], earlier["modules"])]
+        options = {name: options_of(base, name, ground.shaped) for name in free}
+        switches = [*free, *spec.toggles]
+        answers = yield from ask_together(ground, "exploration", switches, spec.free_trials, starts, options)
+        facts = winner_of(ground, "exploration", switches, answers)
+        facts["options"] = {key: list(held.options) for own in options.values() for key, held in own.items()}
+        runs = fresh_runs(ground)
+        arms = (earlier["settings"], facts["settings"])
+        outcomes = yield [order for settings in arms for order in ground.orders(settings, runs)]
+        return self.decide(ground, facts, outcomes)
+
+    def decide(self, ground: SearchContext, facts: dict[str, Any], outcomes: Sequence[Outcome]) -> Decision:
+        """The teacher: the winner of phase 5 where fresh folds bear it out, else that of phase 4."""
+        earlier = ground.decided["synthesis"].facts
+        size = len(outcomes) // 2
+        mask = ground.folds(fresh_runs(ground)[-1] + 1)[-size:]
+        seen = mask.any(axis=0)
+        scores = np.stack([ground.table(part)[:, seen] for part in (outcomes[:size], outcomes[size:])])
+        filled = fill_worst(scores, mask[:, seen])
+        test = clustered_t(filled[1] - filled[0], mask[:, seen])
+        fresh = [float(own[mask[:, seen]].mean()) for own in filled]
+        found = changed(test, fresh[0])
+        better = found["change"] < 0 and found["p"] < ground.spec.alpha
+        names = ", ".join(map(title_of, facts["modules"])) or "no module"
+        facts |= {
+            **found,
+            "fresh": {"synthesis": fresh[0], "exploration": fresh[1]},
+            "runs": size,
+            "teacher": "exploration" if better else "synthesis",
+        }
+        facts["teacher_settings"] = facts["settings"] if better else earlier["settings"]
+        verdict = "it is the teacher" if better else "the winner of phase 4 stays the teacher"
+        sentences = (
+            f"Best of {len(facts['trials'])} questions about all modules: {names}.",
+            f"Against the winner of phase 4 on {size} fresh runs: {100 * found['change']:+.2f} % (one-sided p "
+            f"{found['p']:.2g}); {verdict}.",
+            *facts["said_of_pruned"],
+        )
+        return Decision("exploration", facts, sentences)
+
+
+def fresh_runs(ground: SearchContext) -> range:
+    """Two repeats of the folds behind all that phases 0 to 4 may have used."""
+    spec = ground.spec
+    used = max(spec.most_runs, spec.variance_runs, spec.trial_runs, spec.screening_repeats)
+    start = -(-used // spec.folds) * spec.folds
+    return range(start, start + 2 * spec.folds)
+
+
+PHASES.register("exploration")(Exploration())

@@ -1,0 +1,194 @@
+"""Phase 0: how much scores vary between folds and seeds, and which feature set goes on (thesis 3.3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.config.experiment import Table
+from edp.errors import DataError
+from edp.stats.clustered import clustered_t
+from edp.stats.paired import fill_worst
+from edp.stats.variance import SplitVariance, paired_variance, split_variance, thesis_variance
+from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
+from edp.workflows.search.phases.base import PHASES, Course, changed
+
+DEFAULT_BACKBONE: dict[str, Table] = {
+    "lstm": {"kind": "lstm", "units": 64},
+    "gru": {"kind": "gru", "units": 64},
+    "tcn": {"kind": "tcn", "channels": [64, 64, 64, 64], "kernel": 3},
+    "hybrid": {"kind": "hybrid", "channels": [64], "kernel": 5, "units": 64},
+}
+
+
+def arm_settings(base: Table, backbone: str, features: Any) -> Table:
+    """The base with another backbone of like size, and another feature set (a name, or a plain table)."""
+    held = base["model"]["backbone"]
+    if held["kind"] == backbone:
+        made = dict(held)
+    else:
+        made = dict(DEFAULT_BACKBONE[backbone])
+        width = int(held.get("units", (held.get("channels") or [64])[-1]))
+        if "units" in made:
+            made["units"] = width
+        if "channels" in made:
+            made["channels"] = [width] * len(made["channels"])
+    return {
+        **base,
+        "task": {**base["task"], "features": features},
+        "model": {**base["model"], "backbone": made, "blocks": []},
+    }
+
+
+class Isolation:
+    """Phase 0."""
+
+    title = "isolation and variance"
+
+    def arms(self, ground: SearchContext) -> list[tuple[str, str]]:
+        """Backbone and feature set of each arm."""
+        return [(backbone, features) for backbone in ground.spec.backbones for features in ground.spec.feature_sets]
+
+    def trainings(self, ground: SearchContext) -> int:
+        """All of them at once."""
+        return len(self.arms(ground)) * ground.spec.variance_runs * ground.spec.variance_seeds
+
+    def run(self, ground: SearchContext) -> Course:
+        """All arms on the same folds with the same seeds, in one batch."""
+        spec = ground.spec
+        outcomes = yield [
+            order
+            for backbone, features in self.arms(ground)
+            for seed in range(spec.variance_seeds)
+            for order in ground.orders(
+                ground.shaped(arm_settings(ground.base, backbone, spec.feature_sets[features])),
+                range(spec.variance_runs),
+                seed=seed,
+            )
+        ]
+        return self.decide(ground, outcomes)
+
+    def decide(self, ground: SearchContext, outcomes: Sequence[Outcome]) -> Decision:
+        """Variance components of each arm; the feature set with the lowest mean score over all backbones."""
+        spec, arms = ground.spec, self.arms(ground)
+        tables = _tables(ground, outcomes, len(arms))
+        errors = _tables(ground, outcomes, len(arms), "mae")
+        facts: dict[str, Any] = {"arms": {}, "runs": spec.variance_runs, "seeds": spec.variance_seeds}
+        estimate = thesis_variance if spec.mode == "thesis" else split_variance
+        for (backbone, features), scores, mae in zip(arms, tables, errors, strict=True):
+            by_run = np.nanmean(scores, axis=2).T  # (run, seed)
+            facts["arms"][f"{backbone} {features}"] = _plain(estimate(by_run)) | {
+                "by_run": by_run.tolist(),
+                "mae": _plain(estimate(np.nanmean(mae, axis=2).T)),
+            }
+        # Table 4.3 compares feature sets by their mean absolute error.
+        what, judging = ("MAE", errors) if spec.mode == "thesis" else ("composite score", tables)
+        means = {
+            features: float(np.mean([np.nanmean(t) for (_, f), t in zip(arms, judging, strict=True) if f == features]))
+            for features in spec.feature_sets
+        }
+        chosen = min(means, key=lambda name: means[name])
+        facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(ground, tables, chosen)}
+        own = {name: held.mean(axis=0) for (name, f), held in zip(arms, tables, strict=True) if f == chosen}
+        facts["backbones"] = lowest_against_others(own, _judged(ground)[0])
+        facts["variance"] = _proxy(ground, tables, arms)
+        sentences = [
+            f"Feature set {chosen} goes on: mean {what} "
+            + ", ".join(f"{name} {value:.3g}" for name, value in means.items())
+            + f" {ground.unit} over all backbones."
+        ]
+        for backbone, found in facts["comparisons"].items():
+            sentences.append(
+                f"{backbone}: {chosen} against {found['rival']} {100 * found['change']:+.2f} % "
+                f"(one-sided p {found['p']:.2g}, two-way clustered t over {spec.variance_runs} runs)."
+            )
+        for backbone, found in facts["backbones"].items():
+            sentences.append(
+                f"With {chosen}, {found['best']} against {backbone} {100 * found['change']:+.2f} % "
+                f"({100 * found['low']:+.2f} to {100 * found['high']:+.2f} %); phase 1 tunes each before one is chosen."
+            )
+        return Decision("isolation", facts, tuple(sentences))
+
+    def _comparisons(self, ground: SearchContext, tables: list[Array], chosen: str) -> dict[str, Any]:
+        """The chosen feature set against the next best one, for each backbone."""
+        spec = ground.spec
+        rivals = [name for name in spec.feature_sets if name != chosen]
+        found = {}
+        for place, backbone in enumerate(spec.backbones):
+            own = {f: tables[place * len(spec.features) + i] for i, f in enumerate(spec.feature_sets)}
+            if not rivals:
+                continue
+            rival = min(rivals, key=lambda name: float(np.nanmean(own[name])))
+            first, second = (own[name].mean(axis=0) for name in (chosen, rival))
+            mask, _ = _judged(ground)
+            test = clustered_t(np.where(mask, first - second, 0.0), mask)
+            found[backbone] = {"rival": rival, **changed(test, float(np.nanmean(second)))}
+        return found
+
+
+def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """The arm with the lowest mean score against each of the others.
+
+    Args:
+        tables: scores ``(run, session)`` by the name of the arm.
+        mask: cells that are judged.
+    """
+    means = {name: float(held[mask].mean()) for name, held in tables.items()}
+    best = min(means, key=lambda name: means[name])
+    return {
+        name: {"best": best, **changed(clustered_t(np.where(mask, tables[best] - held, 0.0), mask), means[name])}
+        for name, held in tables.items()
+        if name != best
+    }
+
+
+def _tables(ground: SearchContext, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
+    """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
+    spec = ground.spec
+    size = spec.variance_runs
+    mask, seen = _judged(ground)
+    raw = np.stack([ground.table(outcomes[at : at + size], name)[:, seen] for at in range(0, len(outcomes), size)])
+    filled = fill_worst(raw, mask)
+    filled[:, ~mask] = np.nan
+    return list(filled.reshape(arms, spec.variance_seeds, size, -1))
+
+
+def _judged(ground: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Cells ``(run, session)`` of the sessions that some run is judged on, and which sessions these are."""
+    mask = ground.folds(ground.spec.variance_runs)
+    seen = np.asarray(mask.any(axis=0))
+    return mask[:, seen], seen
+
+
+def _proxy(ground: SearchContext, tables: list[Array], arms: list[tuple[str, str]]) -> dict[str, float]:
+    """The variance of paired differences that planning takes for that of a module's effect.
+
+    Before a module was ever trained the variance of its effect is not known. That between the feature sets of one
+    backbone stands in for it; with one feature set, that between backbones, and with one arm, that between seeds. The
+    largest of them counts.
+    """
+    mask, _ = _judged(ground)
+    pairs = [(i, j) for i in range(len(arms)) for j in range(i + 1, len(arms))]
+    alike = [(i, j) for i, j in pairs if arms[i][0] == arms[j][0]] or pairs
+    differences = [tables[i][0] - tables[j][0] for i, j in alike] or [tables[0][0] - own for own in tables[0][1:]]
+    if not differences:
+        raise DataError("one backbone, one feature set and one seed show no variance; set variance_seeds = 2 or more")
+    found = [paired_variance(np.where(mask, difference, 0.0), mask) for difference in differences]
+    largest = max(found, key=lambda held: held.session + held.run + held.cell)
+    return {"session": largest.session, "run": largest.run, "cell": largest.cell}
+
+
+def _plain(found: SplitVariance) -> dict[str, Any]:
+    return {
+        "mean": found.mean,
+        "split": found.split,
+        "seed": found.seed,
+        "split_interval": found.split_interval,
+        "seed_interval": found.seed_interval,
+    }
+
+
+PHASES.register("isolation")(Isolation())

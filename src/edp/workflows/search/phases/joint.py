@@ -1,0 +1,110 @@
+"""What phases 4 and 5 share: modules and rates tuned together, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from typing import Any
+
+from edp.config.experiment import Table
+from edp.errors import DataError
+from edp.stats.pareto import pareto
+from edp.workflows.search.context import Outcome, SearchContext
+from edp.workflows.search.modules import contradicting, present_options
+from edp.workflows.search.phases.base import (
+    AnsweredQuestion,
+    Quest,
+    answer_all,
+    best,
+    mean_of,
+    new_study,
+    said_of_pruned,
+)
+from edp.workflows.search.phases.screening import baseline_of
+from edp.workflows.search.space import Candidate, Choice, Real, Space, apply
+from edp.workflows.search.study import Trial
+from edp.workflows.search.trainings import TrainingRequest
+
+Asked = Generator[list[TrainingRequest], list[Outcome], list[AnsweredQuestion]]
+
+
+def ask_together(
+    ground: SearchContext,
+    name: str,
+    modules: Sequence[str],
+    trials: int,
+    starts: Sequence[tuple[Candidate, Sequence[str]]],
+    options: Mapping[str, Mapping[str, Choice]] | None = None,
+) -> Asked:
+    """Questions about modules on or off, rates inside the window and what was deferred, with warm starts first.
+
+    Args:
+        ground: with the baseline of phase 1.
+        name: of the phase.
+        modules: and toggles that may be on.
+        trials: how many questions, the warm starts among them.
+        starts: values and modules to begin with.
+        options: what is varied of a module where it is on.
+    """
+    base, _, window = baseline_of(ground)
+    space = {**window, **ground.spec.deferred}
+    study = new_study(ground, name, space, modules, contradicting(base, modules, ground.channels))
+    study.options = options or {}
+    for values, flags in starts[:trials]:
+        present = present_options(base, flags, ground.shaped) if options else None
+        study.suggest(_inside(space, values), flags, present)
+
+    def settings(trial: Trial) -> Table:
+        return ground.network(apply(base, trial.values), trial.flags, trial.options)
+
+    # The thesis prunes in phase 1 only (3.3.2).
+    stops = () if ground.spec.mode == "thesis" else ground.spec.stops
+    (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)], stops)
+    return answers
+
+
+def winner_of(
+    ground: SearchContext, name: str, modules: Sequence[str], answers: list[AnsweredQuestion]
+) -> dict[str, Any]:
+    """The best answer, how often each module was on, and the front where a cost counts.
+
+    Raises:
+        DataError: no training ended well.
+    """
+    found = best(answers)
+    if found is None:
+        raise DataError(f"{name}: none of {len(answers)} trainings ended well; see their messages in the ledger")
+    done = [answer for answer in answers if answer.score is not None]
+    facts: dict[str, Any] = {
+        "settings": found.settings,
+        "values": {**found.trial.values, **found.trial.options},
+        "modules": list(found.trial.flags),
+        "score": found.score,
+        "costs": found.costs,
+        "on": {module: sum(module in answer.trial.flags for answer in done) / len(done) for module in modules},
+        "trials": [
+            {
+                "number": answer.trial.number,
+                "values": {**answer.trial.values, **answer.trial.options},
+                "modules": list(answer.trial.flags),
+                "score": answer.score,
+                "mae": None if answer.pruned else mean_of(ground, answer.outcomes, "mae"),
+                **answer.costs,
+                **answer.course(),
+            }
+            for answer in answers
+        ],
+    }
+    facts["said_of_pruned"] = said_of_pruned(ground, answers)
+    if ground.spec.cost != "none":
+        points = [(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done]
+        facts["front"] = [done[place].trial.number for place in pareto(points)]
+    return facts
+
+
+def _inside(window: Space, values: Candidate) -> dict[str, Any]:
+    """Values of the window's dimensions, brought into it."""
+    made: dict[str, Any] = {}
+    for name, held in window.items():
+        if name in values:
+            made[name] = min(max(float(values[name]), held.low), held.high) if isinstance(held, Real) else values[name]
+    return made

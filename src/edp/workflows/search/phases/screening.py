@@ -1,0 +1,139 @@
+"""Phase 2: which modules are worth a confirmation (thesis 3.3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from edp.config.experiment import Table
+from edp.stats.factorial import Factorial, two_level_design
+from edp.stats.importance import main_effects
+from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.modules import MODULES, contradicting, fitting
+from edp.workflows.search.phases.base import PHASES, AnsweredQuestion, Course, Quest, answer_all, new_study
+from edp.workflows.search.space import Candidate, Choice, Space, apply, elastic, names
+
+
+class ModuleScreening:
+    """Phase 2. Sound: a two-level design over all modules at once; thesis: each module tuned by itself."""
+
+    title = "screening"
+
+    def trainings(self, ground: SearchContext) -> int:
+        """The design, or the questions of all modules with the baseline's seeds."""
+        spec = ground.spec
+        if spec.mode == "thesis":
+            return spec.run_seeds + len(MODULES) * spec.module_trials * spec.trial_runs
+        return spec.screening_runs * spec.screening_repeats
+
+    def run(self, ground: SearchContext) -> Course:
+        """Trainings of the mode, and what passes."""
+        return (yield from (_thesis(ground) if ground.spec.mode == "thesis" else _sound(ground)))
+
+
+def baseline_of(ground: SearchContext) -> tuple[Table, Candidate, Space]:
+    """Settings of the baseline, its values, and the window around them in which candidates are tuned."""
+    facts = ground.decided["calibration"].facts
+    space = {name: held for name, held in ground.spec.space.items() if name in ground.spec.elastic}
+    beyond = ground.spec.mode == "thesis"
+    return facts["settings"], facts["baseline"], elastic(space, facts["baseline"], ground.spec.elastic, beyond)
+
+
+def _sound(ground: SearchContext) -> Course:
+    spec = ground.spec
+    base, _, window = baseline_of(ground)
+    free = fitting(base, ground.channels)
+    barred = [sorted(pair) for pair in contradicting(base, free, ground.channels)]
+    design = two_level_design(free, spec.screening_runs, sorted(barred))
+    drawn = _drawn(ground, window, spec.screening_repeats * len(design.levels))
+    orders, rows = [], []
+    for repeat in range(spec.screening_repeats):
+        for row, levels in enumerate(design.levels):
+            values = drawn[repeat * len(design.levels) + row]
+            chosen = [name for name, on in zip(free, levels, strict=True) if on]
+            settings = ground.network(apply(base, values), chosen)
+            orders += ground.orders(settings, [repeat])
+            rows.append((levels, values, repeat))
+    outcomes = yield orders
+    return _passed_by_design(ground, design, rows, outcomes)
+
+
+def _drawn(ground: SearchContext, window: Space, count: int) -> list[dict[str, float]]:
+    """Values inside the window by chance, so that effects are averages over it."""
+    rng = np.random.default_rng(ground.seed("screening"))
+    made = []
+    for _ in range(count):
+        values = {}
+        for name in names(window):
+            held = window[name]
+            if isinstance(held, Choice):
+                continue
+            low, high = (np.log10([held.low, held.high])) if held.log else (held.low, held.high)
+            value = float(rng.uniform(low, high))
+            values[name] = 10.0**value if held.log else value
+        made.append(values)
+    return made
+
+
+def _passed_by_design(
+    ground: SearchContext,
+    design: Factorial,
+    rows: Sequence[tuple[Any, dict[str, float], int]],
+    outcomes: Sequence[Outcome],
+) -> Decision:
+    """Main effects by least squares, with the drawn values and the fold as covariates; what shows a sign passes."""
+    scores = np.array([outcome.mean(ground.spec.horizon) for outcome in outcomes])
+    failed = int((~np.isfinite(scores)).sum())
+    if failed < len(scores):
+        scores = np.where(np.isfinite(scores), scores, np.nanmax(scores))
+    drawn = [[np.log10(v) if v > 0 and name != "dropout" else v for name, v in row[1].items()] for row in rows]
+    folds = [[float(row[2] == repeat) for repeat in range(1, ground.spec.screening_repeats)] for row in rows]
+    covariates = np.hstack([np.array(drawn), np.array(folds).reshape(len(rows), -1)])
+    covariates = covariates[:, covariates.std(axis=0) > 0]
+    levels = np.stack([row[0] for row in rows])
+    effects = main_effects(levels, design.factors, scores, covariates if covariates.size else None)
+    mean = float(scores.mean())
+    passed = [effect.factor for effect in effects if effect.passed]
+    table = {effect.factor: asdict(effect) | {"change": effect.effect / mean} for effect in effects}
+    sentences = [
+        f"{len(passed)} of {len(effects)} modules show a sign of an improvement and go on: "
+        f"{', '.join(MODULES[name].title for name in passed) or 'none'}; {len(rows)} trainings, {failed} failed."
+    ]
+    facts = {"passed": passed, "registered": list(design.factors), "modules": table, "alias": design.alias}
+    return Decision("screening", facts, tuple(sentences))
+
+
+def _thesis(ground: SearchContext) -> Course:
+    """The best of some questions of each module against the median of the baseline over seeds, as the thesis does."""
+    spec = ground.spec
+    base, _, window = baseline_of(ground)
+    free = fitting(base, ground.channels)
+    median = yield [order for seed in range(spec.run_seeds) for order in ground.orders(base, [0], seed=seed)]
+    reference = float(np.median([outcome.mean(spec.horizon) for outcome in median]))
+    quests = [_quest(ground, base, name, window) for name in free]
+    answers = yield from answer_all(ground, quests)
+    table = {name: _gain(own, reference) for name, own in zip(free, answers, strict=True)}
+    passed = [name for name, held in table.items() if held["gain"] is not None and held["gain"] > 0]
+    sentences = (
+        f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {reference:.3g} "
+        f"{ground.unit} and go on; by chance alone most do, since the best of {spec.module_trials} is compared with a "
+        "median.",
+    )
+    return Decision("screening", {"passed": passed, "registered": list(free), "modules": table}, sentences)
+
+
+def _quest(ground: SearchContext, base: Table, module: str, window: Space) -> Quest:
+    settings = ground.network(base, [module])
+    study = new_study(ground, f"screening {module}", window)
+    return Quest(study, lambda trial: apply(settings, trial.values), ground.spec.module_trials)
+
+
+def _gain(answers: list[AnsweredQuestion], reference: float) -> dict[str, float | None]:
+    scores = [answer.score for answer in answers if answer.score is not None]
+    return {"best": min(scores), "gain": reference - min(scores)} if scores else {"best": None, "gain": None}
+
+
+PHASES.register("screening")(ModuleScreening())

@@ -1,0 +1,189 @@
+"""The settings of a search: a preset, a file, changes; and the experiment from which it starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from edp.config.experiment import (
+    Experiment,
+    FeatureSettings,
+    Table,
+    build,
+    merged,
+    override,
+    plain_tree,
+    preset_table,
+    read_toml,
+    with_set_file,
+)
+from edp.data.feature_files import is_set_file, read_set_table
+from edp.data.features import FEATURE_SETS
+from edp.errors import ConfigError, closest
+from edp.evaluation.controller import load_budget
+from edp.storage import parse_toml
+from edp.workflows.search.phases.isolation import DEFAULT_BACKBONE, arm_settings
+from edp.workflows.search.settings import SearchSpec
+from edp.workflows.search.space import DIMENSIONS, THESIS, WIDTHS, Choice, Range, Real, Space, applicable, apply
+from edp.workflows.search.trainings import settings_of
+
+PRESETS = ("quick", "standard", "thesis")
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """What is searched, and from where.
+
+    Attributes:
+        spec: the settings of the search.
+        experiment: network, task and training from which it starts.
+        preset: name of the preset that was taken, for the report.
+    """
+
+    spec: SearchSpec
+    experiment: Experiment
+    preset: str = ""
+
+    def to_plain(self) -> Table:
+        """What a study is bound to, in parts that a message can name."""
+        spec = plain_spec(self.spec)
+        return {"space": spec.pop("space"), "search": spec, "network": settings_of(self.experiment)}
+
+
+def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: Sequence[str] = ()) -> SearchPlan:
+    """A plan from a preset, changed by a TOML file, changed by ``key.path=value`` overrides.
+
+    The file is one of an experiment, with a table ``[search]`` beside the others, and may say with ``base`` from which
+    preset of networks it starts. In ``[search.space]`` a dimension is ``{ low = .., high = .., log = true }`` or a list
+    of values; ``false`` leaves it out.
+
+    Raises:
+        ConfigError: an unknown preset; names every unknown key, wrong type and impossible value.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(f"there is no preset '{preset}' of a search{closest(preset, PRESETS)}")
+    text = resources.files("edp.workflows.search").joinpath(f"presets/{preset}.toml").read_text(encoding="utf-8")
+    where = f"preset '{preset}' of the search"
+    table = parse_toml(text, where, ConfigError)
+    if path is not None:
+        table, where = merged(table, _with_files(read_toml(path), Path(path).parent)), f"'{path}'"
+    for change in overrides:
+        table = merged(table, _with_files(override(change), Path()))
+    where += " with --set" if overrides else ""
+    base, search = table.pop("base", "quick"), table.pop("search", {})
+    if not isinstance(search, Mapping):
+        raise ConfigError(f"settings {where}: search = {search!r}; expected a table")
+    experiment = build(Experiment, merged(preset_table(base), table), where)
+    spec = _spec(dict(search), where)
+    _check_parts(spec, settings_of(experiment), f"settings {where}: search")
+    if spec.horizon not in experiment.task.horizons:
+        held = ", ".join(map(str, experiment.task.horizons))
+        raise ConfigError(
+            f"settings {where}: search.horizon = {spec.horizon}, and the task predicts {held} samples ahead; give one "
+            "of these, or --set task.horizons=[...]"
+        )
+    return SearchPlan(spec, experiment, preset)
+
+
+def _with_files(table: Table, folder: Path) -> Table:
+    """`table` with the feature sets and the budget that it names by files."""
+    made, search = with_set_file(table, folder), table.get("search")
+    if not isinstance(search, Mapping):
+        return made
+    held = search.get("compression")
+    if isinstance(held, Mapping) and isinstance(held.get("budget"), str):
+        search = {**search, "compression": {**held, "budget": asdict(load_budget(folder / held["budget"]))}}
+        made = {**made, "search": search}
+    if not isinstance(search.get("features"), list):
+        return made
+    sets = [
+        build(FeatureSettings, read_set_table(folder / one), f"'{folder / one}'") if is_set_file(one) else one
+        for one in search["features"]
+    ]
+    return {**made, "search": {**search, "features": sets}}
+
+
+def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
+    """Every backbone, feature set and value of the space makes an experiment; otherwise the first that does not."""
+    for name in spec.backbones:
+        if name not in DEFAULT_BACKBONE:
+            known = ", ".join(DEFAULT_BACKBONE)
+            raise ConfigError(f"{where}.backbones: there is no '{name}'{closest(name, DEFAULT_BACKBONE)} ({known})")
+    for name, held in spec.feature_sets.items():
+        if held == name and name not in (*FEATURE_SETS, "all"):
+            raise ConfigError(
+                f"{where}.features: there is no feature set '{name}'{closest(name, [*FEATURE_SETS, 'all'])}; a set of "
+                "your own is named by its file (.toml)"
+            )
+    for backbone in spec.backbones:
+        arm = arm_settings(settings, backbone, next(iter(spec.feature_sets.values())))
+        for key, space in (("space", applicable(spec.space, arm)), ("deferred", spec.deferred)):
+            _check_values(space, arm, f"{where}.{key}", backbone, spec.widths)
+
+
+def _check_values(space: Space, arm: Table, where: str, backbone: str, widths: str) -> None:
+    for name, range_ in space.items():
+        for value in range_.options if isinstance(range_, Choice) else (range_.low, range_.high):
+            try:
+                build(Experiment, WIDTHS[widths](apply(arm, {name: value})), "of the search")
+            except (ConfigError, KeyError, TypeError, ValueError) as error:
+                raise ConfigError(f"{where}.{name} = {value!r} cannot be for {backbone}: {error}") from error
+
+
+def _spec(table: Table, where: str) -> SearchSpec:
+    space = space_of(table.pop("space", {}), THESIS, where)
+    deferred = space_of(table.pop("deferred", {}), None, where, "deferred")
+    if not space:
+        raise ConfigError(f"settings {where}: search.space holds no dimension; leave at least one in")
+    return replace(build(SearchSpec, table, f"{where}, search"), space=space, deferred=deferred)
+
+
+def space_of(
+    table: Mapping[str, Any], over: Space | None = None, where: str = "of a study", key: str = "space"
+) -> dict[str, Range]:
+    """A space from its form in a settings file, laid over another one; `key` is its name there.
+
+    Raises:
+        ConfigError: an unknown dimension, or a range that holds nothing.
+    """
+    space = dict(over or {})
+    for name, given in dict(table).items():
+        if name not in DIMENSIONS:
+            raise ConfigError(f"settings {where}: unknown dimension 'search.{key}.{name}'{closest(name, DIMENSIONS)}")
+        if given is False:
+            space.pop(name, None)
+        else:
+            space[name] = _range(given, f"{where}: search.{key}.{name}")
+    return space
+
+
+def _range(given: Any, where: str) -> Range:
+    if isinstance(given, Mapping):
+        return build(Real, given, where)
+    try:
+        if isinstance(given, list):
+            return Choice(tuple(given))
+    except ConfigError as error:
+        raise ConfigError(f"settings {where}: {error}") from error
+    raise ConfigError(
+        f"settings {where} = {given!r}; a list of values, a table {{ low = .., high = .., log = true }}, or false must "
+        "hold"
+    )
+
+
+def plain_spec(spec: SearchSpec) -> Table:
+    """A spec as plain values."""
+    made: Table = plain_tree(spec)
+    made["space"], made["deferred"] = plain_space(spec.space), plain_space(spec.deferred)
+    return made
+
+
+def plain_space(space: Space) -> Table:
+    """A space as in a settings file."""
+    return {
+        name: list(held.options) if isinstance(held, Choice) else {"low": held.low, "high": held.high, "log": held.log}
+        for name, held in space.items()
+    }

@@ -1,0 +1,65 @@
+"""Walk through the phases: ask for orders, have them done, hand on what came of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from edp.errors import ConfigError
+from edp.workflows.search.context import Decision, Outcome, SearchContext
+from edp.workflows.search.phases import PHASES
+from edp.workflows.search.trainings import TrainingRequest
+
+Do = Callable[[list[TrainingRequest]], list[Outcome]]
+"""Has orders done side by side; outcomes in their order. Orders that were done before need not be done again."""
+
+
+def run_phases(
+    ground: SearchContext,
+    do: Do,
+    until: str | None = None,
+    on_decision: Callable[[Decision], None] | None = None,
+    phases: Sequence[str] | None = None,
+    on_phase: Callable[[str, SearchContext], None] | None = None,
+) -> SearchContext:
+    """Run the phases in order, each on what the ones before decided.
+
+    Nothing is remembered between calls but what `do` remembers: phases are pure, so a search that was stopped comes
+    to the same decisions again, with the same orders.
+
+    Args:
+        ground: what the phases stand on.
+        do: has orders done.
+        until: the last phase to run; None for all.
+        on_decision: told of each decision.
+        phases: names of those to run; None for all that are registered.
+        on_phase: told of each phase before it begins, and what it stands on.
+
+    Raises:
+        ConfigError: an unknown phase.
+    """
+    names = list(PHASES if phases is None else phases)
+    if until is not None:
+        _ = PHASES[until]
+        if until not in names:
+            raise ConfigError(f"search: phase '{until}' is not among those to run: {', '.join(names)}")
+        names = names[: names.index(until) + 1]
+    for name in names:
+        if on_phase is not None:
+            on_phase(name, ground)
+        decision = _run(name, ground, do)
+        ground = replace(ground, decided={**ground.decided, name: decision})
+        if on_decision is not None:
+            on_decision(decision)
+    return ground
+
+
+def _run(name: str, ground: SearchContext, do: Do) -> Decision:
+    course = PHASES[name].run(ground)
+    try:
+        orders = next(course)
+        while True:
+            orders = course.send(do(orders))
+    except StopIteration as end:
+        decision: Decision = end.value
+        return decision

@@ -1,0 +1,360 @@
+"""A whole search: data read and bound, sessions set apart, phases walked through, everything written down."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from edp.config.experiment import Experiment, Table, build, plain_tree
+from edp.data.frozen import SECOND_BOX, ByFrozen
+from edp.errors import ConfigError, DataError, LostError
+from edp.logs.source import DataSource
+from edp.recording import Recording
+from edp.settings.bounds import MOST_THREADS, above, check_bounds, whole
+from edp.signals import KINDS
+from edp.storage import make_folder, write_bytes
+from edp.storage.ledger import Ledger, Record, TrainingStatus
+from edp.workflows.search.context import Decision, Outcome, SearchContext, set_apart
+from edp.workflows.search.dispatch import Dispatcher
+from edp.workflows.search.executor import Executor
+from edp.workflows.search.local import LocalPool
+from edp.workflows.search.networks import frozen_split, network_name, write_networks
+from edp.workflows.search.phases import PHASES
+from edp.workflows.search.plan import SearchPlan, plain_spec
+from edp.workflows.search.run_phases import run_phases
+from edp.workflows.search.study_log import StudyLog
+from edp.workflows.search.trainings import TrainingRequest, settings_of
+
+BOX = "test sessions"
+TEACHER = "teacher.toml"
+MOST_SECONDS, MOST_MB = 31_557_600.0, 1e9  # a year, a petabyte: caps beyond cap nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resources:
+    """Who does the trainings.
+
+    Attributes:
+        workers: processes of this machine; 0 for one to each of its cores (of those that this process may use) over
+            `threads`.
+        threads: of each training; another number gives other bits, and is another training.
+        seconds: cap on the time of a training.
+        memory_mb: cap on its memory.
+        cluster: address of a Ray cluster that does them instead; empty for this machine.
+        open_cluster: take a cluster without a token at an address that other computers may reach.
+
+    Raises:
+        ConfigError: a number out of range, or workers of this machine and a cluster.
+    """
+
+    workers: int = 0
+    threads: int = 1
+    seconds: float | None = None
+    memory_mb: float | None = None
+    cluster: str = ""
+    open_cluster: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "search",
+            self,
+            workers=whole(0, MOST_THREADS),
+            threads=whole(1, MOST_THREADS),
+            seconds=above(0.0, MOST_SECONDS),
+            memory_mb=above(0.0, MOST_MB),
+        )
+        if self.cluster and self.workers:
+            raise ConfigError(
+                f"workers = {self.workers} and the cluster '{self.cluster}' came; a cluster has its own number of "
+                "workers, as many as its cores hold: give one of the two"
+            )
+
+    def gather(self) -> Executor:
+        """What does the trainings."""
+        if self.cluster:
+            from edp.workflows.search.cluster import RayPool  # Ray takes seconds to import, and few have it
+
+            return RayPool(self.cluster, self.threads, open_cluster=self.open_cluster)
+        return LocalPool(self.workers or max(1, len(os.sched_getaffinity(0)) // self.threads), self.threads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchCallbacks:
+    """Who is told of a search under way.
+
+    Attributes:
+        on_note: a sentence, such as that damaged records were set apart.
+        on_phase: a phase begins: its name.
+        on_progress: a training is asked for or has ended.
+        on_decision: a phase has decided.
+    """
+
+    on_note: Callable[[str], None] = lambda text: None
+    on_phase: Callable[[str, StudyLog], None] = lambda name, diary: None
+    on_progress: Callable[[StudyLog], None] = lambda diary: None
+    on_decision: Callable[[Decision], None] = lambda decision: None
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """What a search has found so far.
+
+    Attributes:
+        folder: of the study.
+        ground: with the decisions.
+        state: ``finished``, or ``stopped`` where not all phases were to run.
+        digest: hash over the results of all trainings.
+        trained: trainings of this sitting.
+        teacher: settings of the winner as an experiment file; None before phase 4.
+        networks: runs that phase 6 left: the teacher, and the network that was chosen; none before.
+    """
+
+    folder: Path
+    ground: SearchContext
+    state: str
+    digest: str
+    trained: int
+    teacher: Path | None = field(default=None)
+    networks: Mapping[str, Path] = field(default_factory=dict)
+
+
+def run_search(
+    source: DataSource,
+    plan: SearchPlan,
+    folder: str | Path,
+    crew: Resources | None = None,
+    until: str | None = None,
+    watchers: SearchCallbacks | None = None,
+) -> SearchResult:
+    """Search, or go on with a search where it stopped.
+
+    Args:
+        source: where the recordings are; each is a session.
+        plan: what is searched.
+        folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml`` and ``networks``.
+        crew: who does the trainings.
+        until: name of the last phase to run.
+        watchers: are told of what happens.
+
+    Raises:
+        BusyError: another process searches in this folder.
+        ConfigError: the study was begun with other data, space, settings or network; an unknown phase.
+        DataError: recordings that are the same session twice, too few of them, or without a channel that is needed.
+        LostError: the processes of a training were killed again and again.
+        StorageError: the disk is full or the folder cannot be written; what was done stays.
+    """
+    crew, watchers = crew or Resources(), watchers or SearchCallbacks()
+    if until is not None:
+        _ = PHASES[until]
+    data = _Data.read(source, plan)  # before anything is made on disk
+    development, test, second = set_apart(data.names, data.families, plan.spec)
+    target = make_folder(folder)
+    with ExitStack() as open_things:
+        ledger = open_things.enter_context(Ledger(target / "ledger"))
+        if ledger.damaged:
+            watchers.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
+        ledger.bind({"data": data.digest, **plan.to_plain()})
+        settings = settings_of(plan.experiment)
+        ground = SearchContext(
+            plan.spec, settings, source.to_plain(), development, test, data.channels, data.unit, second=second
+        )
+        diary = StudyLog(target, _facts(plan, data, source, ground), ground)
+        executor = open_things.enter_context(crew.gather())
+        diary.workers = executor.workers
+        work = _Work(ledger, diary, ground, watchers)
+        doing = Dispatcher(
+            ledger, executor, data.digest, crew.threads, crew.seconds, crew.memory_mb, work.on_record, work.on_orders
+        )
+        state = "stopped"
+        try:
+            ground = run_phases(
+                ground, lambda orders: _whole(doing(orders)), until, work.on_decision, on_phase=work.on_phase
+            )
+            ledger.keep_states(())
+            state = "finished" if len(ground.decided) == len(PHASES) else "stopped"
+        finally:
+            diary.openings = ledger.openings()
+            diary.end(state)
+        split = frozen_split(target, ground, data.digests)
+        networks = write_networks(target, source, ground, split, work.made)
+        teacher = _write_teacher(target, ground, split)
+        return SearchResult(target, ground, state, ledger.digest(), diary.trained, teacher, networks)
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What a search must know of its recordings; they themselves are read by those who train."""
+
+    names: tuple[str, ...]
+    families: dict[str, str]
+    channels: tuple[str, ...]
+    digest: str
+    hours: float
+    unit: str
+    digests: dict[str, str]
+
+    @staticmethod
+    def read(source: DataSource, plan: SearchPlan) -> _Data:
+        recordings = source.read()
+        _refuse_twice(recordings)
+        unit = _check_channels(recordings, plan)
+        names = tuple(recording.name for recording in recordings)
+        # Names such as m22_003_dig say what a session is of; a kind with one session is no kind.
+        kinds = {name: re.sub(r"\d+", "", name) for name in names}
+        count = Counter(kinds.values())
+        families = {name: kind if count[kind] > 1 else "" for name, kind in kinds.items()}
+        state = hashlib.blake2b(digest_size=16)
+        for recording in recordings:
+            state.update(f"{recording.name}\0{recording.digest}\0".encode())
+        hours = sum(recording.duration_s for recording in recordings) / 3600
+        digests = {recording.name: recording.digest for recording in recordings}
+        return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit, digests)
+
+
+class _Work:
+    """Passes on what happens, and opens a lock-box when a batch is to be judged on its sessions.
+
+    Attributes:
+        orders: of the batch under way, by key.
+        made: networks that were judged on the second lock-box, by name: order and result.
+    """
+
+    def __init__(self, ledger: Ledger, diary: StudyLog, ground: SearchContext, watchers: SearchCallbacks) -> None:
+        self.ledger, self.diary, self.ground, self.watchers = ledger, diary, ground, watchers
+        self.orders: dict[str, TrainingRequest] = {}
+        self.made: dict[str, tuple[TrainingRequest, Mapping[str, Any]]] = {}
+
+    def on_phase(self, name: str, ground: SearchContext) -> None:
+        self.diary.on_phase(name, ground)
+        self.watchers.on_phase(name, self.diary)
+
+    def on_orders(self, keys: Sequence[str], orders: Sequence[TrainingRequest]) -> None:
+        self.orders = dict(zip(keys, orders, strict=True))
+        for box, sessions, why in (
+            (BOX, self.ground.test, "phase 4: its winner and the baseline, trained at length"),
+            (SECOND_BOX, self.ground.second, "phase 6: the chosen network and its teacher"),
+        ):
+            sealed = sorted({key for key, order in self.orders.items() if set(order.judged) & set(sessions)})
+            if sealed:
+                self._open(box, sealed, why)
+        self.diary.on_orders(keys, orders)
+        self.watchers.on_progress(self.diary)
+
+    def _open(self, box: str, keys: Sequence[str], why: str) -> None:
+        """Record a look before it is taken. ``edp compress`` may have opened the second lock-box before phase 6."""
+        earlier = [one for one in self.ledger.openings(box) if one.judged != tuple(keys)]
+        self.ledger.open_box(box, keys, why, again=box == SECOND_BOX)
+        if earlier:
+            self.watchers.on_note(
+                f"lock-box '{box}' was opened on {earlier[0].time} ({earlier[0].why}), so this look shows less"
+            )
+        self.diary.openings = self.ledger.openings()
+
+    def on_record(self, record: Record, trained: bool) -> None:
+        order = self.orders[record.key]
+        if record.result is not None and set(order.judged) & set(self.ground.second):
+            self.made[network_name(order)] = order, record.result
+        self.diary.on_record(record, order, trained)
+        self.watchers.on_progress(self.diary)
+
+    def on_decision(self, decision: Decision) -> None:
+        self.diary.on_decision(decision)
+        self.watchers.on_decision(decision)
+
+
+def _whole(outcomes: list[Outcome]) -> list[Outcome]:
+    """The outcomes of a batch, unless they tell of a fault that a decision must not rest on.
+
+    Raises:
+        LostError: a training was lost.
+        DataError: every one of several trainings ended in an error.
+    """
+    lost = [outcome for outcome in outcomes if outcome.status == TrainingStatus.LOST]
+    if lost:
+        raise LostError(
+            f"{len(lost)} trainings were lost: {lost[0].message}. What is done is kept; free memory or take fewer "
+            "workers, and give the same command again"
+        )
+    failed = [outcome for outcome in outcomes if outcome.status == TrainingStatus.FAILED]
+    if len(outcomes) > 1 and len(failed) == len(outcomes):
+        raise DataError(f"all {len(outcomes)} trainings of a batch failed; the first says: {failed[0].message}")
+    return outcomes
+
+
+def _refuse_twice(recordings: Sequence[Recording]) -> None:
+    """The same session twice would train and judge."""
+    seen: dict[str, str] = {}
+    for recording in recordings:
+        if recording.digest in seen:
+            raise DataError(
+                f"'{recording.name}' and '{seen[recording.digest]}' are the same session, value for value; one of "
+                "them would train and the other judge, or test: remove one (edp inspect names all that repeat)"
+            )
+        seen[recording.digest] = recording.name
+
+
+def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> str:
+    """See that every feature set can be had of every recording; the unit of the scores."""
+    units: set[str] = set()
+    kinds: dict[tuple[str, ...], Recording] = {}
+    for recording in recordings:
+        kinds.setdefault(recording.channel_names, recording)
+    for name, features in plan.spec.feature_sets.items():
+        settings = settings_of(plan.experiment)
+        settings["task"] = {**settings["task"], "features": features}
+        experiment = build(Experiment, settings, "of the search")
+        for recording in kinds.values():
+            try:
+                names = recordings[0].channel_names
+                task = experiment.task.resolve(recording.rate_hz, names, experiment.model.physics)
+                task.series(recording)
+                units |= {KINDS[kind].report_unit for kind in task.kinds(recording)}
+            except (ConfigError, DataError) as error:
+                raise DataError(
+                    f"feature set {name} cannot be had of '{recording.name}': {error}; name others with --set "
+                    "search.features=[...] (a file of edp screen is one)"
+                ) from error
+    return units.pop() if len(units) == 1 else "mixed units"
+
+
+def _facts(plan: SearchPlan, data: _Data, source: DataSource, ground: SearchContext) -> Table:
+    return {
+        "mode": plan.spec.mode,
+        "unit": data.unit,
+        "preset": plan.preset,
+        "data": {
+            "path": str(source.path),
+            "sessions": len(data.names),
+            "hours": round(data.hours, 4),
+            "hash": data.digest,
+        },
+        "spec": plain_spec(plan.spec),
+        "sessions": {
+            "development": list(ground.development),
+            "test": list(ground.test),
+            "second": list(ground.second),
+        },
+    }
+
+
+def _write_teacher(folder: Path, ground: SearchContext, split: ByFrozen) -> Path | None:
+    """The winner's settings with the sessions that stay frozen, as `edp train --config` takes them."""
+    settings: Any = None
+    if "exploration" in ground.decided:
+        settings = ground.decided["exploration"].facts["teacher_settings"]
+    elif "synthesis" in ground.decided:
+        settings = ground.decided["synthesis"].facts["settings"]
+    if settings is None:
+        return None
+    file = folder / TEACHER
+    write_bytes(file, tomli_w.dumps({**settings, "split": plain_tree(split, "split")}).encode())
+    return file

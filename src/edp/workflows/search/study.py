@@ -1,0 +1,389 @@
+"""Ask and tell: the only door to Optuna. Nothing is stored; what was told is told again when a search goes on.
+
+A study is a pure function of its root seed and of what it was told, in the order of the trials: each question is asked
+with a sampler seeded by root and number. So a search that was killed asks the same again and finds the answers in the
+ledger, and any number of workers gives the same sequence.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edp.errors import ConfigError
+from edp.settings.bounds import MOST_NAMES, check_bounds, whole
+from edp.storage import replacing
+from edp.workflows.search.space import Candidate, Choice, Range, Real, Space, Value, check, names
+
+if TYPE_CHECKING:
+    import optuna
+
+GP_TRIALS = 100  # a Gaussian process is the better sampler up to here, then it gets slow
+STARTUP = 10
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One question of a study.
+
+    Attributes:
+        number: from 0 in the order of asking.
+        values: of the dimensions of the space.
+        flags: names of the switches that are on.
+        options: of the switches that are on.
+    """
+
+    number: int
+    values: Candidate
+    flags: tuple[str, ...] = ()
+    options: Candidate = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerSpec:
+    """How questions are chosen.
+
+    Attributes:
+        kind: ``gp`` (a Gaussian process for the first 100 trials, then TPE), ``tpe``, ``thesis_tpe`` (univariate,
+            without liar, as in the thesis) or ``random``.
+        startup: trials at random before the first model.
+
+    Raises:
+        ConfigError: an unknown kind, or fewer than one trial at random.
+    """
+
+    kind: str = "gp"
+    startup: int = STARTUP
+
+    def __post_init__(self) -> None:
+        if self.kind not in SAMPLERS:
+            raise ConfigError(f"sampler '{self.kind}'; {', '.join(SAMPLERS)} must hold")
+        check_bounds("sampler", self, startup=whole(1, MOST_NAMES))
+
+
+@dataclass
+class Study:
+    """Questions about a space and what they gave; smaller values are better.
+
+    Attributes:
+        space: dimensions and their ranges.
+        root: seed of the whole sequence.
+        sampler: how questions are chosen.
+        flags: switches that may be on or off.
+        barred: sets of switches that cannot be on together: of each the later one in `flags` is switched off.
+        objectives: how many values are told.
+        pruner: ``none``, or ``median``, which says of a reported trial whether it is worse than the median of those
+            that were told before, at the same step; only with one objective.
+        bounds: how many costs are told that must not exceed zero; a trial that exceeds may be told by its costs alone,
+            so that what cannot be used need not be trained. With bounds TPE stands in for the Gaussian process.
+        options: further dimensions of a switch, asked where it is on.
+    """
+
+    space: Space
+    root: int
+    sampler: SamplerSpec = field(default_factory=SamplerSpec)
+    flags: tuple[str, ...] = ()
+    barred: frozenset[frozenset[str]] = frozenset()
+    objectives: int = 1
+    bounds: int = 0
+    pruner: str = "none"
+    options: Mapping[str, Mapping[str, Choice]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        import optuna
+
+        both = sorted(set(self.flags) & set(self.space))
+        if both:
+            raise ConfigError(f"study: {', '.join(both)} would be a dimension and a switch; rename one of them")
+        if self.pruner != "none" and self.objectives > 1:
+            raise ConfigError(
+                f"study: pruner '{self.pruner}' with {self.objectives} objectives; one of them, or no pruner, must hold"
+            )
+        logging.getLogger("optuna").setLevel(logging.ERROR)
+        self._study = optuna.create_study(
+            directions=["minimize"] * self.objectives,
+            sampler=optuna.samplers.RandomSampler(seed=0),
+            pruner=PRUNERS[self.pruner](),
+        )
+        self._distributions = {name: _distribution(self.space[name]) for name in names(self.space)} | {
+            name: _distribution(Choice((0, 1))) for name in self.flags
+        }
+        self._open: dict[int, optuna.Trial] = {}
+        self._told = 0
+        self._waiting: dict[int, tuple[Sequence[float] | None, Sequence[float], bool]] = {}
+
+    def suggest(self, values: Candidate, flags: Sequence[str] | None = None, options: Candidate | None = None) -> None:
+        """Have this asked next: a warm start. What is not given, the sampler chooses.
+
+        Args:
+            values: of some or all dimensions.
+            flags: switches that are on, the others being off; None leaves them all to the sampler.
+            options: of switches that are on.
+
+        Raises:
+            ConfigError: a value outside the space, or an unknown dimension, switch or option.
+        """
+        unknown = [name for name in values if name not in self.space]
+        if unknown:
+            raise ConfigError(f"study: there is no dimension '{unknown[0]}' (it has {', '.join(self.space)})")
+        check({name: self.space[name] for name in values}, values)
+        strange = [name for name in flags or () if name not in self.flags]
+        if strange:
+            raise ConfigError(f"study: there is no switch '{strange[0]}' (it has {', '.join(self.flags)})")
+        own: dict[str, Range] = {}
+        for name in flags or ():
+            own |= self.options.get(name, {})
+        odd = [name for name in options or () if name not in own]
+        if odd:
+            raise ConfigError(f"study: there is no option '{odd[0]}' of what is on (there are {', '.join(own)})")
+        check({name: own[name] for name in options or ()}, options or {})
+        switched = {} if flags is None else {name: int(name in flags) for name in self.flags}
+        self._study.enqueue_trial(dict(values) | switched | dict(options or {}))
+
+    def ask(self, count: int) -> list[Trial]:
+        """The next questions, `count` of them; those asked before count as unanswered until they are told."""
+        return [self._ask() for _ in range(count)]
+
+    def _ask(self) -> Trial:
+        number = len(self._study.trials)
+        waiting = any(trial.state.name == "WAITING" for trial in self._study.trials)
+        if waiting:
+            number = next(trial.number for trial in self._study.trials if trial.state.name == "WAITING")
+        self._study.sampler = self._sampler(number)
+        asked = self._study.ask(self._distributions)
+        self._open[asked.number] = asked
+        values = {name: asked.params[name] for name in names(self.space)}
+        on = self._allowed(tuple(name for name in self.flags if asked.params[name]))
+        chosen: dict[str, Any] = {
+            name: asked.suggest_categorical(name, held.options)
+            for flag in on
+            for name, held in self.options.get(flag, {}).items()
+        }
+        return Trial(asked.number, values, on, chosen)
+
+    def _allowed(self, on: tuple[str, ...]) -> tuple[str, ...]:
+        kept: tuple[str, ...] = ()
+        for name in on:
+            if not any(name in pair and set(pair) <= {*kept, name} for pair in self.barred):
+                kept = (*kept, name)
+        return kept
+
+    def report(self, number: int, step: int, value: float) -> None:
+        """What a question that is not answered yet gives at a step of its training.
+
+        Raises:
+            ConfigError: a question that was not asked, a value that is not finite, or several objectives.
+        """
+        if number not in self._open or number in self._waiting:
+            raise ConfigError(f"study: trial {number} was not asked, or was told before; report before you tell")
+        if self.objectives > 1 or not math.isfinite(value):
+            raise ConfigError(
+                f"study: trial {number} reports {value} at step {step} of a study with {self.objectives} objectives; a "
+                "finite value and one objective must hold"
+            )
+        self._open[number].report(value, step)
+
+    def hopeless(self, number: int) -> bool:
+        """Whether the pruner would end a question after its last report, by what was told of earlier ones."""
+        return self.pruner != "none" and bool(self._open[number].should_prune())  # NumPy's would not be plain
+
+    def tell(
+        self, number: int, values: Sequence[float] | None, costs: Sequence[float] = (), pruned: bool = False
+    ) -> None:
+        """What a question gave; told in any order, it counts in the order of numbers.
+
+        Args:
+            number: of the trial.
+            values: of the objectives; None where the training failed, diverged or was not done.
+            costs: each at most 0 where its bound is kept.
+            pruned: it was ended after its last report; it has no values.
+
+        Raises:
+            ConfigError: a question that was not asked, a value that is not finite, another count of them, or values of
+                one that was pruned.
+        """
+        if number not in self._open and number not in self._waiting:
+            raise ConfigError(f"study: trial {number} was not asked, or was told before; tell each once")
+        if pruned and values is not None:
+            raise ConfigError(f"study: trial {number} is told as pruned, with values {list(values)}; none must hold")
+        for what, wanted, given in (("values", self.objectives, values), ("costs", self.bounds, costs)):
+            if given is not None and (len(given) != wanted or not all(map(math.isfinite, given))):
+                raise ConfigError(f"study: trial {number} is told {what} {list(given)}; {wanted} finite ones must hold")
+        self._waiting[number] = (values, costs, pruned)
+        while self._told in self._waiting:
+            self._pass_on(self._told, *self._waiting.pop(self._told))
+            self._told += 1
+
+    def _pass_on(self, number: int, values: Sequence[float] | None, costs: Sequence[float], pruned: bool) -> None:
+        from optuna.trial import TrialState
+
+        trial = self._open.pop(number)
+        for place, cost in enumerate(costs):
+            trial.set_constraint(f"bound {place}", cost)
+        if values is None:  # Never as infinity: a sampler would model the wall.
+            beyond = pruned or any(cost > 0 for cost in costs)
+            self._study.tell(trial, state=TrialState.PRUNED if beyond else TrialState.FAIL)
+        else:
+            self._study.tell(trial, list(values))
+
+    def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
+        seed = int.from_bytes(hashlib.blake2b(f"{self.root} {number}".encode(), digest_size=4).digest(), "big")
+        kind = self.sampler.kind
+        # A Gaussian process does not learn from trials that were refused for their costs.
+        if kind == "gp" and (number >= GP_TRIALS or self.bounds):
+            kind = "tpe"
+        return SAMPLERS[kind](seed, self.sampler.startup)
+
+
+def _gp(seed: int, startup: int) -> Any:
+    from optuna.samplers import GPSampler, TPESampler
+
+    fallback = TPESampler(seed=seed, n_startup_trials=startup)
+    return GPSampler(
+        seed=seed,
+        n_startup_trials=startup,
+        independent_sampler=fallback,
+        warn_independent_sampling=False,
+    )
+
+
+def _tpe(seed: int, startup: int) -> Any:
+    from optuna.samplers import TPESampler
+
+    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
+
+
+def _thesis_tpe(seed: int, startup: int) -> Any:
+    from optuna.samplers import TPESampler
+
+    return TPESampler(seed=seed, n_startup_trials=startup, multivariate=False, constant_liar=False)
+
+
+def _random(seed: int, startup: int) -> Any:
+    from optuna.samplers import RandomSampler
+
+    return RandomSampler(seed=seed)
+
+
+SAMPLERS: dict[str, Callable[[int, int], Any]] = {
+    "gp": _gp,
+    "tpe": _tpe,
+    "thesis_tpe": _thesis_tpe,
+    "random": _random,
+}
+
+
+def _no_pruner() -> Any:
+    from optuna.pruners import NopPruner
+
+    return NopPruner()
+
+
+def _median() -> Any:
+    """Optuna's defaults: after five whole trials; the first rung is the warm-up."""
+    from optuna.pruners import MedianPruner
+
+    return MedianPruner()
+
+
+PRUNERS: dict[str, Callable[[], Any]] = {"none": _no_pruner, "median": _median}
+
+
+def _distribution(held: Range) -> Any:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if isinstance(held, Real):
+        return FloatDistribution(held.low, held.high, log=held.log)
+    if held.options == (0, 1):
+        return IntDistribution(0, 1)
+    return CategoricalDistribution(held.options)
+
+
+@dataclass(frozen=True)
+class ToldTrial:
+    """A question of a study that is over.
+
+    Attributes:
+        values: of its dimensions.
+        objectives: None where it was not trained to its end.
+        known: what else is known of it.
+        reports: values at steps before the end.
+        pruned: whether it was ended at the last of them.
+    """
+
+    values: Candidate
+    objectives: Sequence[float] | None
+    known: dict[str, Any]
+    reports: dict[int, float] = field(default_factory=dict)
+    pruned: bool = False
+
+
+@dataclass(frozen=True)
+class Told:
+    """A study that is over: what was asked and what came of it, for a viewer.
+
+    Attributes:
+        name: of the study.
+        space: dimensions and their ranges.
+        rows: its questions.
+        objectives: names of what was made small.
+    """
+
+    name: str
+    space: Space
+    rows: Sequence[ToldTrial]
+    objectives: tuple[str, ...]
+
+
+def write_journal(path: str | Path, studies: Sequence[Told]) -> None:
+    """A copy of studies as a journal that Optuna and its dashboard read; replaced whole, never appended to.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
+    logging.getLogger("optuna").setLevel(logging.ERROR)
+    with replacing(path) as temporary:
+        storage = optuna.storages.JournalStorage(JournalFileBackend(str(temporary)))
+        for held in studies:
+            directions: list[Any] = ["minimize"] * len(held.objectives)
+            study = optuna.create_study(storage=storage, study_name=held.name, directions=directions)
+            study.set_user_attr("objectives", list(held.objectives))
+            study.add_trials([_frozen(held.space, row) for row in held.rows])
+
+
+def _frozen(space: Space, row: ToldTrial) -> optuna.trial.FrozenTrial:
+    from optuna.trial import TrialState, create_trial
+
+    answer, state = row.objectives, TrialState.FAIL if row.objectives is None else TrialState.COMPLETE
+    if row.pruned:  # Optuna, too, gives it the last value that it reported
+        answer, state = [row.reports[max(row.reports)]], TrialState.PRUNED
+    return create_trial(
+        state=state,
+        values=None if answer is None else list(answer),
+        params=dict(row.values),
+        distributions={name: _distribution(space[name]) for name in row.values},
+        user_attrs=row.known,
+        intermediate_values=row.reports,
+    )
+
+
+__all__ = [
+    "PRUNERS",
+    "SAMPLERS",
+    "Candidate",
+    "SamplerSpec",
+    "Study",
+    "Told",
+    "ToldTrial",
+    "Trial",
+    "Value",
+    "write_journal",
+]

@@ -1,0 +1,294 @@
+"""One training of a search: a plain order in, a plain record out, so that any process on any machine can do it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+from edp.config.experiment import Experiment, Table, build, plain_tree
+from edp.data.prepared import Prepared, prepare
+from edp.data.splits import ByRecording, Split, Stretch
+from edp.errors import ConfigError, DataError
+from edp.evaluation.footprint import footprint
+from edp.evaluation.judge import JudgeSpec, judge, score_predictions
+from edp.evaluation.mac_check import check_counted
+from edp.logs.source import DataSource
+from edp.networks.predictor import build_model
+from edp.networks.running import window_predictions
+from edp.recording import Recording
+from edp.settings.bounds import MOST_EPOCHS, MOST_UPDATES, SEED, check_bounds, whole
+from edp.training.bundle import blank_scaler
+from edp.training.parts import fit_part
+
+SCORES = ("mae", "rmse", "p95", "p99", "composite")
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """A training to be done and judged; equal orders give equal records.
+
+    Attributes:
+        settings: the whole experiment as plain tables; its split is not used.
+        source: what `DataSource.to_plain` gave.
+        train: names of the sessions that train.
+        judged: names of the sessions that judge; none of them trains, and with one epoch none chooses anything.
+        seed: root of every random choice of the training.
+        updates: training steps over all epochs; 0 with several epochs makes each of them one pass over the data.
+        until: the step after which this part of the training ends and is judged, or with several epochs the epoch;
+            None for the end. A part goes on to the same bits as a training without a stop.
+        stops: where earlier parts may have ended; they decide nothing, and are not part of a key.
+        epochs: one for a training without an early stop, so that no session that judges has a say.
+        patience: epochs without a better validation score before an early stop; 0 never.
+        validation: names of the sessions that validate after each of several epochs; they may be those that judge, as
+            in the thesis, and do not train.
+        recipe: what is made of the network in phase 6 (`edp.workflows.search.smaller.Recipe`), plain; None in the other
+            phases.
+    """
+
+    settings: Table
+    source: Mapping[str, Any]
+    train: tuple[str, ...]
+    judged: tuple[str, ...]
+    seed: int
+    updates: int
+    until: int | None = None
+    stops: tuple[int, ...] = ()
+    epochs: int = 1
+    patience: int = 0
+    validation: tuple[str, ...] = ()
+    recipe: Table | None = None
+
+    def __post_init__(self) -> None:
+        both = sorted(set(self.train) & {*self.judged, *self.validation})
+        if both:
+            raise ConfigError(f"order: {', '.join(both)} would train and judge or validate; each session must do one")
+        if not self.train or not self.judged:
+            raise ConfigError(
+                f"order: {len(self.train)} sessions train, {len(self.judged)} judge; at least one of each must hold"
+            )
+        self._check_length()
+        length, what = (self.updates, "updates") if self.epochs == 1 else (self.epochs, "epochs")
+        steps = [*self.stops, length if self.until is None else self.until]
+        if steps[0] < 1 or any(a >= b for a, b in pairwise(steps)) or (self.until or 0) >= length:
+            raise ConfigError(
+                f"order: stops {list(self.stops)} and an end at {self.until} of {length} {what}; steps from 1 "
+                "on, each after the one before and all before the last, must hold"
+            )
+
+    def _check_length(self) -> None:
+        check_bounds("order", self, seed=SEED, epochs=whole(1, MOST_EPOCHS), patience=whole(0, MOST_EPOCHS))
+        check_bounds("order", self, updates=whole(1 if self.epochs == 1 else 0, MOST_UPDATES))
+        if self.updates % self.epochs:
+            raise ConfigError(
+                f"order: updates = {self.updates} in {self.epochs} epochs; a multiple of them, or 0 for passes over "
+                "the data, must hold"
+            )
+        if (self.epochs > 1) != bool(self.validation):
+            raise ConfigError(
+                f"order: {self.epochs} epochs and {len(self.validation)} sessions that validate; several epochs need "
+                "some, and one has none"
+            )
+
+    @property
+    def whole(self) -> TrainingRequest:
+        """The training that this is a part of."""
+        return replace(self, until=None, stops=())
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, from which `from_json` makes the same order."""
+        return {
+            "settings": self.settings,
+            "source": dict(self.source),
+            "train": list(self.train),
+            "judged": list(self.judged),
+            "seed": self.seed,
+            "updates": self.updates,
+            "until": self.until,
+            "stops": list(self.stops),
+            **({} if self.recipe is None else {"recipe": self.recipe}),
+        } | self.several()
+
+    def several(self) -> dict[str, Any]:
+        """What is said of a training of several epochs, plain; nothing of one epoch, whose keys stay what they were."""
+        if self.epochs == 1:
+            return {}
+        return {"epochs": self.epochs, "patience": self.patience, "validation": list(self.validation)}
+
+    @staticmethod
+    def from_json(plain: Mapping[str, Any]) -> TrainingRequest:
+        """The order that `to_json` gave."""
+        return TrainingRequest(
+            plain["settings"],
+            plain["source"],
+            tuple(plain["train"]),
+            tuple(plain["judged"]),
+            plain["seed"],
+            plain["updates"],
+            plain.get("until"),
+            tuple(plain.get("stops", ())),
+            plain.get("epochs", 1),
+            plain.get("patience", 0),
+            tuple(plain.get("validation", ())),
+            plain.get("recipe"),
+        )
+
+
+def train_order(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Train and judge an order given as plain values; see `train_part`.
+
+    Returns:
+        ``sessions``: for each judging session its scores at each horizon, report units, mean over targets;
+        ``scores``: their means over sessions; ``parameters``, ``macs_tick``; ``seconds``; ``train_loss``.
+    """
+    return train_part(plain)[0]
+
+
+def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[dict[str, Any], bytes | None]:
+    """Train and judge an order, which may be a part of a training.
+
+    Args:
+        plain: of `TrainingRequest.to_json`.
+        start: what an earlier part left; it saves the time to come there, and changes nothing else.
+
+    Returns:
+        What `train_order` returns, and what the next part goes on from; None at the end of the training.
+
+    Raises:
+        ConfigError: settings that contradict one another or the data.
+        DataError: a session is missing or cannot be read.
+        Diverged: the loss was not finite any more.
+    """
+    order = TrainingRequest.from_json(plain)
+    began = time.perf_counter()
+    experiment = experiment_of(order)
+    data = prepared(order, experiment)
+    windowed = order.epochs > 1 and experiment.training.chunks.regime == "window"
+    fitted, state = fit_part(data, experiment.model, experiment.training, order.until, start, windowed)
+    spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
+    if windowed:
+        skip = max(spec.skip or 0, experiment.model.window, data.task.features.starting_ticks)
+        found = score_predictions(window_predictions(fitted.predictor, data.test), data, skip)["recordings"]
+    else:
+        found = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
+    sessions = {
+        name: {k: {score: held["mean"][score] for score in SCORES} for k, held in horizons.items()}
+        for name, horizons in found.items()
+    }
+    counted = footprint(fitted.predictor)
+    result = {
+        "sessions": sessions,
+        "scores": mean_scores(sessions),
+        "parameters": counted.parameters,
+        "macs_tick": counted.macs_tick,
+        "train_loss": fitted.history[-1]["train_loss"],
+        "seconds": round(time.perf_counter() - began, 3),
+    }
+    if order.epochs > 1:
+        rows = fitted.history
+        result |= {"epochs": len(rows), "best_epoch": max((row["epoch"] for row in rows if row["best"]), default=0)}
+    return result, state
+
+
+def experiment_of(order: TrainingRequest) -> Experiment:
+    """The experiment that an order trains.
+
+    With one long epoch schedules run to their end and nothing is chosen; with several, each is validated.
+    """
+    made = build(Experiment, order.settings, "of a search")
+    training = replace(
+        made.training,
+        epochs=order.epochs,
+        updates=order.updates // order.epochs,
+        patience=order.patience,
+        refit="none",
+        seed=order.seed,
+    )
+    return replace(made, training=training)
+
+
+def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
+    """Mean of each score over sessions and horizons."""
+    rows = [scores for horizons in sessions.values() for scores in horizons.values()]
+    return {name: sum(row[name] for row in rows) / len(rows) for name in SCORES}
+
+
+def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
+    """Series of an order: those that train, the first of them as validation part, too; those that judge as test part.
+
+    Raises:
+        ConfigError: settings that contradict the data.
+        DataError: a session is missing or cannot be read.
+    """
+    recordings = {recording.name: recording for recording in _recordings(_frozen(order.source))}
+    wanted = dict.fromkeys((*order.train, *order.validation, *order.judged))
+    missing = [name for name in wanted if name not in recordings]
+    if missing:
+        raise DataError(
+            f"'{order.source['path']}' has no session {', '.join(missing)}; the data changed since the search began: "
+            "restore them, or begin another search"
+        )
+    chosen = [recordings[name] for name in wanted]
+    first = chosen[0]
+    task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
+    if len(order.train) == 1:
+        raise DataError("a search needs two training sessions or more; give more recordings or fewer folds")
+    if order.validation:
+        data = prepare(chosen, task, _Named(order.train, order.validation, order.judged), experiment.model.window)
+        return data
+    # A training needs a part that validates; with one epoch it decides nothing, so it is one of those that train.
+    split = ByRecording(validation=order.train[:1], test=order.judged)
+    data = prepare(chosen, task, split, experiment.model.window)
+    return replace(data, train=[*data.validation, *data.train])
+
+
+@dataclass(frozen=True)
+class _Named:
+    """Whole sessions by name; those that validate may be those that judge, which `ByRecording` refuses."""
+
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+    judged: tuple[str, ...]
+
+    def split(self, recordings: Sequence[Recording], gap: int) -> Split:
+        """Every session whole."""
+        whole = {recording.name: Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)}
+        parts = (self.train, self.validation, self.judged)
+        return Split(*(tuple(whole[name] for name in part) for part in parts))
+
+
+def _frozen(source: Mapping[str, Any]) -> str:
+    return json.dumps(source, sort_keys=True)
+
+
+@lru_cache(maxsize=1)
+def _recordings(source: str) -> Sequence[Recording]:
+    """The recordings of a source, kept by the process that trains on them again and again."""
+    return DataSource.from_plain(json.loads(source)).read()
+
+
+def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
+    """Analytic costs of the network of some settings, before anything is trained: parameters, MACs of a tick.
+
+    Raises:
+        ConfigError: settings that cannot be, or a part that counts other work than it does.
+    """
+    experiment = build(Experiment, settings, "of a search")
+    task = experiment.task.resolve(100.0, channels, experiment.model.physics)
+    network = build_model(task, experiment.model, blank_scaler(task), seed=0)
+    check_counted(network)
+    counted = footprint(network)
+    return {"parameters": float(counted.parameters), "macs_tick": float(counted.macs_tick)}
+
+
+def settings_of(experiment: Experiment) -> Table:
+    """An experiment as plain tables, without what an order decides itself, so that equal orders have equal keys."""
+    made: Table = plain_tree(experiment)
+    del made["split"], made["judge"]["baselines"]
+    for name in ("epochs", "updates", "patience", "refit", "seed"):
+        del made["training"][name]
+    return made

@@ -1,0 +1,158 @@
+"""The process that does trainings for a pool: ``python -m edp.workflows.search.worker`` with a socket; nothing for
+people.
+
+It lives as long as its parent and not longer, and answers each job with one record.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import queue
+import resource
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from multiprocessing.connection import Connection
+from typing import Any
+
+from edp.errors import BusyError, ConfigError, EdpError, NotFiniteError, StorageError
+from edp.sandbox.processes import die_with_parent
+from edp.storage.ledger import (
+    Record,
+    TrainingIdentity,
+    TrainingStatus,
+    WithState,
+    canonical,
+    claim,
+    known,
+    leave_arrival,
+    leave_state,
+)
+
+CLAIM_WAIT_S = 10.0
+"""For how long a worker waits for the claim of another one, such as that of a pool that was killed a moment ago."""
+SHOWN_TRACE = 4000
+BEGUN = b"begun"
+
+
+def perform(
+    identity: TrainingIdentity, where: Mapping[str, Any], folder: str | None, begun: Callable[[], None]
+) -> Record:
+    """Do a training; whatever happens in it comes back as a record.
+
+    Args:
+        identity: what to train.
+        where: see `edp.workflows.search.executor.Job`.
+        folder: of the ledger, to claim the training and leave its state and its record.
+        begun: called before the function of the training.
+    """
+    with contextlib.ExitStack() as stack:
+        if folder is not None:
+            try:
+                stack.enter_context(_claimed(folder, identity.key))
+            except (BusyError, StorageError) as error:
+                return Record(identity, TrainingStatus.LOST, None, str(error))
+            before = known(folder, identity.key)
+            if before is not None:
+                return before
+        record, state = _end_of(identity, where, begun)
+        if folder is not None:
+            try:
+                if state is not None:  # first: a record without it would have its successor begin anew
+                    leave_state(folder, identity.key, state)
+            except StorageError as error:
+                return Record(identity, TrainingStatus.LOST, None, str(error))
+            with contextlib.suppress(StorageError):  # a full disk: the coordinator meets it, too, and says so
+                leave_arrival(folder, record)
+        return record
+
+
+def _claimed(folder: str, key: str) -> Any:
+    patience = time.monotonic() + CLAIM_WAIT_S
+    while True:
+        try:
+            return claim(folder, key)
+        except BusyError:
+            if time.monotonic() > patience:
+                raise
+            time.sleep(0.05)
+
+
+def _end_of(
+    identity: TrainingIdentity, where: Mapping[str, Any], begun: Callable[[], None]
+) -> tuple[Record, bytes | None]:
+    started = time.monotonic()
+    status, result, message, trace, state = TrainingStatus.DONE, None, "", "", None
+    try:
+        function = resolve(identity.job)
+        begun()
+        started = time.monotonic()
+        given = function(identity, where)
+        result = given.result if isinstance(given, WithState) else given
+        if not isinstance(result, Mapping):
+            raise ConfigError(f"'{identity.job}' returned {type(result).__name__}; a training returns a table")
+        canonical(result)
+        state = given.state if isinstance(given, WithState) else None
+    except NotFiniteError as error:
+        status, result, message = TrainingStatus.DIVERGED, None, str(error)
+    except EdpError as error:
+        status, result, message = TrainingStatus.FAILED, None, str(error)
+    except (Exception, SystemExit) as error:
+        status = TrainingStatus.OOM if _out_of_memory(error) else TrainingStatus.FAILED
+        result, message, trace = None, f"{type(error).__name__}: {error}", traceback.format_exc()[-SHOWN_TRACE:]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    measured: dict[str, Any] = {
+        "seconds": time.monotonic() - started,
+        "peak_mb": peak,
+        "host": os.uname().nodename,
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    record = Record(identity, status, result, message, measured | ({"trace": trace} if trace else {}))
+    return record, state
+
+
+def resolve(name: str) -> Callable[[TrainingIdentity, Mapping[str, Any]], Any]:
+    """The function called ``package.module:name``.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    module, _, function = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"there is no job '{name}' ({error}); give it as package.module:function") from error
+    return found  # type: ignore[no-any-return]
+
+
+def _out_of_memory(error: BaseException) -> bool:
+    """Python's, NumPy's and PyTorch's ways to say so."""
+    named = any("OutOfMemoryError" in kind.__name__ for kind in type(error).__mro__)
+    return named or isinstance(error, MemoryError) or "can't allocate memory" in str(error)
+
+
+def serve(connection: Connection) -> None:
+    """Do jobs until the other side closes."""
+    jobs: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def listen() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                jobs.put(connection.recv())
+        os._exit(1)  # in the middle of a training, too: nobody waits for it
+
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        identity, where, folder = jobs.get()
+        record = perform(identity, where, folder, lambda: connection.send_bytes(BEGUN))
+        connection.send_bytes(record.to_bytes())
+
+
+if __name__ == "__main__":
+    os.set_inheritable(int(sys.argv[1]), False)
+    die_with_parent(int(sys.argv[2]))
+    serve(Connection(int(sys.argv[1])))

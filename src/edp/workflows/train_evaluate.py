@@ -1,0 +1,400 @@
+"""The main jobs as functions: simulate, train, evaluate, report. The command line and scripts call the same ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.numpy import save
+
+from edp import __version__
+from edp.config.experiment import (
+    Experiment,
+    experiment_toml,
+    load_experiment,
+    plain_tree,
+)
+from edp.data.coverage import Coverage, cover
+from edp.data.frozen import frozen_before, frozen_of, refuse_frozen
+from edp.data.prepared import Prepared, prepare
+from edp.data.spectrum import LAGS
+from edp.data.splits import SPLITS
+from edp.errors import DataError
+from edp.evaluation.channel_importance import Worths, WorthSpec
+from edp.evaluation.channel_importance import channel_worths as measure_worths
+from edp.evaluation.conditional import collinear
+from edp.evaluation.controller import Budget
+from edp.evaluation.footprint import Footprint, check_possible, footprint
+from edp.evaluation.judge import Evaluation, JudgeSpec, judge
+from edp.evaluation.mac_check import check_counted
+from edp.export import TARGETS, make_target
+from edp.ir.rls import Adaptation
+from edp.logs.source import DataSource
+from edp.networks.integer import IntegerPredictor
+from edp.networks.narrow import student
+from edp.networks.predictor import ModelSpec, Predictor, build_model, check_combination, describe
+from edp.report import build_report
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.storage import check_writable, make_folder, read_object, write_bytes, write_json
+from edp.storage.runs import RunFolder, command_line, environment, read_provenance, run_key
+from edp.training import Bundle, Diverged, Fitted, TrainingProgress, fit, load_bundle, make_bundle, save_bundle
+from edp.training.bundle import blank_scaler, weights_digest
+from edp.training.fit import thread_count
+from edp.training.spec import check_training
+from edp.training.strategy import TrainingStrategy
+
+SHOWN_RECORDINGS = 6
+SHOWN_TICKS = 60_000
+
+
+def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
+    """What a data set covers: see `edp.data.coverage`.
+
+    Args:
+        source: where the recordings are.
+        inputs: channels that command, where neither names nor kinds tell.
+        split: name of a split with its usual settings, to say how far tests lie from training.
+
+    Raises:
+        EdpError: the recordings cannot be read as they are, or do not command or move anything; an unknown split.
+    """
+    chosen = SPLITS[split]() if split else None
+    recordings = source.read()
+    return cover(recordings, inputs, None if chosen is None else chosen.split(recordings, LAGS))
+
+
+def prepare_data(source: DataSource, experiment: Experiment, frozen: Mapping[str, str] | None = None) -> Prepared:
+    """Read and cut a data set for an experiment.
+
+    Args:
+        source: where the recordings are.
+        experiment: the settings.
+        frozen: names of sessions by digest that must not be among them, unless the split keeps them frozen.
+
+    Raises:
+        EdpError: recordings or settings that cannot be used, or a frozen session that would train.
+    """
+    recordings = source.read()
+    others = {key: name for key, name in (frozen or {}).items() if key not in frozen_of(experiment.split)}
+    refuse_frozen(recordings, others, "would be divided into training and test part")
+    first = recordings[0]
+    task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
+    check_combination(task, experiment.model)
+    check_training(task, experiment.model, experiment.training)
+    return prepare(recordings, task, experiment.split, experiment.model.window)
+
+
+@dataclass(frozen=True)
+class StrategyFactory:
+    """What a training has besides data and settings.
+
+    Attributes:
+        facts: plain values that decide what is taught; they are part of the run's key and provenance.
+        lesson: makes the lesson for the prepared data.
+        frozen: names by digest of sessions that stay frozen for what comes of the run, beside those of its split.
+    """
+
+    facts: Mapping[str, Any]
+    lesson: Callable[[Prepared], TrainingStrategy]
+    frozen: Mapping[str, str] = field(default_factory=dict)
+
+
+def train(
+    source: DataSource,
+    experiment: Experiment,
+    out: str | Path,
+    on_event: Callable[[TrainingProgress], None] | None = None,
+    teaching: StrategyFactory | None = None,
+    data: Prepared | None = None,
+) -> Bundle:
+    """Train on a data set and write a run folder with its bundle; an interrupted run goes on where it stopped.
+
+    Args:
+        source: where the recordings are.
+        experiment: the settings.
+        out: run folder.
+        on_event: called with progress.
+        teaching: teachers, weights to begin with.
+        data: what `prepare_data` gave for this source and experiment, where it is there already.
+
+    Raises:
+        EdpError: the data, settings or folder cannot be used; what was on disk stays.
+        Diverged: the loss was not finite any more, now or in an earlier sitting; a bundle holds the best weights
+            before that, where an epoch was finished.
+    """
+    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    if experiment.model.physics is not None:  # an unknown machine is told before recordings are read
+        settings["machine"] = experiment.model.physics.digest()
+    taught = {} if teaching is None else {"lesson": dict(teaching.facts)}
+    frozen = {} if teaching is None else teaching.frozen
+    data = data or prepare_data(source, experiment, frozen)
+    key = run_key(settings | taught, data.digest)
+    with RunFolder(out) as run:
+        run.claim(key, experiment_toml(experiment))
+        _refuse_diverged(run)
+        run.write_status("running")
+        try:
+            lesson = None if teaching is None else teaching.lesson(data)
+            fitted = fit(data, experiment.model, experiment.training, (run, key), on_event, lesson)
+        except Diverged as end:
+            if end.fitted is not None:
+                provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen) | taught
+                _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
+            run.write_status("diverged", message=str(end), **end.facts)
+            raise
+        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, frozen) | taught, data)
+        run.write_status("finished")
+    return bundle
+
+
+def _keep(run: RunFolder, fitted: Fitted, provenance: dict[str, Any], data: Prepared) -> Bundle:
+    """Write what a training leaves: provenance, footprint and the bundle."""
+    write_json(run.file("provenance.json"), provenance)
+    write_json(run.file("footprint.json"), footprint(fitted.predictor).to_json(Budget()))
+    bundle = make_bundle(fitted.predictor, data, provenance)
+    save_bundle(bundle, run.file("bundle"))
+    return bundle
+
+
+def _refuse_diverged(run: RunFolder) -> None:
+    """A run that diverged would do so again, to the same bits."""
+    held = run.status()
+    if held.get("status") == "diverged":
+        kept = " Its bundle holds the weights from before." if run.file("bundle").exists() else ""
+        raise Diverged(
+            f"the run in '{run.path}' diverged on {held['time']}: {held['message']}. The same settings would do so "
+            f"again.{kept} Change them and choose another folder with --out, or remove this one",
+            None,
+            {name: held[name] for name in ("epoch", "update", "kept_epoch")},
+        )
+
+
+def _provenance(
+    source: DataSource, experiment: Experiment, data: Prepared, seconds: float, frozen: Mapping[str, str]
+) -> dict[str, Any]:
+    rate = data.task.rate_hz
+    sealed = {**frozen, **frozen_of(experiment.split)}
+
+    def part(series: Sequence[Any]) -> dict[str, Any]:
+        hours = sum(entry.samples for entry in series) / rate / 3600
+        return {"recordings": len(series), "hours": round(hours, 4), "names": [entry.name for entry in series]}
+
+    return {
+        "edp_version": __version__,
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": command_line(),
+        "seed": experiment.training.seed,
+        "environment": environment(thread_count(experiment.training)),
+        "regime": experiment.training.chunks.regime,
+        "seconds": round(seconds, 2),
+        "device": experiment.training.device,
+        "data": {
+            "source": str(source.path),
+            "reader": source.to_plain(),
+            "rate_hz": rate,
+            "train": part(data.train),
+            "validation": part(data.validation),
+            "test": part(data.test),
+            "digest": data.digest,
+            **({"frozen": sealed} if sealed else {}),
+        },
+    }
+
+
+def evaluate(
+    run: str | Path,
+    source: DataSource | None = None,
+    baselines: Sequence[str] | None = None,
+    on_step: Callable[[str], None] | None = None,
+) -> Path:
+    """Judge a run on its held-out recordings, or on other ones, beside baselines trained on its training data.
+
+    Scores of the same weights, recordings and settings are kept, not computed again.
+
+    Args:
+        run: run folder.
+        source: other recordings; all of them are judged.
+        baselines: names; None takes those of the settings.
+        on_step: called with the name of each model before it runs.
+
+    Returns:
+        The folder with ``scores.json`` and ``predictions.safetensors``: the run folder, or one in it for `source`.
+    """
+    folder = Path(run)
+    _check_run_writable(folder)
+    bundle, experiment, provenance, data = trained_run(folder)
+    target, judged = folder, [data.digest]
+    if source is not None:
+        recordings = source.read()
+        data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
+        judged += [part for recording in recordings for part in (recording.name, recording.digest)]
+        target = make_folder(folder / f"on_{source.path.stem}")
+    chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))
+    settings = plain_tree(replace(experiment, judge=chosen))["judge"]
+    key = run_key({"judge": settings, "weights": weights_digest(bundle.predictor)}, " ".join(judged))
+    scores = _kept(target, key)
+    if scores is None:
+        found = judge(bundle.predictor, data, chosen, describe(bundle.predictor.spec), provenance["seconds"], on_step)
+        scores = found.scores | {"key": key}
+        write_bytes(target / "predictions.safetensors", save(_shown(found)))
+        write_json(target / "scores.json", scores)
+    if source is None:
+        save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
+    return target
+
+
+def _check_run_writable(folder: Path) -> None:
+    """See before minutes of work that a run folder can be written; one that is not there is told by its reader."""
+    if folder.is_dir():
+        check_writable(folder)
+
+
+def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepared]:
+    """Bundle, settings, provenance and data of a run, the data checked to be what it was trained on.
+
+    Raises:
+        EdpError: not a run folder of EDP, or its recordings changed since.
+    """
+    bundle = load_bundle(folder)
+    provenance = read_provenance(folder)
+    experiment = load_experiment(folder / "config.toml", preset=None)
+    torch.set_num_threads(thread_count(experiment.training))  # the ticks of a stream are too small to share
+    data = prepare_data(DataSource.from_plain(provenance["data"]["reader"]), experiment, frozen_before(provenance))
+    if data.digest != provenance["data"]["digest"]:
+        raise DataError(
+            f"the recordings in '{provenance['data']['source']}' changed since '{folder}' was trained; the held-out "
+            "split would not be the same: train again, or judge other recordings with --data"
+        )
+    return bundle, experiment, provenance, data
+
+
+def channel_worths(
+    run: str | Path,
+    source: DataSource | None = None,
+    spec: WorthSpec | None = None,
+    on_group: Callable[[str, int, int], None] | None = None,
+) -> tuple[Worths, Path]:
+    """What each input channel is worth to the network of a run, on its held-out recordings or on other ones.
+
+    Args:
+        run: run folder.
+        source: other recordings; all of them are judged.
+        spec: how channels are taken away; without it, collinear channels are also taken away together.
+        on_group: called with the channels, how many groups are done and of how many.
+
+    Returns:
+        The figures, and the file ``worth.json`` with them: in the run folder, or in the folder in it for `source`.
+    """
+    folder = Path(run)
+    _check_run_writable(folder)
+    bundle, _, _, data = trained_run(folder)
+    target = folder
+    if source is not None:
+        data = replace(data, test=[bundle.task.series(recording) for recording in source.read()])
+        target = make_folder(folder / f"on_{source.path.stem}")
+    if spec is None:
+        groups = collinear([part.inputs for part in data.train])
+        spec = WorthSpec(groups=tuple(tuple(data.task.inputs[i] for i in group) for group in groups))
+    found = measure_worths(bundle.predictor, data, spec, on_group)
+    write_json(target / "worth.json", {"schema": 1} | found.to_json())
+    return found, target / "worth.json"
+
+
+def _kept(folder: Path, key: str) -> dict[str, Any] | None:
+    """Scores of an earlier judgement of the same things."""
+    if not (folder / "scores.json").is_file() or not (folder / "predictions.safetensors").is_file():
+        return None
+    scores = read_object(folder / "scores.json")
+    return scores if scores.get("key") == key else None
+
+
+def _shown(found: Evaluation) -> dict[str, np.ndarray]:
+    """Truth and predictions of a few recordings, for the report."""
+    tensors: dict[str, np.ndarray] = {}
+    for i, series in enumerate(found.series[:SHOWN_RECORDINGS]):
+        tensors[f"{series.name}/truth"] = np.ascontiguousarray(series.targets[:SHOWN_TICKS])
+        for name in ("network", "ridge_arx"):
+            if name in found.predictions:
+                tensors[f"{series.name}/{name}"] = np.ascontiguousarray(found.predictions[name][i][:SHOWN_TICKS])
+    return tensors
+
+
+def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:
+    """Judge a bundle on ``data.test`` without touching the disk."""
+    return judge(bundle.predictor, data, spec or JudgeSpec(), describe(bundle.predictor.spec))
+
+
+def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footprint, str]:
+    """Footprint of a bundle, a run folder, or a settings file, and what it is called.
+
+    Raises:
+        EdpError: neither a bundle nor valid settings, a budget that no network of these inputs and targets meets, or a
+            part that counts other work than it does.
+    """
+    predictor, name, adaptation = _predictor_of(path)
+    check_counted(predictor)
+    if budget is not None:
+        alone = replace(predictor.spec, blocks=(), physics=None)
+        check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
+    return footprint(predictor, adaptation), name
+
+
+def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
+    source = Path(path)
+    if source.suffix == ".toml":
+        experiment = load_experiment(source)
+        task = experiment.task.resolve(100.0, physics=experiment.model.physics)
+        return _untrained(experiment.model, task), source.stem, None
+    bundle = load_bundle(source)
+    predictor = bundle.predictor
+    # Whole numbers have the counts of the network that they were made of.
+    counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
+    return counted, describe(predictor.spec), bundle.adaptation
+
+
+def export_bundle(
+    path: str | Path,
+    to: str,
+    folder: str | Path,
+    name: str = "predictor",
+    options: Mapping[str, object] | None = None,
+) -> list[Path]:
+    """Write a bundle or the bundle of a run folder in the form `to`; returns the files, the one to read first in front.
+
+    Raises:
+        EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
+    """
+    return make_target(to, options).write(load_bundle(path), name, Path(folder))
+
+
+def unheld_adaptation(path: str | Path, to: str) -> bool:
+    """Whether a bundle has an adaptation that the form `to` leaves out."""
+    return load_bundle(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
+
+
+def _untrained(model: ModelSpec, task: Any) -> Predictor:
+    return build_model(task, model, blank_scaler(task), seed=0)
+
+
+__all__ = [
+    "DataSource",
+    "SimulationOrder",
+    "StrategyFactory",
+    "build_report",
+    "channel_worths",
+    "coverage",
+    "evaluate",
+    "export_bundle",
+    "footprint_of",
+    "judge_bundle",
+    "prepare_data",
+    "simulate_data_set",
+    "train",
+    "trained_run",
+    "unheld_adaptation",
+]

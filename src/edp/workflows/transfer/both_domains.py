@@ -1,0 +1,160 @@
+"""Trainings that keep the source: replay, distillation from its network, adversarial training (thesis 5.5.1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.networks.losses import Huber, masked_loss
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_predictions
+from edp.settings.bounds import MOST_WEIGHT, SHARE, WEIGHT, check_bounds, span
+from edp.training.objective import Objective
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import BatchContext
+from edp.training.warm_start import WarmStart
+
+TARGET, SOURCE = 0.0, 1.0
+HIDDEN = 64
+STEEPNESS = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class BothSpec:
+    """How much the source counts beside the target.
+
+    Attributes:
+        weight: of the source's loss; that of the target's is one.
+        soft: share of it that compares with what the source's network says, not with the truth.
+        reversal: weight of the reversed gradient of a classifier of the two worlds; 0 for none.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    weight: float = 1.0
+    soft: float = 0.0
+    reversal: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_bounds("both worlds", self, weight=WEIGHT, soft=SHARE, reversal=span(0.0, MOST_WEIGHT))
+
+
+class BothDomains:
+    """A lesson that goes on from the source's network with recordings of both worlds, in equal shares of ticks.
+
+    Args:
+        start: the source's network.
+        kept: training series of the source, with truth.
+        spec: how much they count.
+    """
+
+    def __init__(self, start: Predictor, kept: Sequence[Series], spec: BothSpec) -> None:
+        self.base, self.kept, self.spec = WarmStart(start), list(kept), spec
+
+    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+        """Series of both worlds, the fewer ticks several times, with their world and what the source's network says."""
+        own = [self._marked(part, TARGET, None) for part in known]
+        said = stream_predictions(self.base.start, self.kept) if self.spec.soft else [None] * len(self.kept)
+        kept = [self._marked(part, SOURCE, values) for part, values in zip(self.kept, said, strict=True)]
+        ticks = [sum(part.samples for part in parts) for parts in (own, kept)]
+        # The arrays are shared, so to name a series again takes no memory.
+        own, kept = (parts * max(1, round(max(ticks) / n)) for parts, n in zip((own, kept), ticks, strict=True))
+        return [*own, *kept]
+
+    def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
+        """Take over weights and scaling; put the classifier beside the network, where there is one."""
+        self.base.begin(net, spec)
+        if self.spec.reversal:
+            x = torch.zeros(1, 1, len(net.task.inputs))
+            with torch.no_grad():
+                width = int(net.forward_features(x, net.initial_state(1, x))[2].shape[-1])
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(spec.seed)
+                net.add_module("classifier", Classifier(width))
+            self._classifier = net.get_submodule("classifier")
+        return True
+
+    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+        """The loss of the target, that of the source, and that of the classifier with its gradient reversed."""
+        spec, world = self.spec, moment.teacher_targets[..., 0]
+        here, there = moment.valid & (world < 0.5), moment.valid & (world > 0.5)
+        loss = objective.evaluate(moment.answer, moment.future, moment.features, here)
+        if spec.soft < 1:
+            truth = objective.evaluate(moment.answer, moment.future, moment.features, there)
+            loss = loss + spec.weight * (1 - spec.soft) * truth
+        if spec.soft:
+            said = moment.teacher_targets[..., 1:].unflatten(-1, moment.future.shape[2:])
+            goal = objective.code.encode(said, moment.features)
+            soft = masked_loss(Huber(), moment.answer, goal, there, objective.weights)
+            loss = loss + spec.weight * spec.soft * soft
+        if spec.reversal:
+            hidden = reverse(moment.hidden, spec.reversal * ramp(moment.progress))
+            loss = loss + self._confusion(self._classifier(hidden), here, there)
+        return loss
+
+    def end(self, net: Predictor) -> None:
+        """Take the classifier away."""
+        if self.spec.reversal:
+            del net.classifier
+        self.base.end(net)
+
+    def _confusion(self, logits: Tensor, here: Tensor, there: Tensor) -> Tensor:
+        """Cross-entropy of the classifier, both worlds with equal weight."""
+        parts = [
+            nn.functional.binary_cross_entropy_with_logits(found, torch.full_like(found, world))
+            for found, world in ((logits[here], TARGET), (logits[there], SOURCE))
+            if found.numel()
+        ]
+        return torch.stack(parts).mean() if parts else logits.sum() * 0.0
+
+    def _marked(self, part: Series, world: float, said: np.ndarray[Any, Any] | None) -> Series:
+        columns = [np.full((part.samples, 1), world, dtype=np.float32)]
+        if self.spec.soft:
+            width = len(self.base.start.task.horizons) * len(self.base.start.task.targets)
+            held = np.zeros((part.samples, width)) if said is None else said.reshape(part.samples, -1)
+            columns.append(held.astype(np.float32))
+        return replace(part, teacher_targets=np.concatenate(columns, axis=1))
+
+
+class Classifier(nn.Module):
+    """Which world a tick is from, by the backbone's representation: ``(..., width)`` to logits ``(...)``."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(width, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Logits; positive for the source."""
+        said: Tensor = self.layers(hidden)
+        return said.squeeze(-1)
+
+
+def ramp(progress: float) -> float:
+    """``2 / (1 + exp(-10 p)) - 1``: the adversary comes in slowly (Ganin et al. 2016, arXiv 1505.07818)."""
+    return 2.0 / (1.0 + math.exp(-STEEPNESS * progress)) - 1.0
+
+
+class _Reverse(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factor: float) -> Tensor:
+        ctx.factor = factor
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return -ctx.factor * grad, None
+
+
+def reverse(values: Tensor, factor: float) -> Tensor:
+    """The values themselves, whose gradient is multiplied with ``-factor``."""
+    result: Tensor = _Reverse.apply(values, factor)  # type: ignore[no-untyped-call]
+    return result

@@ -1,0 +1,126 @@
+"""One transfer: a source, the logs of a target, and the trainings that methods ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from edp.config.experiment import Experiment
+from edp.data.chunks import ChunkSpec
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.logs.source import DataSource
+from edp.networks.losses import Smoothness
+from edp.networks.predictor import Predictor
+from edp.training import TrainingProgress
+from edp.training.optimizers import OptimizerSpec, Soap
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import TrainingStrategy
+from edp.workflows.train_evaluate import StrategyFactory, train
+from edp.workflows.transfer.centring import Centred
+from edp.workflows.transfer.source import SourceModel
+from edp.workflows.transfer.spec import FinetuneSpec
+
+NEIGHBOURS = 4
+"""Windows drawn together, so that smoothness can compare neighbours; divides the usual batches."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransferCase:
+    """What a method works with.
+
+    Attributes:
+        source: the network of another machine.
+        logs: where the recordings of the target are.
+        data: those, divided by time.
+        experiment: settings of the source with the target's split.
+        spec: phases, rates and regularisers.
+        folder: of the method's run.
+        tell: called with the name of a training and its event.
+    """
+
+    source: SourceModel
+    logs: DataSource
+    data: Prepared
+    experiment: Experiment
+    spec: FinetuneSpec
+    folder: Path
+    tell: Callable[[str, TrainingProgress], None]
+
+    def train(
+        self,
+        name: str,
+        training: TrainingSpec,
+        lesson: Callable[[], TrainingStrategy] | None,
+        facts: Mapping[str, Any] | None = None,
+        phase: str = "",
+        judged: Sequence[Series] = (),
+        centred: bool = True,
+    ) -> Predictor:
+        """Train in the method's folder, or for a phase in a folder within; what was stopped goes on.
+
+        Args:
+            name: what progress calls it.
+            training: how.
+            lesson: makes what the training begins with; None begins at random.
+            facts: plain values that decide the lesson beside the source.
+            phase: name of a phase that a later one goes on from.
+            judged: further series that choose the best epoch.
+            centred: whether the mean error over the target's logs may be taken out at the end, if the specs ask for it.
+        """
+        teaching = None
+        if lesson is not None:
+            make, told = lesson, {"method": name, "source": self.source.facts, **(facts or {})}
+            if centred and self.spec.center and not phase:
+                teaching = StrategyFactory({**told, "centred": True}, lambda data: Centred(make()), self.source.frozen)
+            else:
+                teaching = StrategyFactory(told, lambda data: make(), self.source.frozen)
+        experiment = replace(self.experiment, training=training)
+        folder = self.folder / "phases" / phase if phase else self.folder
+        data = replace(self.data, validation=[*self.data.validation, *judged])
+        return train(self.logs, experiment, folder, lambda event: self.tell(name, event), teaching, data).predictor
+
+    def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:
+        """How a network is trained on, see `tuned`."""
+        return tuned(self.experiment.training, self.spec, optimizer, epochs)
+
+
+def tuned(
+    training: TrainingSpec, spec: FinetuneSpec, optimizer: OptimizerSpec | None = None, epochs: int | None = None
+) -> TrainingSpec:
+    """How a network is trained on: small batches, light smoothness, early stopping (thesis 3.4.5).
+
+    Args:
+        training: how the source was trained.
+        spec: what is set of the fine-tuning.
+        optimizer: by default SOAP with one rate for all that learns.
+        epochs: by default those of methods without phases.
+    """
+    terms = tuple(term for term in training.terms if not isinstance(term, Smoothness))
+    if spec.smoothness:
+        smooth: Any = Smoothness(weight=spec.smoothness)
+        terms = (*terms, smooth)
+    chunks = replace(training.chunks, batch=spec.batch, consecutive=1)
+    if chunks.regime == "window":
+        near = NEIGHBOURS if spec.batch % NEIGHBOURS == 0 else spec.batch
+        chunks = replace(chunks, consecutive=near if terms else 1)
+    else:
+        chunks = walked_again(chunks)
+    return replace(
+        training,
+        chunks=chunks,
+        terms=terms,
+        optimizer=optimizer or Soap(learning_rate=spec.rate, weight_decay=spec.weight_decay),
+        epochs=epochs or spec.rounds,
+        patience=spec.patience,
+        refit="none",
+    )
+
+
+def walked_again(chunks: ChunkSpec) -> ChunkSpec:
+    """Chunks with which minutes of logs, which do not fill many lanes, are walked again, cut elsewhere."""
+    if chunks.carried or chunks.regime == "window":
+        return chunks
+    return replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))

@@ -1,0 +1,112 @@
+"""Centring: the mean error of a trained network taken out of its head.
+
+A loss that is nearly linear finds the median of what may come. Where errors are skewed, as in soil, the mean stays off
+by some percent of the mean absolute error, and a plant model in a closed loop integrates it to a drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.networks.predictor import Predictor
+from edp.networks.running import stream_errors
+from edp.training.objective import Objective
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import BatchContext, TrainingStrategy
+
+ROUNDS = 6  # one is enough unless the heads end in a function that bends
+LEAST_ANSWER = 0.1
+CLOSE = 0.005  # of the mean absolute error that may be left
+SHORTEST_S = 30.0  # of logs: the mean error of fewer says little of other logs
+DEAREST = 1.01  # most that it may cost of the mean absolute error
+
+
+class Centred:
+    """A lesson after which the mean error over the training series is taken out of the trained network.
+
+    Args:
+        base: the lesson itself.
+    """
+
+    def __init__(self, base: TrainingStrategy) -> None:
+        self.base = base
+        self._known: list[Series] = []
+
+    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+        """Those of the lesson."""
+        self._known = list(known)
+        return self.base.series(task, known)
+
+    def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
+        """As the lesson begins."""
+        return self.base.begin(net, spec)
+
+    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+        """That of the lesson."""
+        return self.base.loss(objective, moment)
+
+    def end(self, net: Predictor) -> None:
+        """End the lesson, and centre what it taught, unless the logs are too short for a mean to hold elsewhere."""
+        self.base.end(net)
+        if sum(part.samples for part in self._known) >= SHORTEST_S * net.task.rate_hz:
+            centre(net, self._known)
+
+
+def centre(net: Predictor, series: Sequence[Series]) -> None:
+    """Shift the last biases of the heads until the mean error over `series` is nothing.
+
+    What would raise the mean absolute error of a horizon and target by more than a hundredth is left as it was, and
+    everything is where no series is longer than a window.
+
+    Args:
+        net: a trained network, changed in place.
+        series: with truth; each from reset, after a whole window.
+    """
+    bias = net.heads.biases[-1]  # (target, horizon * value), of which the first value is the prediction
+    before = bias.detach().clone()
+    mean, size = _errors(net, series)
+    if not np.isfinite(size).all():
+        return
+    allowed, answered = DEAREST * size, np.ones_like(size)
+    for _ in range(ROUNDS):
+        step = np.where(np.abs(mean) > CLOSE * size, mean / answered, 0.0)
+        if not step.any():
+            break
+        _shift(net, -step)
+        last, (mean, size) = mean, _errors(net, series)
+        # A bent end of the heads answers with less than it is given.
+        share = np.divide(last - mean, step, out=np.ones_like(step), where=step != 0.0)
+        answered = np.where(step != 0.0, np.clip(share, LEAST_ANSWER, 1.0), answered)
+    dear = torch.from_numpy(size > allowed).transpose(0, 1).to(bias.device)
+    with torch.no_grad():
+        own = bias[:, :: net.spec.output.values]
+        own.copy_(torch.where(dear, before[:, :: net.spec.output.values], own))
+
+
+def _shift(net: Predictor, change: NDArray[np.float64]) -> None:
+    """Add a change in SI units, ``(horizon, target)``, to what the heads say."""
+    bias = net.heads.biases[-1]
+    features = torch.zeros(1, 1, len(net.task.features.features), device=bias.device)
+    future = torch.as_tensor(change, dtype=torch.float32, device=bias.device)[None, None]
+    coded: Tensor = net.code.encode(future, features) - net.code.encode(torch.zeros_like(future), features)
+    with torch.no_grad():
+        bias[:, :: net.spec.output.values] += coded[0, 0].transpose(0, 1)
+
+
+def _errors(net: Predictor, series: Sequence[Series]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean error and mean absolute error, SI units, ``(horizon, target)``; NaN where nothing can be judged."""
+    horizons, targets = len(net.task.horizons), len(net.task.targets)
+    total, size, ticks = np.zeros((horizons, targets)), np.zeros((horizons, targets)), np.zeros((horizons, 1))
+    for place, error in stream_errors(net, series):
+        total[place] += error.sum(axis=0, dtype=np.float64)
+        size[place] += np.abs(error).sum(axis=0, dtype=np.float64)
+        ticks[place] += len(error)
+    with np.errstate(invalid="ignore"):
+        return total / ticks, size / ticks

@@ -1,0 +1,219 @@
+"""What must hold of the logs of a target before a network of another machine is trained on them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.chunks import ChunkSpec
+from edp.data.prepared import Prepared
+from edp.data.scaling import CONSTANT
+from edp.data.series import Series
+from edp.data.task import Task
+from edp.errors import DataError, closest
+from edp.networks.frontend import FrontEnd
+from edp.recording import Recording
+from edp.signals import KINDS, Kind
+
+SEARCHED_S = 0.5
+"""Longest lag from a pilot pressure to the motion that it commands."""
+TOGETHER = 0.3
+"""Correlation from which the direction of a motion counts as known."""
+FAR = 100.0
+"""How many times larger or smaller a channel may be than the source's; units differ by more, machines by less."""
+CONVENTION = {
+    ("BmUp", "CylVels_1"): 1,
+    ("BmDwn", "CylVels_1"): -1,
+    ("AmIn", "CylVels_2"): 1,
+    ("AmOut", "CylVels_2"): -1,
+    ("BktIn", "CylVels_3"): 1,
+    ("BktOut", "CylVels_3"): -1,
+}
+"""Sign of the motion that a pilot pressure commands, in the built-in names (extension is positive)."""
+
+
+class PilotPair(NamedTuple):
+    """A pilot pressure and a target that follows it."""
+
+    pilot: str
+    target: str
+
+
+def check_channels(recordings: Sequence[Recording], task: Task) -> None:
+    """Refuse logs that lack a channel or have another rate, with all that is wrong at once.
+
+    Raises:
+        DataError: which channels of which logs, and what to do.
+    """
+    sources = {entry.name: entry.source for entry in task.derived}
+    needed = dict.fromkeys([*task.inputs, *(sources.get(name, name) for name in task.targets)])
+    problems = []
+    for recording in recordings:
+        missing = [name for name in needed if name not in recording.channel_names]
+        if missing:
+            hint = closest(missing[0], recording.channel_names) if len(missing) == 1 else ""
+            problems.append(f"'{recording.name}' ({recording.source}) lacks {', '.join(missing)}{hint}")
+    if problems:
+        raise DataError(
+            "the network reads channels that the logs do not have:\n  - " + "\n  - ".join(problems) + "\n  - "
+            "map the columns that hold them (--map); give a channel that this machine does not have a value there "
+            "(constant = 0.0); or train the source without it (task.features)"
+        )
+    other = [f"'{r.name}' {r.rate_hz:g} Hz" for r in recordings if abs(r.rate_hz - task.rate_hz) > 1e-3 * task.rate_hz]
+    if other:
+        raise DataError(
+            f"the network runs at {task.rate_hz:g} Hz, the logs have another rate: {', '.join(other)}; set rate_hz = "
+            f"{task.rate_hz:g} in the signal map (--map) to resample them, or train the source at the rate of the logs"
+        )
+
+
+def check_lengths(data: Prepared, chunks: ChunkSpec, window: int) -> None:
+    """Refuse logs whose parts are shorter than a start-up and the horizon.
+
+    Raises:
+        DataError: which parts, and how long the shortest log must be.
+    """
+    lead = max(window, chunks.burn_in if chunks.regime == "chunk" else chunks.length + chunks.consecutive - 2)
+    needed = lead + data.task.max_horizon + 1
+    rate = data.task.rate_hz
+    short = [
+        f"{part} '{series.name}' {series.samples / rate:.1f} s"
+        for part in ("train", "validation", "test")
+        for series in getattr(data, part)
+        if series.samples < needed
+    ]
+    if short:
+        raise DataError(
+            f"logs are too short: each part of each log needs {needed / rate:.2f} s (start-up of {lead} ticks and "
+            f"horizon of {data.task.max_horizon}), but there are {'; '.join(short)}. Leave these logs out, join them, "
+            "or give validation and test larger shares (--set split.validation_share=0.2)"
+        )
+
+
+def check_moving(data: Prepared) -> None:
+    """Refuse targets that do not move in the training or test part.
+
+    Raises:
+        DataError: which targets.
+    """
+    for part in ("train", "test"):
+        values = np.concatenate([series.targets for series in getattr(data, part)]).astype(np.float64)
+        still = [
+            f"{name} is {mean:.4g} throughout"
+            for name, kind, mean, std in zip(
+                data.task.targets, data.target_kinds, values.mean(axis=0), values.std(axis=0), strict=True
+            )
+            if std <= CONSTANT * KINDS[kind].nominal
+        ]
+        if still:
+            raise DataError(
+                f"{'; '.join(still)} in the {part} part of the logs: nothing can be learned or judged of a target "
+                "that does not move. Look for a frozen sensor or a wrong column with edp inspect, or give logs in "
+                "which every target moves"
+            )
+
+
+def check_units(data: Prepared, scaler: FrontEnd) -> None:
+    """Refuse logs with channels that are hundreds of times as large, or as small, as the source's.
+
+    A machine that rests is no wrong unit: smallness counts only where all channels of a kind, two or more, have it.
+
+    Args:
+        data: of the target.
+        scaler: of the source, with the middle and spread of each channel that it reads.
+
+    Raises:
+        DataError: which channels, how large they are here and there, and what to change.
+    """
+    names = data.task.features.channels
+    offset, width = (values[: len(names)].detach().double().cpu().numpy() for values in (scaler.offset, scaler.width))
+    there = np.abs(offset) + 2.0 * width
+    logged = np.concatenate([np.abs(part.inputs[:, : len(names)]) for part in data.train])
+    here = np.quantile(logged, 0.99, axis=0).astype(np.float64)
+    wrong = here > FAR * there
+    kinds = np.array([channel.kind for channel in data.inputs[: len(names)]])
+    for kind in dict.fromkeys(kinds):
+        same = (kinds == kind) & (here > 0.0)
+        if same.sum() >= 2 and (here[same] * FAR < there[same]).all():
+            wrong |= same
+    if wrong.any():
+        said = "; ".join(
+            f"{names[i]} up to {here[i]:.3g}, in the source about {there[i]:.3g} {KINDS[data.inputs[i].kind].si_unit}"
+            for i in np.flatnonzero(wrong)
+        )
+        raise DataError(
+            f"channels of the logs are more than {FAR:g} times as large or as small as those that the network learned "
+            f'from: {said}. Say the unit of these columns in the signal map (--map), such as unit = "bar"'
+        )
+
+
+def check_signs(data: Prepared, source: Prepared | None) -> list[str]:
+    """Refuse logs in which targets move against the pilot pressures that moved them in the source.
+
+    Args:
+        data: of the target.
+        source: of the source; None holds the logs against the convention of the built-in names.
+
+    Returns:
+        What could not be found out, in sentences.
+
+    Raises:
+        DataError: which targets move the other way, and what to change.
+    """
+    pairs = list(_pairs(data))
+    if not pairs:
+        return ["The sign convention of the logs was not checked: the network reads no pilot pressure."]
+    own = {pair: correlation(data, data.train, pair) for pair in pairs}
+    usual = {pair: float(CONVENTION[pair]) for pair in pairs if tuple(pair) in CONVENTION}
+    known = usual if source is None else {pair: correlation(source, source.train, pair) for pair in pairs}
+    sure = {p: (r, own[p]) for p, r in known.items() if min(abs(r), abs(own[p])) >= TOGETHER}
+    turned = {pair: both for pair, both in sure.items() if both[0] * both[1] < 0}
+    if turned:
+        origin = "by convention" if source is None else "in the source"
+        said = "; ".join(
+            f"{p.target} after {p.pilot}: {'positive' if r > 0 else 'negative'} {origin}, correlation {own:+.2f} here"
+            for p, (r, own) in turned.items()
+        )
+        raise DataError(
+            f"the logs have another sign convention than the source: {said}. Turn the column in the signal map "
+            "(scale = -1.0), or exchange the two pilot pressures if they are mixed up; --any-sign takes the logs as "
+            "they are"
+        )
+    blind = [t for t in data.task.targets if not any(p.target == t for p in sure)]
+    if blind:
+        return [
+            f"The sign of {', '.join(blind)} was not checked: no pilot pressure moves with it clearly (correlation of "
+            f"{TOGETHER:g} or more within {SEARCHED_S:g} s) in both the source and the logs."
+        ]
+    return []
+
+
+def _pairs(data: Prepared) -> Iterator[PilotPair]:
+    pilots = [channel.name for channel in data.inputs if channel.kind is Kind.PILOT_PRESSURE]
+    speeds = [n for n, kind in zip(data.task.targets, data.target_kinds, strict=True) if kind is Kind.VELOCITY]
+    return (PilotPair(pilot, target) for target in speeds for pilot in pilots)
+
+
+def correlation(data: Prepared, parts: Sequence[Series], pair: PilotPair) -> float:
+    """Pearson's correlation of a pilot pressure with a target, at the lag within `SEARCHED_S` where it is largest."""
+    column, target = data.task.inputs.index(pair.pilot), data.task.targets.index(pair.target)
+    reach = round(SEARCHED_S * data.task.rate_hz)
+    pilot = [part.inputs[:, column].astype(np.float64) for part in parts]
+    moved = [part.targets[:, target].astype(np.float64) for part in parts]
+    found = [_pearson(pilot, moved, lag) for lag in range(0, reach + 1, max(1, reach // 10))]
+    return max(found, key=abs)
+
+
+Values = Sequence[NDArray[np.float64]]
+
+
+def _pearson(first: Values, second: Values, lag: int) -> float:
+    """Of ``first[t]`` and ``second[t + lag]``; 0 where one does not move."""
+    a = np.concatenate([part[: max(0, len(part) - lag)] for part in first])
+    b = np.concatenate([part[lag:] for part in second])
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / size if size > 0 else 0.0

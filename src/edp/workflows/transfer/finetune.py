@@ -1,0 +1,221 @@
+"""From a network of one machine and logs of another to a network of the other, beside rivals on the same ticks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from edp import __version__
+from edp.config.experiment import Experiment
+from edp.data.frozen import refuse_frozen
+from edp.data.prepared import Prepared, prepare
+from edp.errors import ConfigError
+from edp.logs.source import DataSource
+from edp.networks.predictor import describe
+from edp.signals import KINDS
+from edp.storage import make_folder, write_bytes, write_json
+from edp.training import Diverged, TrainingProgress
+from edp.training.bundle import weights_digest
+from edp.workflows.transfer.case import TransferCase, tuned
+from edp.workflows.transfer.checks import check_channels, check_lengths, check_moving, check_signs, check_units
+from edp.workflows.transfer.methods import METHODS, Made, Method
+from edp.workflows.transfer.scores import distributions, errors_of, excerpts, measure
+from edp.workflows.transfer.source import SourceModel, read_source, target_experiment
+from edp.workflows.transfer.spec import FinetuneSpec
+
+RESULT, SHOWN = "transfer.json", "transfer_predictions.safetensors"
+BEFORE = "direct"
+
+
+@dataclass(frozen=True)
+class FinetuneCallbacks:
+    """Called on the way.
+
+    Attributes:
+        on_note: with a sentence.
+        on_training: with the name of a training and its event.
+        on_method: with the name of a method before it begins, how many came before it and how many there are.
+    """
+
+    on_note: Callable[[str], None] = lambda text: None
+    on_training: Callable[[str, TrainingProgress], None] = lambda name, event: None
+    on_method: Callable[[str, int, int], None] = lambda name, done, count: None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetuneRequest:
+    """What is made of a source and logs.
+
+    Attributes:
+        spec: phases, rates and regularisers.
+        method: name of the method whose network is kept as the run.
+        rivals: names of further methods; direct transfer is always among them.
+        changes: settings of the trainings that differ from those of the source, as ``key.path=value``.
+
+    Raises:
+        ConfigError: an unknown method, or one that leaves no network as `method`.
+    """
+
+    spec: FinetuneSpec
+    method: str = "full"
+    rivals: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in (self.method, *self.rivals):
+            _ = METHODS[name]
+        if not METHODS[self.method].trains:
+            able = ", ".join(name for name, method in METHODS.items() if method.trains)
+            raise ConfigError(
+                f"method '{self.method}' trains nothing, so it leaves no run; one of {able} must be given"
+            )
+
+    @property
+    def names(self) -> list[str]:
+        """All methods, each once: the one that is kept, direct transfer, the others in the order of the registry."""
+        wanted = {self.method, BEFORE, *self.rivals}
+        first = [self.method, BEFORE]
+        return first + [name for name in METHODS if name in wanted and name not in first]
+
+
+def finetune(
+    source: str | Path,
+    logs: DataSource,
+    order: FinetuneRequest,
+    out: str | Path,
+    watchers: FinetuneCallbacks | None = None,
+) -> dict[str, Any]:
+    """Train a network of one machine on for another, judge it beside rivals, and write a run folder.
+
+    The source's scaling is carried and never fitted again. Each log is divided by time into training, validation and
+    test part with a gap of W + k. The same call goes on after a stop. Rivals lie in ``rivals/`` of the folder.
+
+    Args:
+        source: run folder or bundle.
+        logs: recordings of the target.
+        order: methods and settings.
+        out: run folder.
+        watchers: called on the way.
+
+    Returns:
+        The content of ``transfer.json``.
+
+    Raises:
+        EdpError: logs that do not go with the source, settings that cannot be, or another run in `out`.
+        Diverged: the training of the method that is kept diverged.
+    """
+    told = watchers or FinetuneCallbacks()
+    begun = read_source(source)
+    experiment = target_experiment(begun, order.changes)
+    names, notes = _able(begun, order)
+    data, found = _target(begun, logs, experiment, order)
+    notes += found
+    for note in notes:
+        told.on_note(note)
+    folder = Path(out)
+    made: dict[str, Made] = {}
+    for number, name in enumerate(names):
+        told.on_method(name, number, len(names))
+        place = folder if name == order.method else folder / "rivals" / name
+        case = TransferCase(begun, logs, data, experiment, order.spec, place, told.on_training)
+        try:
+            made[name] = METHODS[name]().make(case)
+        except Diverged as end:
+            if name == order.method:
+                raise
+            notes.append(f"{METHODS[name].label} is left out: {end}")
+            told.on_note(notes[-1])
+    result, shown = _result(begun, data, experiment, order, made)
+    result |= {"logs": str(logs.path), "notes": notes}
+    write_bytes(make_folder(folder) / SHOWN, save(shown))
+    write_json(folder / RESULT, result)
+    return result
+
+
+def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[str]]:
+    """The methods for which the source has what they need; and which others are left out, and why.
+
+    Raises:
+        ConfigError: the method that is to be kept is one of the others.
+    """
+    lacking = [name for name in order.names if METHODS[name].replays and source.data is None]
+    if order.method in lacking:
+        raise ConfigError(
+            f"method '{order.method}' needs the recordings of the source, which are not there: {source.absent}"
+        )
+    notes = [
+        f"{METHODS[name].label} is left out: it needs the recordings of the source. {source.absent}" for name in lacking
+    ]
+    return [name for name in order.names if name not in lacking], notes
+
+
+def _target(
+    source: SourceModel, logs: DataSource, experiment: Experiment, order: FinetuneRequest
+) -> tuple[Prepared, list[str]]:
+    """The logs, divided and held against the source; and what could not be held."""
+    task, window = source.bundle.task, source.predictor.spec.window
+    recordings = logs.read()
+    refuse_frozen(recordings, source.frozen, "would be trained on")
+    check_channels(recordings, task)
+    data = prepare(recordings, task, experiment.split, window)
+    check_lengths(data, tuned(experiment.training, order.spec).chunks, window)
+    check_moving(data)
+    check_units(data, source.predictor.front)
+    notes = []
+    if order.spec.check_signs:
+        notes += check_signs(data, source.data)
+    if source.data is None:
+        notes.append(f"What becomes of the source's world was not judged: {source.absent}.")
+    return data, notes
+
+
+def _result(
+    source: SourceModel, data: Prepared, experiment: Experiment, order: FinetuneRequest, made: dict[str, Made]
+) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
+    """Scores of all methods in both worlds, and the predictions before and after that pictures show."""
+    skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
+    predictions = {name: one.predict(data) for name, one in made.items()}
+    errors = {name: errors_of(values, data, skip) for name, values in predictions.items()}
+    worlds = {"target": {name: measure(values, data, skip) for name, values in predictions.items()}}
+    if source.data is not None:
+        worlds["source"] = {name: measure(one.predict(source.data), source.data, skip) for name, one in made.items()}
+    pair = {name: values for name, values in predictions.items() if name in (BEFORE, order.method)}
+    rate = data.task.rate_hz
+    parts = {part: getattr(data, part) for part in ("train", "validation", "test")}
+    facts = [KINDS[kind] for kind in data.target_kinds]
+    result = {
+        "schema": 1,
+        "edp": __version__,
+        "method": order.method,
+        "before": BEFORE,
+        "network": describe(source.predictor.spec),
+        "settings": asdict(order.spec),
+        "source": source.facts,
+        "task": {"horizons": list(data.task.horizons), "rate_hz": rate, "skip": skip},
+        "targets": [
+            {"name": name, "description": text, "unit": fact.report_unit, "factor": fact.report_factor}
+            for name, text, fact in zip(data.task.targets, data.descriptions, facts, strict=True)
+        ],
+        "data": {
+            "recordings": len({part.name.partition("[")[0] for part in data.train}),
+            "minutes": {part: round(sum(s.samples for s in held) / rate / 60, 3) for part, held in parts.items()},
+        },
+        "methods": {name: _row(METHODS[name], one, worlds, name) for name, one in made.items()},
+        "distributions": distributions({name: errors[name] for name in pair}, data.task.targets),
+    }
+    return result, excerpts(pair, data, skip)
+
+
+def _row(method: type[Method], made: Made, worlds: dict[str, Any], name: str) -> dict[str, Any]:
+    return {
+        "label": method.label,
+        "learned": made.learned,
+        "weights": None if made.network is None else weights_digest(made.network),
+        "worlds": {world: held[name] for world, held in worlds.items()},
+    }

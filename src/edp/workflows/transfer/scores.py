@@ -1,0 +1,107 @@
+"""Errors of a method on the test part: the scores of Table 4.10, skew, and distributions (figures 4.9 and 4.11)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.prepared import Prepared
+from edp.evaluation.judge import Predictions, score_predictions
+from edp.signals import KINDS
+
+BINS = 81
+SHOWN_S = 30.0
+SHOWN_RECORDINGS = 3
+
+Errors = dict[str, NDArray[np.float64]]
+
+
+def measure(predictions: Predictions, data: Prepared, skip: int) -> dict[str, Any]:
+    """Scores by horizon and target in report units, with the skew of the errors and their mean square."""
+    found: dict[str, Any] = score_predictions(predictions, data, skip)["overall"]
+    for horizon, errors in errors_of(predictions, data, skip).items():
+        rows = found[horizon]
+        for place, name in enumerate(data.task.targets):
+            rows[name] |= {"mse": rows[name]["rmse"] ** 2, "skew": skew(errors[:, place])}
+        own = [rows[name] for name in data.task.targets]
+        rows["mean"] |= {key: float(np.mean([row[key] for row in own])) for key in ("mse", "skew")}
+    return found
+
+
+def errors_of(predictions: Predictions, data: Prepared, skip: int) -> Errors:
+    """Prediction minus truth of all scored ticks by horizon, ``(tick, target)``, report units."""
+    factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
+    found = {}
+    for place, horizon in enumerate(data.task.horizons):
+        parts = []
+        for values, series in zip(predictions, data.test, strict=True):
+            ticks = series.samples - data.task.max_horizon
+            truth = series.targets[horizon : horizon + max(0, ticks)].astype(np.float64)
+            error = (values[: len(truth), place].astype(np.float64) - truth) * factors
+            parts.append(error[skip:][np.isfinite(error[skip:]).all(axis=1)])
+        found[str(horizon)] = np.concatenate(parts)
+    return found
+
+
+def skew(errors: NDArray[np.float64]) -> float:
+    """Third standardised moment; 0 for errors that are all alike."""
+    centred = errors - errors.mean()
+    deviation = float(np.sqrt(np.mean(centred**2)))
+    return float(np.mean((centred / deviation) ** 3)) if deviation > 0 else 0.0
+
+
+def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[str, Any]:
+    """Share of ticks by error, on edges that all methods have in common.
+
+    Args:
+        errors: of each method, see `errors_of`.
+        targets: names.
+
+    Returns:
+        By horizon and target ``edges`` and the ``shares`` of each method; what lies beyond the edges is in none.
+    """
+    found: dict[str, Any] = {}
+    for horizon in next(iter(errors.values())):
+        found[horizon] = {}
+        for place, target in enumerate(targets):
+            reach = max(float(np.quantile(np.abs(held[horizon][:, place]), 0.995)) for held in errors.values()) or 1.0
+            edges = np.linspace(-reach, reach, BINS + 1)
+            shares = {
+                name: (np.histogram(held[horizon][:, place], edges)[0] / len(held[horizon])).tolist()
+                for name, held in errors.items()
+            }
+            found[horizon][target] = {"edges": edges.tolist(), "shares": shares}
+    return found
+
+
+def excerpts(predictions: Mapping[str, Predictions], data: Prepared, skip: int) -> dict[str, NDArray[np.float32]]:
+    """The stretches of the test part in which targets move most: truth and predictions, SI units.
+
+    Returns:
+        ``NAME/truth`` ``(time, horizon, target)`` at t + k, ``NAME/METHOD`` the predictions made at t, and
+        ``NAME/start`` ``(1,)``, the second of the recording's part at which it begins.
+    """
+    size = round(SHOWN_S * data.task.rate_hz)
+    found = []
+    for number, series in enumerate(data.test):
+        ticks = series.samples - data.task.max_horizon
+        for start in range(skip, max(skip + 1, ticks - size + 1), max(1, size // 2)):
+            stop = min(start + size, ticks)
+            if stop > start:
+                moved = series.targets[start:stop].astype(np.float64)
+                found.append((float(moved.std(axis=0).sum()), number, start, stop))
+    best: dict[int, tuple[float, int, int, int]] = {}
+    for entry in found:
+        best[entry[1]] = max(entry, best.get(entry[1], entry))
+    kept: dict[str, NDArray[np.float32]] = {}
+    for _, number, start, stop in sorted(best.values(), reverse=True)[:SHOWN_RECORDINGS]:
+        series = data.test[number]
+        truth = np.stack([series.targets[start + k : stop + k] for k in data.task.horizons], axis=1)
+        kept[f"{series.name}/truth"] = np.ascontiguousarray(truth, dtype=np.float32)
+        kept[f"{series.name}/start"] = np.array([start / data.task.rate_hz], dtype=np.float32)
+        for name, values in predictions.items():
+            kept[f"{series.name}/{name}"] = np.ascontiguousarray(values[number][start:stop], dtype=np.float32)
+    return kept

@@ -1,0 +1,134 @@
+"""Where a transfer begins: a trained network, the settings of its run, and its recordings where they are at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from edp.config.experiment import (
+    Experiment,
+    FeatureSettings,
+    TaskSettings,
+    build,
+    load_experiment,
+    merged,
+    override,
+    plain_tree,
+)
+from edp.data.features import FEATURE_SETS
+from edp.data.frozen import frozen_before
+from edp.data.prepared import Prepared
+from edp.data.splits import ByTime
+from edp.data.task import Task
+from edp.errors import BundleError, ConfigError, EdpError
+from edp.networks.predictor import Predictor
+from edp.training import Bundle, load_bundle
+from edp.training.bundle import weights_digest
+from edp.workflows.train_evaluate import trained_run
+
+OWN = ("training.epochs", "training.optimizer", "training.patience", "training.refit", "training.chunks.batch")
+"""Settings that a fine-tuning has options of its own for."""
+PLACES = ("training", "split", "judge")
+
+
+@dataclass(frozen=True, eq=False)
+class SourceModel:
+    """A trained network and where it comes from.
+
+    Attributes:
+        bundle: the network with what it reads.
+        experiment: settings of its run; those of the preset ``standard`` for a bundle alone.
+        data: its recordings, as its run divided them; None where they cannot be read.
+        absent: why there are no recordings; empty where there are.
+    """
+
+    bundle: Bundle
+    experiment: Experiment
+    data: Prepared | None
+    absent: str = ""
+
+    @property
+    def predictor(self) -> Predictor:
+        """The network, in evaluation mode."""
+        return self.bundle.predictor
+
+    @property
+    def frozen(self) -> dict[str, str]:
+        """Names by digest of sessions that a model search set apart for good."""
+        return frozen_before(self.bundle.provenance)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What identifies it."""
+        digest = None if self.data is None else self.data.digest
+        return {"weights": weights_digest(self.predictor), "recordings": digest}
+
+
+def read_source(path: str | Path) -> SourceModel:
+    """The source of a run folder, of the run that a bundle lies in, or of a bundle alone.
+
+    Raises:
+        BundleError: not a bundle, or one of a network in whole numbers.
+    """
+    folder = Path(path)
+    if (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file():
+        folder = folder.parent
+    bundle = load_bundle(path)
+    if bundle.predictor.number_format != "float32":
+        raise BundleError(
+            f"'{path}' is a network in {bundle.predictor.number_format}, which cannot be trained on; give the run in "
+            "float32 that it was made of, and quantise what comes out"
+        )
+    if not (folder / "config.toml").is_file():
+        return SourceModel(
+            bundle, load_experiment(), None, f"'{path}' is a bundle without the run that it was trained in"
+        )
+    experiment = load_experiment(folder / "config.toml", None)
+    try:
+        return SourceModel(bundle, experiment, trained_run(folder)[3])
+    except EdpError as error:
+        return SourceModel(bundle, experiment, None, str(error))
+
+
+def target_experiment(source: SourceModel, changes: Sequence[str] = ()) -> Experiment:
+    """Settings for logs of a target: the source's task and network, each log divided by time, then `changes`.
+
+    An epoch is a pass over the training parts, however long the source's epochs were, unless a change says otherwise.
+
+    Raises:
+        ConfigError: a change of what a transfer keeps, or of what it has options of its own for.
+    """
+    for text in changes:
+        key = text.partition("=")[0].strip()
+        if key.partition(".")[0] not in PLACES:
+            raise ConfigError(
+                f"--set {key}: a transfer keeps task and network of its source; settings of "
+                f"{', '.join(PLACES)} can be changed"
+            )
+        own = next((name for name in OWN if f"{key}.".startswith(f"{name}.")), None)
+        if own or key in ("training", "training.chunks"):
+            raise ConfigError(f"--set {key}: a fine-tuning has options of its own for it; see edp finetune --help")
+    task = task_settings(source.bundle.task)
+    training = replace(source.experiment.training, updates=0)
+    made = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec, training=training)
+    table = plain_tree(made)
+    for text in changes:
+        table = merged(table, override(text))
+    return build(Experiment, table, "of the source with --set")
+
+
+def task_settings(task: Task) -> TaskSettings:
+    """Settings that resolve to a task, its features by name where the name says them."""
+    held: str | FeatureSettings = task.features.name
+    if FEATURE_SETS.get(task.features.name) != task.features:
+        held = FeatureSettings(**{entry.name: getattr(task.features, entry.name) for entry in fields(FeatureSettings)})
+    return TaskSettings(
+        features=held,
+        targets=task.targets,
+        horizons=task.horizons,
+        mode=task.mode,
+        derived_targets=task.derived_targets,
+        integrate=task.integrate,
+    )

@@ -1,0 +1,88 @@
+"""What is set of a fine-tuning; the two phases have the values of the thesis (Table 3.1 and 3.4.5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.settings.bounds import (
+    DECAY,
+    MOST_BATCH,
+    MOST_EPOCHS,
+    MOST_UNITS,
+    RATE,
+    WEIGHT,
+    above,
+    check_bounds,
+    span,
+    whole,
+)
+
+MOST_STEPS = 10_000
+"""Of the method of few steps, each over all the logs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinetuneSpec:
+    """Phases, rates and regularisers of a fine-tuning.
+
+    Attributes:
+        head_epochs: of phase 1, in which only the head learns.
+        epochs: of phase 2, in which everything learns.
+        head_rate: learning rate of the head, in both phases.
+        backbone_rate: learning rate of the backbone in phase 2.
+        depth_decay: rate of a part of the backbone over that of the part above it; 1 for one rate.
+        rounds: epochs of methods without phases.
+        rate: learning rate of methods without phases, which learn with SOAP.
+        batch: lanes of a chunk, or windows, of an update.
+        smoothness: weight of the second difference of consecutive predictions; 0 for none.
+        weight_decay: lambda of AdamW and SOAP.
+        patience: epochs without a better validation score before a phase ends; 0 never ends early.
+        rank: of the low-rank adapters.
+        source_weight: of the source's loss beside the target's, of methods that replay it.
+        soft: share of that loss that compares with what the source's network says, of the method that distils.
+        reversal: weight of the reversed gradient of the classifier of worlds, of the adversarial method.
+        inner_rate: learning rate of the method of few steps; 0 for that of the source's meta-learning, or 0.5.
+        inner_steps: most steps of that method.
+        center: take the mean error over the logs that train out of the network that comes out.
+        check_signs: refuse logs in which a target moves against the pilot pressures that moved it in the source.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    head_epochs: int = 15
+    epochs: int = 25
+    head_rate: float = 3e-4
+    backbone_rate: float = 1e-5
+    depth_decay: float = 1.0
+    rounds: int = 10
+    rate: float = 3e-3
+    batch: int = 32
+    smoothness: float = 0.05
+    weight_decay: float = 1e-4
+    patience: int = 8
+    rank: int = 8
+    source_weight: float = 1.0
+    soft: float = 0.5
+    reversal: float = 0.1
+    inner_rate: float = 0.0
+    inner_steps: int = 30
+    center: bool = True
+    check_signs: bool = True
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "finetune",
+            self,
+            **dict.fromkeys(("head_epochs", "epochs", "rounds"), whole(1, MOST_EPOCHS)),
+            **dict.fromkeys(("head_rate", "backbone_rate", "rate"), RATE),
+            **dict.fromkeys(("smoothness", "weight_decay"), DECAY),
+            **dict.fromkeys(("source_weight", "reversal"), WEIGHT),
+            depth_decay=above(0.0, 1.0),
+            soft=above(0.0, 1.0),
+            batch=whole(1, MOST_BATCH),
+            patience=whole(0, MOST_EPOCHS),
+            rank=whole(1, MOST_UNITS),
+            inner_rate=span(0.0, RATE.high),
+            inner_steps=whole(1, MOST_STEPS),
+        )

@@ -1,0 +1,54 @@
+"""The shape of the code in the large; `benchmarks/house.py` counts it and prints the whole table."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(FOLDER)
+        import house
+
+        yield house
+        for name in ("house", "common"):
+            sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def house(benchmark):
+    return benchmark.measure()
+
+
+def test_rooms_are_few_and_imports_go_down(house):
+    assert len(house.siblings) <= 22, house.siblings
+    assert house.arrows <= 130
+    assert house.circles == []
+
+
+def test_files_and_functions_are_short(house):
+    assert house.long_functions == []
+    assert house.long_files == []
+
+
+def test_no_public_class_name_stands_twice(house):
+    assert house.duplicates == {}
+
+
+def test_the_counts_see_what_they_are_to_refuse(benchmark, tmp_path):
+    package = tmp_path / "thing"
+    (package / "a").mkdir(parents=True)
+    for folder in (package, package / "a"):
+        (folder / "__init__.py").write_text("")
+    (package / "b.py").write_text("from thing.a import c\n\n\nclass Plan:\n    pass\n")
+    (package / "a" / "c.py").write_text("import thing.b\n\n\nclass Plan:\n    pass\n\n\ndef f():\n    held = 1\n")
+    house = benchmark.measure(package)
+    assert house.siblings == ["a", "b"]
+    assert house.arrows == 2
+    assert house.circles == [["thing.a.c", "thing.b"]]
+    assert house.duplicates == {"Plan": 2}
+    assert house.banned == ["thing/a/c.py:9 held"]
