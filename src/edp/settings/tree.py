@@ -28,6 +28,7 @@ T = typing.TypeVar("T")
 
 SHOWN_CHANGE = 200
 """Of a ``--set``, in messages."""
+_NUMBERS = frozenset((int, float, bool, type(None)))
 MOST_LISTED, MOST_KEY = 50, 100
 """Problems that a message lists, and characters of a key that it repeats."""
 
@@ -103,7 +104,7 @@ class SettingsTree:
         return {name: self.plain(value, name) for name, value in values.items() if value is not None}
 
     def build(self, cls: type[T], table: Mapping[str, Any], where: str) -> T:
-        """A spec tree from a table; what the table leaves out, or holds as None, has its default.
+        """A spec tree from a table; what the table leaves out has its default.
 
         Args:
             cls: dataclass of the tree's root.
@@ -134,12 +135,12 @@ class SettingsTree:
                 problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), known)}")
         for entry in fields(cls):
             required = entry.default is MISSING and entry.default_factory is MISSING
-            if required and table.get(entry.name) is None:
+            if required and entry.name not in table:
                 problems.append(f"'{_join(path, entry.name)}' is missing; it must be given")
         values = {
             name: self._value(name, hints[name], table[name], _join(path, name), problems)
             for name in known
-            if table.get(name) is not None
+            if name in table
         }
         if len(problems) > before:
             return None
@@ -150,6 +151,8 @@ class SettingsTree:
             return None
 
     def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
+        if value is None and type(None) in _leaves(hint):
+            return None  # JSON has a word for it; TOML leaves the key out
         if name in self.parts:
             if typing.get_origin(hint) is tuple:
                 items = value if isinstance(value, list) else [value]
@@ -165,6 +168,9 @@ class SettingsTree:
             return tuple(self._build(typing.cast(type, item_type), v, f"{path}[{i}]", problems) for i, v in items)
         if _truth_in(value) and bool not in _leaves(hint):
             problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
+            return None
+        if isinstance(value, str) and _leaves(hint) <= _NUMBERS:
+            problems.append(f"{path} = {shown(value)}: a text is no number; write it without quotes")
             return None
         try:
             return _adapter(hint).validate_python(value)

@@ -12,14 +12,14 @@ from edp.storage.ledger import Ledger, read_records
 
 STUDY = """
 import sys
-from edp.storage.ledger import Identity, Ledger
+from edp.storage.ledger import Ledger, TrainingIdentity
 from edp.workflows.search.batch import complete
 from edp.workflows.search.executor import Job
 from edp.workflows.search.local import LocalPool
 
 def identity(seed):
     facts = {"code": "c", "data": "d", "environment": {"threads": "1"}}
-    return Identity("trainings_of_tests:train", {"sleep": 0.1}, {}, seed, 1, **facts)
+    return TrainingIdentity("trainings_of_tests:train", {"sleep": 0.1}, {}, seed, 1, **facts)
 
 study, log, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
 if __name__ == "__main__":
