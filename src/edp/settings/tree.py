@@ -164,8 +164,8 @@ class SettingsTree:
             return self._build(typing.cast(type, table_type), value, path, problems)
         item_type = next(iter(typing.get_args(hint)), None) if typing.get_origin(hint) is tuple else None
         if is_dataclass(item_type) and isinstance(value, list):
-            items = enumerate(value)
-            return tuple(self._build(typing.cast(type, item_type), v, f"{path}[{i}]", problems) for i, v in items)
+            cls = typing.cast(type, item_type)
+            return tuple(self._build(cls, item, f"{path}[{i}]", problems) for i, item in enumerate(value))
         if _truth_in(value) and bool not in _leaves(hint):
             problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
             return None
