@@ -3,23 +3,37 @@ PYTHON ?= python3
 WORKERS ?= 2
 BIN := .venv/bin
 READY := .venv/.ready
+INSTALL := pip install --quiet --no-deps
 BENCHMARKS = $(filter-out benchmarks/common.py benchmarks/decoys.py benchmarks/m22_truth.py benchmarks/onnx_rivals.py benchmarks/score_worlds.py,$(wildcard benchmarks/*.py))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint bench system-packages clean
+.PHONY: help setup lock demo test test-slow lint bench system-packages clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: $(READY) ## make .venv with the pinned packages of constraints.txt
+setup: $(READY) ## make .venv with the pinned packages of requirements.lock
 
-$(READY): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 11) else \
-		"EDP needs Python 3.11 or newer, $(PYTHON) is %d.%d; for example: make PYTHON=python3.12 setup" % v[:2])'
+# torch comes first and by plain pip: which of its builds fits depends on the machine, so no hash can be locked.
+# uv is itself installed by the hash of the lock. Without uv, pip installs the same files.
+$(READY): pyproject.toml constraints.txt requirements.lock
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if (3, 11) <= v < (3, 15) else \
+		"EDP needs Python 3.11 to 3.14, $(PYTHON) is %d.%d; for example: make PYTHON=python3.12 setup" % v[:2])'
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet $(shell sed -n '/^torch==/p' constraints.txt)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@sed -n '/^uv==/,/[^\\]$$/p' requirements.lock > .venv/uv.lock
+	@if $(BIN)/python -m pip install --quiet --no-deps --require-hashes -r .venv/uv.lock && $(BIN)/uv --version; then \
+		set -x; $(BIN)/uv $(INSTALL) --python $(BIN)/python --require-hashes -r requirements.lock; \
+	else \
+		echo "uv cannot be installed here: pip installs instead, which takes longer"; \
+		set -x; $(BIN)/python -m $(INSTALL) --require-hashes -r requirements.lock; \
+	fi
+	$(BIN)/python -m $(INSTALL) --no-build-isolation -e .
 	@touch $@
+
+lock: ## write requirements.lock from pyproject.toml and constraints.txt; give the result to a review
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate --no-header \
+		--extra dev --constraint constraints.txt --no-emit-package torch pyproject.toml --output-file requirements.lock
 
 demo: $(READY) ## the main job, small: simulate, train, judge, write a report page
 	$(BIN)/edp demo --out demo

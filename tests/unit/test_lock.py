@@ -1,0 +1,61 @@
+"""pyproject.toml, constraints.txt and requirements.lock say the same: what is tested is what `make setup` installs."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+BESIDE = "# Of the extra `cluster` alone"
+ADVICE = "call `make lock` and look through what changed"
+
+
+def pins(text: str) -> dict[str, str]:
+    """Versions by canonical name."""
+    found = re.findall(r"^([A-Za-z0-9._-]+)==([^\s;\\]+)", text, re.MULTILINE)
+    return {str(canonicalize_name(name)): version for name, version in found}
+
+
+LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+LOCKED = pins(LOCK)
+INSTALLED, CLUSTER = map(pins, (ROOT / "constraints.txt").read_text(encoding="utf-8").split(BESIDE))
+
+
+def required(extra: str) -> dict[str, Requirement]:
+    """Requirements of an extra, with those of the extras of this project that it names."""
+    found: dict[str, Requirement] = {}
+    for line in PROJECT["optional-dependencies"][extra]:
+        requirement = Requirement(line)
+        if requirement.name == PROJECT["name"]:
+            for other in requirement.extras:
+                found |= required(other)
+        else:
+            found[str(canonicalize_name(requirement.name))] = requirement
+    return found
+
+
+def test_the_lock_holds_the_constraints_but_torch_and_the_cluster():
+    assert INSTALLED["torch"], "the Makefile takes the version of torch from here"
+    assert {name: version for name, version in INSTALLED.items() if name != "torch"} == LOCKED, ADVICE
+    assert not set(LOCKED) & set(CLUSTER)
+
+
+def test_what_the_project_asks_for_is_locked_in_a_version_that_it_takes():
+    asked = {str(canonicalize_name(Requirement(line).name)): Requirement(line) for line in PROJECT["dependencies"]}
+    for name, requirement in (asked | required("dev")).items():
+        assert name in INSTALLED, f"{name}: add its version to constraints.txt, then {ADVICE}"
+        assert requirement.specifier.contains(INSTALLED[name]), (name, INSTALLED[name])
+    for name, requirement in required("cluster").items():
+        assert requirement.specifier.contains(CLUSTER[name]), (name, CLUSTER[name])
+
+
+def test_every_package_of_the_lock_has_hashes():
+    blocks = re.split(r"\n(?=[A-Za-z])", LOCK.strip())
+    assert len(blocks) == len(LOCKED)
+    for block in blocks:
+        assert re.fullmatch(r"[^\n]+( \\\n    --hash=sha256:[0-9a-f]{64})+", block), block[:200]
