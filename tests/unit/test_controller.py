@@ -93,8 +93,11 @@ def test_what_a_budget_leaves_out_is_as_in_the_thesis(tmp_path):
     [
         ("cycle = 5", "unknown key 'cycle'; did you mean 'cycles'"),
         ("cycles = 0", "cycles = 0; whole numbers, 1 <= cycles"),
-        ("cycles = true", "cycles = True; a whole number must hold"),
-        ("cycles = 1.5\nname = 3", "a whole number must hold; name = 3; text must hold|text must hold; cycles"),
+        ("cycles = true", "cycles = True: true and false are no numbers"),
+        (
+            "cycles = 1.5\nname = 3",
+            r"2 problems\n.*name = 3: a text in quotes must hold\n.*cycles = 1.5: an integer must hold",
+        ),
         ("core = 'cortex_m5'", "core = 'cortex_m5' is not known; did you mean"),
         ("cycles = ", "is not valid TOML"),
     ],

@@ -134,10 +134,16 @@ def test_a_new_material_is_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("density = 1900.0", "density = -1.0"), "density = -1.0 must be a number from 500 to 3500"),
-        (("swell = 1.35", ""), "missing swell"),
-        (("swell = 1.35", "swel = 1.35"), "unknown key 'swel'"),
-        (("[0.6e6, 2.5e6]", "[2.5e6, 0.6e6]"), "cone_index"),
+        (("density = 1900.0", "density = -1.0"), "density = -1.0; 500 <= density <= 3,500 must hold"),
+        (("swell = 1.35", ""), "'swell' is missing"),
+        (("swell = 1.35", "swel = 1.35"), "unknown key 'swel'; did you mean 'swell'"),
+        (
+            ("[0.6e6, 2.5e6]", "[2.5e6, 0.6e6]"),
+            "cone_index = [2500000.0, 600000.0] Pa; the smaller one must come first",
+        ),
+        (("[0.6e6, 2.5e6]", "[0.0, 2.5e6]"), "cone_index = [0.0, 2500000.0]; 0 < cone_index"),
+        (("[0.6e6, 2.5e6]", "0.6e6"), "cone_index = 600000.0: a list must hold"),
+        (("density = 1900.0", "density = '1900'"), "density = '1900': a text is no number"),
         (("swell = 1.35", "swell = "), "not valid TOML"),
     ],
 )

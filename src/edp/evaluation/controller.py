@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from edp.errors import ConfigError, closest
 from edp.export.c.sizes import Sizes
 from edp.networks.streaming import Cost
 from edp.settings.bounds import check_bounds, whole
+from edp.settings.tree import SettingsTree
 from edp.storage import read_toml
 
 STACK_BYTES = 1_024  # an allowance: a tick was seen to take 340 (``benchmarks/controller_memory.py``)
@@ -101,23 +102,17 @@ class Budget:
         check_bounds("budget", self, **dict.fromkeys(limits, whole(1, MOST_GRANTED)))
 
 
+BUDGET_FILE = SettingsTree(what="budget")
+
+
 def load_budget(path: str | Path) -> Budget:
     """A budget from a TOML file with the fields of `Budget`; what is left out is as in the thesis.
 
     Raises:
         ConfigError: the file cannot be read, or holds something else than a budget.
     """
-    held = read_toml(path, f"budget '{path}'", ConfigError)
-    known = [entry.name for entry in fields(Budget)]
-    wrong = [f"unknown key '{key}'{closest(key, known)}" for key in held if key not in known]
-    for key in set(held) & set(known):
-        wanted = str if key in ("name", "core") else int
-        if type(held[key]) is not wanted:
-            kind = "text" if wanted is str else "a whole number"
-            wrong.append(f"{key} = {held[key]!r}; {kind} must hold")
-    if wrong:
-        raise ConfigError(f"budget '{path}': {'; '.join(wrong)}")
-    return Budget(**({"name": Path(path).stem} | held))
+    table = read_toml(path, f"budget '{path}'", ConfigError)
+    return BUDGET_FILE.build(Budget, {"name": Path(path).stem} | table, f"'{path}'")
 
 
 @dataclass(frozen=True)

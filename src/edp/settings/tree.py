@@ -28,7 +28,18 @@ T = typing.TypeVar("T")
 
 SHOWN_CHANGE = 200
 """Of a ``--set``, in messages."""
-_NUMBERS = frozenset((int, float, bool, type(None)))
+_NUMBERS = frozenset((int, float, bool, type(None), Ellipsis))
+_RULES = {
+    "finite_number": "a finite number must hold",
+    "float_type": "a number must hold",
+    "int_from_float": "an integer must hold",
+    "int_type": "an integer must hold",
+    "string_type": "a text in quotes must hold",
+    "tuple_type": "a list must hold",
+    "mapping_type": "a table must hold",
+    "dict_type": "a table must hold",
+}
+"""By kind of pydantic's error, what must hold; kinds that are not listed are told in its words."""
 MOST_LISTED, MOST_KEY = 50, 100
 """Problems that a message lists, and characters of a key that it repeats."""
 
@@ -76,11 +87,21 @@ class SettingsTree:
     Args:
         parts: registries by the name of the field that holds one of their parts.
         usual_kinds: by field, the kind that a table without ``kind`` means.
+        what: the kind of file, as messages call it.
+        positions: by the type of a list of fixed length, what stands at each position.
     """
 
-    def __init__(self, parts: Parts | None = None, usual_kinds: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        parts: Parts | None = None,
+        usual_kinds: Mapping[str, str] | None = None,
+        what: str = "settings",
+        positions: Mapping[Any, tuple[str, ...]] | None = None,
+    ) -> None:
         self.parts = dict(parts or {})
         self.usual_kinds = dict(usual_kinds or {})
+        self.what = what
+        self.positions = dict(positions or {})
 
     def plain(self, value: Any, name: str = "") -> Any:
         """Nested plain values of a spec tree; registered parts carry their ``kind``; None is left out.
@@ -120,7 +141,7 @@ class SettingsTree:
             more = [f"and {len(problems) - MOST_LISTED:,} more"] if len(problems) > MOST_LISTED else []
             listed = "\n  - ".join(problems[:MOST_LISTED] + more)
             count = f"{len(problems)} problem" + ("s" if len(problems) > 1 else "")
-            raise ConfigError(f"settings {where}: {count}\n  - {listed}")
+            raise ConfigError(f"{self.what} {where}: {count}\n  - {listed}")
         return typing.cast(T, spec)
 
     def _build(self, cls: type, table: Any, path: str, problems: list[str]) -> Any:
@@ -147,7 +168,7 @@ class SettingsTree:
         try:
             return cls(**values)
         except ConfigError as error:
-            problems.append(f"{path or 'top level'}: {error}")
+            problems.append(f"{path}: {error}" if path else str(error))
             return None
 
     def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
@@ -166,18 +187,24 @@ class SettingsTree:
         if is_dataclass(item_type) and isinstance(value, list):
             cls = typing.cast(type, item_type)
             return tuple(self._build(cls, item, f"{path}[{i}]", problems) for i, item in enumerate(value))
-        if _truth_in(value) and bool not in _leaves(hint):
-            problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
+        inner = typing.get_args(hint)
+        if typing.get_origin(hint) is tuple and Ellipsis not in inner and isinstance(value, list | tuple):
+            return self._row(hint, value, path, problems)
+        if typing.get_origin(hint) is Mapping and isinstance(value, Mapping):
+            entries = {key: _join(path, _key(key)) for key in value}
+            return {key: self._value("", inner[1], value[key], where, problems) for key, where in entries.items()}
+        return _scalar(hint, value, path, problems)
+
+    def _row(self, hint: Any, values: list[Any] | tuple[Any, ...], path: str, problems: list[str]) -> Any:
+        """A list of fixed length; each entry is checked by itself, so that messages name the one that is wrong."""
+        hints = typing.get_args(hint)
+        labels = self.positions.get(hint, tuple(map(str, range(len(hints)))))
+        if len(values) != len(hints):
+            named = f" ({', '.join(labels)})" if hint in self.positions else ""
+            problems.append(f"{path} = {shown(values)} lists {len(values):,}; a list of {len(hints)} must hold{named}")
             return None
-        if isinstance(value, str) and _leaves(hint) <= _NUMBERS:
-            problems.append(f"{path} = {shown(value)}: a text is no number; write it without quotes")
-            return None
-        try:
-            return _adapter(hint).validate_python(value)
-        except pydantic.ValidationError as error:
-            first = error.errors()[0]
-            problems.append(f"{path} = {shown(value)}: {first['msg'][0].lower()}{first['msg'][1:]}")
-            return None
+        entries = zip(hints, values, labels, strict=True)
+        return tuple(self._value("", entry, value, f"{path}[{label}]", problems) for entry, value, label in entries)
 
     def _part(self, name: str, table: Any, path: str, problems: list[str]) -> Any:
         registry = self.parts[name]
@@ -213,6 +240,32 @@ def _leaves(hint: Any) -> frozenset[Any]:
     """The types that a hint is made of."""
     inner = typing.get_args(hint)
     return frozenset().union(*map(_leaves, inner)) if inner else frozenset((hint,))
+
+
+def _scalar(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
+    """A value, or a list of any length, by pydantic; what it would coerce without a word is refused first."""
+    leaves = _leaves(hint)
+    if _truth_in(value) and not leaves & {bool, Any}:
+        problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
+        return None
+    if leaves <= {bool, type(None)} and not isinstance(value, bool):
+        problems.append(f"{path} = {shown(value)}: write true or false")
+        return None
+    if leaves <= _NUMBERS and _text_in(value):
+        problems.append(f"{path} = {shown(value)}: a text is no number; write it without quotes")
+        return None
+    try:
+        return _adapter(hint).validate_python(value)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        rule = _RULES.get(first["type"], f"{first['msg'][0].lower()}{first['msg'][1:]}")
+        problems.append(f"{path} = {shown(value)}: {rule}")
+        return None
+
+
+def _text_in(value: Any) -> bool:
+    """Whether a value is a text, or a list that holds one."""
+    return any(map(_text_in, value)) if isinstance(value, list | tuple) else isinstance(value, str)
 
 
 def _truth_in(value: Any) -> bool:

@@ -18,11 +18,12 @@ import numpy as np
 from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.sandbox.processes import begin_helper
+from edp.settings.bounds import above, check_bounds, span, whole
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics import soil
-from edp.sim.scenario import START_STROKES, Scenario, SimulationError
+from edp.sim.scenario import LARGEST_STEP_S, START_STROKES, Scenario, SimulationError
 from edp.sim.simulate import simulate
 
 DEFAULT_MIX: Mapping[str, float] = {
@@ -38,6 +39,15 @@ DEFAULT_MIX: Mapping[str, float] = {
 
 MOST_RECORDINGS, MOST_MINUTES, MOST_MACHINES, MOST_SEED = 100_000, 1e6, 1000, 2**63
 """Bounds of one data set; the plan of the most recordings takes some seconds."""
+BOUNDS = {
+    "recordings": whole(1, MOST_RECORDINGS),
+    "minutes": above(0.0, MOST_MINUTES),
+    "seed": whole(0, MOST_SEED - 1),
+    "family": whole(0, MOST_MACHINES),
+    "scatter": above(0.0, WIDEST),
+    "rate_hz": span(1.0, 1000.0),
+    "step_s": above(0.0, LARGEST_STEP_S),
+}
 AIR = "air"
 """Free air in a mix of materials."""
 
@@ -83,28 +93,13 @@ class DataSetSpec:
     sensors: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.recordings < 1 or not 0 < self.minutes < math.inf:
-            raise ConfigError(
-                f"data set of recordings = {self.recordings} and minutes = {self.minutes}; both must be positive"
-            )
-        if self.recordings > MOST_RECORDINGS or self.minutes > MOST_MINUTES:
-            raise ConfigError(
-                f"data set of recordings = {self.recordings} and minutes = {self.minutes:g}; at most "
-                f"{MOST_RECORDINGS} and {MOST_MINUTES:g} are simulated in one go"
-            )
-        if not 0 <= self.seed < MOST_SEED:
-            raise ConfigError(f"seed = {self.seed}; a whole number from 0 to 2^63 - 1 must hold")
-        if not 0 <= self.family <= MOST_MACHINES:
-            raise ConfigError(f"family = {self.family} machines; must be at least 0 and at most {MOST_MACHINES}")
+        check_bounds("data set", self, **BOUNDS)
         if not self.family and tuple(self.masses) != MASSES_T:
             raise ConfigError(f"masses = {list(self.masses)} are those of a family; say how many machines with family")
         if not self.family and self.scatter != 1.0:
             raise ConfigError(f"scatter = {self.scatter} is that of a family; say how many machines with family")
-        if not 0.0 < self.scatter <= WIDEST or self.scatter != round(self.scatter, 3):
-            raise ConfigError(
-                f"scatter = {self.scatter}; must be above 0 and at most {WIDEST:g}, with at most three decimals: names "
-                "of machines hold it"
-            )
+        if self.scatter != round(self.scatter, 3):
+            raise ConfigError(f"scatter = {self.scatter} has more than three decimals; names of machines hold three")
         member_mass(self.seed, 0, *self.masses)
         if any(mass != round(mass, 3) for mass in self.masses):
             raise ConfigError(f"masses = {list(self.masses)} t must be whole kilograms: names of machines hold them")

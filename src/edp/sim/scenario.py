@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from edp.errors import ConfigError, EdpError, closest
+from edp.errors import ConfigError, EdpError
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine.machine import Machine, Sensors
-from edp.sim.machine.machine_checks import check_machine
+from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.sim.machine.machine_files import load_machine
 from edp.sim.physics import soil
 from edp.sim.physics.plant import steps_per_sample
@@ -86,13 +86,10 @@ class Scenario:
         machine = load_machine(self.machine)
         if not self.sensors:
             return machine
-        known = [entry.name for entry in fields(Sensors)]
-        for key in self.sensors:
-            if key not in known:
-                raise ConfigError(f"scenario: sensors.{key} is unknown{closest(key, known)}")
-        chosen: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in self.sensors.items()}
-        changed = replace(machine, sensors=replace(machine.sensors, **chosen))
-        check_machine(changed, f"{machine.name} with the scenario's sensors")
+        where = f"{machine.name} with the scenario's sensors"
+        values = {**MACHINE_FILE.plain(machine.sensors), **self.sensors}
+        changed = replace(machine, sensors=MACHINE_FILE.build(Sensors, values, where))
+        check_machine(changed, where)
         return changed
 
     @property

@@ -248,20 +248,3 @@ class Machine:
     bucket: Bucket
     chassis: Chassis
     sensors: Sensors
-
-
-SECTIONS: dict[str, type] = {
-    "bodies": Bodies,
-    "boom_cylinder": PinTriangle,
-    "arm_cylinder": PinTriangle,
-    "bucket_linkage": BucketLinkage,
-    "cylinders": Cylinders,
-    "friction": Friction,
-    "oil": Oil,
-    "pumps": Pumps,
-    "valves": Valves,
-    "bucket": Bucket,
-    "chassis": Chassis,
-    "sensors": Sensors,
-}
-"""Tables of a machine file."""

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError
+from edp.settings.tree import SettingsTree
 from edp.sim.machine import layout as at
-from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine import Machine, Rating, Ratings, Triple
 from edp.sim.machine.parameters import FLOW_SHARING, pack
 from edp.sim.physics import linkage
 
 CYLINDERS = ("boom", "arm", "bucket")
+MACHINE_FILE = SettingsTree(what="machine file", positions={Triple: CYLINDERS, Ratings: CYLINDERS})
 BEYOND_STOPS = math.radians(4.0)
 """How far beyond its stops a joint must still have a lever arm: impacts push it there."""
 LEAST_LEVER = 0.08
@@ -164,19 +166,17 @@ def check_machine(machine: Machine, where: str) -> None:
     """Refuse a machine that cannot be simulated.
 
     Raises:
-        ConfigError: a value is no number or out of bounds, or the linkage is impossible.
+        ConfigError: a value is out of bounds, or the linkage is impossible.
     """
     for section, key, kind, value in _leaves(machine):
         place = f"machine file {where}{f' [{section}]' if section else ''}: {key}"
         if kind in ("Rating", "Ratings"):
             _check_ratings(value, key, place)
         elif kind == "str":
-            if not isinstance(value, str):
-                raise ConfigError(f"{place} = {value!r} must be text")
             if key == "flow_sharing" and value not in FLOW_SHARING:
                 raise ConfigError(f"{place} = {value!r} must be one of {', '.join(FLOW_SHARING)}")
         else:
-            _check_numbers(value, kind, BOUNDS.get(f"{section}.{key}" if section else key, ANY), place)
+            _check_numbers(value, BOUNDS.get(f"{section}.{key}" if section else key, ANY), place)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", machine.name):
         raise ConfigError(
             f"machine file {where}: name = {machine.name!r} must be letters, digits, - and _: recordings carry it"
@@ -198,31 +198,30 @@ def _leaves(machine: Machine) -> Iterator[tuple[str, str, str, Any]]:
             yield "", field.name, str(field.type), value
 
 
-def _check_numbers(value: Any, kind: str, bound: ParameterBound, place: str) -> None:
-    """A number, or the numbers of a list where the key's type is one."""
-    if kind not in ("float", "int") and isinstance(value, tuple):
-        for i, part in enumerate(value):
-            _check_number(part, bound, f"{place}[{CYLINDERS[i] if len(value) == 3 else i}]")
+def _check_numbers(value: float | tuple[float, ...], bound: ParameterBound, place: str) -> None:
+    """A number, or every number of a list."""
+    if isinstance(value, tuple):
+        labels = CYLINDERS if len(value) == len(CYLINDERS) else range(len(value))
+        for label, entry in zip(labels, value, strict=True):
+            _check_number(entry, bound, f"{place}[{label}]")
     else:
         _check_number(value, bound, place)
 
 
-def _check_number(value: Any, bound: ParameterBound, place: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigError(f"{place} = {value!r} must be a number")
+def _check_number(value: float, bound: ParameterBound, place: str) -> None:
     if not math.isfinite(value) or not bound.holds(value):
         raise ConfigError(f"{place} = {value!r} must be {bound if bound is not ANY else 'finite'}")
 
 
-def _check_ratings(value: Any, key: str, place: str) -> None:
-    if isinstance(value, tuple) and len(value) == 3:
-        for i, part in enumerate(value):
-            _check_ratings(part, key, f"{place}[{CYLINDERS[i]}]")
+def _check_ratings(value: Rating | Ratings, key: str, place: str) -> None:
+    """A rating, or one of each cylinder."""
+    if isinstance(value[0], tuple):
+        for name, rating in zip(CYLINDERS, value, strict=True):
+            _check_ratings(rating, key, f"{place}[{name}]")
         return
-    if not isinstance(value, tuple) or len(value) != 2:
-        raise ConfigError(f"{place} = {value!r} must be [L/min, bar]")
-    _check_number(value[0], POSITIVE if key in FLOWING else NOT_NEGATIVE, f"{place}, flow in L/min,")
-    _check_number(value[1], POSITIVE, f"{place}, pressure in bar,")
+    flow, pressure = value
+    _check_number(flow, POSITIVE if key in FLOWING else NOT_NEGATIVE, f"{place}, flow in L/min,")
+    _check_number(pressure, POSITIVE, f"{place}, pressure in bar,")
 
 
 def _check_pairs(machine: Machine, where: str) -> None:

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 
 from edp.errors import ConfigError, closest
 from edp.sim.machine.family import MASSES_T, WIDEST, Draws, member_mass, member_name, scaled_machine
-from edp.sim.machine.machine import SECTIONS, Machine
-from edp.sim.machine.machine_checks import check_machine
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_checks import MACHINE_FILE, check_machine
 from edp.storage import SETTINGS_BYTES, parse_toml, read_text
 
-Section = TypeVar("Section")
 FAMILY = re.compile(
     r"FAMILY-(\d{1,9})-(\d{1,6})(?:-(\d{1,3}(?:P\d{1,3})?)-(\d{1,3}(?:P\d{1,3})?))?(?:-X(\d(?:P\d{1,3})?))?"
 )
 """A machine of a family, see `member_name`: it needs no file."""
-LISTS = {"Triple": 3, "Ratings": 3, "Rating": 2, "tuple[float, float]": 2}
-"""Length of a list by the type of its key."""
 
 
 def machine_names() -> tuple[str, ...]:
@@ -122,35 +117,6 @@ def parse_machine(text: str, where: str) -> Machine:
     Raises:
         ConfigError: not TOML, a key is missing or unknown, or a value cannot be (see `machine_checks`).
     """
-    table = parse_toml(text, f"machine file {where}", ConfigError)
-    parts: dict[str, Any] = {
-        key: _section(SECTIONS[key], value, f"{where} [{key}]") if key in SECTIONS else value
-        for key, value in table.items()
-    }
-    machine = _section(Machine, parts, where)
+    machine = MACHINE_FILE.build(Machine, parse_toml(text, f"machine file {where}", ConfigError), where)
     check_machine(machine, where)
     return machine
-
-
-def _section(kind: type[Section], table: Any, where: str) -> Section:
-    if not isinstance(table, dict):
-        raise ConfigError(f"machine file {where}: is {table!r}, expected a table of keys")
-    known = {field.name: str(field.type) for field in fields(kind)}  # type: ignore[arg-type]
-    for key in table:
-        if key not in known:
-            raise ConfigError(f"machine file {where}: unknown key '{key}'{closest(key, known)}")
-    missing = sorted(set(known) - set(table))
-    if missing:
-        raise ConfigError(f"machine file {where}: missing {', '.join(missing)}")
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        size = LISTS.get(known[key])
-        if size is not None and (not isinstance(value, list) or len(value) != size):
-            wanted = "boom, arm, bucket" if size == 3 else "two values"
-            raise ConfigError(f"machine file {where}: {key} = {value!r} must list {wanted}")
-        values[key] = _frozen(value)
-    return kind(**values)
-
-
-def _frozen(value: Any) -> Any:
-    return tuple(_frozen(part) for part in value) if isinstance(value, list) else value

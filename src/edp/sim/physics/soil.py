@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
+from edp.settings.bounds import above, check_bounds, span
+from edp.settings.tree import SettingsTree
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.physics import terramechanics
@@ -22,6 +23,27 @@ SPACING_M = 0.05
 BEYOND_M = 1.0
 """How far the ground goes on beyond the machine's reach."""
 UNEVENNESS_M = 0.04
+
+
+BOUNDS = {
+    "density": span(500.0, 3500.0),
+    "cohesion": span(0.0, 2e5),
+    "friction_deg": span(0.0, 50.0),
+    "metal_friction_deg": span(0.0, 40.0),
+    "adhesion": span(0.0, 1e5),
+    "bekker_exponent": span(0.1, 2.0),
+    "bekker_cohesive": span(0.0, 1e7),
+    "bekker_frictional": span(1e4, 1e9),
+    "shear_length": span(1e-3, 0.2),
+    "cone_index": above(0.0, 1e9),
+    "swell": span(1.0, 2.0),
+    "repose_deg": span(10.0, 60.0),
+    "roughness": span(0.0, 0.6),
+    "roughness_length": span(0.02, 5.0),
+    "stones_per_m": span(0.0, 10.0),
+    "sawtooth": span(0.0, 0.9),
+}
+"""Of a material; the softest mud has a cone index of some kPa, rock has no cone index."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +58,9 @@ class Material:
         roughness: spread of the logarithm of the resistance along the way.
         roughness_length: length over which it varies, m.
         sawtooth: share of the resistance lost when a chip breaks off.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
     """
 
     name: str
@@ -57,24 +82,13 @@ class Material:
     stones_per_m: float
     sawtooth: float
 
+    def __post_init__(self) -> None:
+        check_bounds("material", self, **BOUNDS)
+        if self.cone_index[0] > self.cone_index[1]:
+            raise ConfigError(f"material: cone_index = {list(self.cone_index)} Pa; the smaller one must come first")
 
-BOUNDS: dict[str, tuple[float, float]] = {
-    "density": (500.0, 3500.0),
-    "cohesion": (0.0, 2e5),
-    "friction_deg": (0.0, 50.0),
-    "metal_friction_deg": (0.0, 40.0),
-    "adhesion": (0.0, 1e5),
-    "bekker_exponent": (0.1, 2.0),
-    "bekker_cohesive": (0.0, 1e7),
-    "bekker_frictional": (1e4, 1e9),
-    "shear_length": (1e-3, 0.2),
-    "swell": (1.0, 2.0),
-    "repose_deg": (10.0, 60.0),
-    "roughness": (0.0, 0.6),
-    "roughness_length": (0.02, 5.0),
-    "stones_per_m": (0.0, 10.0),
-    "sawtooth": (0.0, 0.9),
-}
+
+MATERIAL_FILE = SettingsTree(what="material file")
 
 
 def material_names() -> tuple[str, ...]:
@@ -106,26 +120,7 @@ def parse_material(text: str, where: str) -> Material:
         ConfigError: not TOML, or a value is missing, unknown or out of bounds.
     """
     table = parse_toml(text, f"material file {where}", ConfigError)
-    known = [field.name for field in fields(Material)]
-    for key in table:
-        if key not in known:
-            raise ConfigError(f"material file {where}: unknown key '{key}'{closest(key, known)}")
-    missing = [key for key in known if key not in table]
-    if missing:
-        raise ConfigError(f"material file {where}: missing {', '.join(missing)}")
-    for key, (low, high) in BOUNDS.items():
-        value = table[key]
-        if not _number(value) or not low <= value <= high:
-            raise ConfigError(f"material file {where}: {key} = {value!r} must be a number from {low:g} to {high:g}")
-    cone = table["cone_index"]
-    if not (isinstance(cone, list) and len(cone) == 2 and all(_number(v) for v in cone) and 0 < cone[0] <= cone[1]):
-        raise ConfigError(f"material file {where}: cone_index = {cone!r} must be [low, high] in Pa, 0 < low <= high")
-    values: dict[str, Any] = {**table, "cone_index": tuple(map(float, cone))}
-    return Material(**values)
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return MATERIAL_FILE.build(Material, table, where)
 
 
 class Ground:
