@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from edp.data.features import Derived, FeatureSet
-from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, ExportError
 from edp.ir.w8a16 import calibrate
@@ -28,9 +26,9 @@ from edp.networks.initial import INITIAL_STATES
 from edp.networks.integer import IntegerPredictor
 from edp.networks.outputs import OUTPUTS, Point
 from edp.networks.physics import PHYSICS
-from edp.networks.predictor import ModelSpec, Predictor, build_model, check_combination
+from edp.networks.predictor import ModelSpec, Predictor, check_combination
+from edp.testing.networks import WINDOW, small_network, small_task
 
-WINDOW = 9
 # Small options, so that every combination is cheap; a part that is absent here is tested with its defaults.
 SMALL = {
     "lstm": [
@@ -57,12 +55,6 @@ SMALL = {
     "glu": [GluHead(hidden=4), GluHead(hidden=4, layers=2)],
     "linear_bypass": [BLOCKS["linear_bypass"](taps=4), BLOCKS["linear_bypass"](taps=1, trained=False)],
 }
-FEATURES = FeatureSet(
-    "contract",
-    ("CylVels_1", "CylVels_3", "pressure", "lever"),
-    (Derived("dpressure", "pressure"), Derived("dload", "load", "derivative")),
-    hidden=("load",),
-)
 FORMS = [
     (activation, horizons, mode)
     for activation in ACTIVATIONS
@@ -163,9 +155,7 @@ def model_of(structure: str, activation: str) -> ModelSpec:
 
 
 def task_of(form: Form, model: ModelSpec) -> Task:
-    extra = () if model.physics is None else model.physics.channels()
-    physics = tuple(name for name in extra if name not in FEATURES.inputs)
-    return Task(FEATURES, ("CylVels_1", "CylVels_3"), form[1], form[2], 100.0, physics=physics)
+    return small_task(model, form[1], form[2])
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -192,17 +182,7 @@ def forms_of(structure: str) -> list[Form]:
 @cache
 def _build(structure: str, form: Form, shake: float) -> Predictor:
     spec = model_of(structure, form[0])
-    task = task_of(form, spec)
-    shape = (len(form[1]), 2)
-    rng = np.random.default_rng(7)
-    scaler = Scaler(rng.normal(size=6), rng.uniform(0.5, 2, 6), rng.normal(size=shape), rng.uniform(0.5, 2, shape))
-    predictor = build_model(task, spec, scaler, seed=3)
-    # Some parts start at zero or fully open; shaken weights let every path take part.
-    draw = torch.Generator().manual_seed(11)
-    with torch.no_grad():
-        for parameter in predictor.parameters():
-            parameter.add_(shake * torch.randn(parameter.shape, generator=draw))
-    return predictor
+    return small_network(spec, task_of(form, spec), shake)
 
 
 @pytest.fixture(scope="session")

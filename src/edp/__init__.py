@@ -1,3 +1,45 @@
-"""Excavator Dynamics Predictor: recordings in, a judged and deployable plant model out."""
+"""Excavator Dynamics Predictor: recordings in, a judged and deployable plant model out.
+
+The public names are imported when they are first asked for, so that ``import edp`` costs nothing; docs/python.md lists
+them. `__init__.pyi` states their types.
+"""
+
+from importlib import import_module
 
 __version__ = "0.1.0"
+
+_API = "edp.workflows.api"
+_PUBLIC = {
+    "EdpError": "edp.errors",
+    "JudgedScores": f"{_API}.scores",
+    "Predictions": f"{_API}.predictions",
+    "Recording": "edp.recording",
+    "Recordings": f"{_API}.recordings",
+    "SearchStudy": f"{_API}.scores",
+    "Stream": "edp.networks.stream",
+    "TrainedPredictor": f"{_API}.predictor",
+    "load": f"{_API}.predictor",
+    "load_study": f"{_API}.scores",
+    "read": f"{_API}.recordings",
+    "testing": "",
+    "train": f"{_API}.training",
+}
+"""Where each public name is defined; an empty text is a module of its own."""
+
+__all__ = (  # noqa: PLE0604 - the names of the table, and nothing else
+    "__version__",
+    *_PUBLIC,
+)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'edp' has no attribute '{name}'")
+    module = _PUBLIC[name]
+    value = getattr(import_module(module), name) if module else import_module(f"edp.{name}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -17,6 +17,7 @@ from edp.networks.blocks.base import BlockSlot
 from edp.networks.cells import CELLS
 from edp.networks.predictor import ModelSpec, build_model
 from edp.networks.streaming import Cost, Streaming
+from edp.testing.streaming import check_work_counted
 from edp.training.bundle import blank_scaler
 from edp.workflows.compression import dynamic_int8
 from edp.workflows.train_evaluate import footprint_of
@@ -24,7 +25,7 @@ from edp.workflows.train_evaluate import footprint_of
 
 def test_every_network_of_the_registries_passes(structure, predictor_of):
     predictor = predictor_of(structure)
-    check_counted(predictor)
+    check_work_counted(predictor)
     if predictor.physics is None:
         check_counted(dynamic_int8(predictor).predictor)
 

@@ -10,55 +10,18 @@ import torch
 
 from edp.errors import ExportError
 from edp.ir import base, layers, memory
-from edp.ir.reference import STEPS, Reference
-from edp.networks.streaming import parameters_of, state_numbers
+from edp.ir.reference import STEPS
+from edp.testing.streaming import check_graph, check_graph_costs
 from edp.training.bundle import blank_scaler
-
-TICKS = 24
-
-
-def stream(predictor, ticks=TICKS, seed=0):
-    """Inputs ``(time, input)``, predictions and, where there are any, bounds, as PyTorch streams them."""
-    draw = torch.Generator().manual_seed(seed)
-    x = torch.randn(1, ticks, predictor.front.inputs, generator=draw).double()
-    with torch.no_grad():
-        found = {"prediction": predictor.predict(x, predictor.initial_state(1, x))[0][0].flatten(1)}
-        if predictor.output.coverages:
-            bounds, _ = predictor.intervals(x, predictor.initial_state(1, x))
-            found |= {"lower": bounds[0, :, :, 0].flatten(1), "upper": bounds[0, :, :, 1].flatten(1)}
-    return x[0].numpy(), {meaning: values.numpy() for meaning, values in found.items()}
-
-
-def single(predictor):
-    """The predictor with the float32 weights that a graph holds."""
-    return predictor.float().double()
 
 
 def test_the_list_means_what_the_network_computes(structure, predictor_of):
-    predictor = single(predictor_of(structure))
-    graph = predictor.graph()
-    inputs, wanted = stream(predictor)
-    run = Reference(graph)
-    found = [run.results(row) for row in inputs]
-    assert set(found[0]) == set(wanted)
-    for meaning, values in wanted.items():
-        # Folding rounds once more, in single precision.
-        near = 1e-5 * max(1.0, np.median(np.abs(values)))
-        np.testing.assert_allclose([row[meaning] for row in found], values, rtol=1e-5, atol=near, err_msg=meaning)
-    run.reset()
-    np.testing.assert_array_equal(run.results(inputs[0])["prediction"], found[0]["prediction"])
+    # The float32 weights that a graph holds.
+    check_graph(predictor_of(structure).float().double())
 
 
 def test_the_list_counts_what_the_network_counts(structure, predictor_of):
-    predictor = predictor_of(structure)
-    graph = predictor.graph()
-    # A physics base has no weights: its arithmetic is element by element.
-    costs = [cost for cost in predictor.costs() if not cost.part.startswith("physics base")]
-    assert graph.macs == sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)
-    carried = sum(slot.size for _, slot in graph.slots())
-    assert carried <= 1.1 * state_numbers(predictor.initial_state(1, torch.zeros(1))) + 8  # counters differ
-    machine = 0 if predictor.physics is None else 800
-    assert graph.parameters <= parameters_of(predictor) * 1.1 + 200 + machine
+    check_graph_costs(predictor_of(structure))
 
 
 def test_names_are_unique_and_values_are_made_before_they_are_read(structure, predictor_of):

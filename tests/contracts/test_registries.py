@@ -1,14 +1,11 @@
 """The parts that exist: what is registered, what fits where, and that the contract tests reach all of it."""
 
-import dataclasses
-import json
 from pathlib import Path
 
 import pytest
 
 import edp.networks.blocks
 import edp.networks.cells
-from edp.config.experiment import SETTINGS, plain_tree
 from edp.data.augment import AUGMENTATIONS
 from edp.data.features import DERIVATIONS
 from edp.data.splits import SPLITS
@@ -16,7 +13,7 @@ from edp.errors import ConfigError, EdpError
 from edp.networks.activations import ACTIVATIONS
 from edp.networks.backbones import BACKBONES, TcnSpec
 from edp.networks.blocks import BLOCKS
-from edp.networks.blocks.base import OUTPUT_SLOTS, BlockSlot, BlockSpec
+from edp.networks.blocks.base import OUTPUT_SLOTS
 from edp.networks.cells import CELLS
 from edp.networks.heads import HEADS
 from edp.networks.initial import INITIAL_STATES
@@ -25,6 +22,7 @@ from edp.networks.outputs import OUTPUTS
 from edp.networks.physics import PHYSICS
 from edp.networks.predictor import ModelSpec
 from edp.registry import Registry
+from edp.testing.networks import check_space, check_spec
 from edp.training.averages import AVERAGES
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import SCHEDULES
@@ -85,25 +83,12 @@ def test_every_file_in_blocks_registers_a_block():
 
 @pytest.mark.parametrize("name", list(BLOCKS))
 def test_a_block_names_its_slot_and_a_search_space_of_its_options(name):
-    part = BLOCKS[name]
-    assert isinstance(part(), BlockSpec)
-    assert part.slot in BlockSlot
-    options = {field.name for field in dataclasses.fields(part)}
-    for option, values in part.space.items():
-        assert option in options
-        for value in values:
-            part(**{option: value})
+    check_space(BLOCKS[name])
 
 
 @pytest.mark.parametrize(("registry", "name"), ENTRIES)
 def test_a_spec_is_frozen_has_defaults_and_survives_json(registry, name):
-    spec = registry[name]()
-    assert dataclasses.is_dataclass(spec)
-    assert SETTINGS.build(registry[name], json.loads(json.dumps(plain_tree(spec))), name) == spec
-    assert registry.name_of(spec) == name
-    for field in dataclasses.fields(spec):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(spec, field.name, None)
+    check_spec(registry, name)
 
 
 @pytest.mark.parametrize("registry", [*SPECS, DERIVATIONS], ids=lambda registry: registry.what)

@@ -9,116 +9,54 @@ import torch
 
 from edp.data.augment import AUGMENTATIONS, Jitter, TimeWarp, WindowShift, input_deviation
 from edp.data.chunks import ChunkSpec
-from edp.data.features import FeatureSet
-from edp.data.scaling import Scaler
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
-from edp.networks.backbones import LstmSpec
-from edp.networks.heads import MlpHead
 from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights
 from edp.networks.outputs import OUTPUTS, Laplace, Normal, Quantiles
-from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.predictor import ModelSpec
 from edp.networks.stream import Stream
+from edp.testing.losses import (
+    TASK,
+    check_least_value,
+    check_masked_ticks,
+    check_objective,
+    check_order_of_streams,
+    loss_batch,
+    loss_network,
+)
 from edp.training.averages import AVERAGES
 from edp.training.objective import Objective
 from edp.training.spec import TrainingSpec, check_training
 
-TASK = Task(FeatureSet("f", ("a", "b", "u")), ("a", "b"), (1, 4), TargetMode.DELTA, 100.0)
 PAIRS = [(loss, output) for loss in LOSSES for output in LOSSES[loss].outputs]
 STATED = [output for output in OUTPUTS if OUTPUTS[output]().coverages]
 
 
-def network(output, dtype=torch.float64, task=TASK):
-    shape = (len(task.horizons), len(task.targets))
-    rng = np.random.default_rng(3)
-    scaler = Scaler(np.zeros(3), rng.uniform(0.5, 2, 3), np.zeros(shape), rng.uniform(0.5, 2, shape))
-    spec = ModelSpec(backbone=LstmSpec(units=5), head=MlpHead(hidden=6), output=OUTPUTS[output](), window=6)
-    return build_model(task, spec, scaler, seed=1).to(dtype)
-
-
-def batch(streams=4, ticks=12, seed=0):
-    rng = np.random.default_rng(seed)
-    valid = rng.random((streams, ticks)) > 0.2
-    valid[:, :3] = False
-    return (
-        torch.from_numpy(rng.normal(size=(streams, ticks, 3))),
-        torch.from_numpy(rng.normal(size=(streams, ticks, 2, 2))),
-        torch.from_numpy(valid),
-    )
-
-
-def everything(loss, **options):
-    return TrainingSpec(
-        loss=LOSSES[loss](),
-        terms=tuple(TERMS[name]() for name in TERMS),
-        weight_power=1.0,
-        horizon_decay=0.8,
-        adaptive=AdaptiveWeights(blend=0.5),
-        **options,
-    )
-
-
-def value(net, spec, x, future, valid):
-    answer, features, _ = net.run(x, net.initial_state(len(x), x))
-    return Objective(spec, net.code).evaluate(answer, future, features, valid)
-
-
 @pytest.mark.parametrize(("loss", "output"), PAIRS)
 def test_the_objective_is_finite_and_its_gradient_reaches_every_parameter(loss, output):
-    net = network(output)
-    found = value(net, everything(loss), *batch())
-    assert torch.isfinite(found)
-    found.backward()
-    for name, parameter in net.named_parameters():
-        assert torch.isfinite(parameter.grad).all(), name
-        if not name.endswith("pooling.score.bias"):  # A softmax does not notice a shift of all scores.
-            assert parameter.grad.abs().sum() > 1e-9, name
+    check_objective(loss, output)
 
 
 @pytest.mark.parametrize(("loss", "output"), PAIRS)
 def test_the_order_of_the_streams_does_not_matter(loss, output):
-    net, parts = network(output), batch()
-    turned = [part[[2, 0, 3, 1]] for part in parts]
-    with torch.no_grad():
-        torch.testing.assert_close(
-            value(net, everything(loss), *turned), value(net, everything(loss), *parts), rtol=1e-12, atol=1e-12
-        )
+    check_order_of_streams(loss, output)
 
 
 @pytest.mark.parametrize(("loss", "output"), PAIRS)
 def test_ticks_that_do_not_count_do_not_matter(loss, output):
-    net = network(output)
-    x, future, valid = batch()
-    changed = torch.where(valid[..., None, None], future, 100.0)
-    with torch.no_grad():
-        first, second = (value(net, everything(loss), x, target, valid) for target in (future, changed))
-    torch.testing.assert_close(second, first, rtol=1e-12, atol=1e-12)
+    check_masked_ticks(loss, output)
 
 
 @pytest.mark.parametrize(("loss", "output"), PAIRS)
 def test_a_loss_is_least_at_a_perfect_prediction(loss, output):
-    net, spec = network(output), LOSSES[loss]()
-    x, _, _ = batch()
-    with torch.no_grad():
-        answer, _, _ = net.run(x, net.initial_state(len(x), x))
-        # A stated spread is held fixed; only the prediction moves.
-        perfect = spec.evaluate(answer, answer.center)
-        before = perfect
-        for away in (0.01, 0.1, 1.0, 3.0):
-            for sign in (-1.0, 1.0):
-                worse = spec.evaluate(answer, answer.center + sign * away)
-                assert (worse >= perfect).all()
-            assert worse.mean() > before.mean()
-            before = worse
-    if output == "point":
-        assert perfect.abs().max() == 0
+    check_least_value(loss, output)
 
 
 @pytest.mark.parametrize("name", list(TERMS))
 def test_a_term_is_zero_at_a_perfect_prediction_of_a_steady_change(name):
-    net = network("point")
-    x, _, valid = batch()
+    net = loss_network("point")
+    x, _, valid = loss_batch()
     steady = torch.arange(12.0, dtype=torch.float64).reshape(1, 12, 1, 1).expand(4, 12, 2, 2)
     with torch.no_grad():
         answer, features, _ = net.run(x, net.initial_state(4, x))
@@ -133,8 +71,8 @@ def test_a_term_is_zero_at_a_perfect_prediction_of_a_steady_change(name):
 @pytest.mark.parametrize("mode", [TargetMode.DELTA, TargetMode.ABSOLUTE])
 def test_smoothness_sees_predicted_values_not_changes(mode):
     task = Task(TASK.features, TASK.targets, TASK.horizons, mode, 100.0)
-    net = network("point", task=task)
-    x, _, _ = batch()
+    net = loss_network("point", task=task)
+    x, _, _ = loss_batch()
     with torch.no_grad():
         answer, features, _ = net.run(x, net.initial_state(4, x))
         physical, _ = net.predict(x, net.initial_state(4, x))
@@ -183,8 +121,8 @@ def test_weights_with_nothing_to_weigh_are_refused():
 
 @pytest.mark.parametrize("output", list(OUTPUTS))
 def test_every_output_predicts_in_the_same_shape_and_as_a_stream(output):
-    net = network(output).eval()
-    x, _, _ = batch(streams=1)
+    net = loss_network(output).eval()
+    x, _, _ = loss_batch(streams=1)
     with torch.no_grad():
         whole, _ = net.predict(x, net.initial_state(1, x))
         first, state = net.predict(x[:, :5], net.initial_state(1, x))
@@ -197,11 +135,11 @@ def test_every_output_predicts_in_the_same_shape_and_as_a_stream(output):
 
 @pytest.mark.parametrize("output", STATED)
 def test_intervals_lie_around_the_prediction_and_in_one_another(output):
-    net = network(output).eval()
+    net = loss_network(output).eval()
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.add_(2.0 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2)))
-    x, _, _ = batch()
+    x, _, _ = loss_batch()
     with torch.no_grad():
         center, _ = net.predict(x, net.initial_state(4, x))
         bounds, _ = net.intervals(x, net.initial_state(4, x))
@@ -214,8 +152,8 @@ def test_intervals_lie_around_the_prediction_and_in_one_another(output):
 
 @pytest.mark.parametrize("output", STATED)
 def test_a_stream_gives_the_same_intervals_tick_by_tick(output):
-    net = network(output).eval()
-    x, _, _ = batch(streams=1)
+    net = loss_network(output).eval()
+    x, _, _ = loss_batch(streams=1)
     with torch.no_grad():
         bounds, _ = net.intervals(x, net.initial_state(1, x))
     stream = Stream(net)
@@ -229,15 +167,15 @@ def test_a_stream_gives_the_same_intervals_tick_by_tick(output):
 
 
 def test_a_point_has_no_intervals():
-    net = network("point").eval()
+    net = loss_network("point").eval()
     with pytest.raises(ConfigError, match="this network has none: its output is a point"):
         Stream(net).step(np.zeros(len(net.task.inputs))).interval(0.9)
 
 
 @pytest.mark.parametrize("output", STATED)
 def test_calibrated_intervals_hold_their_share_of_what_they_were_calibrated_on(output):
-    net = network(output).eval()
-    x, _, _ = batch(streams=1, ticks=4001)
+    net = loss_network(output).eval()
+    x, _, _ = loss_batch(streams=1, ticks=4001)
     with torch.no_grad():
         answer, _, _ = net.run(x, net.initial_state(1, x))
         target = (

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, EdpError, closest
 from edp.logs.formats.base import RawLog, RawSignal
-from edp.logs.units import normalise_unit, unit_for
-from edp.signals import UNITS, VOCABULARY, Channel, ChannelMap, Kind, SignalMap, Unit
+from edp.logs.units import kind_of_unit, unit_for
+from edp.signals import VOCABULARY, Channel, ChannelMap, SignalMap, Unit
 
 _LOOKED_ROWS = 1000
 
@@ -78,7 +78,7 @@ def _other_entries(raw: RawLog, signal_map: SignalMap) -> list[ChannelMap]:
         if name in columns or name in names or not _holds_numbers(signal):
             continue
         known = VOCABULARY.get(name)
-        kind = signal.kind or (known.kind if known is not None else _kind_of_unit(signal.unit))
+        kind = signal.kind or (known.kind if known is not None else kind_of_unit(signal.unit))
         found.append(ChannelMap(name, name, kind=kind, description=signal.description))
     return found
 
@@ -93,12 +93,6 @@ def _holds_numbers(signal: RawSignal) -> bool:
     except DataError:
         return False
     return True
-
-
-def _kind_of_unit(stated: str | None) -> Kind:
-    """The first kind that a unit measures; generic where it says nothing."""
-    unit = UNITS.get(normalise_unit(stated) or "1")
-    return Kind.GENERIC if unit is None or Kind.GENERIC in unit.kinds else unit.kinds[0]
 
 
 def _nothing_known(raw: RawLog) -> DataError:

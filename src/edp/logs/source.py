@@ -143,7 +143,16 @@ def load_signal_map(path: str | Path) -> SignalMap:
     Raises:
         ConfigError: unknown keys or wrong values, all at once.
     """
-    return build(SignalMap, _map_table(read_toml(path)), f"'{path}'")
+    return map_of_table(read_toml(path), f"'{path}'")
+
+
+def map_of_table(table: Table, where: str) -> SignalMap:
+    """A signal map from the content of a map file; `where` names it in messages.
+
+    Raises:
+        ConfigError: unknown keys or wrong values, all at once.
+    """
+    return build(SignalMap, _map_table(table), where)
 
 
 def load_data_set(path: str | Path) -> DataSetSettings:

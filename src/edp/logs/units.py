@@ -44,6 +44,12 @@ def normalise_unit(text: str | None) -> str | None:
     return _ALIASES.get(unit, unit)
 
 
+def kind_of_unit(stated: str | None) -> Kind:
+    """The first kind that a unit measures; generic where it says nothing."""
+    unit = UNITS.get(normalise_unit(stated) or "1")
+    return Kind.GENERIC if unit is None or Kind.GENERIC in unit.kinds else unit.kinds[0]
+
+
 def unit_for(stated: str | None, kind: Kind, where: str) -> Unit:
     """The conversion for a unit that a file or a map states; nothing stated means SI.
 

@@ -1,0 +1,42 @@
+"""How a contract says that it is broken; nothing here needs a test runner."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+
+class ContractError(AssertionError):
+    """A part does not do what EDP relies on; test runners count it as a failure."""
+
+
+def expect(condition: bool, message: str) -> None:
+    """Go on where the condition holds.
+
+    Raises:
+        ContractError: it does not; `message` says what is wrong.
+    """
+    if not condition:
+        raise ContractError(message)
+
+
+def expect_near(actual: Tensor | ArrayLike, wanted: Tensor | ArrayLike, message: str, rtol: float, atol: float) -> None:
+    """Go on where two arrays are equal within a tolerance; NaN equals NaN.
+
+    Raises:
+        ContractError: they are not; `message` says what is wrong, and the largest difference follows.
+    """
+    first, second = (_array(values) for values in (actual, wanted))
+    expect(first.shape == second.shape, f"{message}: shapes {first.shape} and {second.shape}")
+    near = np.isclose(first, second, rtol=rtol, atol=atol, equal_nan=True)
+    if not near.all():
+        largest = float(np.nanmax(np.abs(first - second)))
+        raise ContractError(f"{message}: {int((~near).sum())} of {near.size} numbers differ, by up to {largest:.3g}")
+
+
+def _array(values: Tensor | ArrayLike) -> np.ndarray:
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().numpy()
+    return np.asarray(values, dtype=np.float64)

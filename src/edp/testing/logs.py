@@ -1,0 +1,115 @@
+"""The contract of a log format: what it writes it reads to the last bit; damaged files are told, never a crash."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from edp.errors import EdpError
+from edp.logs.assemble import assemble
+from edp.logs.formats.base import LogFormat, WriteOptions
+from edp.logs.repair import Repair
+from edp.logs.resolve import resolve
+from edp.recording import Recording
+from edp.signals import TABLE_A1, SignalMap
+from edp.testing.expectations import ContractError, expect
+
+RATES_HZ = (100.0, 50.0, 128.98, 0.25, 1000.0 / 3.0)
+HEAD_BYTES = 4096
+"""Of a file, by which `LogFormat.claims` tells its own."""
+
+
+def sample_recording(rate_hz: float = 100.0, ticks: int = 400) -> Recording:
+    """Three channels of the vocabulary, of sizes from 0.1 to 1e7."""
+    channels = tuple(TABLE_A1[name] for name in ("CylVels_1", "CylPressures_1", "BmUp"))
+    values = np.random.default_rng(0).standard_normal((ticks, 3)) * np.array([0.1, 1e7, 1e6])
+    return Recording("R1", channels, values.astype(np.float32), rate_hz, "sim:test", {"seed": 3, "text": "ü"})
+
+
+def written_log(form: LogFormat, recording: Recording, folder: Path) -> Path:
+    """A file that a format wrote, under its first ending."""
+    path = folder / f"{recording.name}{form.suffixes[0]}"
+    form.write(recording, path, WriteOptions())
+    return path
+
+
+def read_log(form: LogFormat, path: Path) -> Recording:
+    """A file as a format reads it, in this process; `edp.read` gives each log a process of its own.
+
+    Raises:
+        EdpError: the file cannot be used.
+    """
+    raw = form.read(path, SignalMap())
+    wanted, problems = resolve(raw, SignalMap())
+    if problems:
+        raise problems[0]
+    return assemble(raw, wanted, SignalMap(), Repair())[0]
+
+
+def check_round_trip(form: LogFormat, recording: Recording) -> None:
+    """What is written is read to the last bit, with channels, rate and name.
+
+    Raises:
+        ContractError: something of it is lost or changed.
+    """
+    with tempfile.TemporaryDirectory(prefix="edp-format-") as place:
+        path = written_log(form, recording, Path(place))
+        again = read_log(form, path)
+        if path.is_file():
+            with path.open("rb") as stream:
+                expect(form.claims(stream.read(HEAD_BYTES)), f"format '{form.name}' does not claim its own file")
+    where = f"format '{form.name}' at {recording.rate_hz:g} Hz"
+    expect(again.channels == recording.channels, f"{where}: channels are {again.channel_names}, or of another kind")
+    expect(again.values.tobytes() == recording.values.tobytes(), f"{where}: values are not those that were written")
+    expect(np.isclose(again.rate_hz, recording.rate_hz, rtol=1e-9, atol=0.0), f"{where}: read at {again.rate_hz!r} Hz")
+    expect(again.name == recording.name, f"{where}: the recording is called '{again.name}'")
+
+
+def check_damage(form: LogFormat) -> None:
+    """Files that are cut off, or hold something else, end in an error for the user and in nothing else.
+
+    Raises:
+        ContractError: another exception, or noise that is read as a log.
+    """
+    with tempfile.TemporaryDirectory(prefix="edp-format-") as place:
+        path = written_log(form, sample_recording(), Path(place))
+        if not path.is_file():
+            return
+        content = path.read_bytes()
+        for size in (0, 10, len(content) // 2, len(content) - 10):
+            path.write_bytes(content[:size])
+            _refused(form, path, f"a file that is cut off after {size} of {len(content)} bytes")
+        path.write_bytes(np.random.default_rng(0).bytes(len(content)))
+        expect(_refused(form, path, "random bytes"), f"format '{form.name}' reads random bytes as a log")
+
+
+def check_log_format(form: LogFormat) -> None:
+    """Everything that EDP relies on of a log format.
+
+    Args:
+        form: an object like those that are entered with ``FORMATS.register("name")``.
+
+    Raises:
+        ContractError: a contract is broken; the message says which and how.
+    """
+    expect(bool(form.name) and bool(form.content), "a format must say its `name` and its `content`")
+    expect(bool(form.suffixes), f"format '{form.name}' has no endings")
+    for suffix in form.suffixes:
+        right = suffix.startswith(".") and suffix == suffix.lower()
+        expect(right, f"format '{form.name}': the ending '{suffix}' must begin with a dot, in lower case")
+    expect(isinstance(form.parts, bool), f"format '{form.name}': `parts` must be True or False")
+    for rate_hz in RATES_HZ:
+        check_round_trip(form, sample_recording(rate_hz))
+    check_damage(form)
+
+
+def _refused(form: LogFormat, path: Path, what: str) -> bool:
+    try:
+        read_log(form, path)
+    except EdpError:
+        return True
+    except Exception as error:
+        raise ContractError(f"format '{form.name}' answers {what} with {type(error).__name__}: {error}") from error
+    return False

@@ -1,0 +1,69 @@
+"""Columns of pandas and Polars frames, in and out; neither library is imported before it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, DataError
+
+
+def frame_library(name: str) -> ModuleType:
+    """Pandas or polars.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ConfigError(f"{name} is not installed; install it (pip install {name}), or use NumPy arrays") from error
+
+
+def frame_of(library: str, columns: Mapping[str, NDArray[Any] | list[str]]) -> Any:
+    """A frame of ``pandas`` or ``polars`` with these columns.
+
+    Raises:
+        ConfigError: the library is not installed.
+    """
+    return frame_library(library).DataFrame(dict(columns))
+
+
+def columns_of(frame: Any, where: str) -> dict[str, NDArray[Any]]:
+    """Columns of a frame by name, each ``(time,)``.
+
+    Raises:
+        DataError: it is no frame, or a name is no text or stands twice.
+    """
+    names = getattr(frame, "columns", None)
+    if names is None or not hasattr(frame, "__getitem__"):
+        raise DataError(f"{where} is a {type(frame).__name__}; give a pandas or Polars DataFrame")
+    names = list(names)
+    unnamed = [name for name in names if not isinstance(name, str)]
+    if unnamed:
+        raise DataError(f"{where}: column {str(unnamed[0])[:40]} is not named by a text; rename it")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DataError(f"{where}: column '{twice[0]}' occurs twice; rename one of them")
+    return {name: _numpy(frame[name]) for name in names}
+
+
+def _numpy(column: Any) -> NDArray[Any]:
+    """Values of a column; missing integers, which NumPy cannot hold, become NaN."""
+    values = np.asarray(column.to_numpy())
+    if values.dtype != object:
+        return values
+    try:
+        return np.array([np.nan if _missing(value) else value for value in values], dtype=np.float64)
+    except (TypeError, ValueError):
+        return values
+
+
+def _missing(value: Any) -> bool:
+    """None, and pandas' NA, which is not even equal to itself."""
+    return value is None or type(value).__name__ == "NAType"

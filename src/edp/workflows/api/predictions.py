@@ -1,0 +1,142 @@
+"""Predictions over whole recordings, as arrays, frames and figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, DataError, closest
+from edp.recording import FloatArray, Recording
+from edp.report.common.tables import TextTable
+from edp.report.notebook import BandLine, html_of, prediction_figure, text_of
+from edp.report.run.figures import aligned
+from edp.signals import KINDS, Channel, Kind
+from edp.workflows.api.frames import frame_of
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Predictions:
+    """What was predicted at every tick of some recordings, in SI units.
+
+    Attributes:
+        recordings: that were read.
+        targets: predicted channels.
+        kinds: of the targets.
+        horizons: look-ahead in samples.
+        coverages: of the intervals; empty where the network has none.
+        values: for each recording float32 ``(time, horizon, target)``; row t was said at t, of t + horizon.
+        bounds: for each recording float32 ``(time, coverage, 2, horizon, target)``, lower then upper; None without
+            intervals.
+    """
+
+    recordings: tuple[Recording, ...]
+    targets: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    horizons: tuple[int, ...]
+    coverages: tuple[float, ...]
+    values: tuple[FloatArray, ...]
+    bounds: tuple[FloatArray, ...] | None = None
+
+    def __len__(self) -> int:
+        """Number of recordings."""
+        return len(self.recordings)
+
+    def to_numpy(self) -> list[FloatArray]:
+        """For each recording float32 ``(time, horizon, target)``, SI units; row t was said at t."""
+        return list(self.values)
+
+    def to_pandas(self) -> Any:
+        """One pandas frame: ``recording``, ``time_s`` of the tick, and a column for each target and horizon.
+
+        A column is called ``TARGET+HORIZON``; bounds of an interval ``TARGET+HORIZON lower 0.9`` and ``... upper 0.9``.
+
+        Raises:
+            ConfigError: pandas is not installed.
+        """
+        return frame_of("pandas", self._columns())
+
+    def to_polars(self) -> Any:
+        """The same as a Polars frame.
+
+        Raises:
+            ConfigError: Polars is not installed.
+        """
+        return frame_of("polars", self._columns())
+
+    def plot(self, recording: int | str = 0, horizon: int | None = None) -> Any:
+        """A Plotly figure: predictions, moved to the time that they speak of, over what was measured.
+
+        Args:
+            recording: number or name.
+            horizon: look-ahead in samples; the longest by default.
+
+        Raises:
+            ConfigError: no such horizon.
+            DataError: no such recording.
+        """
+        which = self._number(recording)
+        ahead = max(self.horizons) if horizon is None else horizon
+        if ahead not in self.horizons:
+            raise ConfigError(f"horizon = {ahead}; this predictor has {', '.join(map(str, self.horizons))}")
+        source = self.recordings[which]
+        lines = [self._line(source, which, place, ahead) for place in range(len(self.targets))]
+        title = f"{source.name}, {1000 * ahead / source.rate_hz:g} ms ahead"
+        return prediction_figure(lines, source.rate_hz, title)
+
+    def _number(self, recording: int | str) -> int:
+        names = [entry.name for entry in self.recordings]
+        if isinstance(recording, str):
+            if recording not in names:
+                raise DataError(f"there are no predictions of '{recording}'{closest(recording, names)}")
+            return names.index(recording)
+        if not -len(names) <= recording < len(names):
+            raise DataError(f"there are predictions of {len(names)} recording(s); {recording} is not one of them")
+        return recording
+
+    def _line(self, source: Recording, which: int, place: int, horizon: int) -> BandLine:
+        column, name = self.horizons.index(horizon), self.targets[place]
+        lower = upper = None
+        if self.bounds is not None:
+            # The first coverage is the widest.
+            lower, upper = (aligned(self.bounds[which][:, 0, side, column, place], horizon) for side in (0, 1))
+        return BandLine(
+            channel=Channel(name, self.kinds[place]),
+            predicted=aligned(self.values[which][:, column, place], horizon),
+            measured=source.column(name) if name in source.channel_names else None,
+            lower=lower,
+            upper=upper,
+        )
+
+    def _columns(self) -> dict[str, NDArray[Any] | list[str]]:
+        columns: dict[str, NDArray[Any] | list[str]] = {
+            "recording": [entry.name for entry in self.recordings for _ in range(entry.samples)],
+            "time_s": np.concatenate([np.arange(entry.samples) / entry.rate_hz for entry in self.recordings]),
+        }
+        for place, target in enumerate(self.targets):
+            for number, horizon in enumerate(self.horizons):
+                name = f"{target}+{horizon}"
+                columns[name] = np.concatenate([values[:, number, place] for values in self.values])
+                for which, coverage in enumerate(self.coverages if self.bounds is not None else ()):
+                    for side, word in enumerate(("lower", "upper")):
+                        parts = [bounds[:, which, side, number, place] for bounds in self.bounds or ()]
+                        columns[f"{name} {word} {coverage:g}"] = np.concatenate(parts)
+        return columns
+
+    def _table(self) -> TextTable:
+        rows = tuple((entry.name, f"{entry.samples:,}", f"{entry.duration_s:,.1f}") for entry in self.recordings)
+        targets = [f"{name} [{KINDS[kind].si_unit}]" for name, kind in zip(self.targets, self.kinds, strict=True)]
+        ahead = f"{', '.join(map(str, self.horizons))} sample(s) ahead"
+        intervals = "".join(f", interval {coverage:g}" for coverage in self.coverages)
+        caption = f"Predictions of {', '.join(targets)}, {ahead}{intervals}"
+        return TextTable(caption, (("Recording", ""), ("Samples", ""), ("Duration", "s")), rows)
+
+    def __repr__(self) -> str:
+        """What was predicted of which recordings."""
+        return text_of(self._table())
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return html_of([self._table()])

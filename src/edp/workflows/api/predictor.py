@@ -1,0 +1,221 @@
+"""A trained predictor on disk, as a user handles it: judge, predict, draw, export, stream."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from edp.data.prepared import Prepared
+from edp.data.unlabelled import unlabelled
+from edp.errors import ConfigError
+from edp.evaluation.judge import JudgeSpec
+from edp.networks import AdaptedStream, Stream
+from edp.networks.running import stream_intervals, stream_predictions
+from edp.recording import Recording
+from edp.report import Facts, read_facts
+from edp.report.common.tables import TextTable
+from edp.report.notebook import html_of, text_of
+from edp.signals import KINDS
+from edp.training import load_bundle
+from edp.workflows import train_evaluate
+from edp.workflows.api.predictions import Predictions
+from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
+from edp.workflows.api.scores import JudgedScores
+
+BASELINES = ("persistence", "ridge_arx")
+"""Rivals that take seconds; the others, `trees` and `mlp` among them, are asked for by name."""
+PROVENANCE = "provenance.json"
+"""What a run folder has and a bundle alone has not: which data it was trained on."""
+
+
+class TrainedPredictor:
+    """A network with its scaling, and the run folder around it where there is one.
+
+    Args:
+        folder: a run folder, or a bundle.
+        temporary: the folder is removed with this object.
+
+    Raises:
+        BundleError: neither a run folder nor a bundle, or a damaged one.
+    """
+
+    def __init__(self, folder: str | Path, temporary: bool = False) -> None:
+        self.folder = Path(folder)
+        if temporary:
+            weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+        self._bundle = load_bundle(self.folder)
+        self._task = self._bundle.task
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Channels that are fed at each tick, in order, in SI units."""
+        return self._task.inputs
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Channels that are predicted."""
+        return self._task.targets
+
+    @property
+    def horizons(self) -> tuple[int, ...]:
+        """Look-ahead in samples."""
+        return self._task.horizons
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second of what it reads."""
+        return self._task.rate_hz
+
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit of each input and target, by name."""
+        targets = zip(self.targets, self._bundle.target_kinds, strict=True)
+        return {c.name: c.unit for c in self._bundle.inputs} | {name: KINDS[kind].si_unit for name, kind in targets}
+
+    def evaluate(
+        self,
+        test: Recordings | Recording | Sequence[Recording] | None = None,
+        baselines: Sequence[str] | None = None,
+    ) -> JudgedScores:
+        """Score it on recordings that it was not trained on, beside baselines fitted on its training data.
+
+        Args:
+            test: recordings, all of which are judged; without them those that the training set apart.
+            baselines: names, such as ``persistence``, ``ridge_arx``; by default these two, and none for a bundle
+                without its run folder, whose training data is not known.
+
+        Raises:
+            DataError: recordings that cannot be used, too short to be judged, or training data that changed.
+            ConfigError: an unknown baseline, or what a bundle alone cannot give.
+        """
+        recordings = None if test is None else as_recordings(test)
+        if not (self.folder / PROVENANCE).is_file():
+            return self._judged_alone(recordings, baselines)
+        source = None if recordings is None else recordings.source or _memory(recordings)
+        names = BASELINES if baselines is None else tuple(baselines)
+        return JudgedScores(read_facts(train_evaluate.evaluate(self.folder, source, names)))
+
+    def predict(self, recordings: Recordings | Recording | Sequence[Recording]) -> Predictions:
+        """Predictions at every tick of every recording, each from reset; targets need not be recorded.
+
+        Raises:
+            DataError: another rate, a missing input, or one that is not finite.
+        """
+        data = as_recordings(recordings)
+        predictor = self._bundle.predictor
+        series = [unlabelled(self._task, recording) for recording in data]
+        bounds = stream_intervals(predictor, series) if predictor.output.coverages else None
+        return Predictions(
+            recordings=tuple(data),
+            targets=self.targets,
+            kinds=self._bundle.target_kinds,
+            horizons=self.horizons,
+            coverages=tuple(predictor.output.coverages),
+            values=tuple(stream_predictions(predictor, series)),
+            bounds=None if bounds is None else tuple(bounds),
+        )
+
+    def plot(self, test: Recordings | Recording | Sequence[Recording], horizon: int | None = None) -> Any:
+        """A Plotly figure: what is predicted of the first recording over what was measured.
+
+        Args:
+            test: recordings with the inputs.
+            horizon: look-ahead in samples; the longest by default.
+
+        Raises:
+            DataError: as of `predict`.
+            ConfigError: no such horizon.
+        """
+        return self.predict(as_recordings(test)[:1]).plot(horizon=horizon)
+
+    def export(self, target: str, folder: str | Path, name: str = "predictor", **options: object) -> list[Path]:
+        """Write it in a form that runs without EDP.
+
+        Args:
+            target: ``c``, ``onnx``, ``simulink``, ``fmu``, ``casadi`` or ``ros2``.
+            folder: where to; it is made.
+            name: what the network is called there.
+            options: of the target (docs/export.md).
+
+        Returns:
+            The files, the one to read first in front.
+
+        Raises:
+            ConfigError: an unknown target or option.
+            ExportError: a network or a name that this form cannot hold.
+        """
+        return train_evaluate.export_bundle(self.folder, target, folder, name, options)
+
+    def stream(self) -> Stream:
+        """It as a stream: ``step(row)`` takes one tick of `inputs` and gives prediction, intervals and a status.
+
+        What is learned on board (`edp adapt`) is part of it.
+        """
+        adaptation = self._bundle.adaptation
+        if adaptation is not None:
+            return AdaptedStream(self._bundle.predictor, adaptation)
+        return Stream(self._bundle.predictor)
+
+    def _judged_alone(self, recordings: Recordings | None, baselines: Sequence[str] | None) -> JudgedScores:
+        """Scores of a bundle, of which nothing but itself is known."""
+        if recordings is None:
+            raise ConfigError(f"'{self.folder}' is a bundle without its run folder; give the recordings to judge it on")
+        if baselines:
+            raise ConfigError(
+                f"'{self.folder}' is a bundle without its run folder: the data to fit a baseline on is not known; "
+                "leave baselines out, or load the run folder"
+            )
+        task, bundle = self._task, self._bundle
+        data = Prepared(
+            task=task,
+            train=[],
+            validation=[],
+            test=[task.series(recording) for recording in recordings],
+            inputs=bundle.inputs,
+            feature_kinds=(),
+            target_kinds=bundle.target_kinds,
+            descriptions=bundle.descriptions,
+            digest="",
+        )
+        judged = train_evaluate.judge_bundle(bundle, data, JudgeSpec(baselines=()))
+        return JudgedScores(Facts(folder=self.folder, scores=judged.scores))
+
+    def _table(self) -> TextTable:
+        ahead = ", ".join(f"{k} ({1000 * k / self.rate_hz:g} ms)" for k in self.horizons)
+        parameters = sum(parameter.numel() for parameter in self._bundle.predictor.parameters())
+        rows = (
+            ("Predicts", ", ".join(f"{name} [{self.units[name]}]" for name in self.targets)),
+            ("Samples ahead", f"{ahead} at {self.rate_hz:g} Hz"),
+            ("Reads", ", ".join(f"{name} [{self.units[name]}]" for name in self.inputs)),
+            ("Parameters", f"{parameters:,}"),
+            ("Folder", str(self.folder)),
+        )
+        return TextTable("Trained predictor", (("", ""), ("", "")), rows)
+
+    def __repr__(self) -> str:
+        """What it reads and predicts."""
+        return text_of(self._table())
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return html_of([self._table()])
+
+
+def load(path: str | Path) -> TrainedPredictor:
+    """A predictor from a run folder (of `train` or `edp train`) or from a bundle.
+
+    Raises:
+        BundleError: neither of them, or a damaged one.
+    """
+    return TrainedPredictor(path)
+
+
+def _memory(recordings: Recordings) -> MemorySource:
+    """Recordings of this process; their scores lie in a folder of the run that is named by their content."""
+    content = "".join(f"{recording.name}\n{recording.digest}\n" for recording in recordings)
+    digest = hashlib.blake2b(content.encode("utf-8", "surrogateescape"), digest_size=6).hexdigest()
+    return MemorySource(Path(f"recordings-{digest}"), recordings=tuple(recordings))

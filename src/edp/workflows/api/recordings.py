@@ -1,0 +1,400 @@
+"""Recordings as a user handles them: from files, arrays and frames, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError, closest
+from edp.logs.arrays import recording_of_columns
+from edp.logs.read import RATE_TOLERANCE
+from edp.logs.repair import Repair
+from edp.logs.source import DataSource, load_signal_map, map_of_table
+from edp.recording import FloatArray, Recording
+from edp.report.common.tables import TextTable
+from edp.report.notebook import html_of, recordings_figure, text_of
+from edp.settings.bounds import SEED, between, check_bounds
+from edp.settings.tree import build
+from edp.signals import KINDS, SignalMap
+from edp.workflows.api.frames import columns_of, frame_of
+
+SHOWN_CHANNELS = 12
+"""Channels that `Recordings.plot` draws where none are named."""
+SHOWN_RECORDINGS = 20
+"""Recordings that the table of a notebook lists."""
+
+
+class Recordings(Sequence[Recording]):
+    """Recordings of one set of channels at one rate, in SI units.
+
+    Iterating and indexing give a `Recording` each (by number or by name), a slice gives `Recordings`.
+
+    Args:
+        recordings: at least one; equal channels, equal rates, each with a name of its own.
+        source: where they can be read again, where that is so.
+
+    Raises:
+        DataError: none, or recordings that do not belong together.
+    """
+
+    def __init__(self, recordings: Sequence[Recording], source: DataSource | None = None) -> None:
+        self._recordings, self.source = tuple(recordings), source
+        _check_together(self._recordings)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: Sequence[NDArray[Any]] | NDArray[Any],
+        *,
+        rate_hz: float,
+        names: Sequence[str] | None = None,
+        units: Sequence[str | None] | Mapping[str, str] | None = None,
+        recording_names: Sequence[str] | None = None,
+        repair: Mapping[str, str] | None = None,
+    ) -> Recordings:
+        """Recordings from arrays ``(time, channel)``, one array a recording; one array alone is one recording.
+
+        Args:
+            arrays: numbers, each of shape ``(time, channel)``.
+            rate_hz: samples per second.
+            names: of the channels; ``channel_0``, ``channel_1``, ... by default.
+            units: of the channels, in their order or by name; values are converted to SI. Without one a value is
+                taken as it is.
+            recording_names: of the recordings; ``recording_0``, ... by default.
+            repair: what may be mended: ``{"nan": "hold"}`` holds the last good value, ``{"nan": "keep"}`` keeps NaN.
+
+        Raises:
+            DataError: shapes, names or units that do not fit, a rate that is not positive, or missing values.
+        """
+        matrices = [arrays] if isinstance(arrays, np.ndarray) and arrays.ndim == 2 else list(arrays)
+        tables = [_matrix(values, number) for number, values in enumerate(matrices)]
+        if not tables:
+            raise DataError("no arrays given; give one array (time, channel) for each recording")
+        width = tables[0].shape[1]
+        channel_names = _names(names, [f"channel_{i}" for i in range(width)], "names", "channels")
+        columns = [dict(zip(channel_names, values.T, strict=True)) for values in _of_one_width(tables, channel_names)]
+        return cls._of_columns(columns, rate_hz, _units(units, channel_names), recording_names, repair)
+
+    @classmethod
+    def from_frames(
+        cls,
+        frames: Any,
+        *,
+        rate_hz: float | None = None,
+        units: Mapping[str, str] | None = None,
+        recording_names: Sequence[str] | None = None,
+        repair: Mapping[str, str] | None = None,
+    ) -> Recordings:
+        """Recordings from pandas or Polars frames, one frame a recording, one column a channel.
+
+        Args:
+            frames: a frame, or a sequence of them.
+            rate_hz: samples per second; every column is then a channel. Without it a column of time stamps (``time_s``,
+                ``time``, ``timestamp`` or the like; numbers or dates) tells the rate, under the time rule of logs.
+            units: by column; values are converted to SI. Without one a value is taken as it is.
+            recording_names: of the recordings; ``recording_0``, ... by default.
+            repair: what may be mended, as in `read`.
+
+        Raises:
+            DataError: no frame, no time stamps and no rate, text for numbers, or missing values.
+        """
+        listed = list(frames) if isinstance(frames, list | tuple) else [frames]
+        if not listed:
+            raise DataError("no frames given; give one DataFrame for each recording")
+        columns = [columns_of(frame, f"frame {number}") for number, frame in enumerate(listed)]
+        return cls._of_columns(columns, rate_hz, _units(units, list(columns[0])), recording_names, repair)
+
+    @classmethod
+    def _of_columns(
+        cls,
+        tables: Sequence[Mapping[str, NDArray[Any]]],
+        rate_hz: float | None,
+        units: Mapping[str, str],
+        recording_names: Sequence[str] | None,
+        repair: Mapping[str, str] | None,
+    ) -> Recordings:
+        names = _names(recording_names, [f"recording_{i}" for i in range(len(tables))], "recording_names", "recordings")
+        mend = repair_of(repair)
+        return cls(
+            [
+                recording_of_columns(name, columns, units, rate_hz, repair=mend)
+                for name, columns in zip(names, tables, strict=True)
+            ]
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels."""
+        return self._recordings[0].channel_names
+
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit of each channel, by name."""
+        return {channel.name: channel.unit for channel in self._recordings[0].channels}
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second."""
+        return self._recordings[0].rate_hz
+
+    @property
+    def recording_names(self) -> tuple[str, ...]:
+        """Names of the recordings."""
+        return tuple(recording.name for recording in self._recordings)
+
+    def __len__(self) -> int:
+        """Number of recordings."""
+        return len(self._recordings)
+
+    def __iter__(self) -> Iterator[Recording]:
+        """Recording by recording."""
+        return iter(self._recordings)
+
+    @overload
+    def __getitem__(self, which: int | str) -> Recording: ...
+    @overload
+    def __getitem__(self, which: slice) -> Recordings: ...
+    def __getitem__(self, which: int | str | slice) -> Recording | Recordings:
+        """A recording by number or name, or some of them by a slice.
+
+        Raises:
+            DataError: there is no recording of this name, or the slice is empty.
+            IndexError: there is no recording of this number.
+        """
+        if isinstance(which, slice):
+            return Recordings(self._recordings[which])
+        if isinstance(which, str):
+            if which not in self.recording_names:
+                raise DataError(f"there is no recording '{which}'{closest(which, self.recording_names)}")
+            return self._recordings[self.recording_names.index(which)]
+        return self._recordings[which]
+
+    def to_numpy(self) -> list[FloatArray]:
+        """Values of each recording, float32 ``(time, channel)``, SI units."""
+        return [recording.values for recording in self._recordings]
+
+    def to_pandas(self) -> list[Any]:
+        """A pandas frame a recording: ``time_s``, then a column a channel, SI units.
+
+        Raises:
+            ConfigError: pandas is not installed.
+        """
+        return [frame_of("pandas", _columns(recording)) for recording in self._recordings]
+
+    def to_polars(self) -> list[Any]:
+        """A Polars frame a recording: ``time_s``, then a column a channel, SI units.
+
+        Raises:
+            ConfigError: Polars is not installed.
+        """
+        return [frame_of("polars", _columns(recording)) for recording in self._recordings]
+
+    def split(self, test: float = 0.2, seed: int = 0) -> tuple[Recordings, Recordings]:
+        """A part to train on and a part to test on: whole recordings, drawn at random.
+
+        One recording alone is cut in time: its end tests.
+
+        Args:
+            test: share that tests, above 0 and below 1; at least one recording is in each part.
+            seed: of the draw.
+
+        Raises:
+            ConfigError: a share or seed out of range.
+        """
+        check_bounds("split", SimpleNamespace(test=test, seed=seed), test=between(0.0, 1.0), seed=SEED)
+        if len(self) == 1:
+            (only,) = self._recordings
+            cut = min(max(1, only.samples - round(test * only.samples)), only.samples - 1)
+            return Recordings([only.rows(0, cut)]), Recordings([only.rows(cut, only.samples)])
+        order = np.random.default_rng(seed).permutation(len(self))
+        count = min(max(1, round(test * len(self))), len(self) - 1)
+        tests = set(order[:count].tolist())
+        parts = [[r for i, r in enumerate(self._recordings) if (i in tests) == wanted] for wanted in (False, True)]
+        return Recordings(parts[0]), Recordings(parts[1])
+
+    def plot(self, recording: int | str = 0, channels: Sequence[str] = ()) -> Any:
+        """A Plotly figure of a recording over time, a row a channel.
+
+        Args:
+            recording: number or name.
+            channels: names; without any, the first twelve.
+
+        Raises:
+            DataError: there is no such recording or channel.
+        """
+        return recordings_figure(self[recording], list(channels) or self.names[:SHOWN_CHANNELS])
+
+    def __repr__(self) -> str:
+        """Recordings and channels as text."""
+        return "\n\n".join(text_of(table) for table in self._tables())
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return html_of(self._tables())
+
+    def _tables(self) -> list[TextTable]:
+        shown = self._recordings[:SHOWN_RECORDINGS]
+        more = f", the first {len(shown)} of {len(self)}" if len(shown) < len(self) else ""
+        rows = tuple((r.name, f"{r.samples:,}", f"{r.duration_s:,.1f}") for r in shown)
+        columns = (("Recording", ""), ("Samples", ""), ("Duration", "s"))
+        channels = tuple((c.name, str(c.kind), c.unit, c.description) for c in self._recordings[0].channels)
+        return [
+            TextTable(f"Recordings at {self.rate_hz:g} Hz{more}", columns, rows),
+            TextTable("Channels", (("Channel", ""), ("Kind", ""), ("SI unit", ""), ("Description", "")), channels),
+        ]
+
+
+def read(
+    path: str | Path, map: str | Path | Mapping[str, Any] | None = None, repair: Mapping[str, str] | None = None
+) -> Recordings:
+    """Recordings from a log, a folder of logs, or a data-set file.
+
+    Args:
+        path: what to read (docs/recordings.md).
+        map: which columns become which channels: a map file, or its content as a mapping. Without one every column of
+            numbers is taken under its own name; the vocabulary or else the file's unit tells its kind.
+        repair: what may be mended, by default nothing: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``,
+            ``keep``), ``duplicates`` (``last``), ``falling`` (``sort``).
+
+    Raises:
+        DataError: nothing to read, or a log that cannot be used as it is.
+        ConfigError: a map or a repair that cannot be.
+    """
+    place = Path(path)
+    if map is None:
+        # The maps of a data-set file are in it.
+        signal_map = None if place.suffix == ".toml" else SignalMap(others=True)
+    elif isinstance(map, Mapping):
+        signal_map = map_of_table(dict(map), "map")
+    else:
+        signal_map = load_signal_map(map)
+    source = DataSource(place, signal_map, repair_of(repair))
+    return Recordings(source.read(), source)
+
+
+def as_recordings(data: Recordings | Recording | Sequence[Recording]) -> Recordings:
+    """What a user gave as data, as `Recordings`.
+
+    Raises:
+        DataError: it is something else.
+    """
+    if isinstance(data, Recordings):
+        return data
+    listed = [data] if isinstance(data, Recording) else data
+    if not isinstance(listed, list | tuple) or not all(isinstance(entry, Recording) for entry in listed):
+        raise DataError(
+            f"the data is a {type(data).__name__}; give edp.Recordings (edp.read, edp.Recordings.from_arrays or "
+            "edp.Recordings.from_frames)"
+        )
+    return Recordings(listed)
+
+
+@dataclass(frozen=True)
+class MemorySource(DataSource):
+    """Recordings of this process, as a source; `path` is where they lie once they are written."""
+
+    recordings: tuple[Recording, ...] = ()
+
+    def read(self) -> list[Recording]:
+        """The recordings."""
+        return list(self.recordings)
+
+
+def repair_of(table: Mapping[str, str] | None) -> Repair | None:
+    """What may be mended, from a mapping.
+
+    Raises:
+        ConfigError: an unknown repair or choice.
+    """
+    return None if table is None else build(Repair, dict(table), "repair")
+
+
+def _check_together(recordings: Sequence[Recording]) -> None:
+    if not recordings:
+        raise DataError("no recordings are left; give at least one")
+    first = recordings[0]
+    names = [recording.name for recording in recordings]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DataError(f"recording name(s) {', '.join(twice)} occur twice; give each its own")
+    for recording in recordings:
+        if abs(recording.rate_hz - first.rate_hz) > RATE_TOLERANCE * first.rate_hz:
+            raise DataError(
+                f"mixed rates: '{first.name}' {first.rate_hz:g} Hz, '{recording.name}' {recording.rate_hz:g} Hz; bring "
+                "them to one rate"
+            )
+        ours, theirs = ([(c.name, c.unit) for c in entry.channels] for entry in (first, recording))
+        if ours != theirs:
+            both = zip(ours, theirs)
+            other = next((f"'{a[0]}' ({a[1]}) is '{b[0]}' ({b[1]}) there" for a, b in both if a != b), "")
+            counts = f"{len(first.channels)} and {len(recording.channels)} channels"
+            raise DataError(
+                f"mixed channels: '{first.name}' and '{recording.name}' differ: {other or counts}; give equal channels "
+                "in equal order"
+            )
+
+
+def _matrix(values: Any, number: int) -> NDArray[Any]:
+    matrix = np.asarray(values)
+    if matrix.ndim != 2 or 0 in matrix.shape:
+        advice = "; numpy.column_stack([u, y]) makes one of single channels" if matrix.ndim == 1 else ""
+        raise DataError(
+            f"array {number} has shape {matrix.shape}; (time, channel) must hold, one array for each recording{advice}"
+        )
+    if matrix.dtype.kind not in "fiub":
+        raise DataError(f"array {number} holds {matrix.dtype}; numbers must hold")
+    return matrix
+
+
+def _of_one_width(tables: Sequence[NDArray[Any]], names: Sequence[str]) -> Sequence[NDArray[Any]]:
+    for number, values in enumerate(tables):
+        if values.shape[1] != len(names):
+            raise DataError(
+                f"array {number} has shape {values.shape}; {len(names)} channels must hold ({', '.join(names[:8])})"
+            )
+    return tables
+
+
+def _names(names: Sequence[str] | None, usual: list[str], what: str, counted: str) -> list[str]:
+    if names is None:
+        return usual
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise DataError(f"{what} must be a list of texts, one for each of the {counted}")
+    if len(names) != len(usual):
+        raise DataError(f"{what} has {len(names)} entries for {len(usual)} {counted}; give one for each")
+    twice = sorted({name for name in names if list(names).count(name) > 1})
+    if twice or "" in names:
+        raise DataError(f"{what}: {f'{twice[0]!r} occurs twice' if twice else 'one is empty'}; give each its own")
+    return list(names)
+
+
+def _units(units: Sequence[str | None] | Mapping[str, str] | None, names: Sequence[str]) -> dict[str, str]:
+    if units is None:
+        return {}
+    if isinstance(units, Mapping):
+        for name in units:
+            if name not in names:
+                raise DataError(f"units: there is no channel '{name}'{closest(str(name), names)}")
+        pairs = list(units.items())
+    else:
+        if isinstance(units, str) or len(units) != len(names):
+            raise DataError(f"units has {len(units)} entries for {len(names)} channels; give one for each")
+        pairs = [(name, unit) for name, unit in zip(names, units, strict=True) if unit is not None]
+    wrong = [name for name, unit in pairs if not isinstance(unit, str)]
+    if wrong:
+        raise DataError(f"units: that of '{wrong[0]}' is no text; give its name, such as {KINDS['pressure'].si_unit}")
+    return dict(pairs)
+
+
+def _columns(recording: Recording) -> dict[str, NDArray[Any]]:
+    time_name = "time_s"
+    if time_name in recording.channel_names:
+        raise DataError(f"recording '{recording.name}' has a channel '{time_name}'; rename it to have frames")
+    time_s = np.arange(recording.samples) / recording.rate_hz
+    return {time_name: time_s, **dict(zip(recording.channel_names, recording.values.T, strict=True))}

@@ -1,0 +1,138 @@
+"""Scores of a predictor beside its baselines, and what a search came to: tables, frames, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from edp.report import Facts, headline, read_study
+from edp.report.common.tables import TextTable
+from edp.report.notebook import html_of, score_figure, score_tables, study_figure, study_html, text_of
+from edp.report.run.facts import comparison_rows
+from edp.report.search import words
+from edp.report.search.facts import StudyFacts, facts_of
+from edp.workflows.api.frames import frame_of
+
+
+class ShownTable:
+    """Tables that print as text and show as HTML.
+
+    Args:
+        tables: one below the other.
+    """
+
+    def __init__(self, tables: list[TextTable]) -> None:
+        self._tables = tables
+
+    def __repr__(self) -> str:
+        """As text."""
+        return "\n\n".join(map(text_of, self._tables))
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        return html_of(self._tables)
+
+
+class JudgedScores:
+    """Scores of a predictor and of its baselines on the same ticks, in the units of reports (mm/s, bar, ...).
+
+    Args:
+        facts: what was judged.
+    """
+
+    def __init__(self, facts: Facts) -> None:
+        self._facts = facts
+
+    @property
+    def folder(self) -> Path:
+        """Where ``scores.json`` lies, or the bundle that was judged."""
+        return self._facts.folder
+
+    def to_dict(self) -> Mapping[str, Any]:
+        """Everything that was measured: the content of ``scores.json``."""
+        return dict(self._facts.scores or {})
+
+    def table(self) -> ShownTable:
+        """A table for each horizon: every judged model, the best first."""
+        return ShownTable(score_tables(self._facts))
+
+    def to_pandas(self) -> Any:
+        """One pandas frame, a row for each model and horizon.
+
+        Raises:
+            ConfigError: pandas is not installed.
+        """
+        return frame_of("pandas", self._columns())
+
+    def to_polars(self) -> Any:
+        """The same as a Polars frame.
+
+        Raises:
+            ConfigError: Polars is not installed.
+        """
+        return frame_of("polars", self._columns())
+
+    def plot(self) -> Any:
+        """A Plotly figure: mean absolute error of every judged model, against the horizon where there are several."""
+        return score_figure(self._facts)
+
+    def _columns(self) -> dict[str, list[Any]]:
+        rows = [{"horizon": k, **row} for k in sorted(self._facts.horizons) for row in comparison_rows(self._facts, k)]
+        keys = [key for key in rows[0] if key not in ("outputs", "is_network", "label")]
+        columns = {key: [row[key] for row in rows] for key in keys}
+        for target in self._facts.targets:
+            columns[f"mae {target.name}"] = [row["outputs"][target.name] for row in rows]
+        return columns
+
+    def __repr__(self) -> str:
+        """The headline and the tables."""
+        return f"{headline(self._facts)}\n\n{self.table()!r}"
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return html_of(score_tables(self._facts), headline(self._facts))
+
+
+class SearchStudy:
+    """What a model search has decided so far.
+
+    Args:
+        facts: of the study.
+    """
+
+    def __init__(self, facts: StudyFacts) -> None:
+        self._facts = facts
+
+    @property
+    def state(self) -> str:
+        """``running``, ``stopped``, ``killed`` or ``finished``."""
+        return self._facts.state
+
+    def plot(self, name: str | None = None) -> Any:
+        """A Plotly figure of the study: ``variance``, ``pareto``, ``confirmation``, ``screening`` or ``history``.
+
+        Args:
+            name: without it the first that there are facts for.
+
+        Raises:
+            ConfigError: no such figure, or nothing is decided yet.
+        """
+        return study_figure(self._facts, name)
+
+    def __repr__(self) -> str:
+        """What came out, in sentences."""
+        return " ".join([words.headline(self._facts), *words.verdict(self._facts)])
+
+    def _repr_html_(self) -> str:
+        """The same and the phases, for a notebook."""
+        return study_html(self._facts)
+
+
+def load_study(path: str | Path) -> SearchStudy:
+    """A model search from the folder of ``edp search --study``, finished or not.
+
+    Raises:
+        StorageError: no study, or one of another version.
+    """
+    return SearchStudy(facts_of(read_study(path)))

@@ -1,0 +1,180 @@
+"""Training as one call: recordings and settings in, a trained predictor in a folder out."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from edp.config.experiment import Experiment, build, preset_table, with_set_file
+from edp.data.features import FEATURE_SETS
+from edp.errors import ConfigError, DataError, closest
+from edp.logs.source import DataSource
+from edp.logs.write import write_recording
+from edp.recording import Recording
+from edp.settings.tree import Table, merged, read_toml
+from edp.storage import make_folder
+from edp.training import Diverged, TrainingProgress
+from edp.workflows import train_evaluate
+from edp.workflows.api.predictor import TrainedPredictor
+from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
+
+RECORDINGS = "recordings"
+"""Folder of a run that holds the recordings of a training whose data came from memory."""
+
+
+def train(
+    data: Recordings | Recording | Sequence[Recording],
+    targets: Sequence[str],
+    horizons: Sequence[int] = (10,),
+    *,
+    test: Recordings | Recording | Sequence[Recording] | None = None,
+    features: Sequence[str] | str | None = None,
+    out: str | Path | None = None,
+    preset: str = "quick",
+    settings: Mapping[str, Any] | str | Path | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+) -> TrainedPredictor:
+    """Train a predictor of `targets` some samples ahead; what `edp train` does, with the same settings.
+
+    A training that was stopped goes on where `out` holds it, and one that is finished is read again.
+
+    Args:
+        data: recordings to train on.
+        targets: channels to predict.
+        horizons: look-ahead in samples; 10 samples are 0.1 s at 100 Hz.
+        test: recordings that are set apart to judge on. Without them a part of `data` is, as the settings say (a fifth
+            of the recordings; of a single recording its end).
+        features: channels to read, or the name of a feature set. Without them those of the preset where the recordings
+            have them all, else every channel.
+        out: folder of the run; without it a temporary one, which is removed with the predictor.
+        preset: ``quick``, ``small``, ``standard`` or ``thesis``.
+        settings: laid over the preset: a TOML file, or a mapping with the keys of docs/settings.md, nested or dotted
+            (``{"training.epochs": 3}``).
+        on_progress: called with the progress.
+
+    Returns:
+        The predictor with the weights of the best epoch.
+
+    Raises:
+        DataError: recordings that cannot be used, too short ones, or an unknown target.
+        ConfigError: settings that cannot be.
+        StorageError: the folder cannot be written or holds another run.
+        Diverged: the loss was not finite any more.
+    """
+    recordings = as_recordings(data)
+    tests = None if test is None else _apart(as_recordings(test), recordings)
+    together = recordings if tests is None else Recordings([*recordings, *tests])
+    experiment = _experiment(together, tests, targets, horizons, features, preset, settings)
+    folder = Path(tempfile.mkdtemp(prefix="edp-run-")) if out is None else Path(out)
+    source = together.source or MemorySource(folder / RECORDINGS, recordings=tuple(together))
+    try:
+        _train(source, experiment, folder, on_progress)
+    except BaseException:
+        if out is None:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return TrainedPredictor(folder, temporary=out is None)
+
+
+def _train(
+    source: DataSource, experiment: Experiment, folder: Path, on_progress: Callable[[TrainingProgress], None] | None
+) -> None:
+    try:
+        train_evaluate.train(source, experiment, folder, on_progress)
+    except Diverged:
+        _write(source)
+        raise
+    _write(source)
+
+
+def _apart(tests: Recordings, recordings: Recordings) -> Recordings:
+    """Recordings to test on, named apart from those to train on: arrays of both parts have the same usual names."""
+    names = [f"test {name}" if name in recordings.recording_names else name for name in tests.recording_names]
+    return Recordings([replace(entry, name=name) for entry, name in zip(tests, names, strict=True)])
+
+
+def _experiment(
+    data: Recordings,
+    tests: Recordings | None,
+    targets: Sequence[str],
+    horizons: Sequence[int],
+    features: Sequence[str] | str | None,
+    preset: str,
+    settings: Mapping[str, Any] | str | Path | None,
+) -> Experiment:
+    if isinstance(targets, str):
+        raise ConfigError(f"targets = '{targets}'; give a list of names, such as [\"{targets}\"]")
+    table = preset_table(preset)
+    own = _table(settings)
+    task: Table = {"targets": list(targets), "horizons": list(horizons)}
+    if features is not None:
+        task["features"] = features if isinstance(features, str) else {"name": "own", "channels": list(features)}
+    elif "features" not in own.get("task", {}):
+        usual = FEATURE_SETS.get(str(table["task"]["features"]))
+        whole = usual is not None and set(usual.inputs) <= set(data.names)
+        task["features"] = table["task"]["features"] if whole else "all"
+    for key in ("targets", "horizons"):
+        if key in own.get("task", {}):
+            raise ConfigError(f"settings: task.{key} is the argument `{key}` of edp.train; leave it out")
+    table = merged(table, {"task": task})
+    if tests is not None:
+        if "split" in own:
+            raise ConfigError(
+                "settings: split and the argument `test` both set recordings apart; leave one of them out"
+            )
+        table["split"] = {"kind": "recordings", "test": list(tests.recording_names)}
+    elif len(data) == 1 and "split" not in own:
+        table["split"] = {"kind": "time"}
+    experiment = build(Experiment, merged(table, own), f"preset '{preset}' with settings")
+    _check_targets(data, experiment)
+    return experiment
+
+
+def _table(settings: Mapping[str, Any] | str | Path | None) -> Table:
+    if settings is None:
+        return {}
+    if isinstance(settings, Mapping):
+        return with_set_file(_nested(settings), Path())
+    return with_set_file(read_toml(settings), Path(settings).parent)
+
+
+def _nested(settings: Mapping[str, Any]) -> Table:
+    """Dotted keys as tables, in the order given."""
+    table: Table = {}
+    for key, value in settings.items():
+        first, *others = reversed(str(key).split("."))
+        change: Table = {first: _nested(value) if isinstance(value, Mapping) else _plain(value)}
+        for part in others:
+            change = {part: change}
+        table = merged(table, change)
+    return table
+
+
+def _plain(value: Any) -> Any:
+    """What TOML would give: lists for tuples, tables in them as dictionaries."""
+    if isinstance(value, list | tuple):
+        return [_nested(entry) if isinstance(entry, Mapping) else _plain(entry) for entry in value]
+    return value
+
+
+def _check_targets(data: Recordings, experiment: Experiment) -> None:
+    task = experiment.task.resolve(data.rate_hz, data.names, experiment.model.physics)
+    names = [*data.names, *(entry.name for entry in task.derived)]
+    for target in task.targets:
+        if target not in names:
+            raise DataError(f"there is no channel '{target}' to predict{closest(target, names)}")
+
+
+def _write(source: DataSource) -> None:
+    """Recordings of this process into the run folder, so that the run can be judged and reported on later."""
+    if not isinstance(source, MemorySource):
+        return
+    folder = make_folder(source.path)
+    for number, recording in enumerate(source.recordings):
+        file = folder / f"{number:05d}.parquet"  # read back in this order
+        if not file.exists():
+            write_recording(recording, file)
