@@ -2,24 +2,21 @@
 
 import sys
 
-from edp.config.experiment import load_experiment
-from edp.networks import Stream
-from edp.training import load_bundle
-from edp.workflows.train_evaluate import DataSource, build_report, evaluate, train
+import edp
+from edp.report import build_report
 
 
-def main(data: str, run: str, *changes: str) -> None:
-    source = DataSource.of(data)
-    train(source, load_experiment(preset="quick", overrides=changes), run)
-    evaluate(run, baselines=["persistence", "ridge_arx"])
+def main(data: str, run: str, settings: dict[str, object] | None = None) -> None:
+    recordings = edp.read(data)
+    targets = ["CylVels_1", "CylVels_2", "CylVels_3"]
+    model = edp.train(recordings, targets=targets, horizons=[10], out=run, settings=settings)
+    print(model.evaluate())
     print("report:", build_report(run))
 
-    bundle = load_bundle(run)
-    stream = Stream(bundle.predictor)
-    names = [channel.name for channel in bundle.inputs]
-    for row in source.read()[0].select(names)[:100]:
+    stream = model.stream()
+    for row in recordings[0].select(model.inputs)[:100]:
         tick = stream.step(row)  # prediction (horizon, target), intervals, status
-    print("after 1 s:", dict(zip(bundle.task.targets, tick.prediction[0].tolist(), strict=True)), "m/s, 100 ms ahead")
+    print("after 1 s:", dict(zip(model.targets, tick.prediction[0].tolist(), strict=True)), "m/s, 100 ms ahead")
 
 
 if __name__ == "__main__":

@@ -137,9 +137,7 @@ def test_a_loss_is_least_at_a_perfect_prediction(monkeypatch, sound):
     if sound:
         edp.testing.check_loss(loss)
     else:
-        with pytest.raises(
-            edp.testing.ContractError, match=r"loss 'quartic', output 'point': an error of .* less loss"
-        ):
+        with pytest.raises(edp.testing.ContractError, match=r"loss 'quartic', .*: an error of .* less loss"):
             edp.testing.check_loss(loss)
 
 
