@@ -44,11 +44,16 @@ class TrainedPredictor:
     """
 
     def __init__(self, folder: str | Path, temporary: bool = False) -> None:
-        self.folder = Path(folder)
+        self._folder = Path(folder)
         if temporary:
-            weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
-        self._bundle = load_bundle(self.folder)
+            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        self._bundle = load_bundle(self._folder)
         self._task = self._bundle.task
+
+    @property
+    def folder(self) -> Path:
+        """The run folder or bundle."""
+        return self._folder
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ class Recordings(Sequence[Recording]):
     """
 
     def __init__(self, recordings: Sequence[Recording], source: DataSource | None = None) -> None:
-        self._recordings, self.source = tuple(recordings), source
+        self._recordings, self._source = tuple(recordings), source
         _check_together(self._recordings)
 
     @classmethod
@@ -127,6 +127,11 @@ class Recordings(Sequence[Recording]):
                 for name, columns in zip(names, tables, strict=True)
             ]
         )
+
+    @property
+    def source(self) -> DataSource | None:
+        """Where the same recordings can be read again; None for those of arrays, frames and slices."""
+        return self._source
 
     @property
     def names(self) -> tuple[str, ...]:
