@@ -58,16 +58,16 @@ SHOWN_CAUSE = 300
 
 def brief(error: BaseException | str, most: int = SHOWN_CAUSE) -> str:
     """What a library says about a file, on one line of bounded length; its kind where it says nothing."""
-    told = " ".join(str(error).split()) or type(error).__name__
-    return told if len(told) <= most else f"{told[:most]}..."
+    message = " ".join(str(error).split()) or type(error).__name__
+    return message if len(message) <= most else f"{message[:most]}..."
 
 
 def closest(name: str, options: Iterable[str]) -> str:
     """A suffix for messages: ``; did you mean 'x'?`` or ``; known: a, b, c``."""
-    known = sorted(options)
-    lower = {option.lower(): option for option in known}
+    known_options = sorted(options)
+    lower = {option.lower(): option for option in known_options}
     match = difflib.get_close_matches(name.lower(), list(lower), n=1, cutoff=0.6)
     if match:
         return f"; did you mean '{lower[match[0]]}'?"
-    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
-    return f"; known: {shown}" if known else ""
+    shown = ", ".join(known_options[:12]) + (", ..." if len(known_options) > 12 else "")
+    return f"; known: {shown}" if known_options else ""

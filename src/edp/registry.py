@@ -49,7 +49,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def name_of(self, part: object) -> str:
         """The name under which `part` (or the class of `part`) is registered."""
-        for name, known in self._parts.items():
-            if known is part or known is type(part):
+        for name, registered in self._parts.items():
+            if registered is part or registered is type(part):
                 return name
         raise ConfigError(f"{part!r} is not a registered {self.what}")

@@ -132,13 +132,13 @@ def conversion(unit: str, kind: Kind, where: str) -> Unit:
     Raises:
         ConfigError: the unit is unknown or does not measure `kind`; `where` names the column and the file.
     """
-    known = UNITS.get(unit)
+    conversion_of_unit = UNITS.get(unit)
     fitting = [name for name, entry in UNITS.items() if kind in entry.kinds]
-    if known is None:
+    if conversion_of_unit is None:
         raise ConfigError(f"{where}: unknown unit '{unit}' for kind '{kind}'{closest(unit, fitting)}")
-    if kind not in known.kinds:
+    if kind not in conversion_of_unit.kinds:
         raise ConfigError(f"{where}: unit '{unit}' does not measure '{kind}'; expected one of {', '.join(fitting)}")
-    return known
+    return conversion_of_unit
 
 
 _CYLINDERS = ("Boom", "Arm", "Bucket")
@@ -258,9 +258,9 @@ class ChannelMap:
 
     def channel(self) -> Channel:
         """The channel this entry yields; a name outside the vocabulary needs a kind (default generic)."""
-        known = VOCABULARY.get(self.name)
-        if known is not None and self.kind in (None, known.kind):
-            return known
+        standard_channel = VOCABULARY.get(self.name)
+        if standard_channel is not None and self.kind in (None, standard_channel.kind):
+            return standard_channel
         return Channel(self.name, self.kind or Kind.GENERIC, self.description)
 
 

@@ -61,9 +61,9 @@ def test_worths_follow_the_law(worths):
     base = worths.error["3"]["mean"]
     lever, twice, both = rows[("lever",)], rows[("twice",)], rows[("lever", "twice")]
     # A law gives the one from the other: alone they have nothing of their own, together nearly all.
-    assert lever.told > 0.999
-    assert twice.told > 0.999
-    assert both.told < 0.9
+    assert lever.explained > 0.999
+    assert twice.explained > 0.999
+    assert both.explained < 0.9
     assert max(lever.renewed.mean, twice.renewed.mean) < 0.05 * both.renewed.mean
     assert both.renewed.low > base
     assert both.exchanged.mean > rows[("second",)].exchanged.mean > 0

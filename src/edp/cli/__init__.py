@@ -62,8 +62,8 @@ app.command("quantise")(quantise.quantise)
 app.command("report")(report.report)
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(show_version: bool) -> None:
+    if show_version:
         typer.echo(__version__)
         raise typer.Exit
 

@@ -43,15 +43,19 @@ def adapt(
         judged_s=judged,
         margin=margin,
     )
-    made, facts = make(run, folder, spec)
+    correction, facts = make(run, folder, spec)
 
     def show() -> None:
-        out.print(f"{made.features} features, {made.macs:,} multiply-accumulates a tick; {folder}")
+        out.print(f"{correction.features} features, {correction.macs:,} multiply-accumulates a tick; {folder}")
         out.print("its test recordings, each from nothing:")
         replay_tables(facts)
         out.print(f"next: edp replay {folder} LOGS, edp export {folder} --to c --out firmware/predictor")
 
-    emit(as_json, {"folder": str(folder), "features": made.features, "macs": made.macs, "replay": facts}, show)
+    emit(
+        as_json,
+        {"folder": str(folder), "features": correction.features, "macs": correction.macs, "replay": facts},
+        show,
+    )
 
 
 def replay(

@@ -56,10 +56,10 @@ def _read(log: Path, signal_map: Path | None) -> Recording:
     from edp.logs import known_suffixes, read_truth
     from edp.logs.source import DataSource
 
-    found = DataSource.of(log, signal_map).read()
-    if len(found) != 1:
-        raise DataError(f"'{log}' holds {len(found)} recordings; give one log to animate")
-    recording = found[0]
+    recordings = DataSource.of(log, signal_map).read()
+    if len(recordings) != 1:
+        raise DataError(f"'{log}' holds {len(recordings)} recordings; give one log to animate")
+    recording = recordings[0]
     truth = read_truth(log) if log.suffix.lower() in known_suffixes() and log.is_file() else None
     if truth is None:
         return recording

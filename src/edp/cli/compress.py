@@ -63,10 +63,10 @@ def compress(
             display.done, display.count = done, max(1, count)
             display.on_training(name, event)
 
-        found = search(bundle, spec, folder, source, CompressionCallbacks(display.on_note, on_training))
+        compression = search(bundle, spec, folder, source, CompressionCallbacks(display.on_note, on_training))
     page = write_compression_page(folder)
     facts = read_compression(folder)
-    best = found.best
+    best = compression.best
 
     def show() -> None:
         _tables(facts)
@@ -84,7 +84,7 @@ def _tables(facts: Any) -> None:
 
     for horizon in facts.horizons:
         sheet = words.table_sheet(facts, horizon)
-        marked = [("* " if place in sheet.marked else "  ") + cells[0] for place, cells in enumerate(sheet.texts())]
+        marked = [("* " if row in sheet.marked else "  ") + cells[0] for row, cells in enumerate(sheet.texts())]
         rows = [[name, *cells[2:]] for name, cells in zip(marked, sheet.texts(), strict=True)]
         first, _, *others = sheet.heads()
         table(f"{sheet.caption}; * on the front", [first, *others], rows)

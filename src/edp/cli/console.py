@@ -80,22 +80,22 @@ def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None
 
 def table(title: str, headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Print a table; the first column is text, the others are aligned right."""
-    made = _table(title)
+    printed_table = _table(title)
     for i, heading in enumerate(headings):
-        made.add_column(_shown(heading), justify="left" if i == 0 else "right")
+        printed_table.add_column(_shown(heading), justify="left" if i == 0 else "right")
     for row in rows:
-        made.add_row(*(_shown(f"{cell:,}" if isinstance(cell, int) else str(cell)) for cell in row))
-    out.print(made)
+        printed_table.add_row(*(_shown(f"{cell:,}" if isinstance(cell, int) else str(cell)) for cell in row))
+    out.print(printed_table)
 
 
 def listing(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print rows of text, everything to the left and folded where it is wide."""
-    made = _table(title)
+    printed_table = _table(title)
     for heading in headings:
-        made.add_column(_shown(heading), overflow="fold")
+        printed_table.add_column(_shown(heading), overflow="fold")
     for row in rows:
-        made.add_row(*map(_shown, row))
-    out.print(made)
+        printed_table.add_row(*map(_shown, row))
+    out.print(printed_table)
 
 
 def _table(title: str) -> Table:
@@ -211,8 +211,8 @@ def refuse_empty(words: Sequence[str]) -> None:
     Raises:
         ConfigError: an empty word, or an option of `PATH_OPTIONS` with nothing behind it.
     """
-    for place, word in enumerate(words):
-        before = words[place - 1] if place else ""
+    for position, word in enumerate(words):
+        before = words[position - 1] if position else ""
         behind_option = before.startswith("--") and before not in PATH_OPTIONS
         option, sign, value = word.partition("=")
         if (not word and not behind_option) or (sign and not value and option in PATH_OPTIONS):

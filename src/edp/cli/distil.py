@@ -63,11 +63,11 @@ def distil(
         "bundle": str(folder / "bundle"),
         "seconds": bundle.provenance["seconds"],
         "validation_mae": display.best,
-        **{name: {"parameters": found.parameters, "macs_tick": found.macs_tick} for name, found in counts.items()},
+        **{name: {"parameters": count.parameters, "macs_tick": count.macs_tick} for name, count in counts.items()},
     }
 
     def show() -> None:
-        rows = [(name, found.parameters, found.macs_tick, found.macs_window) for name, found in counts.items()]
+        rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
         table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
         tail = "" if display.best is None else f", validation MAE {display.best:.4g} (report units)"
         out.print(f"distilled in {duration(bundle.provenance['seconds'])}{tail}; bundle in {folder / 'bundle'}")

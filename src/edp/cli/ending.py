@@ -31,9 +31,9 @@ def stopped_code(usual: int) -> int:
 
 def out_of_memory(error: BaseException) -> bool:
     """Python's, NumPy's and PyTorch's ways to say that memory is gone."""
-    told = str(error)
+    message = str(error)
     named = isinstance(error, MemoryError) or any("OutOfMemory" in kind.__name__ for kind in type(error).__mro__)
-    return named or (isinstance(error, RuntimeError) and ("can't allocate memory" in told or "bad_alloc" in told))
+    return named or (isinstance(error, RuntimeError) and ("can't allocate memory" in message or "bad_alloc" in message))
 
 
 ADVICE = {

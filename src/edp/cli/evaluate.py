@@ -74,8 +74,8 @@ def run_worths(run: Path, source: DataSource | None = None, quiet: bool = False)
 
     with progress(quiet) as shown:
         on_group = counted(shown, Steps(quiet), "worth", "taken away")
-        found, _ = channel_worths(run, source, on_group=on_group)
-    return found
+        importances, _ = channel_worths(run, source, on_group=on_group)
+    return importances
 
 
 def worth_table(worths: Worths) -> None:
@@ -85,10 +85,10 @@ def worth_table(worths: Worths) -> None:
         rows = []
         for row in worths.ranked(int(horizon)):
             bounds = f"{row.renewed.low:.3g} to {row.renewed.high:.3g}"
-            figures = [f"{row.renewed.mean:.3g}", bounds, f"{row.exchanged.mean:.3g}", f"{row.told:.0%}"]
+            figures = [f"{row.renewed.mean:.3g}", bounds, f"{row.exchanged.mean:.3g}", f"{row.explained:.0%}"]
             rows.append([", ".join(row.members), *figures])
         title = f"growth of the error at k = {horizon} (MAE {error['mean']:.4g} {unit}) without the channel, {unit}"
-        table(title, ["channel", "its own", "95 %", "with all it shares", "told by others"], rows)
+        table(title, ["channel", "its own", "95 %", "with all it shares", "explained by others"], rows)
 
 
 def score_table(scores: dict[str, Any]) -> None:
@@ -109,16 +109,16 @@ def score_table(scores: dict[str, Any]) -> None:
         table(f"{ahead}, mean over outputs, {unit}", heads, [row for _, row in rows])
     interval_rows(scores, unit)
     for name, model in scores["models"].items():
-        for target, found in model.get("integrated", {}).items():
-            out.print(f"free run of the integral of {target}, {name}: RMSE {found['rmse']:.4g} {unit} s")
+        for target, integral_scores in model.get("integrated", {}).items():
+            out.print(f"free run of the integral of {target}, {name}: RMSE {integral_scores['rmse']:.4g} {unit} s")
 
 
 def interval_rows(scores: dict[str, Any], unit: str) -> None:
     """Print how much of the truth the network's intervals hold, where it states any."""
-    held = scores["models"]["network"].get("intervals", {})
+    intervals = scores["models"]["network"].get("intervals", {})
     rows = [
         [f"k = {horizon}", f"{row['coverage']:.1%}", f"{row['covered']['mean']:.1%}", f"{row['width']['mean']:.4g}"]
-        for horizon, entries in held.items()
+        for horizon, entries in intervals.items()
         for row in entries
     ]
     if rows:

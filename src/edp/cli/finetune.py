@@ -71,7 +71,7 @@ def finetune(
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "finetune", "method")
         watchers = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
-        found = make(bundle, source, order, folder, watchers)
+        result = make(bundle, source, order, folder, watchers)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 
@@ -80,7 +80,7 @@ def finetune(
         out.print(f"report: {page}")
         out.print(f"next: edp evaluate {folder}, or edp export {folder} --to c --out exported")
 
-    emit(as_json, found | {"run": str(folder), "report": str(page)}, show)
+    emit(as_json, result | {"run": str(folder), "report": str(page)}, show)
 
 
 def _named(rivals: str, every: tuple[str, ...]) -> tuple[str, ...]:

@@ -45,23 +45,23 @@ def inspect(
         quality = source.inspect(LogDisplay(shown, Steps(as_json)).on_log)
     errors = quality.errors
     asked = page is not None or bool(split or inputs)
-    found, why = None, "" if covered or asked else "not asked for"
+    coverage_facts, why = None, "" if covered or asked else "not asked for"
     if not errors and (covered or asked):
-        found, why = _coverage(source, split, tuple(filter(None, inputs.split(","))), asked)
-    if found is not None and page is not None:
+        coverage_facts, why = _coverage(source, split, tuple(filter(None, inputs.split(","))), asked)
+    if coverage_facts is not None and page is not None:
         from edp.report import build_coverage_page
 
-        build_coverage_page(found, page, data.resolve().stem, quality)
+        build_coverage_page(coverage_facts, page, data.resolve().stem, quality)
 
     def show() -> None:
         for report in quality.reports:
             show_report(report, channels)
         show_between(quality)
-        if found is not None:
-            show_coverage(found)
+        if coverage_facts is not None:
+            show_coverage(coverage_facts)
         elif why and covered:
             out.print(f"coverage: {why}")
-        if found is not None and page is not None:
+        if coverage_facts is not None and page is not None:
             out.print(f"page: {page.resolve()}")
         out.print(verdict_text(quality))
         if not errors:
@@ -69,10 +69,10 @@ def inspect(
             out.print(f"next: edp train {data}{mapped} --out runs/first")
 
     covers = None
-    if found is not None:
+    if coverage_facts is not None:
         from edp.data.coverage_targets import wanted
 
-        covers = {**found.to_json(), "wanted": [figure.to_json() for figure in wanted(found)]}
+        covers = {**coverage_facts.to_json(), "wanted": [figure.to_json() for figure in wanted(coverage_facts)]}
     emit(as_json, {**quality.to_json(), "coverage": covers, "coverage_absent": why}, show)
     if errors:
         err.print("see the advice beside each error, or ask for a repair with --repair when training")
@@ -91,55 +91,57 @@ def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bo
         return None, str(error)
 
 
-def show_coverage(found: Coverage) -> None:
+def show_coverage(coverage: Coverage) -> None:
     """Print what a data set covers."""
     from edp.data.coverage_targets import wanted
 
     rows: list[tuple[Any, ...]] = []
-    if found.singular:
-        lags = max(found.singular)
-        rows.append((f"smallest singular value, {lags} lags", f"{found.singular[lags]:.3g}", "white noise: 1"))
-    if found.spectrum is not None:
-        for name, flat, drop in zip(found.spectrum.names, found.spectrum.flat_to_hz, found.spectrum.drop_db):
+    if coverage.singular:
+        lags = max(coverage.singular)
+        rows.append((f"smallest singular value, {lags} lags", f"{coverage.singular[lags]:.3g}", "white noise: 1"))
+    if coverage.spectrum is not None:
+        for name, flat, drop in zip(coverage.spectrum.names, coverage.spectrum.flat_to_hz, coverage.spectrum.drop_db):
             rows.append(
                 (
                     f"{name}: flat within 10 dB to",
                     f"{flat:.2g} Hz",
-                    f"{drop:.0f} dB down at {found.spectrum.used_hz:.2g} Hz",
+                    f"{drop:.0f} dB down at {coverage.spectrum.used_hz:.2g} Hz",
                 )
             )
-    if found.occupancy is not None:
-        spans = "full strokes" if found.occupancy.full_stroke else "range that was seen"
-        cells = found.occupancy.samples.size
-        rows.append((f"cells of {cells} visited", _share(found.occupancy.share), f"{found.occupancy.source}, {spans}"))
-    if found.distance is not None:
-        far = found.distance
+    if coverage.occupancy is not None:
+        spans = "full strokes" if coverage.occupancy.full_stroke else "range that was seen"
+        cells = coverage.occupancy.samples.size
+        rows.append(
+            (f"cells of {cells} visited", _share(coverage.occupancy.share), f"{coverage.occupancy.source}, {spans}")
+        )
+    if coverage.distance is not None:
+        far = coverage.distance
         rows.append(("test to train, median", f"{far.test[0]:.3g}", f"train to train {far.train[0]:.3g}"))
         rows.append(("test farther than 95 % of train", _share(far.beyond), "5 % where both are alike"))
-    table(f"coverage: {found.recordings} recording(s), {found.hours:.2f} h", ["", "value", "note"], rows)
+    table(f"coverage: {coverage.recordings} recording(s), {coverage.hours:.2f} h", ["", "value", "note"], rows)
     out.print()
     judged = [
         (w.name, f"{w.value:.3g} {w.unit}", f"{'>=' if w.at_least else '<='} {w.bound:g} {w.unit}", _verdict(w.met))
-        for w in wanted(found)
+        for w in wanted(coverage)
     ]
     if judged:
         table("wanted of data to learn a machine from", ["", "here", "wanted", "verdict"], judged)
         out.print()
-    moves = [(a.axis, *(_count(v) for v in (a.reversals, a.crossings)), _share(a.active)) for a in found.activity]
+    moves = [(a.axis, *(_count(v) for v in (a.reversals, a.crossings)), _share(a.active)) for a in coverage.activity]
     table("commands", ["axis", "reversals", "dead-band crossings", "time active"], moves)
     out.print()
-    if found.together:
-        table("in use at once", ["", "time"], [(name, _share(share)) for name, share in found.together.items()])
+    if coverage.together:
+        table("in use at once", ["", "time"], [(name, _share(share)) for name, share in coverage.together.items()])
         out.print()
-    counted = [(e.name, _count(e.count), _share(e.share), e.note) for e in found.events]
+    counted = [(e.name, _count(e.count), _share(e.share), e.note) for e in coverage.events]
     table("events", ["", "count", "time", "note"], counted)
     out.print()
     pairs = [
         (f"{j.group}: {j.x}", j.y, _share(j.filled), f"{j.correlation:.2f}", f"{j.information:.2f}")
-        for j in found.joints
+        for j in coverage.joints
     ]
     table("joint histograms", ["", "with", "bins filled", "correlation", "mutual information, nat"], pairs)
-    for note in found.absent:
+    for note in coverage.absent:
         out.print(f"  note: {note}")
     out.print()
 

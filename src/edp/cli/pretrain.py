@@ -49,7 +49,7 @@ def pretrain(
     with progress(as_json) as shown:
         steps = Steps(as_json)
         display = TrainingDisplay(shown, steps)
-        found = make(
+        result = make(
             source_of(data, signal_map, repair),
             experiment,
             order,
@@ -59,16 +59,16 @@ def pretrain(
         )
 
     def show() -> None:
-        _tables(found)
+        _tables(result)
         out.print(f"next: edp finetune {folder} LOGS --out RUN, or edp evaluate {folder}")
 
-    emit(as_json, found | {"run": str(folder)}, show)
+    emit(as_json, result | {"run": str(folder)}, show)
 
 
-def _tables(found: dict[str, Any]) -> None:
+def _tables(result: dict[str, Any]) -> None:
     """Machines of each part, and the errors on those that test."""
     from edp.report.run.foundation import contexts_sheet, parts_sheet
 
-    for sheet in (parts_sheet(found), contexts_sheet(found)):
+    for sheet in (parts_sheet(result), contexts_sheet(result)):
         table(sheet.caption, sheet.heads(), sheet.texts())
         out.print()

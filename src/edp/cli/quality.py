@@ -62,9 +62,9 @@ def show_report(report: QualityReport, channels: bool) -> None:
 def show_finding(finding: Finding) -> None:
     """Print one finding with its advice."""
     where = f" {finding.channel}:" if finding.channel else ""
-    place = f" ({finding.where})" if finding.where else ""
+    location = f" ({finding.where})" if finding.where else ""
     advice = f". {finding.advice}" if finding.advice else ""
-    out.print(f"  {finding.severity}:{where} {finding.what}{place}{advice}")
+    out.print(f"  {finding.severity}:{where} {finding.what}{location}{advice}")
 
 
 def show_between(quality: DataQuality) -> None:

@@ -24,13 +24,13 @@ def quantise(
     """
     from edp.workflows.compression.quantise import quantise as make
 
-    found = make(run, folder, ticks)
+    result = make(run, folder, ticks)
 
     def show() -> None:
-        change = 100.0 * (found["integer"] / found["float"] - 1.0)
+        change = 100.0 * (result["integer"] / result["float"] - 1.0)
         out.print(
-            f"error on the validation part: {change:+.2f} % against float32; constants {found['bytes']:,.0f} bytes"
+            f"error on the validation part: {change:+.2f} % against float32; constants {result['bytes']:,.0f} bytes"
         )
         out.print(f"next: edp evaluate {folder}, edp export {folder} --to c --out firmware/predictor")
 
-    emit(as_json, {"folder": str(folder), **found}, show)
+    emit(as_json, {"folder": str(folder), **result}, show)

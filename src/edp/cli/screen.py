@@ -63,17 +63,17 @@ def screen(
         (_names(exclude), truth, pictures),
         _trials(config, preset, own, random) if trials else {},
     )
-    made = run_screening(source, folder, order, as_json)
-    command = next_command(data, signal_map, repair, made)
+    selection = run_screening(source, folder, order, as_json)
+    command = next_command(data, signal_map, repair, selection)
 
     def show() -> None:
-        show_between(made.quality)
-        out.print(verdict_text(made.quality))
+        show_between(selection.quality)
+        out.print(verdict_text(selection.quality))
         out.print()
-        show_selection(made)
+        show_selection(selection)
         out.print(f"next: {command}")
 
-    emit(as_json, facts_of(made) | {"next": command}, show)
+    emit(as_json, facts_of(selection) | {"next": command}, show)
 
 
 def run_screening(source: Any, folder: Path, order: SelectionOrder, quiet: bool = False) -> Selection:
@@ -125,44 +125,46 @@ class ScreeningDisplay:
         self.steps.say(f"{what}: {note}, {100 * share:.0f} %{tail}")
 
 
-def show_selection(made: Selection) -> None:
+def show_selection(selection: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
-    found = made.found
-    rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in found.proposal.choices if c.keep]
-    listing(f"keep: {len(rows)} of {len(found.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
+    screening = selection.found
+    rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in screening.proposal.choices if c.keep]
+    listing(f"keep: {len(rows)} of {len(screening.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
     if len(rows) > SHOWN:
-        out.print(f"  ... and {len(rows) - SHOWN} more in {made.files['page']}")
+        out.print(f"  ... and {len(rows) - SHOWN} more in {selection.files['page']}")
     out.print()
-    if found.flags:
-        flags = [(flag.channel, str(flag.kind), flag.evidence) for flag in found.flags]
+    if screening.flags:
+        flags = [(flag.channel, str(flag.kind), flag.evidence) for flag in screening.flags]
         listing(f"flags: {len(flags)}", ["channel", "what", "evidence"], flags[:SHOWN_FLAGS])
         if len(flags) > SHOWN_FLAGS:
-            out.print(f"  ... and {len(flags) - SHOWN_FLAGS} more in {made.files['page']}")
+            out.print(f"  ... and {len(flags) - SHOWN_FLAGS} more in {selection.files['page']}")
         out.print()
-    _show_lags(made)
-    window = found.proposal.window
-    out.print(f"memory: W = {window} samples ({1e3 * window / found.rate_hz:g} ms): {found.proposal.window_reason}")
-    for note in (*found.proposal.notes, *made.notes):
+    _show_lags(selection)
+    window = screening.proposal.window
+    out.print(
+        f"memory: W = {window} samples ({1e3 * window / screening.rate_hz:g} ms): {screening.proposal.window_reason}"
+    )
+    for note in (*screening.proposal.notes, *selection.notes):
         out.print(f"note: {note}")
-    if made.trials is not None:
-        _show_trials(made)
-    out.print(f"page: {made.files['page']}")
-    out.print(f"feature sets: {made.files['sets']}")
+    if selection.trials is not None:
+        _show_trials(selection)
+    out.print(f"page: {selection.files['page']}")
+    out.print(f"feature sets: {selection.files['sets']}")
 
 
-def _show_lags(made: Selection) -> None:
+def _show_lags(selection: Selection) -> None:
     from edp.report.screening.views import lag_ranges
 
     rows = [
         (row.group, "-" if row.low is None else f"{row.low} to {row.high}", f"{row.certain} of {row.curves}")
-        for row in lag_ranges(made.found)
+        for row in lag_ranges(selection.found)
     ]
     table("best lags, samples; negative: the channel leads", ["kind of signal", "range", "certain"], rows)
     out.print()
 
 
-def _show_trials(made: Selection) -> None:
-    trials = made.trials
+def _show_trials(selection: Selection) -> None:
+    trials = selection.trials
     if trials is None:
         return
     ahead = list(trials.persistence)
@@ -176,32 +178,32 @@ def _show_trials(made: Selection) -> None:
     out.print()
 
 
-def facts_of(made: Selection) -> dict[str, Any]:
+def facts_of(selection: Selection) -> dict[str, Any]:
     """What a machine needs; the whole is in the files."""
-    proposal = made.found.proposal
+    proposal = selection.found.proposal
     return {
         "kept": list(proposal.kept),
         "dropped": list(proposal.dropped),
         "window": proposal.window,
         "flags": [
             {"channel": flag.channel, "kind": str(flag.kind), "source": flag.source, "lag": flag.lag}
-            for flag in made.found.flags
+            for flag in selection.found.flags
         ],
-        "verdict": made.quality.verdict,
-        "repeats": [repeat.to_json() for repeat in made.quality.repeats],
-        "notes": [*proposal.notes, *made.notes],
-        "seconds": made.found.seconds,
-        "trials": None if made.trials is None else made.trials.to_json(),
-        "files": {name: str(path) for name, path in made.files.items()},
+        "verdict": selection.quality.verdict,
+        "repeats": [repeat.to_json() for repeat in selection.quality.repeats],
+        "notes": [*proposal.notes, *selection.notes],
+        "seconds": selection.found.seconds,
+        "trials": None if selection.trials is None else selection.trials.to_json(),
+        "files": {name: str(path) for name, path in selection.files.items()},
     }
 
 
-def next_command(data: Path, signal_map: Path | None, repair: Sequence[str], made: Selection) -> str:
+def next_command(data: Path, signal_map: Path | None, repair: Sequence[str], selection: Selection) -> str:
     """The training that the proposal is for."""
-    chosen = signal_map or made.map
+    chosen = signal_map or selection.map
     parts = [f"edp train {data}"] + ([f"--map {chosen}"] if chosen is not None else [])
     parts += [f"--repair {entry}" for entry in repair]
-    return " ".join([*parts, f"--config {made.files['settings']}", "--out runs/first"])
+    return " ".join([*parts, f"--config {selection.files['settings']}", "--out runs/first"])
 
 
 def _names(text: str) -> list[str]:
@@ -209,14 +211,14 @@ def _names(text: str) -> list[str]:
 
 
 def _order(
-    given: dict[str, Any], changes: Sequence[str], others: tuple[list[str], bool, bool], trials: dict[str, Any]
+    arguments: dict[str, Any], changes: Sequence[str], others: tuple[list[str], bool, bool], trials: dict[str, Any]
 ) -> SelectionOrder:
     """What the options ask for."""
     from edp.config.experiment import build, merged, override
     from edp.data.screening import ScreeningSpec
     from edp.workflows.feature_selection.select import SelectionOrder
 
-    options = given
+    options = arguments
     for text in changes:
         options = merged(options, override(text))
     exclude, truth, pictures = others

@@ -106,9 +106,9 @@ def run(
             on_progress=display.on_progress,
             on_decision=display.on_decision,
         )
-        found = run_search(source, plan, study, crew, phase, watchers)
-        page = _write_report(study, None, pictures=found.state == "finished")
-    emit(as_json, _facts(found) | {"report": str(page)}, lambda: _show(found, data, page))
+        result = run_search(source, plan, study, crew, phase, watchers)
+        page = _write_report(study, None, pictures=result.state == "finished")
+    emit(as_json, _facts(result) | {"report": str(page)}, lambda: _show(result, data, page))
 
 
 @app.command("status")
@@ -119,8 +119,8 @@ def status(study: StudyArgument, as_json: JsonFlag = False) -> None:
     """
     from edp.workflows.search.study_log import look_at
 
-    held = look_at(study)
-    emit(as_json, held, lambda: _show_status(held))
+    progress = look_at(study)
+    emit(as_json, progress, lambda: _show_status(progress))
 
 
 @app.command("report")
@@ -206,47 +206,47 @@ def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
     return write_study_page(read_study(study), study if output is None else output, pictures).page
 
 
-def _facts(found: SearchResult) -> dict[str, Any]:
+def _facts(result: SearchResult) -> dict[str, Any]:
     return {
-        "study": str(found.folder),
-        "state": found.state,
-        "phases": list(found.ground.decided),
-        "trained_now": found.trained,
-        "digest": found.digest,
-        "decisions": [decision.to_json() for decision in found.ground.decided.values()],
-        "teacher": None if found.teacher is None else str(found.teacher),
-        "networks": {name: str(folder) for name, folder in found.networks.items()},
+        "study": str(result.folder),
+        "state": result.state,
+        "phases": list(result.ground.decided),
+        "trained_now": result.trained,
+        "digest": result.digest,
+        "decisions": [decision.to_json() for decision in result.ground.decided.values()],
+        "teacher": None if result.teacher is None else str(result.teacher),
+        "networks": {name: str(folder) for name, folder in result.networks.items()},
     }
 
 
-def _show(found: SearchResult, data: Path, page: Path) -> None:
-    out.print(f"study: {found.folder}, {found.state}; {found.trained} trainings now")
+def _show(result: SearchResult, data: Path, page: Path) -> None:
+    out.print(f"study: {result.folder}, {result.state}; {result.trained} trainings now")
     out.print(f"report: {page}")
-    if found.teacher is None:
+    if result.teacher is None:
         out.print("next: the same command without --phase, or with a later one")
         return
-    if found.networks:
-        out.print(f"next: {_deploying(found)}")
+    if result.networks:
+        out.print(f"next: {_deploying(result)}")
     out.print(
-        f"{'or' if found.networks else 'next'}: edp train {data} --config {found.teacher} --out runs/teacher (frozen "
+        f"{'or' if result.networks else 'next'}: edp train {data} --config {result.teacher} --out runs/teacher (frozen "
         "sessions stay frozen)"
     )
 
 
-def _deploying(found: SearchResult) -> str:
+def _deploying(result: SearchResult) -> str:
     """The command that goes on with the network that phase 6 chose."""
-    facts = found.ground.decided["compression"].facts
-    run = found.networks.get("chosen", found.networks.get("teacher"))
+    facts = result.ground.decided["compression"].facts
+    run = result.networks.get("chosen", result.networks.get("teacher"))
     if facts["rows"][facts["chosen"]]["format"] == "w8a16":
-        return f"edp quantise {run} --out {found.folder / 'w8a16'}"
+        return f"edp quantise {run} --out {result.folder / 'w8a16'}"
     return f"edp export {run} --to c --out firmware/predictor"
 
 
-def _show_status(held: dict[str, Any]) -> None:
-    counts = held["counts"]
-    running = f"process {held['holder']}" if held["holder"] else "nobody now"
-    out.print(f"{held['data']['path']}: {held['data']['sessions']} sessions, {held['data']['hours']:.2f} h")
-    out.print(f"mode {held['mode']}, {held['state']}, coordinated by {running}; written {held['updated']}")
+def _show_status(progress: dict[str, Any]) -> None:
+    counts = progress["counts"]
+    running = f"process {progress['holder']}" if progress["holder"] else "nobody now"
+    out.print(f"{progress['data']['path']}: {progress['data']['sessions']} sessions, {progress['data']['hours']:.2f} h")
+    out.print(f"mode {progress['mode']}, {progress['state']}, coordinated by {running}; written {progress['updated']}")
     rows = [
         (
             phase["title"],
@@ -256,10 +256,12 @@ def _show_status(held: dict[str, Any]) -> None:
             duration(phase["seconds"]),
             "decided" if phase["ended"] else "under way",
         )
-        for phase in held["phases"]
+        for phase in progress["phases"]
     ]
     table("phases", ["phase", "trainings", "pruned", "failed", "training time", "state"], rows)
-    out.print(f"{counts['done']} trainings done, {held['running']} running, {counts['total'] - counts['done']} left")
-    for decision in held["decisions"]:
+    out.print(
+        f"{counts['done']} trainings done, {progress['running']} running, {counts['total'] - counts['done']} left"
+    )
+    for decision in progress["decisions"]:
         for sentence in decision["sentences"]:
             out.print(f"  {sentence}")

@@ -65,25 +65,25 @@ def simulate(
     """
     from edp.sim.data_set import SimulationOrder, suffix_of
 
-    given = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
-    given["scatter"] = scatter
+    arguments = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
+    arguments["scatter"] = scatter
     tables = {
         "masses": None if masses is None else _range(masses),
         "materials": dict.fromkeys(material, 1.0) if material else None,
     }
     suffix = None if form is None else suffix_of(form)
-    order = SimulationOrder.of(scenario, _note, **given, **tables, suffix=suffix, layout=layout, truth=truth)
+    order = SimulationOrder.of(scenario, _note, **arguments, **tables, suffix=suffix, layout=layout, truth=truth)
     spec = _limit_spec(moments, branches, horizons) if limit else None
     paths = run(folder, order, workers, as_json)
-    found = None if spec is None else run_limit(folder, order, spec, workers, as_json)
-    made = f"{order.family} machines" if order.family else order.machine
+    limit_facts = None if spec is None else run_limit(folder, order, spec, workers, as_json)
+    what_simulated = f"{order.family} machines" if order.family else order.machine
     facts: dict[str, Any] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
-    facts |= {"machine": made, "seed": order.seed} | ({} if found is None else {"limit": found})
+    facts |= {"machine": what_simulated, "seed": order.seed} | ({} if limit_facts is None else {"limit": limit_facts})
 
     def show() -> None:
-        if found is not None:
-            limit_table(found)
-        out.print(f"{len(paths)} recordings of {made}, {order.minutes:g} min, in {folder}")
+        if limit_facts is not None:
+            limit_table(limit_facts)
+        out.print(f"{len(paths)} recordings of {what_simulated}, {order.minutes:g} min, in {folder}")
         out.print(f"next: edp inspect {folder}   or   edp train {folder} --out runs/first")
 
     emit(as_json, facts, show)
@@ -93,17 +93,17 @@ def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = Fa
     """Simulate with a progress display."""
     from edp.sim.data_set import simulate_data_set
 
-    began, steps, made = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
+    began, steps, counts = time.monotonic(), Steps(quiet), {"kept": 0, "new": 0, "seconds": 0.0}
     with progress(quiet) as shown:
         bar = shown.add_task("simulate", total=order.recordings, note="")
 
-        def on_done(recording: Recording, kept: bool) -> None:
-            made["kept" if kept else "new"] += 1
-            made["seconds"] += 0.0 if kept else recording.duration_s
+        def on_done(recording: Recording, existed: bool) -> None:
+            counts["kept" if existed else "new"] += 1
+            counts["seconds"] += 0.0 if existed else recording.duration_s
             elapsed = time.monotonic() - began
-            done = made["kept"] + made["new"]
-            left = elapsed / max(1, made["new"]) * (order.recordings - done)
-            note = f"{made['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
+            done = counts["kept"] + counts["new"]
+            left = elapsed / max(1, counts["new"]) * (order.recordings - done)
+            note = f"{counts['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
             shown.update(bar, advance=1, note=note)
             steps.say(f"simulate: {done:g} of {order.recordings} recordings, {note}, {duration(left)} left")
 
@@ -126,21 +126,21 @@ def run_limit(folder: Path, order: SimulationOrder, spec: LimitSpec, workers: in
         return find_data_set_limit(folder, order, spec, workers, on_done)
 
 
-def limit_table(found: dict[str, Any]) -> None:
+def limit_table(limit: dict[str, Any]) -> None:
     """Print the limit beside persistence."""
     names = [
         target.replace("CylVels_1", "boom").replace("CylVels_2", "arm").replace("CylVels_3", "bucket")
-        for target in found["targets"]
+        for target in limit["targets"]
     ]
     rows = []
-    for n, samples in enumerate(found["horizons"]):
-        unknown, known = found["commands_unknown"], found["commands_known"]
+    for n, samples in enumerate(limit["horizons"]):
+        unknown, commands_known = limit["commands_unknown"], limit["commands_known"]
         spread = f"{unknown['low'][n][-1]:.2f}-{unknown['high'][n][-1]:.2f}"
-        row = [f"{samples} ({1000 * samples / found['rate_hz']:g} ms)", *(f"{v:.2f}" for v in unknown["mae"][n])]
-        rows.append([*row, spread, f"{known['mae'][n][-1]:.2f}", f"{found['persistence']['mae'][n][-1]:.2f}"])
+        row = [f"{samples} ({1000 * samples / limit['rate_hz']:g} ms)", *(f"{v:.2f}" for v in unknown["mae"][n])]
+        rows.append([*row, spread, f"{commands_known['mae'][n][-1]:.2f}", f"{limit['persistence']['mae'][n][-1]:.2f}"])
     title = (
-        f"Least mean absolute error of any predictor, {found['unit']} "
-        f"({found['moments']} moments of {found['recordings']} recordings, {found['branches']} futures each)"
+        f"Least mean absolute error of any predictor, {limit['unit']} "
+        f"({limit['moments']} moments of {limit['recordings']} recordings, {limit['branches']} futures each)"
     )
     table(title, ["k", *names, "mean", "95 %", "commands known", "persistence"], rows)
 

@@ -89,7 +89,7 @@ class Worth:
         target: name, or ``mean``.
         exchanged: growth of the error with another recording's course.
         renewed: growth with another recording's surprise.
-        told: share of the members' variance that the other channels tell, on training rows; the mean over members.
+        explained: share of variance that the other channels explain, on training rows; mean over members.
     """
 
     members: tuple[str, ...]
@@ -97,7 +97,7 @@ class Worth:
     target: str
     exchanged: Growth
     renewed: Growth
-    told: float
+    explained: float
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def channel_worths(
     ruler = _Ruler(data, predictor.spec.window if spec.skip is None else spec.skip)
     others = OthersModel.fit([part.inputs for part in data.train], spec.lags, spec.rows)
     places = [[data.task.inputs.index(name) for name in members] for members in groups]
-    expected, told = others.expect(places, [part.inputs for part in data.test])
+    expected, explained = others.expect(places, [part.inputs for part in data.test])
     plain = ruler.errors(stream_predictions(predictor, data.test))
     donors = [_donors(data.test, np.random.default_rng([spec.seed, turn])) for turn in range(spec.repeats)]
     rows: list[Worth] = []
@@ -162,20 +162,20 @@ def channel_worths(
             predictions, count = stream_predictions(predictor, changed), len(data.test)
             each = [ruler.errors(predictions[i * count : (i + 1) * count]) for i in range(spec.repeats)]
             growths.append(np.mean(each, axis=0) - plain)
-        rows += ruler.rows(members, growths[0], growths[1], told[done])
+        rows += ruler.rows(members, growths[0], growths[1], explained[done])
     return Worths(tuple(rows), ruler.table(plain), ruler.units(), tuple(part.name for part in data.test))
 
 
-def _groups(inputs: Sequence[str], given: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
+def _groups(inputs: Sequence[str], asked_groups: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
     """Each input alone, then the groups of several."""
-    for group in given:
+    for group in asked_groups:
         for name in group:
             if name not in inputs:
                 raise ConfigError(
                     f"worth: group {list(group)} names '{name}', which is no input{closest(name, inputs)}"
                 )
     alone = [(name,) for name in inputs]
-    return alone + [tuple(group) for group in given if len(group) > 1]
+    return alone + [tuple(group) for group in asked_groups if len(group) > 1]
 
 
 @dataclass(frozen=True)
@@ -193,8 +193,8 @@ def _donors(series: Sequence[Series], rng: np.random.Generator) -> list[_Donor]:
         samples = series[0].samples
         return [_Donor(0, int(rng.integers(samples // 4, max(samples // 4 + 1, 3 * samples // 4))))]
     step, order = int(rng.integers(1, count)), rng.permutation(count)
-    place = np.argsort(order)
-    others = [int(order[(place[i] + step) % count]) for i in range(count)]
+    rank = np.argsort(order)
+    others = [int(order[(rank[i] + step) % count]) for i in range(count)]
     return [_Donor(other, int(rng.integers(0, series[other].samples))) for other in others]
 
 
@@ -233,17 +233,17 @@ class _Ruler:
 
     def errors(self, predictions: Sequence[NDArray[np.float32]]) -> Array:
         """Shape ``(stretch, horizon, 1 + target)``; the mean of the targets first."""
-        found = np.empty((len(self.stretches), len(self.task.horizons), len(self.task.targets)))
+        errors = np.empty((len(self.stretches), len(self.task.horizons), len(self.task.targets)))
         for n, (i, start, stop) in enumerate(self.stretches):
             for h, horizon in enumerate(self.task.horizons):
                 truth = self.data.test[i].targets[start + horizon : stop + horizon].astype(np.float64)
-                found[n, h] = np.abs(predictions[i][start:stop, h] - truth).mean(axis=0) * self.factors
-        return np.concatenate([found.mean(axis=2, keepdims=True), found], axis=2)
+                errors[n, h] = np.abs(predictions[i][start:stop, h] - truth).mean(axis=0) * self.factors
+        return np.concatenate([errors.mean(axis=2, keepdims=True), errors], axis=2)
 
-    def rows(self, members: tuple[str, ...], exchanged: Array, renewed: Array, told: float) -> list[Worth]:
+    def rows(self, members: tuple[str, ...], exchanged: Array, renewed: Array, explained: float) -> list[Worth]:
         """A row for each horizon and target from growths by stretch."""
         return [
-            Worth(members, horizon, name, self._growth(exchanged[:, h, n]), self._growth(renewed[:, h, n]), told)
+            Worth(members, horizon, name, self._growth(exchanged[:, h, n]), self._growth(renewed[:, h, n]), explained)
             for h, horizon in enumerate(self.task.horizons)
             for n, name in enumerate(("mean", *self.task.targets))
         ]

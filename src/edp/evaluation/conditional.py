@@ -13,7 +13,7 @@ from scipy.cluster import hierarchy
 
 Array = NDArray[np.float64]
 KNEES = (0.5, 0.7, 0.8, 0.9, 0.96)
-"""Quantiles at which each channel has a hinge, so that laws with a dead zone or a threshold can be told."""
+"""Quantiles at which each channel has a hinge, so that laws with a dead zone or a threshold can be represented."""
 RIDGE = 1e-6
 """Penalty over the mean squared size of a term."""
 BLOCK = 8192
@@ -76,7 +76,7 @@ class OthersModel:
         """What the channels outside of each group tell of its members, and how much of their variance that is.
 
         Args:
-            groups: channels that are told together, none of them from another of them.
+            groups: channels that are estimated together, none of them from another of them.
             parts: inputs, each ``(time, channel)``.
 
         Returns:
@@ -84,32 +84,32 @@ class OthersModel:
             fit, mean over its members.
         """
         settled = [self._weights(group) for group in groups]
-        weights = np.concatenate([found for found, _ in settled], axis=1)
-        wanted = [self._present(column) for group in groups for column in group]
-        told: list[NDArray[np.float32]] = []
+        weights = np.concatenate([group_weights for group_weights, _ in settled], axis=1)
+        members = [self._present(column) for group in groups for column in group]
+        expected: list[NDArray[np.float32]] = []
         for part in parts:
-            values = np.empty((len(part), len(wanted)), np.float32)
+            values = np.empty((len(part), len(members)), np.float32)
             for start in range(0, len(part), BLOCK):
                 rows = np.arange(start, min(start + BLOCK, len(part)))
                 terms = (_terms(part, self.lags, self.knees, rows) - self.mean) / self.deviation
-                values[rows] = self.mean[wanted] + self.deviation[wanted] * (terms @ weights)
-            told.append(values)
+                values[rows] = self.mean[members] + self.deviation[members] * (terms @ weights)
+            expected.append(values)
         edges = np.cumsum([0, *(len(group) for group in groups)])
         spans = [slice(a, b) for a, b in itertools.pairwise(edges)]
-        return [[values[:, span] for values in told] for span in spans], [share for _, share in settled]
+        return [[values[:, span] for values in expected] for span in spans], [share for _, share in settled]
 
     def _weights(self, group: Sequence[int]) -> tuple[Array, float]:
-        """Weights of all terms, shape ``(term, member)``, zero for the group's own; and the share of variance told."""
-        wanted = np.array([self._present(column) for column in group])
+        """Weights, shape ``(term, member)``, zero for the group itself; and the explained share of variance."""
+        members = np.array([self._present(column) for column in group])
         weights = np.zeros((len(self.owner), len(group)))
-        known = np.flatnonzero(~np.isin(self.owner, group))
-        if len(known) == 0:
+        outside_terms = np.flatnonzero(~np.isin(self.owner, group))
+        if len(outside_terms) == 0:
             return weights, 0.0
-        inner, cross = self.gram[np.ix_(known, known)], self.gram[np.ix_(known, wanted)]
-        found = linalg.solve(inner + RIDGE * len(known) * np.eye(len(known)), cross, assume_a="pos")
-        weights[known] = found
-        told = 2 * np.sum(found * cross, axis=0) - np.sum(found * (inner @ found), axis=0)
-        return weights, float(np.clip(told, 0.0, 1.0).mean())
+        inner, cross = self.gram[np.ix_(outside_terms, outside_terms)], self.gram[np.ix_(outside_terms, members)]
+        solution = linalg.solve(inner + RIDGE * len(outside_terms) * np.eye(len(outside_terms)), cross, assume_a="pos")
+        weights[outside_terms] = solution
+        explained = 2 * np.sum(solution * cross, axis=0) - np.sum(solution * (inner @ solution), axis=0)
+        return weights, float(np.clip(explained, 0.0, 1.0).mean())
 
     def _present(self, column: int) -> int:
         """Term that is the channel itself at the present tick."""

@@ -89,31 +89,33 @@ def context_errors(
         DataError: no series is long enough for the shortest.
     """
     rate = predictor.task.rate_hz
-    wanted = sorted(set(seconds))
-    if not wanted or wanted[0] <= 0:
+    asked_seconds = sorted(set(seconds))
+    if not asked_seconds or asked_seconds[0] <= 0:
         raise ConfigError(f"contexts of {list(seconds)} s; at least one, all positive, must hold")
     block, step, reach = round(BLOCK_S * rate), round(EVERY_S * rate), predictor.task.max_horizon
     longest = max((part.samples for part in series), default=0) - block - reach
-    kept = [s for s in wanted if round(s * rate) <= longest]
-    if not kept:
+    measurable = [s for s in asked_seconds if round(s * rate) <= longest]
+    if not measurable:
         raise DataError(
             f"the longest recording allows a context of {max(0, longest) / rate:g} s before a block of {BLOCK_S:g} s; "
-            f"the shortest that was asked for is {wanted[0]:g} s: give longer recordings"
+            f"the shortest that was asked for is {asked_seconds[0]:g} s: give longer recordings"
         )
-    first = max(1, round(kept[-1] * rate))
+    first = max(1, round(measurable[-1] * rate))
     blocks = [(part, at) for part in series for at in range(first, part.samples - block - reach + 1, step)]
     factors = np.array([KINDS[kind].report_factor for kind in kinds])
     owners = [part.machine or part.name for part, _ in blocks]
     machines = tuple(dict.fromkeys(owners))
-    place = np.array([machines.index(owner) for owner in owners])
+    machine_index = np.array([machines.index(owner) for owner in owners])
     errors = []
-    for context in kept:
-        found = _block_errors(predictor, blocks, max(1, round(context * rate)), block) * factors
-        errors.append(np.stack([found[place == i].mean(axis=(0, 1)) for i in range(len(machines))]))
+    for context in measurable:
+        block_errors = _block_errors(predictor, blocks, max(1, round(context * rate)), block) * factors
+        errors.append(np.stack([block_errors[machine_index == i].mean(axis=(0, 1)) for i in range(len(machines))]))
         if on_done is not None:
             on_done(context)
     ticks = len(blocks) * block
-    return Contexts(tuple(kept), machines, np.stack(errors), ticks, tuple(s for s in wanted if s not in kept))
+    return Contexts(
+        tuple(measurable), machines, np.stack(errors), ticks, tuple(s for s in asked_seconds if s not in measurable)
+    )
 
 
 def _block_errors(
@@ -129,7 +131,7 @@ def _block_errors(
         )
         for part, at in blocks
     ]
-    said = stream_predictions(predictor, pieces, LANES)
+    predictions = stream_predictions(predictor, pieces, LANES)
     horizons = predictor.task.horizons
     return np.stack(
         [
@@ -137,6 +139,6 @@ def _block_errors(
                 values[context:].astype(np.float64)
                 - np.stack([part.targets[at + k : at + k + size] for k in horizons], axis=1)
             )
-            for values, (part, at) in zip(said, blocks, strict=True)
+            for values, (part, at) in zip(predictions, blocks, strict=True)
         ]
     )

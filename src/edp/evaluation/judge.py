@@ -239,21 +239,21 @@ class _Ruler:
                 recordings.setdefault(name, {}).update(entry)
             spreads[str(horizon)] = spread([entry[str(horizon)]["mean"]["mae"] for entry in by_name.values()])
             speeds[str(horizon)] = self._by_speed(pairs)
-        found = {"overall": overall, "recordings": recordings, "spread": spreads, "by_speed": speeds}
-        return found | ({"integrated": self._integrated(predicted)} if self.task.integrate else {})
+        scores = {"overall": overall, "recordings": recordings, "spread": spreads, "by_speed": speeds}
+        return scores | ({"integrated": self._integrated(predicted)} if self.task.integrate else {})
 
     def intervals(self, bounds: Predictions, coverages: Sequence[float]) -> dict[str, Any]:
         """Share of the truth that each interval holds and its mean width, by horizon, coverage and target."""
-        found: dict[str, Any] = {str(horizon): [] for horizon in self.task.horizons}
+        by_horizon: dict[str, Any] = {str(horizon): [] for horizon in self.task.horizons}
         truth = np.concatenate([values[self.skip :] for values in self.truth])
         for which, coverage in enumerate(coverages):
             parts = [pair[self.skip : len(t), which] for pair, t in zip(bounds, self.truth, strict=True)]
             lower, upper = np.moveaxis(np.concatenate(parts).astype(np.float64) * self.factors, 1, 0)
             for h, horizon in enumerate(self.task.horizons):
                 each = [interval_scores(lower[:, h, i], upper[:, h, i], truth[:, h, i]) for i in range(truth.shape[-1])]
-                held, wide = (self._named(values) for values in zip(*each, strict=True))
-                found[str(horizon)].append({"coverage": coverage, "covered": held, "width": wide})
-        return found
+                covered, wide = (self._named(values) for values in zip(*each, strict=True))
+                by_horizon[str(horizon)].append({"coverage": coverage, "covered": covered, "width": wide})
+        return by_horizon
 
     def _named(self, values: Sequence[float]) -> dict[str, float]:
         return {"mean": float(np.mean(values)), **dict(zip(self.task.targets, values, strict=True))}
@@ -261,8 +261,8 @@ class _Ruler:
     def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Scored ticks: after start-up and where the model has its history."""
         predicted, truth = predicted[self.skip :], truth[self.skip :]
-        known = np.isfinite(predicted).all(axis=1)
-        return predicted[known], truth[known]
+        predicted_ticks = np.isfinite(predicted).all(axis=1)
+        return predicted[predicted_ticks], truth[predicted_ticks]
 
     def _scores(self, predicted: Sequence[NDArray[Any]], truth: Sequence[NDArray[Any]]) -> dict[str, Any]:
         p, t = np.concatenate(predicted), np.concatenate(truth)
@@ -274,10 +274,10 @@ class _Ruler:
         """Mean absolute error in bins of the target's magnitude, outputs pooled."""
         truth = np.concatenate([np.abs(t).ravel() for _, t in pairs])
         error = np.concatenate([np.abs(p - t).ravel() for p, t in pairs])
-        place = np.clip(np.digitize(truth, self.edges) - 1, 0, SPEED_BINS - 1)
+        bin_index = np.clip(np.digitize(truth, self.edges) - 1, 0, SPEED_BINS - 1)
         rows = []
         for i in range(SPEED_BINS):
-            inside = place == i
+            inside = bin_index == i
             mae = float(error[inside].mean()) if inside.any() else None
             low, high = float(self.edges[i]), float(self.edges[i + 1])
             rows.append({"low": low, "high": high, "count": int(inside.sum()), "mae": mae})
@@ -286,12 +286,12 @@ class _Ruler:
     def _integrated(self, predicted: Predictions) -> dict[str, Any]:
         """Root mean square of the running integral's error, in report unit times seconds, per integrated target."""
         h = self.task.horizons.index(0)
-        found = {}
+        scores = {}
         for target in self.task.integrate:
             column = self.task.targets.index(target)
             errors = []
             for p, t in zip(predicted, self.truth, strict=True):
                 difference = (p[:, h, column] - t[:, h, column])[self.skip :]
                 errors.append(np.nancumsum(difference) / self.task.rate_hz)
-            found[target] = {"rmse": float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))}
-        return found
+            scores[target] = {"rmse": float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))}
+        return scores

@@ -102,54 +102,54 @@ class Trace(TorchDispatchMode):
         name = name if name.startswith("_") else name.rstrip("_")
         part = self._inside[-1]
         self.operations[part][name] += 1
-        given = _tensors((args, kwargs))
-        made = _tensors(result)
-        self._kept += made
-        known = name in MATRIX or name == "convolution"
-        if known:
+        operands = _tensors((args, kwargs))
+        results = _tensors(result)
+        self._kept += results
+        counted = name in MATRIX or name == "convolution"
+        if counted:
             self.macs[part] += macs_of(name, args, result)
         elif part in self._physics:
             self.macs[part] += arithmetic_of(name, args, result)
         else:
-            self.macs[part] += self._element_wise(name, given, made)
-        if not known and name not in MOVES and torch.Tag.pointwise not in function.tags and self._hides(given):
+            self.macs[part] += self._element_wise(name, operands, results)
+        if not counted and name not in MOVES and torch.Tag.pointwise not in function.tags and self._hides(operands):
             self.opaque[part].add(name)
-        self._follow(given, made)
+        self._follow(operands, results)
         return result
 
-    def _follow(self, given: list[Tensor], made: list[Tensor]) -> None:
+    def _follow(self, operands: list[Tensor], results: list[Tensor]) -> None:
         """Note which results come from data, and which from weights alone."""
-        read = {_storage(value) for value in given}
+        read = {_storage(value) for value in operands}
         into = self._data if read & self._data else self._weights if read & self._weights else None
         if into is not None:
-            into |= {_storage(value) for value in made}
+            into |= {_storage(value) for value in results}
 
-    def _hides(self, given: list[Tensor]) -> bool:
+    def _hides(self, operands: list[Tensor]) -> bool:
         """Whether an operation could multiply: data by a matrix of weights, or data by data."""
-        data = [value for value in given if _storage(value) in self._data]
-        matrices = [value for value in given if value.dim() > 1 and self._constant(value)]
+        data = [value for value in operands if _storage(value) in self._data]
+        matrices = [value for value in operands if value.dim() > 1 and self._constant(value)]
         return bool(data) and len(data) + len(matrices) > 1
 
     def _constant(self, value: Tensor) -> bool:
         """Whether a tensor comes from weights alone."""
-        place = _storage(value)
-        return place in self._weights and place not in self._data
+        address = _storage(value)
+        return address in self._weights and address not in self._data
 
-    def _element_wise(self, name: str, given: list[Tensor], made: list[Tensor]) -> int:
+    def _element_wise(self, name: str, operands: list[Tensor], results: list[Tensor]) -> int:
         """Multiply-accumulates of matrix products that are written as products and sums."""
-        places = [_storage(value) for value in given]
+        places = [_storage(value) for value in operands]
         if name in ("sum", "mean", "cumsum") and places[0] in self._scaled:
-            return given[0].numel()
+            return operands[0].numel()
         if name in ("add", "sub") and len(places) == 2 and set(places) <= set(self._spread):
-            first = sum(self._spread[place] for place in places)
-            self._spread[_storage(made[0])] = 0  # counted: only what is added to it still counts
+            first = sum(self._spread[address] for address in places)
+            self._spread[_storage(results[0])] = 0  # counted: only what is added to it still counts
             return first
         if name == "mul" and len(places) == 2:
-            data = [value for value, place in zip(given, places, strict=True) if place in self._data]
+            data = [value for value, address in zip(operands, places, strict=True) if address in self._data]
             if len(data) == 1 and set(places) & self._weights:
-                self._scaled.add(_storage(made[0]))
-                if made[0].numel() > data[0].numel():
-                    self._spread[_storage(made[0])] = made[0].numel()
+                self._scaled.add(_storage(results[0]))
+                if results[0].numel() > data[0].numel():
+                    self._spread[_storage(results[0])] = results[0].numel()
         return 0
 
 

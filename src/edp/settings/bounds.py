@@ -58,9 +58,9 @@ class Bound:
         """Whether a value is a number within; NaN, infinity, text and truth values are not."""
         if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
             return False
-        given: Any = value  # whole numbers beyond what a float holds compare as they are
-        over = given > self.low if self.above else given >= self.low
-        under = given < self.high if self.below else given <= self.high
+        number: Any = value  # whole numbers beyond what a float holds compare as they are
+        over = number > self.low if self.above else number >= self.low
+        under = number < self.high if self.below else number <= self.high
         return bool(over and under)
 
     def rule(self, name: str) -> str:

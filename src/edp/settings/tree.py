@@ -149,18 +149,18 @@ class SettingsTree:
             problems.append(f"{path}: expected a table, got {shown(table)}")
             return None
         hints = _hints(cls)
-        known = [entry.name for entry in fields(cls)]
+        field_names = [entry.name for entry in fields(cls)]
         before = len(problems)
         for key in table:
-            if key not in known:
-                problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), known)}")
+            if key not in field_names:
+                problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), field_names)}")
         for entry in fields(cls):
             required = entry.default is MISSING and entry.default_factory is MISSING
             if required and entry.name not in table:
                 problems.append(f"'{_join(path, entry.name)}' is missing; it must be given")
         values = {
             name: self._value(name, hints[name], table[name], _join(path, name), problems)
-            for name in known
+            for name in field_names
             if name in table
         }
         if len(problems) > before:

@@ -60,11 +60,11 @@ def _groups(processes: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys
     except (OSError, ValueError):
         return
     for line in lines:
-        _, names, place = (*line.split(":", 2), "", "")[:3]
+        _, names, group_path = (*line.split(":", 2), "", "")[:3]
         if names and "memory" not in names.split(","):
             continue
         top = root if not names else root / "memory"
-        group = top / place.lstrip("/")
+        group = top / group_path.lstrip("/")
         # In a container the path may be that of the host; its own group then lies at the top.
         for folder in (group, *group.parents):
             if folder == top or top in folder.parents:
@@ -100,11 +100,11 @@ def _own_limits() -> Iterator[int]:
         return
     page = os.sysconf("SC_PAGE_SIZE")
     used = {resource.RLIMIT_AS: pages[0] * page, resource.RLIMIT_DATA: pages[5] * page}
-    for limit, taken in used.items():
+    for limit, used_bytes in used.items():
         soft, hard = resource.getrlimit(limit)
         most = soft if _listener is None else hard
         if most != resource.RLIM_INFINITY:
-            yield most - taken
+            yield most - used_bytes
 
 
 def check_memory(path: Path, needed: int, what: str, advice: str) -> None:

@@ -84,8 +84,8 @@ class RunFolder:
         """
         identity = self.file("run.json")
         if identity.exists():
-            held = read_object(identity, ("key",))
-            if held["key"] != key:
+            stored_identity = read_object(identity, ("key",))
+            if stored_identity["key"] != key:
                 raise StorageError(
                     f"run folder '{self.path}' holds another run (other settings, data or version); nothing was "
                     "changed. Choose another folder with --out, or remove this one"
@@ -102,8 +102,8 @@ class RunFolder:
 
     def status(self) -> dict[str, Any]:
         """Where the run stands; empty where nothing was written yet."""
-        held = self.file("status.json")
-        return read_object(held, ("status", "time")) if held.exists() else {}
+        status_file = self.file("status.json")
+        return read_object(status_file, ("status", "time")) if status_file.exists() else {}
 
     def write_history(self, rows: list[dict[str, Any]]) -> None:
         """Write all epochs so far, a JSON line each."""
@@ -120,15 +120,15 @@ def read_provenance(folder: str | Path) -> dict[str, Any]:
     file = Path(folder) / "provenance.json"
     if not file.is_file():
         raise StorageError(f"'{folder}' is not a run folder: it has no {file.name}; give the folder of edp train")
-    held = read_object(file, ("data", "seconds"))
-    data = object_with(held["data"], ("source", "reader", "digest"), f"'{file}', data,")
+    provenance = read_object(file, ("data", "seconds"))
+    data = object_with(provenance["data"], ("source", "reader", "digest"), f"'{file}', data,")
     reader = object_with(data["reader"], ("path",), f"'{file}', data.reader,")
     texts = {"data.reader.path": reader["path"], "data.digest": data["digest"], "data.source": data["source"]}
     wrong = [name for name, value in texts.items() if not isinstance(value, str)]
-    wrong += [] if isinstance(held["seconds"], int | float) else ["seconds"]
+    wrong += [] if isinstance(provenance["seconds"], int | float) else ["seconds"]
     if wrong:
         raise StorageError(f"'{file}' is damaged: {', '.join(wrong)} is of another kind; restore it or train again")
-    return held
+    return provenance
 
 
 def command_line() -> str:

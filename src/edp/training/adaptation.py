@@ -68,9 +68,9 @@ def adapt(
     weights = start
     for rate in steps:
         loss = loss_with(net, weights, objective, support)
-        found = torch.autograd.grad(loss, list(weights.values()), create_graph=second_order, allow_unused=True)
+        gradients = torch.autograd.grad(loss, list(weights.values()), create_graph=second_order, allow_unused=True)
         weights = {
             name: tensor if slope is None else tensor - rate * slope
-            for (name, tensor), slope in zip(weights.items(), found, strict=True)
+            for (name, tensor), slope in zip(weights.items(), gradients, strict=True)
         }
     return weights

@@ -134,27 +134,25 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         "provenance": dict(bundle.provenance),
         "scores": dict(bundle.scores),
     }
-    kept = {weights}
+    referenced = {weights}
     if isinstance(predictor, IntegerPredictor):
         entry = _write_arrays(path, "integers", _integers_bytes(predictor))
-        kept.add(entry["file"])
+        referenced.add(entry["file"])
         header |= {"number_format": form, "formats": dict(predictor.formats.fracs), "integers": entry}
     if bundle.adaptation is not None:
         entry = _write_arrays(path, "adaptation", save_arrays(bundle.adaptation.arrays()))
-        kept.add(entry["file"])
+        referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     write_json(path / HEADER, header | {HASH: header_digest(header)})
-    for old in (
-        found for what in ("weights", "integers", "adaptation") for found in path.glob(f"{what}-*.safetensors")
-    ):
-        if old.name not in kept:
+    for old in (file for what in ("weights", "integers", "adaptation") for file in path.glob(f"{what}-*.safetensors")):
+        if old.name not in referenced:
             old.unlink(missing_ok=True)
     return path
 
 
 def _integers_bytes(predictor: IntegerPredictor) -> bytes:
-    held = {name: torch.from_numpy(np.ascontiguousarray(x)) for name, x in weights_of(predictor.integers).items()}
-    return save(held)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(x)) for name, x in weights_of(predictor.integers).items()}
+    return save(tensors)
 
 
 def _write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
@@ -226,8 +224,8 @@ def _as_damage(path: Path) -> Iterator[None]:
             raise
         raise BundleError(f"bundle '{path}' is damaged: {brief(error)}; restore it or train again") from error
     except (*kinds, SafetensorError) as error:
-        told = f"it lacks {brief(error)}" if isinstance(error, KeyError) else brief(error)
-        raise BundleError(f"bundle '{path}' is damaged: {told}; restore it or train again") from error
+        cause = f"it lacks {brief(error)}" if isinstance(error, KeyError) else brief(error)
+        raise BundleError(f"bundle '{path}' is damaged: {cause}; restore it or train again") from error
 
 
 def _read_header(path: Path) -> dict[str, Any]:
@@ -275,23 +273,23 @@ def _text(value: Any) -> str:
 
 
 def _formats(plain: Any) -> dict[str, int]:
-    held = object_with(plain, (), "its formats")
-    wrong = [name for name, frac in held.items() if isinstance(frac, bool) or not isinstance(frac, int)]
-    wrong += [name for name, frac in held.items() if name not in wrong and abs(frac) > MOST_BITS]
+    formats = object_with(plain, (), "its formats")
+    wrong = [name for name, frac in formats.items() if isinstance(frac, bool) or not isinstance(frac, int)]
+    wrong += [name for name, frac in formats.items() if name not in wrong and abs(frac) > MOST_BITS]
     if wrong:
         raise ValueError(f"the format of '{wrong[0][:40]}' is no whole number of at most {MOST_BITS} bits")
-    return held
+    return formats
 
 
 def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
     """Put weights into a network: all of them, of its shapes and types, finite, and widths above 0."""
-    wanted = predictor.state_dict()
-    other = sorted({*wanted} ^ {*tensors})
+    expected = predictor.state_dict()
+    other = sorted({*expected} ^ {*tensors})
     if other:
         raise ValueError(f"its weights are not those of its header: '{other[0][:80]}' is in one of them only")
     for name, tensor in tensors.items():
-        if (tensor.shape, tensor.dtype) != (wanted[name].shape, wanted[name].dtype):
-            kinds = f"{tuple(tensor.shape)} {tensor.dtype}, not {tuple(wanted[name].shape)} {wanted[name].dtype}"
+        if (tensor.shape, tensor.dtype) != (expected[name].shape, expected[name].dtype):
+            kinds = f"{tuple(tensor.shape)} {tensor.dtype}, not {tuple(expected[name].shape)} {expected[name].dtype}"
             raise ValueError(f"its weights are not those of its header: '{name}' is {kinds}")
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             raise ValueError(f"its weights are damaged: '{name}' holds a number that is not finite")
@@ -302,12 +300,16 @@ def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
 
 
 def _adaptation(entry: Mapping[str, Any], task: Task, path: Path) -> Adaptation:
-    found = Adaptation.from_plain(entry, load_arrays(_weights(path, entry["arrays"])))
-    if (len(found.offset), len(found.columns), found.horizons) != (len(task.inputs), len(task.targets), task.horizons):
+    adaptation = Adaptation.from_plain(entry, load_arrays(_weights(path, entry["arrays"])))
+    if (len(adaptation.offset), len(adaptation.columns), adaptation.horizons) != (
+        len(task.inputs),
+        len(task.targets),
+        task.horizons,
+    ):
         raise ValueError("its adaptation belongs to another task")
-    if found.rate_hz != task.rate_hz:
+    if adaptation.rate_hz != task.rate_hz:
         raise ValueError("its adaptation belongs to a task of another rate")
-    return found
+    return adaptation
 
 
 def _check_schema(header: Mapping[str, Any], path: Path) -> None:

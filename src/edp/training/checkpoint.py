@@ -47,19 +47,19 @@ class Within:
     """Where a training stands inside an epoch.
 
     Attributes:
-        given: updates of the epoch so far.
+        updates: updates of the epoch so far.
         total: sum of their losses.
         stream: state of the net that the next chunk goes on from.
     """
 
-    given: int = 0
+    updates: int = 0
     total: float = 0.0
     stream: State | None = None
 
     @property
     def loss(self) -> float:
         """Mean loss so far."""
-        return self.total / max(1, self.given)
+        return self.total / max(1, self.updates)
 
 
 @dataclass
@@ -154,21 +154,21 @@ def _place_of_digest(data: bytes) -> int:
     return spot.start(1)
 
 
-def _digest(data: bytes, place: int) -> bytes:
-    state = hashlib.blake2b(data[:place], digest_size=16)
+def _digest(data: bytes, position: int) -> bytes:
+    state = hashlib.blake2b(data[:position], digest_size=16)
     state.update(BLANK.encode())
-    state.update(memoryview(data)[place + len(BLANK) :])
+    state.update(memoryview(data)[position + len(BLANK) :])
     return state.hexdigest().encode()
 
 
 def _signed(data: bytes) -> bytes:
-    place = _place_of_digest(data)
-    return data[:place] + _digest(data, place) + data[place + len(BLANK) :]
+    position = _place_of_digest(data)
+    return data[:position] + _digest(data, position) + data[position + len(BLANK) :]
 
 
 def _check_digest(data: bytes) -> None:
-    place = _place_of_digest(data)
-    if data[place : place + len(BLANK)] != _digest(data, place):
+    position = _place_of_digest(data)
+    if data[position : position + len(BLANK)] != _digest(data, position):
         raise ValueError("its checksum does not fit: cut off or changed")
 
 
@@ -189,10 +189,14 @@ def _strip(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
 def _restore(value: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(value, dict):
         if set(value) == {"tensor", "stride"}:
-            held = tensors[value["tensor"]]
-            if sum((n - 1) * step for n, step in zip(held.shape, value["stride"], strict=True)) + 1 > held.numel() > 0:
+            stored = tensors[value["tensor"]]
+            if (
+                sum((n - 1) * step for n, step in zip(stored.shape, value["stride"], strict=True)) + 1
+                > stored.numel()
+                > 0
+            ):
                 raise ValueError(f"'{value['tensor']}' asks for more memory than it has numbers")
-            return torch.empty_strided(held.shape, value["stride"], dtype=held.dtype).copy_(held)
+            return torch.empty_strided(stored.shape, value["stride"], dtype=stored.dtype).copy_(stored)
         if set(value) == {"tuple"}:
             return tuple(_restore(item, tensors) for item in value["tuple"])
         return {key: _restore(item, tensors) for key, item in value.items()}

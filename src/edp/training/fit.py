@@ -104,8 +104,8 @@ class Loop:
         check_training(data.task, model, spec)
         self.net = build_model(data.task, model, data.scaler(), spec.seed)
         check_training_memory(self.net, data, spec, getattr(lesson, "passes", 1))
-        known = data.train if refitted is None else [*data.train, *data.validation]
-        lessons = known if lesson is None else lesson.series(data.task, known)
+        own_series = data.train if refitted is None else [*data.train, *data.validation]
+        lessons = own_series if lesson is None else lesson.series(data.task, own_series)
         self.sampler = self._sampler(lessons)
         for part in data.validation:
             if part.samples <= spec.chunks.burn_in + data.task.max_horizon:
@@ -177,13 +177,12 @@ class Loop:
 
     def _diverged(self, what: str, value: float) -> Diverged:
         progress = self.progress
-        kept = [row for row in progress.history if row["epoch"] == progress.best_epoch]
+        best_rows = [row for row in progress.history if row["epoch"] == progress.best_epoch]
         if self.refitted is not None:
             saved = "this was the refit; the weights of the first training are kept"
-        elif kept:
-            saved = (
-                f"the weights of epoch {progress.best_epoch} (validation MAE {kept[0]['validation_mae']:.4g}) are kept"
-            )
+        elif best_rows:
+            error = f"validation MAE {best_rows[0]['validation_mae']:.4g}"
+            saved = f"the weights of epoch {progress.best_epoch} ({error}) are kept"
         elif math.isfinite(progress.best_score):
             saved = "the weights of the start are kept"
         else:
@@ -201,10 +200,10 @@ class Loop:
         )
 
     def _resume(self) -> None:
-        held = load_checkpoint(self.file, self.run[1]) if self.run and self.file else None
-        if held is None:
+        checkpoint = load_checkpoint(self.file, self.run[1]) if self.run and self.file else None
+        if checkpoint is None:
             return
-        self.progress, weights, optimizer = held
+        self.progress, weights, optimizer = checkpoint
         try:
             self.objective.running.copy_(weights.running)
             with torch.no_grad():
@@ -222,32 +221,32 @@ class Loop:
 
     def _batches(self) -> Iterator[Batch]:
         """Exactly `updates` batches; the order depends on the seed and the epoch alone."""
-        passes, given = 0, 0
-        while given < self.updates:
+        passes, batches = 0, 0
+        while batches < self.updates:
             for batch in self.sampler.epoch(self.progress.epoch * 1000 + passes):
                 yield batch
-                given += 1
-                if given == self.updates:
+                batches += 1
+                if batches == self.updates:
                     return
             passes += 1
 
     def advance(self, until: int, on_event: Callable[[TrainingProgress], None]) -> int:
         """Go on to an update of this epoch; ticks with a loss that were seen on the way."""
         within = self.within
-        if not within.given:
+        if not within.updates:
             # Dropout must not depend on how often the run was stopped: each epoch has its own seed.
             torch.manual_seed(self.spec.seed * 100_003 + self.progress.epoch)
         self.net.train()
         seen, began, shown = 0, time.perf_counter(), time.perf_counter()
-        for batch in islice(self._batches(), within.given, until):
+        for batch in islice(self._batches(), within.updates, until):
             loss, within.stream = self._update(batch, within.stream)
             within.total += loss
-            within.given += 1
+            within.updates += 1
             seen += batch.targets_seen
             now = time.perf_counter()
             if now - shown > 0.5:
                 shown = now
-                on_event(self._event(self.progress.epoch + 1, within.given, seen / (now - began), now - began, None))
+                on_event(self._event(self.progress.epoch + 1, within.updates, seen / (now - began), now - began, None))
         return seen
 
     def pause(self) -> Fitted:
@@ -352,7 +351,7 @@ class Loop:
 
     def _validate(self) -> tuple[float, float, float]:
         """Standardised and reported mean absolute error of the averaged weights, and their loss."""
-        held = {name: parameter.detach().clone() for name, parameter in self.net.named_parameters()}
+        current_weights = {name: parameter.detach().clone() for name, parameter in self.net.named_parameters()}
         with torch.no_grad():
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.average[name])
@@ -363,7 +362,7 @@ class Loop:
         finally:
             with torch.no_grad():
                 for name, parameter in self.net.named_parameters():
-                    parameter.copy_(held[name])
+                    parameter.copy_(current_weights[name])
 
     def _event(
         self, epoch: int, update: int, rate: float, seconds: float, row: dict[str, Any] | None

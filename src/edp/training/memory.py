@@ -44,9 +44,9 @@ def check_training_memory(net: Predictor, data: Prepared, spec: TrainingSpec, pa
         f"{sum(parameter.numel() for parameter in net.parameters()):,} parameters"
     )
     advice = "make training.chunks.batch or training.chunks.length smaller, or the network"
-    kept = _weights(net, spec) + _batch(net, spec) + _validation(net, data)
-    check_setting(kept, what, advice)  # before the network is tried, which takes the state of a stream
-    check_setting(kept + passes * _backward(net, spec), what, advice)
+    constant_bytes = _weights(net, spec) + _batch(net, spec) + _validation(net, data)
+    check_setting(constant_bytes, what, advice)  # before the network is tried, which takes the state of a stream
+    check_setting(constant_bytes + passes * _backward(net, spec), what, advice)
 
 
 def training_bytes(net: Predictor, data: Prepared, spec: TrainingSpec) -> float:
@@ -89,14 +89,14 @@ def _backward(net: Predictor, spec: TrainingSpec) -> float:
 def _saved(net: Predictor, ticks: int) -> int:
     """Bytes of tensors that a forward pass of one stream keeps for the way back."""
     like = next(net.parameters())
-    known = {parameter.untyped_storage().data_ptr() for parameter in net.parameters()}
+    counted_storages = {parameter.untyped_storage().data_ptr() for parameter in net.parameters()}
     total = 0
 
     def pack(tensor: torch.Tensor) -> torch.Tensor:
         nonlocal total
         storage = tensor.untyped_storage()
-        if storage.data_ptr() not in known:
-            known.add(storage.data_ptr())
+        if storage.data_ptr() not in counted_storages:
+            counted_storages.add(storage.data_ptr())
             total += storage.nbytes()
         return tensor
 

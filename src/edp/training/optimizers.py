@@ -118,8 +118,8 @@ class Discriminative:
             by_rate.setdefault(self._rate(name), []).append((name, parameter))
         groups = [
             {"params": some, "weight_decay": decay, "lr": rate}
-            for rate, held in by_rate.items()
-            for some, decay in zip(_decaying(held), (self.weight_decay, 0.0), strict=True)
+            for rate, parameters in by_rate.items()
+            for some, decay in zip(_decaying(parameters), (self.weight_decay, 0.0), strict=True)
             if some
         ]
         return torch.optim.AdamW(groups, lr=self.learning_rate, betas=(self.beta1, self.beta2), fused=True)

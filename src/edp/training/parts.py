@@ -58,9 +58,9 @@ def fit_part(
         _restore(loop, unpack(start))
     if until is None:
         return loop.fit(lambda event: None), None
-    if not loop.within.given < until < loop.updates:
+    if not loop.within.updates < until < loop.updates:
         raise ConfigError(
-            f"a part from update {loop.within.given} to {until} of {loop.updates}; it must end after its start and "
+            f"a part from update {loop.within.updates} to {until} of {loop.updates}; it must end after its start and "
             "before the end of the training"
         )
     loop.advance(until, lambda event: None)
@@ -100,16 +100,16 @@ def _state_of_epochs(loop: Loop) -> dict[str, Any]:
     }
 
 
-def _restore_epochs(loop: Loop, held: dict[str, Any]) -> None:
-    progress = held["progress"]
+def _restore_epochs(loop: Loop, state: dict[str, Any]) -> None:
+    progress = state["progress"]
     loop.progress = Progress(**{**progress, "schedule": ScheduleState(**progress["schedule"])})
     with torch.no_grad():
         for name, parameter in loop.net.named_parameters():
-            parameter.copy_(held["current"][name])
-            loop.average[name].copy_(held["average"][name])
-            loop.best[name].copy_(held["best"][name])
-        loop.objective.running.copy_(held["running"])
-    loop.optimizer.load_state_dict(optimizer_state(held["optimizer"]))
+            parameter.copy_(state["current"][name])
+            loop.average[name].copy_(state["average"][name])
+            loop.best[name].copy_(state["best"][name])
+        loop.objective.running.copy_(state["running"])
+    loop.optimizer.load_state_dict(optimizer_state(state["optimizer"]))
 
 
 def _state(loop: Loop) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def _state(loop: Loop) -> dict[str, Any]:
     cuda = loop.device.type == "cuda"
     return {
         "updates": loop.progress.updates,
-        "given": loop.within.given,
+        "epoch_updates": loop.within.updates,
         "total": loop.within.total,
         "stream": loop.within.stream,
         "current": dict(loop.net.named_parameters()),
@@ -129,19 +129,19 @@ def _state(loop: Loop) -> dict[str, Any]:
     }
 
 
-def _restore(loop: Loop, held: dict[str, Any]) -> None:
-    loop.progress.updates = held["updates"]
-    loop.within.given, loop.within.total = held["given"], held["total"]
-    loop.within.stream = _moved(held["stream"], loop.device)
+def _restore(loop: Loop, state: dict[str, Any]) -> None:
+    loop.progress.updates = state["updates"]
+    loop.within.updates, loop.within.total = state["epoch_updates"], state["total"]
+    loop.within.stream = _moved(state["stream"], loop.device)
     with torch.no_grad():
         for name, parameter in loop.net.named_parameters():
-            parameter.copy_(held["current"][name])
-            loop.average[name].copy_(held["average"][name])
-        loop.objective.running.copy_(held["running"])
-    loop.optimizer.load_state_dict(optimizer_state(held["optimizer"]))
-    torch.set_rng_state(held["chance"])
-    if loop.device.type == "cuda" and held["chance on the device"] is not None:
-        torch.cuda.set_rng_state(held["chance on the device"], loop.device)
+            parameter.copy_(state["current"][name])
+            loop.average[name].copy_(state["average"][name])
+        loop.objective.running.copy_(state["running"])
+    loop.optimizer.load_state_dict(optimizer_state(state["optimizer"]))
+    torch.set_rng_state(state["chance"])
+    if loop.device.type == "cuda" and state["chance on the device"] is not None:
+        torch.cuda.set_rng_state(state["chance on the device"], loop.device)
 
 
 def _moved(tree: Any, device: torch.device) -> Any:

@@ -41,18 +41,22 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
     # A target that is no feature has no level to start from: the regression then finds it from the features.
     present = tuple(None if column is None else read.index(column) for column in task.present)
     lags = LagTask(task.horizons, present, bypass.spec.taps)
-    known = [
+    series_of_parts = [
         [Series(part.name, feature_matrix(task, part)[:, read], part.targets) for part in parts]
         for parts in (train, validation)
     ]
-    if not any(len(origins(part, lags)) for part in known[0]):
+    if not any(len(origins(part, lags)) for part in series_of_parts[0]):
         raise DataError(
             f"linear_bypass: the longest training stretch has {max(part.samples for part in train)} samples, fewer "
             f"than its {bypass.spec.taps} taps plus the horizon of {task.max_horizon}; give longer recordings "
             "or fewer taps"
         )
     crossed = bypass.spec.start == "crossed"
-    solution = crossed_solution(known[0] + known[1], lags) if crossed else ridge_solution(known[0], lags, known[1])
+    solution = (
+        crossed_solution(series_of_parts[0] + series_of_parts[1], lags)
+        if crossed
+        else ridge_solution(series_of_parts[0], lags, series_of_parts[1])
+    )
     # SI to network units: scaled = (x - offset) / width on both sides.
     offset, width = (tensor.double().cpu().numpy() for tensor in (predictor.front.offset, predictor.front.width))
     maps = np.zeros((bypass.spec.taps, len(offset), *solution.intercept.shape))
@@ -76,5 +80,5 @@ def _columns(task: Task) -> list[int]:
     """Features that the regression reads, in order."""
     features = task.features
     new = {entry.name for entry in features.derived if entry.source in features.hidden}
-    wanted = {*features.channels, *new, *task.targets}
-    return [column for column, name in enumerate(features.lasting) if name in wanted]
+    regression_channels = {*features.channels, *new, *task.targets}
+    return [column for column, name in enumerate(features.lasting) if name in regression_channels]

@@ -44,7 +44,7 @@ class BatchContext:
 class TrainingStrategy(Protocol):
     """Weights to begin with, series to learn from, and the loss of a batch of them."""
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series with what is taught about them, and further series.
 
         Either all of them have `teacher_targets` or none; where none has, `loss` is not asked.

@@ -42,8 +42,8 @@ def calibrate(net: Predictor, series: Sequence[Series], spec: TrainingSpec) -> N
     first = pairs[0][0]
     answer = replace(
         first,
-        center=torch.cat([said.center for said, _ in pairs], dim=1),
-        spread=torch.cat([said.spread for said, _ in pairs], dim=1),
+        center=torch.cat([one.center for one, _ in pairs], dim=1),
+        spread=torch.cat([one.spread for one, _ in pairs], dim=1),
     )
     net.output.calibrate(answer, torch.cat([target for _, target in pairs], dim=1))
 
@@ -53,10 +53,10 @@ def _answers(
 ) -> Iterator[tuple[Prediction, Tensor]]:
     """What the network says of each series after start-up, and the standardised targets; batches of one."""
     skip = spec.chunks.burn_in if spec.chunks.regime == "chunk" else net.spec.window - 1
-    for part, said in zip(series, stream_answers(net, series, windowed=windowed), strict=True):
+    for part, answer in zip(series, stream_answers(net, series, windowed=windowed), strict=True):
         target = standard_targets(net, part)[:, skip:]
         ticks = slice(skip, skip + target.shape[1])
-        yield replace(said, center=said.center[:, ticks], spread=said.spread[:, ticks]), target
+        yield replace(answer, center=answer.center[:, ticks], spread=answer.spread[:, ticks]), target
 
 
 def standard_targets(net: Predictor, part: Series) -> Tensor:

@@ -32,9 +32,9 @@ class WarmStart:
         self._frozen: list[nn.Parameter] = []
         self._unfrozen: list[nn.Parameter] = []
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series as they are."""
-        return list(known)
+        return list(own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Copy weights and scaling, freeze the named parameters, and unfreeze the others where that is asked for.

@@ -22,5 +22,5 @@ class Persistence(Baseline):
         self._means = target_means(train)
 
     def _predict(self, inputs: FloatArray) -> DoubleArray:
-        held = anchors(inputs[self.task.history - 1 :], self.task, self._means)
-        return np.repeat(held[:, None, :], len(self.task.horizons), axis=1)
+        last_values = anchors(inputs[self.task.history - 1 :], self.task, self._means)
+        return np.repeat(last_values[:, None, :], len(self.task.horizons), axis=1)

@@ -60,7 +60,7 @@ class SmallMlp(Baseline):
         changes = ((table.changes - self._out_centre) / self._out_scale).astype(np.float32)
         # scikit-learn wants a vector when there is one output.
         changes = changes[:, 0] if self.task.outputs == 1 else changes
-        best, waited, kept = np.inf, 0, None
+        best, waited, best_weights = np.inf, 0, None
         for _ in range(self._epochs):
             self._model.partial_fit(features, changes)
             if not held_out.rows:
@@ -69,14 +69,14 @@ class SmallMlp(Baseline):
             loss = float(np.mean(error**2))
             if loss < best:
                 best, waited = loss, 0
-                kept = [array.copy() for array in (*self._model.coefs_, *self._model.intercepts_)]
+                best_weights = [array.copy() for array in (*self._model.coefs_, *self._model.intercepts_)]
                 continue
             waited += 1
             if waited >= self._patience:
                 break
-        if kept is not None:
-            layers = len(kept) // 2
-            self._model.coefs_, self._model.intercepts_ = kept[:layers], kept[layers:]
+        if best_weights is not None:
+            layers = len(best_weights) // 2
+            self._model.coefs_, self._model.intercepts_ = best_weights[:layers], best_weights[layers:]
 
     def _predict(self, inputs: FloatArray) -> DoubleArray:
         return predict_from_lags(inputs, self.task, self._means, self._change)

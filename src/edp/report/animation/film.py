@@ -52,9 +52,11 @@ def write_film(scene: Scene, output: str | Path) -> Path:
                     running.stdin.write(frame.tobytes())  # type: ignore[union-attr]
             except BrokenPipeError as error:
                 broken = str(error)
-            _, said = running.communicate()
+            _, error_output = running.communicate()
         if running.returncode or broken:
-            raise StorageError(f"ffmpeg could not write '{target}': {said.decode(errors='replace').strip() or broken}")
+            raise StorageError(
+                f"ffmpeg could not write '{target}': {error_output.decode(errors='replace').strip() or broken}"
+            )
     return target
 
 

@@ -128,11 +128,15 @@ class _Columns:
 
 def _filled(values: Any) -> Array:
     """Missing values by straight lines between their neighbours; zeros where there is nothing."""
-    made = np.asarray(values, dtype=float)
-    known = np.isfinite(made)
-    if known.all():
-        return made
-    return np.interp(np.arange(len(made)), np.flatnonzero(known), made[known]) if known.any() else np.zeros(len(made))
+    samples = np.asarray(values, dtype=float)
+    finite = np.isfinite(samples)
+    if finite.all():
+        return samples
+    return (
+        np.interp(np.arange(len(samples)), np.flatnonzero(finite), samples[finite])
+        if finite.any()
+        else np.zeros(len(samples))
+    )
 
 
 def _machine_of(recording: Recording) -> str:
@@ -158,7 +162,7 @@ def _angles(shown: _Columns, machine: Machine) -> Array:
             "animation needs one set: map your columns to these names in a signal map (--map)"
         )
     axes, plant = pack(machine)
-    found = []
+    joint_angles = []
     for i, name in enumerate(strokes):
         values, full = shown.take(name)[:, 0], float(axes[i, at.STROKE])
         if values.min() < -OUTSIDE or values.max() > full + OUTSIDE:
@@ -173,8 +177,8 @@ def _angles(shown: _Columns, machine: Machine) -> Array:
         else:
             branch, length = linkage.bucket_branch(axes[i, at.CLOSED], axes[i, at.CLOSED] + full, plant)
             psi = np.interp(grid + axes[i, at.CLOSED], length[::-1], branch[::-1])
-        found.append(np.interp(values, grid, psi))
-    return np.stack(found, axis=1)
+        joint_angles.append(np.interp(values, grid, psi))
+    return np.stack(joint_angles, axis=1)
 
 
 def write_animation(scene: Scene, output: str | Path) -> Path:

@@ -84,8 +84,8 @@ class Sheet:
         """For a document: the caption and a table; what stands out is bold."""
         heads = [_piped(head) for head in self.heads()]
         lines = [f"**{_piped(self.caption)}**", "", _row(heads), _row(["---"] * len(heads))]
-        for place, cells in enumerate(self.texts()):
-            bold = place in self.marked
+        for row, cells in enumerate(self.texts()):
+            bold = row in self.marked
             lines.append(_row([f"**{_piped(c)}**" if bold and c != MISSING else _piped(c) for c in cells]))
         return "\n".join(lines) + "\n"
 
@@ -105,9 +105,9 @@ def write_sheets(folder: Path, sheets: Iterable[Sheet]) -> None:
         StorageError: a file cannot be written.
     """
     for sheet in sheets:
-        place = make_folder(folder) / sheet.name
-        write_bytes(place.with_suffix(".csv"), sheet.csv().encode("utf-8", "replace"))
-        write_bytes(place.with_suffix(".md"), sheet.markdown().encode("utf-8", "replace"))
+        stem = make_folder(folder) / sheet.name
+        write_bytes(stem.with_suffix(".csv"), sheet.csv().encode("utf-8", "replace"))
+        write_bytes(stem.with_suffix(".md"), sheet.markdown().encode("utf-8", "replace"))
 
 
 def _cell(value: Value) -> Value:

@@ -50,7 +50,7 @@ def _comparison(facts: Facts, horizon: int) -> TextTable:
         cells += [percent(row["change"], signed=True)]
         cells += [duration(row["seconds"])] * with_time
         lines.append(tuple(cells))
-    marked = frozenset(place for place, row in enumerate(rows) if row["is_network"])
+    marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
     return TextTable(f"{horizon_text(facts, horizon)} ahead", tuple(columns), tuple(lines), marked)
 
 
@@ -68,14 +68,14 @@ def output_table(facts: Facts) -> TextTable | None:
     places = {name: decimals_for(row["outputs"][name] for row in rows) for name in names}
     lines = tuple((row["label"], *(number(row["outputs"][name], places[name]) for name in names)) for row in rows)
     columns = (("Model", ""), *((target.description, target.unit) for target in facts.targets))
-    marked = frozenset(place for place, row in enumerate(rows) if row["is_network"])
+    marked = frozenset(index for index, row in enumerate(rows) if row["is_network"])
     return TextTable(f"MAE by output, {horizon_text(facts, horizon)} ahead", columns, lines, marked)
 
 
 def interval_table(facts: Facts) -> TextTable | None:
     """What share of the truth the network's intervals hold, and how wide they are; None where it states none."""
-    held = facts.models.get(NETWORK, {}).get("intervals", {})
-    rows = [(k, row) for k in facts.horizons for row in held.get(str(k), ())]
+    intervals = facts.models.get(NETWORK, {}).get("intervals", {})
+    rows = [(k, row) for k in facts.horizons for row in intervals.get(str(k), ())]
     if not rows:
         return None
     places = decimals_for(row["width"]["mean"] for _, row in rows)
@@ -177,8 +177,8 @@ def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
     }
     values = dict(facts.footprint or {})
     values |= {row["number_format"]: row["parameter_bytes"] for row in values.get("estimates", [])}
-    found = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
-    return [(label, f"{whole(value)} {unit}".rstrip()) for label, value, unit in found if value is not None]
+    figures = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
+    return [(label, f"{whole(value)} {unit}".rstrip()) for label, value, unit in figures if value is not None]
 
 
 def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
@@ -206,10 +206,10 @@ def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
     add("Data digest", data.get("digest"))
     add("Rate", f"{facts.rate_hz:g} Hz" if facts.rate_hz else None)
     for part in ("train", "validation", "test"):
-        held = data.get(part)
-        if isinstance(held, Mapping):
-            hours = f", {number(held['hours'], 2)} h" if held.get("hours") is not None else ""
-            add(part.capitalize(), f"{whole(held.get('recordings'))} recordings{hours}")
+        part_facts = data.get(part)
+        if isinstance(part_facts, Mapping):
+            hours = f", {number(part_facts['hours'], 2)} h" if part_facts.get("hours") is not None else ""
+            add(part.capitalize(), f"{whole(part_facts.get('recordings'))} recordings{hours}")
     for key, value in source.get("environment", {}).items():
         add(key.replace("_", " ").capitalize(), value)
     return rows

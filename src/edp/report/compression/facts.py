@@ -22,39 +22,39 @@ class CompressionFacts:
     """Content of ``compression.json``.
 
     Attributes:
-        held: plain values.
+        content: plain values.
         folder: where it lies.
     """
 
-    held: Mapping[str, Any]
+    content: Mapping[str, Any]
     folder: Path
 
     @property
     def rows(self) -> Sequence[Mapping[str, Any]]:
         """All networks in all formats."""
-        rows: Sequence[Mapping[str, Any]] = self.held["rows"]
+        rows: Sequence[Mapping[str, Any]] = self.content["rows"]
         return rows
 
     def smallest(self) -> list[int]:
         """Places of a row for each network: that of its smallest format; the teacher in float32 comes first."""
-        found: dict[tuple[str, bool], int] = {}
-        for place, row in enumerate(self.rows):
+        smallest: dict[tuple[str, bool], int] = {}
+        for index, row in enumerate(self.rows):
             whole = row["way"] == "teacher" and row["number_format"] == "float32"
-            held = found.get((row["run"], whole))
-            if held is None or row["taken"]["parameter_bytes"] < self.rows[held]["taken"]["parameter_bytes"]:
-                found[row["run"], whole] = place
-        return sorted(found.values(), key=lambda place: (self.rows[place]["way"] != "teacher", place))
+            best = smallest.get((row["run"], whole))
+            if best is None or row["taken"]["parameter_bytes"] < self.rows[best]["taken"]["parameter_bytes"]:
+                smallest[row["run"], whole] = index
+        return sorted(smallest.values(), key=lambda index: (self.rows[index]["way"] != "teacher", index))
 
     @property
     def horizons(self) -> list[str]:
         """Look-aheads in samples, as keys of scores."""
-        return [str(horizon) for horizon in self.held["task"]["horizons"]]
+        return [str(horizon) for horizon in self.content["task"]["horizons"]]
 
     @property
     def chosen(self) -> Mapping[str, Any] | None:
         """The network that was chosen, None where none fits."""
-        place = self.held["chosen"]
-        return None if place is None else self.rows[place]
+        index = self.content["chosen"]
+        return None if index is None else self.rows[index]
 
     def mae(self, row: Mapping[str, Any], horizon: str, when: str = "scores") -> float:
         """MAE on the validation part; `when` is ``scores`` or ``before``."""
@@ -62,12 +62,12 @@ class CompressionFacts:
 
     def cost(self, row: Mapping[str, Any], name: str) -> float:
         """A name of `COSTS`."""
-        held = row["taken"][name]
-        return float(held[2] if name == "cycles" else held)
+        usage = row["taken"][name]
+        return float(usage[2] if name == "cycles" else usage)
 
     def ahead(self, horizon: str) -> str:
         """A horizon in words."""
-        return f"{1e3 * int(horizon) / self.held['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
+        return f"{1e3 * int(horizon) / self.content['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
 
 
 def read_compression(folder: str | Path) -> CompressionFacts:
@@ -79,34 +79,34 @@ def read_compression(folder: str | Path) -> CompressionFacts:
     file = Path(folder) / RESULT
     if not file.is_file():
         raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp compress")
-    held = read_json(file)
-    if not isinstance(held, dict) or held.get("schema") != SCHEMA:
+    content = read_json(file)
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise StorageError(f"'{file}' is of another version of EDP; run edp compress again")
-    return CompressionFacts(held, Path(folder))
+    return CompressionFacts(content, Path(folder))
 
 
 def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
     """A table in the form of Table 4.9, with what the controller sees beside it; what is on the front stands out."""
-    teacher = facts.mae(facts.held["teacher"], horizon)
+    teacher = facts.mae(facts.content["teacher"], horizon)
     rows: list[tuple[Value, ...]] = []
     for row in facts.rows:
-        taken, mae = row["taken"], facts.mae(row, horizon)
+        usage, mae = row["taken"], facts.mae(row, horizon)
         rows.append(
             (
                 row["name"],
                 row["way"],
                 mae,
                 100 * (mae / teacher - 1),
-                taken["parameters"],
-                taken["parameter_bytes"] / 1e6,
+                usage["parameters"],
+                usage["parameter_bytes"] / 1e6,
                 row["label"],
-                taken["macs_window"] / 1e6,
-                taken["macs_tick"],
-                taken["cycles"][2],
+                usage["macs_window"] / 1e6,
+                usage["macs_tick"],
+                usage["cycles"][2],
                 "fits" if row["fits"] else f"over: {listed(LIMITS[name] for name in row['over'])}",
             )
         )
-    unit = facts.held["unit"]
+    unit = facts.content["unit"]
     columns = (
         Column("Variant"),
         Column("Made"),
@@ -121,12 +121,12 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
         Column("Budget"),
     )
     caption = f"{facts.ahead(horizon)}, validation part"
-    return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(facts.held["front"]))
+    return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(facts.content["front"]))
 
 
 def box_sheet(facts: CompressionFacts) -> Sheet | None:
     """Teacher and chosen on the lock-box."""
-    scores = facts.held["box"].get("scores")
+    scores = facts.content["box"].get("scores")
     if not scores:
         return None
     rows: list[tuple[Value, ...]] = []
@@ -135,7 +135,7 @@ def box_sheet(facts: CompressionFacts) -> Sheet | None:
         change = 100 * (last["mae"] / first["mae"] - 1)
         composites = first["composite"], last["composite"]
         rows.append((facts.ahead(horizon), first["mae"], last["mae"], change, *composites))
-    unit = facts.held["unit"]
+    unit = facts.content["unit"]
     columns = (
         Column("Horizon"),
         Column("MAE, teacher", unit, figures([row[1] for row in rows])),
@@ -149,7 +149,7 @@ def box_sheet(facts: CompressionFacts) -> Sheet | None:
 
 def headline(facts: CompressionFacts) -> str:
     """One sentence: what was found."""
-    best, budget = facts.chosen, facts.held["budget"]["name"]
+    best, budget = facts.chosen, facts.content["budget"]["name"]
     if best is None:
         return f"None of the networks made fits the budget “{budget}”"
     change = percent(best["error"] - 1, signed=True)
@@ -158,15 +158,15 @@ def headline(facts: CompressionFacts) -> str:
 
 def verdict(facts: CompressionFacts) -> list[str]:
     """Sentences under the headline."""
-    best, box = facts.chosen, facts.held["box"]
+    best, box = facts.chosen, facts.content["box"]
     if best is None:
         near = min(facts.rows, key=lambda row: max(value / limit for value, limit in row["over"].values()))
         over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near["over"].items())
         return [f"The nearest is {near['name']}: {over}."]
-    taken, budget = best["taken"], facts.held["budget"]
+    usage, budget = best["taken"], facts.content["budget"]
     lines = [
-        f"It takes {taken['cycles'][2]:,} of {budget['cycles']:,} cycles a tick (high estimate) and "
-        f"{taken['parameter_bytes']:,} of {budget['parameter_bytes']:,} bytes for parameters."
+        f"It takes {usage['cycles'][2]:,} of {budget['cycles']:,} cycles a tick (high estimate) and "
+        f"{usage['parameter_bytes']:,} of {budget['parameter_bytes']:,} bytes for parameters."
     ]
     if "error" in box:
         lines.append(f"On the lock-box its MAE is {percent(box['error'] - 1, signed=True)} against the teacher's.")
@@ -175,7 +175,7 @@ def verdict(facts: CompressionFacts) -> list[str]:
 
 def caveats(facts: CompressionFacts) -> list[str]:
     """What the figures can and cannot show."""
-    box, parts = facts.held["box"], facts.held["recordings"]
+    box, parts = facts.content["box"], facts.content["recordings"]
     lines = [
         "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
         "constants, as the exported C code holds them (INT8, which has no such code: as in Table 4.9). The high "
@@ -192,7 +192,7 @@ def caveats(facts: CompressionFacts) -> list[str]:
         )
     if len(box.get("openings", ())) > 1:
         lines.append(f"The lock-box was opened {len(box['openings'])} times; each look after the first shows less.")
-    return [*lines, *facts.held["notes"]]
+    return [*lines, *facts.content["notes"]]
 
 
 def tiles(facts: CompressionFacts) -> list[tuple[str, str, str]]:
@@ -200,11 +200,11 @@ def tiles(facts: CompressionFacts) -> list[tuple[str, str, str]]:
     best = facts.chosen
     if best is None:
         return []
-    horizon, taken, teacher = facts.horizons[-1], best["taken"], facts.held["teacher"]
+    horizon, usage, teacher = facts.horizons[-1], best["taken"], facts.content["teacher"]
     return [
-        (number(facts.mae(best, horizon)), facts.held["unit"], f"MAE {facts.ahead(horizon)}"),
-        (number(facts.mae(teacher, horizon)), facts.held["unit"], "MAE of the teacher"),
-        (f"{taken['parameter_bytes'] / 1e3:.1f}", "kB", "for parameters"),
-        (f"{taken['cycles'][2] / 1e3:,.0f}", "k", "cycles per tick, high estimate"),
-        (f"{taken['macs_tick'] / 1e3:,.1f}", "k", "MACs per tick"),
+        (number(facts.mae(best, horizon)), facts.content["unit"], f"MAE {facts.ahead(horizon)}"),
+        (number(facts.mae(teacher, horizon)), facts.content["unit"], "MAE of the teacher"),
+        (f"{usage['parameter_bytes'] / 1e3:.1f}", "kB", "for parameters"),
+        (f"{usage['cycles'][2] / 1e3:,.0f}", "k", "cycles per tick, high estimate"),
+        (f"{usage['macs_tick'] / 1e3:,.1f}", "k", "MACs per tick"),
     ]

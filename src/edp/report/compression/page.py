@@ -52,8 +52,8 @@ def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
         "caveats": words.caveats(facts),
         "tables": [sheet.table() for sheet in tables if sheet.name != "lockbox"],
         "box": next((sheet.table() for sheet in tables if sheet.name == "lockbox"), None),
-        "opened": facts.held["box"].get("opened", ""),
-        "budget": facts.held["budget"],
+        "opened": facts.content["box"].get("opened", ""),
+        "budget": facts.content["budget"],
         **shown(plots),
     }
     return template("compression.html.jinja").render(**context)

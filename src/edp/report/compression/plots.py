@@ -25,15 +25,15 @@ MOMENTS = (("before", "in float32", "circle-open", GREY), ("scores", "in its for
 
 def compression_plots(facts: CompressionFacts) -> dict[str, Plot]:
     """Every figure by name."""
-    made = [profile_plot(facts), front_plot(facts)]
-    return {plot.name: plot for plot in made}
+    plots = [profile_plot(facts), front_plot(facts)]
+    return {plot.name: plot for plot in plots}
 
 
 def profile_plot(facts: CompressionFacts) -> Plot:
     """Parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
     figure = make_subplots(cols=2, specs=[[{"secondary_y": True}, {}]], horizontal_spacing=0.12)
     places = facts.smallest()
-    rows = [facts.rows[place] for place in places]
+    rows = [facts.rows[index] for index in places]
     names = [html.escape(row["name"]) for row in rows]
     sizes = [row["taken"]["parameters"] for row in rows]
     bars = {"marker": {"color": RULE}, "name": "parameters", "hovertemplate": "%{y:,}"}
@@ -47,14 +47,14 @@ def profile_plot(facts: CompressionFacts) -> Plot:
                 x=names, y=values, mode="markers", name=f"MAE {name}", row=1, col=1, secondary_y=True, marker=marker,
                 hovertemplate="%{y:.4~g}", **shared,
             )  # fmt: skip
-        colours = [BLUE if place in facts.held["front"] else MUTED[3] for place in places]
+        colours = [BLUE if index in facts.content["front"] else MUTED[3] for index in places]
         scores = [row["scores"][horizon]["composite"] for row in rows]
         figure.add_bar(
             x=names, y=scores, row=1, col=2, marker={"color": colours}, showlegend=False, hovertemplate="%{y:.4~g}",
             **shared,
         )  # fmt: skip
     styled(figure, 480)
-    unit = facts.held["unit"]
+    unit = facts.content["unit"]
     figure.update_yaxes(type="log", title_text="Parameters", row=1, col=1, secondary_y=False)
     error = with_unit("Mean absolute error", unit)
     figure.update_yaxes(
@@ -83,7 +83,7 @@ def front_plot(facts: CompressionFacts) -> Plot:
             x=[point[0] for point in line], y=[point[1] for point in line], mode="lines", name="front",
             line={"color": BLUE, "width": 2, "shape": "hv"}, hoverinfo="skip", **shared,
         )  # fmt: skip
-        for place, group in enumerate(groups):
+        for position, group in enumerate(groups):
             rows = [row for row in facts.rows if row["label"] == group]
             figure.add_scatter(
                 x=[facts.cost(row, cost) for row in rows],
@@ -91,11 +91,11 @@ def front_plot(facts: CompressionFacts) -> Plot:
                 mode="markers",
                 name=html.escape(group),
                 text=[html.escape(row["name"]) for row in rows],
-                marker={"size": 9, "color": MUTED[place % len(MUTED)]},
+                marker={"size": 9, "color": MUTED[position % len(MUTED)]},
                 hovertemplate="%{text}: %{y:+.2f} %, %{x:,}",
                 **shared,
             )
-        limit = facts.held["budget"][cost]
+        limit = facts.content["budget"][cost]
         ends = [min(_percent(row) for row in facts.rows), max(_percent(row) for row in facts.rows)]
         figure.add_scatter(
             x=[limit, limit], y=ends, mode="lines", name="budget", line={"color": SOFT, "dash": "dot"},
@@ -115,7 +115,7 @@ def drawings(facts: CompressionFacts) -> dict[str, Callable[[Figure], None]]:
 
 def _draw(figure: Figure, facts: CompressionFacts, horizon: str) -> None:
     shown = facts.smallest()
-    rows = [facts.rows[place] for place in shown]
+    rows = [facts.rows[index] for index in shown]
     figure.set_size_inches(max(8.0, 0.5 * len(rows) + 4), 4.2)
     left, right = figure.subplots(ncols=2)
     places = range(len(rows))
@@ -127,14 +127,14 @@ def _draw(figure: Figure, facts: CompressionFacts, horizon: str) -> None:
         fill = "none" if when == "before" else DRAWN_BLUE
         edge = INK if when == "before" else DRAWN_BLUE
         errors.scatter(places, values, s=size, facecolors=fill, edgecolors=edge, label=text, zorder=3)
-    errors.set(yscale="log", ylabel=f"MAE [{facts.held['unit']}]")
+    errors.set(yscale="log", ylabel=f"MAE [{facts.content['unit']}]")
     errors.legend(frameon=False, fontsize=7)
     for axes in (left, errors):
         axes.yaxis.set_major_formatter(_plainly)
         axes.yaxis.set_minor_formatter(_plainly if axes is errors else "")
-    colours = [DRAWN_BLUE if place in facts.held["front"] else DROPPED for place in shown]
+    colours = [DRAWN_BLUE if index in facts.content["front"] else DROPPED for index in shown]
     right.bar(places, [row["scores"][horizon]["composite"] for row in rows], color=colours)
-    right.set(ylabel=f"Composite score [{facts.held['unit']}], the front in blue")
+    right.set(ylabel=f"Composite score [{facts.content['unit']}], the front in blue")
     for axes in (left, right):
         axes.set_xticks(list(places), [row["name"] for row in rows], rotation=90, fontsize=7)
     figure.suptitle(facts.ahead(horizon), fontsize=10)
@@ -142,15 +142,15 @@ def _draw(figure: Figure, facts: CompressionFacts, horizon: str) -> None:
 
 def _ticks(facts: CompressionFacts) -> list[float]:
     """Five round errors for each horizon, evenly spread on a logarithmic axis."""
-    found = set()
+    ticks = set()
     for horizon in facts.horizons:
         values = [facts.mae(row, horizon) for row in facts.rows]
         low, high = min(values), max(values)
-        found |= {float(f"{low * (high / low) ** (step / 4):.2g}") for step in range(5)} if low > 0 else set()
-    return sorted(found)
+        ticks |= {float(f"{low * (high / low) ** (step / 4):.2g}") for step in range(5)} if low > 0 else set()
+    return sorted(ticks)
 
 
-def _plainly(value: float, place: int | None) -> str:
+def _plainly(value: float, position: int | None) -> str:
     return f"{value:,.4g}" if value < 1e4 else f"{value / 1e3:,.4g} k"
 
 

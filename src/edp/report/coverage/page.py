@@ -18,11 +18,11 @@ from edp.report.run.page import shown
 from edp.storage import write_bytes
 
 
-def build_coverage_page(found: Coverage, output: str | Path, title: str, quality: DataQuality | None = None) -> Path:
+def build_coverage_page(coverage: Coverage, output: str | Path, title: str, quality: DataQuality | None = None) -> Path:
     """Write what a data set covers as one HTML file that opens with no network.
 
     Args:
-        found: what it covers.
+        coverage: what it covers.
         output: where to write.
         title: name of the data set.
         quality: how good its recordings are.
@@ -31,88 +31,88 @@ def build_coverage_page(found: Coverage, output: str | Path, title: str, quality
         StorageError: the page cannot be written.
     """
     target = Path(output)
-    write_bytes(target, render_coverage(found, title, quality).encode("utf-8", "replace"))
+    write_bytes(target, render_coverage(coverage, title, quality).encode("utf-8", "replace"))
     return target
 
 
-def render_coverage(found: Coverage, title: str, quality: DataQuality | None = None) -> str:
+def render_coverage(coverage: Coverage, title: str, quality: DataQuality | None = None) -> str:
     """The page's text."""
-    plots = coverage_plots(found)
+    plots = coverage_plots(coverage)
     context: dict[str, Any] = {
         "title": title,
-        "size": f"{found.recordings} recording{'s' * (found.recordings != 1)}, {number(found.hours, 2)} h at "
-        f"{found.rate_hz:g} Hz",
-        "headline": unbroken(headline(found)),
-        "verdict": verdict(found),
-        "tiles": tiles(found),
+        "size": f"{coverage.recordings} recording{'s' * (coverage.recordings != 1)}, {number(coverage.hours, 2)} h at "
+        f"{coverage.rate_hz:g} Hz",
+        "headline": unbroken(headline(coverage)),
+        "verdict": verdict(coverage),
+        "tiles": tiles(coverage),
         **shown(plots),
-        "wanted": wanted_table(found),
-        "found": found,
+        "wanted": wanted_table(coverage),
+        "found": coverage,
         "quality": {} if quality is None else quality_tables(quality),
-        "integrated": found.occupancy is not None and found.occupancy.source == INTEGRATED,
-        "activity": activity_table(found),
-        "together": together_table(found),
-        "events": events_table(found),
-        "joints": joints_table(found),
-        "distance": distance_table(found),
+        "integrated": coverage.occupancy is not None and coverage.occupancy.source == INTEGRATED,
+        "activity": activity_table(coverage),
+        "together": together_table(coverage),
+        "events": events_table(coverage),
+        "joints": joints_table(coverage),
+        "distance": distance_table(coverage),
     }
     return template("coverage.html.jinja").render(**context)
 
 
-def headline(found: Coverage) -> str:
+def headline(coverage: Coverage) -> str:
     """What the data cover, in a sentence."""
     parts = []
-    if found.occupancy is not None:
-        kind = "of the poses" if found.occupancy.samples.ndim > 1 else "of the stroke"
-        parts.append(f"visits {percent(found.occupancy.share)} {kind}")
-    if found.spectrum is not None and any(found.spectrum.flat_to_hz):
-        parts.append(f"excites its commands up to {number(min(found.spectrum.flat_to_hz), 1)} Hz")
-    if found.distance is not None and found.distance.beyond > BEYOND:
-        parts.append(f"leaves {percent(found.distance.beyond)} of the tests far from training")
-    size = f"{number(found.hours, 1 if found.hours >= 1 else 2)} h of data"
+    if coverage.occupancy is not None:
+        kind = "of the poses" if coverage.occupancy.samples.ndim > 1 else "of the stroke"
+        parts.append(f"visits {percent(coverage.occupancy.share)} {kind}")
+    if coverage.spectrum is not None and any(coverage.spectrum.flat_to_hz):
+        parts.append(f"excites its commands up to {number(min(coverage.spectrum.flat_to_hz), 1)} Hz")
+    if coverage.distance is not None and coverage.distance.beyond > BEYOND:
+        parts.append(f"leaves {percent(coverage.distance.beyond)} of the tests far from training")
+    size = f"{number(coverage.hours, 1 if coverage.hours >= 1 else 2)} h of data"
     return f"{size} that {listed(parts)}." if parts else f"{size}."
 
 
-def verdict(found: Coverage) -> list[str]:
+def verdict(coverage: Coverage) -> list[str]:
     """What is missing for learning a model of the machine from these data."""
     lines = []
-    inputs = found.spectrum
+    inputs = coverage.spectrum
     if inputs is not None and any(inputs.flat_to_hz) and min(inputs.flat_to_hz) < inputs.used_hz:
         lines.append(
             f"Commands fall by {FLAT_DB:g} dB before {inputs.used_hz:.2g} Hz, where they lie up to "
             f"{number(max(inputs.drop_db), 0)} dB below their maximum: faster changes teach little here."
         )
-    if found.occupancy is not None and found.occupancy.share < OCCUPANCY:
+    if coverage.occupancy is not None and coverage.occupancy.share < OCCUPANCY:
         lines.append(f"Fewer than {percent(OCCUPANCY)} of the cells were visited; the white ones were never.")
-    if found.constant:
-        lines.append(f"{listed(found.constant)} never change{'s' * (len(found.constant) == 1)}.")
+    if coverage.constant:
+        lines.append(f"{listed(coverage.constant)} never change{'s' * (len(coverage.constant) == 1)}.")
     return lines
 
 
-def tiles(found: Coverage) -> list[tuple[str, str, str]]:
+def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what."""
-    made: list[tuple[str, str, str]] = []
-    if found.occupancy is not None:
-        cells = found.occupancy.samples.size
-        made.append((number(100 * found.occupancy.share, 0), "%", f"of {cells} cells of the strokes visited"))
-    if found.spectrum is not None and found.spectrum.flat_to_hz:
-        made.append(
-            (number(min(found.spectrum.flat_to_hz), 2), "Hz", f"every command within {FLAT_DB:g} dB up to here")
+    tiles: list[tuple[str, str, str]] = []
+    if coverage.occupancy is not None:
+        cells = coverage.occupancy.samples.size
+        tiles.append((number(100 * coverage.occupancy.share, 0), "%", f"of {cells} cells of the strokes visited"))
+    if coverage.spectrum is not None and coverage.spectrum.flat_to_hz:
+        tiles.append(
+            (number(min(coverage.spectrum.flat_to_hz), 2), "Hz", f"every command within {FLAT_DB:g} dB up to here")
         )
-    if found.singular:
-        lags = max(found.singular)
-        made.append((f"{found.singular[lags]:.2g}", "", f"smallest singular value of the inputs, {lags} lags"))
-    turns = [axis.reversals for axis in found.activity if axis.reversals is not None]
+    if coverage.singular:
+        lags = max(coverage.singular)
+        tiles.append((f"{coverage.singular[lags]:.2g}", "", f"smallest singular value of the inputs, {lags} lags"))
+    turns = [axis.reversals for axis in coverage.activity if axis.reversals is not None]
     if turns:
-        made.append((whole(sum(turns)), "", "reversals of the commands"))
-    if found.distance is not None:
-        made.append(
-            (percent(found.distance.beyond).rstrip(" %"), "%", "of the tests farther than 95 % of the training")
+        tiles.append((whole(sum(turns)), "", "reversals of the commands"))
+    if coverage.distance is not None:
+        tiles.append(
+            (percent(coverage.distance.beyond).rstrip(" %"), "%", "of the tests farther than 95 % of the training")
         )
-    return made
+    return tiles
 
 
-def wanted_table(found: Coverage) -> TextTable | None:
+def wanted_table(coverage: Coverage) -> TextTable | None:
     """Figures beside what is wanted of them."""
     rows = tuple(
         (
@@ -121,51 +121,51 @@ def wanted_table(found: Coverage) -> TextTable | None:
             f"{'at least' if w.at_least else 'at most'} {w.bound:g} {w.unit}",
             "met" if w.met else "not met",
         )
-        for w in wanted(found)
+        for w in wanted(coverage)
     )
     columns = (("Figure", ""), ("Here", ""), ("Wanted", ""), ("Verdict", ""))
     return TextTable("Wanted of data to learn a machine from", columns, rows) if rows else None
 
 
-def activity_table(found: Coverage) -> TextTable | None:
+def activity_table(coverage: Coverage) -> TextTable | None:
     """Commands by axis."""
     rows = tuple(
         (axis.axis, whole(axis.reversals), whole(axis.crossings), percent(axis.active))
-        for axis in found.activity
+        for axis in coverage.activity
         if axis.reversals is not None
     )
     columns = (("Axis", ""), ("Reversals", ""), ("Left the dead band", "times"), ("Commanded", "of the time"))
     return TextTable("Commands", columns, rows) if rows else None
 
 
-def together_table(found: Coverage) -> TextTable | None:
+def together_table(coverage: Coverage) -> TextTable | None:
     """Axes in use at once."""
-    rows = tuple((_first_up(name), percent(share)) for name, share in found.together.items())
+    rows = tuple((_first_up(name), percent(share)) for name, share in coverage.together.items())
     return TextTable("In use at once", (("Commanded", ""), ("Share", "of the time")), rows) if rows else None
 
 
-def events_table(found: Coverage) -> TextTable:
+def events_table(coverage: Coverage) -> TextTable:
     """Events, recorded or not."""
     rows = tuple(
         (_first_up(event.name), whole(event.count), percent(event.share), event.note or "recorded")
-        for event in found.events
+        for event in coverage.events
     )
     return TextTable("How often", (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", "")), rows)
 
 
-def joints_table(found: Coverage) -> TextTable | None:
+def joints_table(coverage: Coverage) -> TextTable | None:
     """Joint histograms in figures."""
     rows = tuple(
         (f"{j.x} and {j.y}", percent(j.filled), number(j.correlation, 2), number(j.information, 2))
-        for j in found.joints
+        for j in coverage.joints
     )
     columns = (("Signals", ""), ("Bins filled", ""), ("Correlation", ""), ("Mutual information", "nat"))
     return TextTable("Joint histograms in figures", columns, rows) if rows else None
 
 
-def distance_table(found: Coverage) -> TextTable | None:
+def distance_table(coverage: Coverage) -> TextTable | None:
     """Distance from tests to training beside that within training."""
-    far = found.distance
+    far = coverage.distance
     if far is None:
         return None
     rows = (

@@ -26,16 +26,16 @@ GROUPS = {
 }
 
 
-def coverage_plots(found: Coverage) -> dict[str, Plot]:
+def coverage_plots(coverage: Coverage) -> dict[str, Plot]:
     """Every picture that a data set has data for, by name."""
-    made = [spectrum_plot(found), excitation_plot(found), occupancy_plot(found.occupancy)]
-    made += [joint_plot(found, group) for group in GROUPS]
-    return {plot.name: plot for plot in made if plot is not None}
+    plots = [spectrum_plot(coverage), excitation_plot(coverage), occupancy_plot(coverage.occupancy)]
+    plots += [joint_plot(coverage, group) for group in GROUPS]
+    return {plot.name: plot for plot in plots if plot is not None}
 
 
-def spectrum_plot(found: Coverage) -> Plot | None:
+def spectrum_plot(coverage: Coverage) -> Plot | None:
     """Power spectral density of each command in dB below its maximum, with the band that should be flat."""
-    inputs = found.spectrum
+    inputs = coverage.spectrum
     if inputs is None or not len(inputs.frequency_hz):
         return None
     figure = go.Figure()
@@ -70,15 +70,15 @@ def spectrum_plot(found: Coverage) -> Plot | None:
     return Plot("spectrum", figure)
 
 
-def excitation_plot(found: Coverage) -> Plot | None:
+def excitation_plot(coverage: Coverage) -> Plot | None:
     """Smallest singular value of the input Hankel matrix against the number of lags."""
-    if len(found.singular) < 2:
+    if len(coverage.singular) < 2:
         return None
-    lags = list(found.singular)
+    lags = list(coverage.singular)
     figure = go.Figure(
         go.Scatter(
             x=lags,
-            y=[max(value, 1e-9) for value in found.singular.values()],
+            y=[max(value, 1e-9) for value in coverage.singular.values()],
             mode="lines+markers",
             line={"color": BLUE, "width": 2.2},
             marker={"size": 7},
@@ -91,7 +91,7 @@ def excitation_plot(found: Coverage) -> Plot | None:
         x=max(lags), y=0.0, text="white noise", showarrow=False, xanchor="right", yanchor="bottom",
         font={"size": 12, "color": SOFT},
     )  # fmt: skip
-    lowest = max(min(found.singular.values()), 1e-9)
+    lowest = max(min(coverage.singular.values()), 1e-9)
     figure.update_xaxes(title_text="Lags [samples]", rangemode="tozero")
     figure.update_yaxes(type="log", title_text="Smallest singular value", dtick=1, exponentformat="power")
     figure.update_yaxes(range=[np.floor(np.log10(lowest)) - 0.1, 0.4])
@@ -146,9 +146,9 @@ def occupancy_plot(occupancy: Occupancy | None) -> Plot | None:
     return Plot("occupancy", figure)
 
 
-def joint_plot(found: Coverage, group: str) -> Plot | None:
+def joint_plot(coverage: Coverage, group: str) -> Plot | None:
     """Joint histograms of one kind side by side, in shares of the samples on a logarithmic scale."""
-    joints = [joint for joint in found.joints if joint.group == group][:6]
+    joints = [joint for joint in coverage.joints if joint.group == group][:6]
     if not joints:
         return None
     name = GROUPS[group]
@@ -164,7 +164,7 @@ def joint_plot(found: Coverage, group: str) -> Plot | None:
     shares = [100.0 * joint.counts.T / max(joint.counts.sum(), 1) for joint in joints]
     top = max(float(part.max()) for part in shares)
     for i, (joint, share) in enumerate(zip(joints, shares, strict=True)):
-        place = {"row": i // columns + 1, "col": i % columns + 1}
+        panel = {"row": i // columns + 1, "col": i % columns + 1}
         figure.add_heatmap(
             x=_middles(joint.x_range, share.shape[1]),
             y=_middles(joint.y_range, share.shape[0]),
@@ -172,10 +172,10 @@ def joint_plot(found: Coverage, group: str) -> Plot | None:
             customdata=share,
             coloraxis="coloraxis",
             hovertemplate="%{x:.4~g}, %{y:.4~g}: %{customdata:.3f} %<extra></extra>",
-            **place,
+            **panel,
         )
-        figure.update_xaxes(title_text=with_unit(_clipped(joint.x), joint.x_unit), **place)
-        figure.update_yaxes(title_text=with_unit(_clipped(joint.y), joint.y_unit), title_standoff=2, **place)
+        figure.update_xaxes(title_text=with_unit(_clipped(joint.x), joint.x_unit), **panel)
+        figure.update_yaxes(title_text=with_unit(_clipped(joint.y), joint.y_unit), title_standoff=2, **panel)
     styled(figure, 60 + 270 * rows, coloraxis=_colours(top, "% of the samples"))
     figure.update_layout(margin={"t": 34, "r": 80})
     figure.update_annotations(font={"size": 12, "color": SOFT})

@@ -12,13 +12,17 @@ SHOWN_CHANNELS = 400
 """Rows of the table of channels; the rest is in the JSON."""
 
 
-def quality_tables(found: DataQuality) -> dict[str, TextTable]:
+def quality_tables(quality: DataQuality) -> dict[str, TextTable]:
     """Recordings, channels that are not good, and findings, by name; a table without rows is left out."""
-    made = {"recordings": recordings_table(found), "channels": channels_table(found), "findings": findings_table(found)}
-    return {name: table for name, table in made.items() if table.rows}
+    tables = {
+        "recordings": recordings_table(quality),
+        "channels": channels_table(quality),
+        "findings": findings_table(quality),
+    }
+    return {name: table for name, table in tables.items() if table.rows}
 
 
-def recordings_table(found: DataQuality) -> TextTable:
+def recordings_table(quality: DataQuality) -> TextTable:
     """A row for each recording."""
     rows = tuple(
         (
@@ -31,7 +35,7 @@ def recordings_table(found: DataQuality) -> TextTable:
             _count(report, "warning"),
             report.verdict,
         )
-        for report in found.reports
+        for report in quality.reports
     )
     columns = (
         ("Recording", ""), ("Length", "s"), ("Rate", "Hz"), ("Jitter", "steps"), ("Gaps", ""), ("Missing", "values"),
@@ -40,16 +44,16 @@ def recordings_table(found: DataQuality) -> TextTable:
     return TextTable("Recordings", columns, rows)
 
 
-def channels_table(found: DataQuality) -> TextTable:
+def channels_table(quality: DataQuality) -> TextTable:
     """Sensor facts of each channel, over all recordings: the worst of each."""
     columns = (
         ("Channel", ""), ("Unit", ""), ("Min", ""), ("Max", ""), ("Step", ""), ("Noise", ""), ("SNR", "dB"),
         ("New", "Hz"), ("Stuck", "s"), ("At ends", ""), ("Verdict", "worst"),
     )  # fmt: skip
-    names = list(dict.fromkeys(channel.name for report in found.reports for channel in report.channels))
+    names = list(dict.fromkeys(channel.name for report in quality.reports for channel in report.channels))
     rows = []
     for name in names[:SHOWN_CHANNELS]:
-        facts = [channel for report in found.reports for channel in report.channels if channel.name == name]
+        facts = [channel for report in quality.reports for channel in report.channels if channel.name == name]
         snr = [channel.snr_db for channel in facts if channel.snr_db is not None]
         worst = next(v for v in ("unusable", "check", "good") if any(channel.verdict == v for channel in facts))
         rows.append(
@@ -70,10 +74,10 @@ def channels_table(found: DataQuality) -> TextTable:
     return TextTable("Channels over all recordings", columns, tuple(rows))
 
 
-def findings_table(found: DataQuality) -> TextTable:
+def findings_table(quality: DataQuality) -> TextTable:
     """Errors and warnings, equal ones of several recordings together, worst first; notes are in the JSON."""
-    grouped: dict[tuple[str, str, str, str], list[str]] = {_key(finding): [] for finding in found.findings}
-    for report in found.reports:
+    grouped: dict[tuple[str, str, str, str], list[str]] = {_key(finding): [] for finding in quality.findings}
+    for report in quality.reports:
         for finding in report.findings:
             if finding.severity != "note":
                 grouped.setdefault(_key(finding), []).append(report.name)

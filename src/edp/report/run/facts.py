@@ -143,11 +143,11 @@ def read_history(path: Path) -> tuple[Mapping[str, Any], ...]:
     """
     lines = [(row, line) for row, line in enumerate(read_text(path, JSON_BYTES).splitlines(), 1) if line.strip()]
     epochs: list[Mapping[str, Any]] = []
-    for place, (row, line) in enumerate(lines, 1):
+    for line_number, (row, line) in enumerate(lines, 1):
         try:
             epoch = parse_json(line, f"'{path}' line {row}", finite=False)
         except StorageError:
-            if place == len(lines):
+            if line_number == len(lines):
                 break
             raise
         if not isinstance(epoch, dict):
@@ -161,11 +161,11 @@ def _read_foundation(folder: Path) -> Mapping[str, Any] | None:
     path = folder / "foundation.json"
     if not path.is_file():
         return None
-    found = read_object(path)
-    unseen = found.get("unseen")
-    if not {"label", "horizon", "data"} <= found.keys() or not {"contexts", "machines"} <= set(unseen or ()):
+    foundation = read_object(path)
+    unseen = foundation.get("unseen")
+    if not {"label", "horizon", "data"} <= foundation.keys() or not {"contexts", "machines"} <= set(unseen or ()):
         raise StorageError(f"'{path}' does not hold what `edp pretrain` writes; run that command once more")
-    return found
+    return foundation
 
 
 def _read_predictions(folder: Path) -> dict[str, dict[str, NDArray[np.floating]]]:
@@ -190,7 +190,7 @@ def _check_predictions(facts: Facts) -> None:
     for recording, parts in facts.predictions.items():
         truth = parts[TRUTH]
         for name, array in parts.items():
-            wanted = (
+            expected_shape = (
                 (len(truth), len(facts.targets))
                 if name == TRUTH
                 else (
@@ -199,10 +199,10 @@ def _check_predictions(facts: Facts) -> None:
                     len(facts.targets),
                 )
             )
-            if array.shape != wanted:
+            if array.shape != expected_shape:
                 raise DataError(
                     f"predictions.safetensors, '{recording}/{name}' has shape {array.shape}, but scores.json asks for "
-                    f"{wanted}; run `edp evaluate {facts.folder}` again so that both come from one evaluation"
+                    f"{expected_shape}; run `edp evaluate {facts.folder}` again so that both come from one evaluation"
                 )
 
 
@@ -307,8 +307,8 @@ def recordings_won(facts: Facts, rival: str) -> tuple[int, int]:
 
     def errors(name: str) -> dict[str, float]:
         scored = facts.models.get(name, {}).get("recordings", {})
-        found = {key: value.get(samples, {}).get("mean", {}).get("mae") for key, value in scored.items()}
-        return {key: value for key, value in found.items() if value is not None}
+        recording_errors = {key: value.get(samples, {}).get("mean", {}).get("mae") for key, value in scored.items()}
+        return {key: value for key, value in recording_errors.items() if value is not None}
 
     ours, theirs = errors(NETWORK), errors(rival)
     both = ours.keys() & theirs.keys()

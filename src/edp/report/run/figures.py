@@ -78,12 +78,12 @@ def downsample(y: Array, points: int) -> NDArray[np.intp]:
         return np.empty(0, dtype=np.intp)
     gaps = finite[:-1][np.diff(finite) > 1] + 1
     if len(finite) <= points:
-        kept = finite
+        selected = finite
     else:
         values = np.ascontiguousarray(y[finite], dtype=np.float64)
         chosen = MinMaxLTTBDownsampler().downsample(finite.astype(np.float64), values, n_out=points)
-        kept = finite[chosen.astype(np.intp)]
-    return np.union1d(kept, gaps[:points]).astype(np.intp)
+        selected = finite[chosen.astype(np.intp)]
+    return np.union1d(selected, gaps[:points]).astype(np.intp)
 
 
 def busiest_start(truth: Array, length: int) -> int:
@@ -121,12 +121,14 @@ def prediction_lines(facts: Facts, budget: int = POINT_BUDGET) -> list[Line]:
         length = min(round(EXCERPT_SECONDS * rate), points)
         first = busiest_start(truth, length)
         for model, horizon, values in _series(facts, recording, horizons):
-            for place, target in enumerate(facts.targets):
-                y = np.asarray(values[:, place] * target.factor, dtype=np.float32)
-                kept = downsample(y, points)
-                lines.append(Line(recording, WHOLE, model, horizon, place, y[kept], (kept / rate).astype(np.float32)))
+            for output, target in enumerate(facts.targets):
+                y = np.asarray(values[:, output] * target.factor, dtype=np.float32)
+                selected = downsample(y, points)
+                lines.append(
+                    Line(recording, WHOLE, model, horizon, output, y[selected], (selected / rate).astype(np.float32))
+                )
                 cut = y[first : first + length]
-                lines.append(Line(recording, EXCERPT, model, horizon, place, cut, start=first / rate, step=1.0 / rate))
+                lines.append(Line(recording, EXCERPT, model, horizon, output, cut, start=first / rate, step=1.0 / rate))
     return lines
 
 
@@ -162,14 +164,14 @@ class Histogram:
 
 def residual_histograms(facts: Facts, bins: int = 61) -> list[Histogram]:
     """Prediction minus truth over the recordings kept, in bins that span 99 % of the network's residuals."""
-    found: list[Histogram] = []
+    histograms: list[Histogram] = []
     models = {name for parts in facts.predictions.values() for name in parts} - {TRUTH}
     order = sorted(models, key=lambda name: name != NETWORK)
     for horizon in horizons_shown(facts):
-        for place, target in enumerate(facts.targets):
+        for output, target in enumerate(facts.targets):
             reach = 0.0
             for model in order:
-                errors = _residuals(facts, model, horizon, place) * target.factor
+                errors = _residuals(facts, model, horizon, output) * target.factor
                 if len(errors) == 0:
                     continue
                 reach = reach or float(np.quantile(np.abs(errors), 0.99)) or 1e-9
@@ -178,14 +180,14 @@ def residual_histograms(facts: Facts, bins: int = 61) -> list[Histogram]:
                 centres = (edges[:-1] + edges[1:]) / 2
                 outside = max(1.0 - float(share.sum()), 0.0)
                 mean, deviation = float(errors.mean()), float(errors.std())
-                found.append(Histogram(model, horizon, place, centres, share, outside, mean, deviation))
-    return found
+                histograms.append(Histogram(model, horizon, output, centres, share, outside, mean, deviation))
+    return histograms
 
 
-def _residuals(facts: Facts, model: str, horizon: int, place: int) -> Array:
+def _residuals(facts: Facts, model: str, horizon: int, output: int) -> Array:
     parts = [recording for recording in facts.predictions.values() if model in recording]
     column = facts.horizons.index(horizon)
-    errors = [aligned(part[model][:, column, place], horizon) - part[TRUTH][:, place] for part in parts]
+    errors = [aligned(part[model][:, column, output], horizon) - part[TRUTH][:, output] for part in parts]
     joined = np.concatenate(errors).astype(np.float64) if errors else np.empty(0)
     return joined[np.isfinite(joined)]
 
@@ -204,11 +206,11 @@ def horizon_curves(facts: Facts) -> dict[str, list[tuple[float, float]]]:
 
 def speed_bands(facts: Facts, horizon: int) -> dict[str, list[dict[str, float | None]]]:
     """Error of each model by speed band: name -> rows of `low`, `high`, `count`, `mae` (None in an empty band)."""
-    found: dict[str, list[dict[str, float | None]]] = {}
+    bands: dict[str, list[dict[str, float | None]]] = {}
     for name, model in facts.models.items():
         rows = model.get("by_speed", {}).get(str(horizon), [])
         if rows:
-            found[name] = [
+            bands[name] = [
                 {
                     "low": row["low"],
                     "high": row["high"],
@@ -217,7 +219,7 @@ def speed_bands(facts: Facts, horizon: int) -> dict[str, list[dict[str, float | 
                 }
                 for row in rows
             ]
-    return found
+    return bands
 
 
 def recording_errors(facts: Facts, horizon: int) -> tuple[list[str], dict[str, list[float | None]]]:
@@ -238,9 +240,9 @@ def learning_curves(facts: Facts) -> dict[str, list[float | None]]:
     """Columns of the training history; `best` holds the epoch whose weights were kept, if the history says."""
     names = ("epoch", "train_loss", "validation_loss", "validation_mae", "learning_rate")
     columns: dict[str, list[float | None]] = {name: [] for name in (*names, "best")}
-    for place, row in enumerate(facts.history, 1):
+    for row_number, row in enumerate(facts.history, 1):
         for name in names:
-            value = row.get(name, place if name == "epoch" else None)
+            value = row.get(name, row_number if name == "epoch" else None)
             usable = isinstance(value, int | float) and math.isfinite(value)
             columns[name].append(float(value) if usable else None)
         if row.get("best"):
@@ -250,10 +252,10 @@ def learning_curves(facts: Facts) -> dict[str, list[float | None]]:
 
 def log_ticks(values: Sequence[float | None]) -> list[float]:
     """Ticks of a logarithmic axis at 1, 2 and 5 per decade, or 1 alone over many; none where a value is <= 0."""
-    known = [value for value in values if value is not None]
-    if not known or min(known) <= 0:
+    present = [value for value in values if value is not None]
+    if not present or min(present) <= 0:
         return []
-    low, high = math.floor(math.log10(min(known))), math.ceil(math.log10(max(known)))
+    low, high = math.floor(math.log10(min(present))), math.ceil(math.log10(max(present)))
     steps = (1, 2, 5) if high - low <= 3 else (1,)
     return [step * 10.0**decade for decade in range(low, high + 1) for step in steps]
 

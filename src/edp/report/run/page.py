@@ -87,12 +87,12 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
 
 def foundation_tables(facts: run.Facts) -> dict[str, tables.TextTable]:
     """Machines that were never seen, of a run over many machines; empty for any other."""
-    found = facts.foundation
-    if found is None:
+    foundation = facts.foundation
+    if foundation is None:
         return {}
     unit = facts.unit or "report units"
-    made = (parts_sheet(found), contexts_sheet(found, unit), machines_sheet(found, unit))
-    return {sheet.name: sheet.table() for sheet in made}
+    sheets = (parts_sheet(foundation), contexts_sheet(foundation, unit), machines_sheet(foundation, unit))
+    return {sheet.name: sheet.table() for sheet in sheets}
 
 
 def shown(plots: Mapping[str, Plot]) -> dict[str, Any]:

@@ -38,8 +38,8 @@ def plots_of(facts: Facts) -> dict[str, Plot]:
         recording_plot,
         learning_plot,
     )
-    made = (maker(facts) for maker in makers)
-    return {plot.name: plot for plot in made if plot is not None}
+    plots = (maker(facts) for maker in makers)
+    return {plot.name: plot for plot in plots if plot is not None}
 
 
 def prediction_plot(facts: Facts) -> Plot | None:
@@ -101,8 +101,8 @@ def prediction_plot(facts: Facts) -> Plot | None:
 
 def residual_plot(facts: Facts) -> Plot | None:
     """Residual histograms: one panel per output."""
-    found = figures.residual_histograms(facts)
-    if not found:
+    histograms = figures.residual_histograms(facts)
+    if not histograms:
         return None
     columns = min(len(facts.targets), 3)
     rows = -(-len(facts.targets) // columns)
@@ -114,7 +114,7 @@ def residual_plot(facts: Facts) -> Plot | None:
         subplot_titles=[html.escape(target.description) for target in facts.targets],
     )
     horizons = figures.headline_first(facts)
-    for item in found:
+    for item in histograms:
         network = item.model == NETWORK
         row, column = divmod(item.target, columns)
         unit = html.escape(facts.targets[item.target].unit)
@@ -136,8 +136,8 @@ def residual_plot(facts: Facts) -> Plot | None:
             f"deviation {item.deviation:.3g} {unit}<br>{100 * item.outside:.1f} % beyond the axis</extra>",
         )
     styled(figure, 60 + 260 * rows)
-    for place, target in enumerate(facts.targets):
-        row, column = divmod(place, columns)
+    for output, target in enumerate(facts.targets):
+        row, column = divmod(output, columns)
         figure.update_xaxes(title_text=with_unit("Residual", target.unit), row=row + 1, col=column + 1)
         if column == 0:
             figure.update_yaxes(title_text="Share of samples [%]", row=row + 1, col=1)

@@ -31,11 +31,11 @@ def read_limit(path: Path | None, provenance: Mapping[str, Any] | None) -> Mappi
             return None
     elif path.is_dir():
         path = path / FILE
-    found = read_json(path)
-    complete = isinstance(found, dict) and {"unit", "rate_hz", "horizons", "targets", *KINDS} <= found.keys()
+    limit = read_json(path)
+    complete = isinstance(limit, dict) and {"unit", "rate_hz", "horizons", "targets", *KINDS} <= limit.keys()
     if not complete:
         raise StorageError(f"'{path}' holds no limit of predictability; `edp simulate FOLDER --limit` writes one")
-    return dict(found)
+    return dict(limit)
 
 
 def limit_line(facts: Facts, samples: int | None) -> str:
@@ -48,9 +48,9 @@ def limit_line(facts: Facts, samples: int | None) -> str:
     row = list(limit["horizons"]).index(samples)
     unknown = limit["commands_unknown"]
     least, low, high = (number(unknown[key][row][-1], 2) for key in ("mae", "low", "high"))
-    known = number(limit["commands_known"]["mae"][row][-1], 2)
+    error_with_commands = number(limit["commands_known"]["mae"][row][-1], 2)
     return (
         f"The limit of predictability here is {least} {facts.unit} (95 %: {low} to {high}): even a predictor that "
         f"knows the true state is off by that, for it knows neither the operator's next choices nor the noise to come; "
-        f"told the commands, it would be off by {known}."
+        f"told the commands, it would be off by {error_with_commands}."
     )

@@ -19,7 +19,7 @@ from edp.storage import write_bytes
 
 
 def build_screening_page(
-    found: ScreeningResult,
+    screening: ScreeningResult,
     output: str | Path,
     title: str,
     quality: DataQuality | None = None,
@@ -29,7 +29,7 @@ def build_screening_page(
     """Write a screening as one HTML file that opens with no network.
 
     Args:
-        found: the screening.
+        screening: the screening.
         output: where to write.
         title: name of the data set.
         quality: how good its recordings are.
@@ -40,73 +40,73 @@ def build_screening_page(
         StorageError: the page cannot be written.
     """
     target = Path(output)
-    write_bytes(target, render_screening(found, title, quality, trials, notes).encode("utf-8", "replace"))
+    write_bytes(target, render_screening(screening, title, quality, trials, notes).encode("utf-8", "replace"))
     return target
 
 
 def render_screening(
-    found: ScreeningResult,
+    screening: ScreeningResult,
     title: str,
     quality: DataQuality | None = None,
     trials: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
 ) -> str:
     """The page's text."""
-    plots = screening_plots(found)
-    hours = found.samples / found.rate_hz / 3600
+    plots = screening_plots(screening)
+    hours = screening.samples / screening.rate_hz / 3600
     context: dict[str, Any] = {
         "title": title,
-        "size": f"{len(found.recordings)} recording{'s' * (len(found.recordings) != 1)}, {number(hours, 2)} h at "
-        f"{found.rate_hz:g} Hz",
-        "headline": unbroken(headline(found)),
-        "verdict": verdict(found, quality),
-        "tiles": tiles(found),
+        "size": f"{len(screening.recordings)} recording{'s' * (len(screening.recordings) != 1)}, {number(hours, 2)} h "
+        f"at {screening.rate_hz:g} Hz",
+        "headline": unbroken(headline(screening)),
+        "verdict": verdict(screening, quality),
+        "tiles": tiles(screening),
         **shown(plots),
-        "found": found,
-        "ahead": f"{found.horizon} samples ({1e3 * found.horizon / found.rate_hz:g} ms)",
-        "kept": tables.kept_table(found),
-        "dropped": tables.dropped_table(found),
-        "flags": tables.flags_table(found),
-        "ranges": tables.ranges_table(found),
-        "lags": tables.lags_table(found),
-        "clusters": tables.clusters_table(found),
-        "stages": tables.stages_table(found),
+        "found": screening,
+        "ahead": f"{screening.horizon} samples ({1e3 * screening.horizon / screening.rate_hz:g} ms)",
+        "kept": tables.kept_table(screening),
+        "dropped": tables.dropped_table(screening),
+        "flags": tables.flags_table(screening),
+        "ranges": tables.ranges_table(screening),
+        "lags": tables.lags_table(screening),
+        "clusters": tables.clusters_table(screening),
+        "stages": tables.stages_table(screening),
         "trials": None if trials is None else tables.trials_table(trials),
         "trial_notes": () if trials is None else tuple(trials["notes"]),
         "held_out": () if trials is None else tuple(trials["held_out"]),
         "quality": {} if quality is None else quality_tables(quality),
-        "options": sorted((key, str(value)) for key, value in found.options.items()),
+        "options": sorted((key, str(value)) for key, value in screening.options.items()),
         "notes": tuple(notes),
-        "window_reason": sentence(found.proposal.window_reason),
-        "seconds": duration(sum(found.seconds.values())),
+        "window_reason": sentence(screening.proposal.window_reason),
+        "seconds": duration(sum(screening.seconds.values())),
     }
     return template("screening.html.jinja").render(**context)
 
 
-def headline(found: ScreeningResult) -> str:
+def headline(screening: ScreeningResult) -> str:
     """The proposal in a sentence."""
-    kept, window = len(found.proposal.kept), found.proposal.window
+    proposed, window = len(screening.proposal.kept), screening.proposal.window
     return (
-        f"{kept} of {len(found.channels)} channels are proposed to predict {listed(found.targets)}, with a memory of "
-        f"{window} samples ({1e3 * window / found.rate_hz:g} ms)."
+        f"{proposed} of {len(screening.channels)} channels are proposed to predict {listed(screening.targets)}, with a "
+        f"memory of {window} samples ({1e3 * window / screening.rate_hz:g} ms)."
     )
 
 
-def verdict(found: ScreeningResult, quality: DataQuality | None) -> list[str]:
+def verdict(screening: ScreeningResult, quality: DataQuality | None) -> list[str]:
     """What to know before the proposal is used."""
     lines = []
-    leaks = sorted({flag.channel for flag in found.flags if flag.kind is FlagKind.LEAK})
+    leaks = sorted({flag.channel for flag in screening.flags if flag.kind is FlagKind.LEAK})
     if leaks:
         shown = listed(leaks[:6]) if len(leaks) <= 6 else f"{', '.join(leaks[:6])} and {len(leaks) - 6} more"
         lines.append(f"{shown} know{'s' * (len(leaks) == 1)} the future and must not be fed to a model.")
-    groups = [joined(entry.members) for entry in best_groups(found) if entry.low > 0]
+    groups = [joined(entry.members) for entry in best_groups(screening) if entry.low > 0]
     if groups:
         lines.append(f"The forest misses {listed(groups)} most.")
     if quality is not None and quality.repeats:
         lines.append("Some recordings repeat each other: read the section on quality before splitting.")
     if quality is not None and quality.errors:
         lines.append("Some recordings hold errors that were repaired for the screening.")
-    return [*lines, *(sentence(note) for note in found.proposal.notes)]
+    return [*lines, *(sentence(note) for note in screening.proposal.notes)]
 
 
 def sentence(text: str) -> str:
@@ -115,18 +115,18 @@ def sentence(text: str) -> str:
     return stripped and stripped[0].upper() + stripped[1:] + ("" if stripped.endswith((".", "!", "?")) else ".")
 
 
-def tiles(found: ScreeningResult) -> list[tuple[str, str, str]]:
+def tiles(screening: ScreeningResult) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what."""
-    made = [
-        (whole(len(found.proposal.kept)), "", f"of {len(found.channels)} channels proposed"),
-        (whole(found.proposal.window), "samples", "suggested memory W"),
+    tiles = [
+        (whole(len(screening.proposal.kept)), "", f"of {len(screening.channels)} channels proposed"),
+        (whole(screening.proposal.window), "samples", "suggested memory W"),
     ]
-    counts = {kind: len({flag.channel for flag in found.flags if flag.kind is kind}) for kind in FlagKind}
+    counts = {kind: len({flag.channel for flag in screening.flags if flag.kind is kind}) for kind in FlagKind}
     words = {
         FlagKind.LEAK: "leaks of the future",
         FlagKind.COPY: "delayed copies",
         FlagKind.ARTEFACT: "artefacts of a file",
         FlagKind.NOISE: "channels without any relation",
     }
-    made += [(whole(counts[kind]), "", text) for kind, text in words.items() if counts[kind]]
-    return made
+    tiles += [(whole(counts[kind]), "", text) for kind, text in words.items() if counts[kind]]
+    return tiles

@@ -37,11 +37,11 @@ DIVERGING = ("#7a4a06", "#d79a3c", "#ffffff", "#6d9fec", "#062c74")
 _FIGURES_IN_CELLS = 32
 
 
-def write_pictures(found: ScreeningResult, folder: str | Path) -> list[Path]:
+def write_pictures(screening: ScreeningResult, folder: str | Path) -> list[Path]:
     """Write every picture as SVG and PNG: matrices, lag curves by target, stability, importance, linear value.
 
     Args:
-        found: the screening.
+        screening: the screening.
         folder: where to write; it is made.
 
     Returns:
@@ -50,23 +50,23 @@ def write_pictures(found: ScreeningResult, folder: str | Path) -> list[Path]:
     Raises:
         StorageError: the folder or a file cannot be written.
     """
-    return write_drawings(folder, _drawings(found))
+    return write_drawings(folder, _drawings(screening))
 
 
-def _drawings(found: ScreeningResult) -> dict[str, Callable[[Figure], None]]:
-    made: dict[str, Callable[[Figure], None]] = {}
-    for matrix in matrix_views(found):
-        made[f"matrix_{matrix.measure}"] = partial(_matrix, view=matrix)
-    for lag in lag_views(found):
-        made[f"lags_{file_name(lag.target)}"] = partial(_lags, view=lag, rate_hz=found.rate_hz)
+def _drawings(screening: ScreeningResult) -> dict[str, Callable[[Figure], None]]:
+    drawings: dict[str, Callable[[Figure], None]] = {}
+    for matrix in matrix_views(screening):
+        drawings[f"matrix_{matrix.measure}"] = partial(_matrix, view=matrix)
+    for lag in lag_views(screening):
+        drawings[f"lags_{file_name(lag.target)}"] = partial(_lags, view=lag, rate_hz=screening.rate_hz)
     for name, views in (
-        *((f"stability_{metric}", _of(stability_views(found), metric)) for metric in METRICS),
-        ("importance", importance_views(found)),
-        ("value", value_views(found)),
+        *((f"stability_{metric}", _of(stability_views(screening), metric)) for metric in METRICS),
+        ("importance", importance_views(screening)),
+        ("value", value_views(screening)),
     ):
         if views:
-            made[name] = partial(_bars, views=views)
-    return made
+            drawings[name] = partial(_bars, views=views)
+    return drawings
 
 
 def _of(views: Sequence[BarView], metric: str) -> tuple[BarView, ...]:
@@ -133,9 +133,9 @@ def _panel(axes: Axes, view: BarView) -> None:
     values = np.array([bar.value for bar in view.bars])
     reach = np.array([[max(b.value - b.low, 0.0), max(b.high - b.value, 0.0)] for b in view.bars]).T
     errors: dict[str, Any] = {"ecolor": INK, "elinewidth": 0.8, "capsize": 1.5}
-    colours = [BLUE if bar.kept else DROPPED for bar in view.bars]
+    colours = [BLUE if bar.proposed else DROPPED for bar in view.bars]
     axes.barh(places, values, 0.66, xerr=np.nan_to_num(reach), color=colours, error_kw=errors)
-    marks = [(bar.mark, place) for bar, place in zip(view.bars, places) if math.isfinite(bar.mark)]
+    marks = [(bar.mark, y) for bar, y in zip(view.bars, places) if math.isfinite(bar.mark)]
     if marks:
         axes.plot([m for m, _ in marks], [p for _, p in marks], "|", color=INK, ms=7, label="chance")
         axes.legend(frameon=False, fontsize=7, loc="lower right")

@@ -37,16 +37,16 @@ _CELL, _LEAST, _MOST = 22, 420, 1500
 _FIGURES_IN_CELLS = 32
 
 
-def screening_plots(found: ScreeningResult) -> dict[str, Plot]:
+def screening_plots(screening: ScreeningResult) -> dict[str, Plot]:
     """Every figure that the screening has data for, by name."""
-    made = [
-        matrix_plot(matrix_views(found)),
-        lag_plot(lag_views(found), found.rate_hz),
-        bar_plot("stability", stability_views(found), ("metric", "target")),
-        bar_plot("importance", importance_views(found), ("target",)),
-        bar_plot("value", value_views(found), ("target",)),
+    plots = [
+        matrix_plot(matrix_views(screening)),
+        lag_plot(lag_views(screening), screening.rate_hz),
+        bar_plot("stability", stability_views(screening), ("metric", "target")),
+        bar_plot("importance", importance_views(screening), ("target",)),
+        bar_plot("value", value_views(screening), ("target",)),
     ]
-    return {plot.name: plot for plot in made if plot is not None}
+    return {plot.name: plot for plot in plots if plot is not None}
 
 
 def matrix_plot(views: Sequence[MatrixView]) -> Plot | None:
@@ -138,7 +138,7 @@ def bar_plot(name: str, views: Sequence[BarView], keys: Sequence[str]) -> Plot |
         figure.add_bar(
             x=[_short(bar.value) for bar in view.bars],
             orientation="h",
-            marker={"color": [BLUE if bar.kept else DROPPED for bar in view.bars]},
+            marker={"color": [BLUE if bar.proposed else DROPPED for bar in view.bars]},
             error_x={
                 "type": "data",
                 "symmetric": False,
@@ -170,11 +170,11 @@ def bar_plot(name: str, views: Sequence[BarView], keys: Sequence[str]) -> Plot |
 
 
 def _controls(views: Sequence[BarView], keys: Sequence[str]) -> tuple[Control, ...]:
-    made: tuple[Control, ...] = ()
+    controls: tuple[Control, ...] = ()
     if "metric" in keys:
         options = tuple((key, METRICS[key]) for key in dict.fromkeys(view.key for view in views))
-        made += (Control("metric", "Metric", options, keeps_zoom=False),) if len(options) > 1 else ()
-    return made + _targets(list(dict.fromkeys(view.target for view in views)))
+        controls += (Control("metric", "Metric", options, keeps_zoom=False),) if len(options) > 1 else ()
+    return controls + _targets(list(dict.fromkeys(view.target for view in views)))
 
 
 def _targets(targets: Sequence[str]) -> tuple[Control, ...]:

@@ -23,30 +23,30 @@ FLAG_WORDS = {
 }
 
 
-def kept_table(found: ScreeningResult) -> TextTable:
+def kept_table(screening: ScreeningResult) -> TextTable:
     """The proposed channels by rank."""
-    return _choices(found, "Keep", True)
+    return _choices(screening, "Keep", True)
 
 
-def dropped_table(found: ScreeningResult) -> TextTable:
+def dropped_table(screening: ScreeningResult) -> TextTable:
     """The other channels by rank."""
-    return _choices(found, "Drop", False)
+    return _choices(screening, "Drop", False)
 
 
-def _choices(found: ScreeningResult, caption: str, keep: bool) -> TextTable:
-    groups = dict(zip(found.channels, found.groups))
+def _choices(screening: ScreeningResult, caption: str, keep: bool) -> TextTable:
+    groups = dict(zip(screening.channels, screening.groups))
     rows = tuple(
-        (c.channel, groups.get(c.channel, MISSING), number(c.score, 2), _lag(found, c), c.reason)
-        for c in found.proposal.choices
+        (c.channel, groups.get(c.channel, MISSING), number(c.score, 2), _lag(screening, c), c.reason)
+        for c in screening.proposal.choices
         if c.keep == keep
     )
     columns = (("Channel", ""), ("Kind of signal", ""), ("Score", "0 to 1"), ("Best lag", "samples"), ("Why", ""))
     return TextTable(caption, columns, rows)
 
 
-def _lag(found: ScreeningResult, choice: ChannelVerdict) -> str:
+def _lag(screening: ScreeningResult, choice: ChannelVerdict) -> str:
     """Best lag against the target that it goes best with."""
-    curves = [c for c in found.lags if c.channel == choice.channel and c.target != choice.channel]
+    curves = [c for c in screening.lags if c.channel == choice.channel and c.target != choice.channel]
     if not curves:
         return MISSING
     best = max(curves, key=lambda curve: abs(curve.value))
@@ -54,10 +54,10 @@ def _lag(found: ScreeningResult, choice: ChannelVerdict) -> str:
     return text if best.certain else f"({text})"
 
 
-def flags_table(found: ScreeningResult) -> TextTable:
+def flags_table(screening: ScreeningResult) -> TextTable:
     """What is wrong with channels, leaks of the future first."""
     order = list(FLAG_WORDS)
-    ranked = sorted(found.flags, key=lambda flag: (_place(order, flag), flag.channel))
+    ranked = sorted(screening.flags, key=lambda flag: (_place(order, flag), flag.channel))
     rows = tuple(
         (
             flag.channel,
@@ -77,7 +77,7 @@ def _place(order: list[str], flag: Flag) -> int:
     return order.index(kind) if kind in order else len(order)
 
 
-def ranges_table(found: ScreeningResult) -> TextTable:
+def ranges_table(screening: ScreeningResult) -> TextTable:
     """Best lags by kind of signal, in the form of the thesis's Table 4.2."""
     rows = tuple(
         (
@@ -87,7 +87,7 @@ def ranges_table(found: ScreeningResult) -> TextTable:
             percent(row.leads),
             f"{row.certain} of {row.curves}",
         )
-        for row in lag_ranges(found)
+        for row in lag_ranges(screening)
     )
     columns = (
         ("Kind of signal", ""), ("Best lags", "samples"), ("Median", "samples"), ("Leads", "share"),
@@ -98,15 +98,15 @@ def ranges_table(found: ScreeningResult) -> TextTable:
     )
 
 
-def lags_table(found: ScreeningResult) -> TextTable:
+def lags_table(screening: ScreeningResult) -> TextTable:
     """Best lag of each channel against each target, with the correlation there; brackets where it is not certain."""
     rows = []
-    by_pair = {(curve.channel, curve.target): curve for curve in found.lags}
-    for channel in found.channels:
-        curves = [by_pair.get((channel, target)) for target in found.targets]
+    by_pair = {(curve.channel, curve.target): curve for curve in screening.lags}
+    for channel in screening.channels:
+        curves = [by_pair.get((channel, target)) for target in screening.targets]
         if any(curve is not None for curve in curves):
             rows.append((channel, *(_cell(channel, curve) for curve in curves)))
-    columns = (("Channel", ""), *((target, "lag, correlation") for target in found.targets))
+    columns = (("Channel", ""), *((target, "lag, correlation") for target in screening.targets))
     return TextTable("Lag and correlation against each target", columns, tuple(rows))
 
 
@@ -117,10 +117,10 @@ def _cell(channel: str, curve: LagCurve | None) -> str:
     return text if curve.certain else f"({text})"
 
 
-def clusters_table(found: ScreeningResult) -> TextTable:
+def clusters_table(screening: ScreeningResult) -> TextTable:
     """Collinear channels."""
     rows = tuple(
-        (cluster.representative, number(cluster.least, 2), ", ".join(cluster.members)) for cluster in found.clusters
+        (cluster.representative, number(cluster.least, 2), ", ".join(cluster.members)) for cluster in screening.clusters
     )
     columns = (("Speaks for all", ""), ("Least rank correlation", "of two members"), ("Members", ""))
     return TextTable("Channels that go together", columns, rows)
@@ -154,7 +154,7 @@ def trials_table(trials: Mapping[str, Any]) -> TextTable:
     return TextTable("Held-out error of one network on each set", columns, tuple(rows), frozenset({0}))
 
 
-def stages_table(found: ScreeningResult) -> TextTable:
+def stages_table(screening: ScreeningResult) -> TextTable:
     """Where the time went."""
-    rows = tuple((stage, duration(seconds)) for stage, seconds in found.seconds.items())
+    rows = tuple((stage, duration(seconds)) for stage, seconds in screening.seconds.items())
     return TextTable("Time of the stages", (("Stage", ""), ("Time", "")), rows)

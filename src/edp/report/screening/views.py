@@ -66,7 +66,7 @@ class Bar:
     low: float
     high: float
     mark: float = math.nan
-    kept: bool = False
+    proposed: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,49 +102,49 @@ class LagRangeView:
     curves: int
 
 
-def matrix_views(found: ScreeningResult) -> tuple[MatrixView, ...]:
+def matrix_views(screening: ScreeningResult) -> tuple[MatrixView, ...]:
     """The four matrices; mutual information without its diagonal, its colours up to the 99.5 % quantile."""
-    made = []
+    views = []
     for measure, title in MEASURES.items():
-        values = np.array(getattr(found.matrices, measure), dtype=float)
+        values = np.array(getattr(screening.matrices, measure), dtype=float)
         signed = measure != "information"
         top = 1.0
         if not signed:
             np.fill_diagonal(values, np.nan)
             good = values[np.isfinite(values)]
             top = max(float(np.quantile(good, 0.995)), 1e-3) if len(good) else 1.0
-        names = short_labels(found.matrices.names)
-        made.append(MatrixView(measure, title, UNITS.get(measure, ""), names, values, top, signed))
-    return tuple(made)
+        names = short_labels(screening.matrices.names)
+        views.append(MatrixView(measure, title, UNITS.get(measure, ""), names, values, top, signed))
+    return tuple(views)
 
 
-def lag_views(found: ScreeningResult) -> tuple[LagView, ...]:
+def lag_views(screening: ScreeningResult) -> tuple[LagView, ...]:
     """For each target the curves of the channels that go best with it, itself left out."""
-    made = []
-    for target in found.targets:
-        curves = [c for c in found.lags if c.target == target and c.channel != target and math.isfinite(c.value)]
+    views = []
+    for target in screening.targets:
+        curves = [c for c in screening.lags if c.target == target and c.channel != target and math.isfinite(c.value)]
         best = sorted(curves, key=lambda curve: -abs(curve.value))[:MOST_CURVES]
         if best:
-            made.append(LagView(target, tuple(best)))
-    return tuple(made)
+            views.append(LagView(target, tuple(best)))
+    return tuple(views)
 
 
-def lag_ranges(found: ScreeningResult, within: Sequence[str] | None = None) -> tuple[LagRangeView, ...]:
+def lag_ranges(screening: ScreeningResult, within: Sequence[str] | None = None) -> tuple[LagRangeView, ...]:
     """Where the best lags lie, by kind of signal, in Table 4.2's form.
 
     Each channel counts once, against the target that it goes best with, itself left out; and it counts where that lag
     is certain and inside the search.
 
     Args:
-        found: the screening.
+        screening: the screening.
         within: channels to look at; None takes all that no flag names.
     """
-    flagged = {flag.channel for flag in found.flags}
-    names = [name for name in found.channels if name not in flagged] if within is None else list(within)
-    made = []
-    for group in dict.fromkeys(found.groups):
-        members = {name for name, own in zip(found.channels, found.groups) if own == group} & set(names)
-        curves = [curve for name in names if name in members and (curve := _strongest(found, name)) is not None]
+    flagged = {flag.channel for flag in screening.flags}
+    names = [name for name in screening.channels if name not in flagged] if within is None else list(within)
+    ranges = []
+    for group in dict.fromkeys(screening.groups):
+        members = {name for name, own in zip(screening.channels, screening.groups) if own == group} & set(names)
+        curves = [curve for name in names if name in members and (curve := _strongest(screening, name)) is not None]
         certain = [curve.best for curve in curves if curve.certain and not curve.at_edge]
         if not curves:
             continue
@@ -155,36 +155,38 @@ def lag_ranges(found: ScreeningResult, within: Sequence[str] | None = None) -> t
             )
         else:
             row = LagRangeView(group, None, None, None, None, 0, len(curves))
-        made.append(row)
-    return tuple(made)
+        ranges.append(row)
+    return tuple(ranges)
 
 
-def _strongest(found: ScreeningResult, channel: str) -> LagCurve | None:
+def _strongest(screening: ScreeningResult, channel: str) -> LagCurve | None:
     """The curve of a channel against the target that it goes best with."""
-    curves = [c for c in found.lags if c.channel == channel != c.target and math.isfinite(c.value)]
+    curves = [c for c in screening.lags if c.channel == channel != c.target and math.isfinite(c.value)]
     return max(curves, key=lambda curve: abs(curve.value), default=None)
 
 
-def stability_views(found: ScreeningResult) -> tuple[BarView, ...]:
+def stability_views(screening: ScreeningResult) -> tuple[BarView, ...]:
     """For each metric and target the channels with the largest mean over the pieces; bars reach over a deviation."""
-    made = []
+    views = []
     for metric, title in METRICS.items():
-        for target in found.targets:
+        for target in screening.targets:
             entries = [
                 entry
-                for entry in found.stability
+                for entry in screening.stability
                 if entry.metric == metric
                 and entry.target == target
                 and entry.channel != target
                 and math.isfinite(entry.mean)
             ]
             if entries:
-                made.append(_stability(found, metric, target, title, entries))
-    return tuple(made)
+                views.append(_stability(screening, metric, target, title, entries))
+    return tuple(views)
 
 
-def _stability(found: ScreeningResult, metric: str, target: str, title: str, entries: Sequence[Stability]) -> BarView:
-    kept = set(found.proposal.kept)
+def _stability(
+    screening: ScreeningResult, metric: str, target: str, title: str, entries: Sequence[Stability]
+) -> BarView:
+    proposed = set(screening.proposal.kept)
     ranked = sorted(entries, key=lambda entry: -abs(entry.mean))
     bars = tuple(
         Bar(
@@ -193,7 +195,7 @@ def _stability(found: ScreeningResult, metric: str, target: str, title: str, ent
             e.mean - e.deviation,
             e.mean + e.deviation,
             math.copysign(e.chance, e.mean),  # chance is a size; it stands on the bar's side
-            e.channel in kept,
+            e.channel in proposed,
         )
         for e in ranked[:MOST_BARS]
     )
@@ -206,37 +208,37 @@ def _told_apart(bars: Sequence[Bar]) -> tuple[Bar, ...]:
     return tuple(replace(bar, label=label) for bar, label in zip(bars, labels, strict=True))
 
 
-def importance_views(found: ScreeningResult) -> tuple[BarView, ...]:
+def importance_views(screening: ScreeningResult) -> tuple[BarView, ...]:
     """Permutation importance by target, the mean of all first."""
-    kept = set(found.proposal.kept)
-    made = []
-    for target in ("all", *found.targets):
-        entries = [entry for entry in found.importance if entry.target == target]
+    proposed = set(screening.proposal.kept)
+    views = []
+    for target in ("all", *screening.targets):
+        entries = [entry for entry in screening.importance if entry.target == target]
         ranked = sorted(entries, key=lambda entry: -entry.increase)
         bars = tuple(
-            Bar(joined(e.members), e.increase, e.low, e.high, kept=bool(kept & set(e.members)))
+            Bar(joined(e.members), e.increase, e.low, e.high, proposed=bool(proposed & set(e.members)))
             for e in ranked[:MOST_BARS]
         )
         if bars:
-            made.append(
+            views.append(
                 BarView(
                     "importance", target, "Permutation importance", _told_apart(bars), max(0, len(ranked) - MOST_BARS)
                 )
             )
-    return tuple(made)
+    return tuple(views)
 
 
-def value_views(found: ScreeningResult) -> tuple[BarView, ...]:
+def value_views(screening: ScreeningResult) -> tuple[BarView, ...]:
     """What each channel's past adds to the pasts of all others, by target."""
-    kept = set(found.proposal.kept)
-    made = []
-    for target in found.targets:
-        entries: list[Value] = [entry for entry in found.values if entry.target == target]
+    proposed = set(screening.proposal.kept)
+    views = []
+    for target in screening.targets:
+        entries: list[Value] = [entry for entry in screening.values if entry.target == target]
         ranked = sorted(entries, key=lambda entry: -entry.gain)
-        bars = tuple(Bar(e.channel, e.gain, e.low, e.high, kept=e.channel in kept) for e in ranked[:MOST_BARS])
+        bars = tuple(Bar(e.channel, e.gain, e.low, e.high, proposed=e.channel in proposed) for e in ranked[:MOST_BARS])
         if bars:
-            made.append(BarView("value", target, "Linear value", _told_apart(bars), max(0, len(ranked) - MOST_BARS)))
-    return tuple(made)
+            views.append(BarView("value", target, "Linear value", _told_apart(bars), max(0, len(ranked) - MOST_BARS)))
+    return tuple(views)
 
 
 def joined(members: Sequence[str]) -> str:
@@ -245,7 +247,7 @@ def joined(members: Sequence[str]) -> str:
     return shown if len(members) <= 3 else f"{shown} + {len(members) - 3}"
 
 
-def best_groups(found: ScreeningResult, count: int = 3) -> tuple[GroupImportance, ...]:
+def best_groups(screening: ScreeningResult, count: int = 3) -> tuple[GroupImportance, ...]:
     """The groups of the largest mean importance."""
-    entries = [entry for entry in found.importance if entry.target == "all"]
+    entries = [entry for entry in screening.importance if entry.target == "all"]
     return tuple(sorted(entries, key=lambda entry: -entry.increase)[:count])

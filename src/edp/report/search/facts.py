@@ -173,7 +173,7 @@ def facts_of(study: Mapping[str, Any]) -> StudyFacts:
 
 
 def _facts_of(study: Mapping[str, Any]) -> StudyFacts:
-    decisions = [dict(held) for held in study["decisions"]]
+    decisions = [dict(decision) for decision in study["decisions"]]
     data, sessions = dict(study["data"]), dict(study["sessions"])
     return StudyFacts(
         state=study["state"],
@@ -186,34 +186,34 @@ def _facts_of(study: Mapping[str, Any]) -> StudyFacts:
         test=tuple(map(str, sessions["test"])),
         modules={str(name): str(title) for name, title in study["modules"].items()},
         phases=_phases(study["phases"]),
-        facts={str(held["phase"]): dict(held["facts"]) for held in decisions},
-        sentences={str(held["phase"]): tuple(map(str, held["sentences"])) for held in decisions},
+        facts={str(decision["phase"]): dict(decision["facts"]) for decision in decisions},
+        sentences={str(decision["phase"]): tuple(map(str, decision["sentences"])) for decision in decisions},
         history=_history(study["history"], study["openings"]),
-        openings=tuple(dict(held) for held in study["openings"]),
+        openings=tuple(dict(decision) for decision in study["openings"]),
         second=tuple(map(str, sessions.get("second", ()))),
     )
 
 
 def _phases(begun: Sequence[Mapping[str, Any]]) -> tuple[PhaseFacts, ...]:
-    made = {phase.name: phase for phase in map(_phase, begun)}
-    ahead = {name: PhaseFacts(name, title) for name, title in TITLES.items() if name not in made}
-    both = made | ahead
+    begun_phases = {phase.name: phase for phase in map(_phase, begun)}
+    ahead = {name: PhaseFacts(name, title) for name, title in TITLES.items() if name not in begun_phases}
+    both = begun_phases | ahead
     order = [name for name in TITLES if name in both] + [name for name in both if name not in TITLES]
     return tuple(both[name] for name in order)
 
 
-def _phase(held: Mapping[str, Any]) -> PhaseFacts:
+def _phase(phase_row: Mapping[str, Any]) -> PhaseFacts:
     return PhaseFacts(
-        name=str(held["name"]),
-        title=str(held["title"]),
-        trainings=int(held["trainings"] or 0),
-        trained=int(held["trained"] or 0),
-        failed=int(held["failed"] or 0),
-        pruned=int(held.get("pruned") or 0),
-        seconds=known(held["seconds"]) or 0.0,
-        wall_s=known(held["wall_s"]) or 0.0,
-        began=str(held["began"] or ""),
-        ended=str(held["ended"] or ""),
+        name=str(phase_row["name"]),
+        title=str(phase_row["title"]),
+        trainings=int(phase_row["trainings"] or 0),
+        trained=int(phase_row["trained"] or 0),
+        failed=int(phase_row["failed"] or 0),
+        pruned=int(phase_row.get("pruned") or 0),
+        seconds=known(phase_row["seconds"]) or 0.0,
+        wall_s=known(phase_row["wall_s"]) or 0.0,
+        began=str(phase_row["began"] or ""),
+        ended=str(phase_row["ended"] or ""),
     )
 
 
@@ -221,23 +221,23 @@ def _history(rows: Sequence[Mapping[str, Any]], openings: Sequence[Mapping[str, 
     """What has ended. The last trainings that phases 4 and 6 asked for are those that a lock-box was opened for."""
     test: set[int] = set()
     for phase, second in (("synthesis", False), ("compression", True)):
-        places = [place for place, held in enumerate(rows) if held["phase"] == phase]
-        looks = [len(held["judged"]) for held in openings if (str(held["box"]) == SECOND_BOX) == second]
+        places = [index for index, row in enumerate(rows) if row["phase"] == phase]
+        looks = [len(row["judged"]) for row in openings if (str(row["box"]) == SECOND_BOX) == second]
         sealed = (looks[-1] if second else sum(looks)) if looks else 0  # looks of edp compress trained nothing here
         test |= set(places[len(places) - sealed :] if sealed and places else ())
-    return tuple(_training(held, place in test) for place, held in enumerate(rows) if held["status"] != "waiting")
+    return tuple(_training(row, index in test) for index, row in enumerate(rows) if row["status"] != "waiting")
 
 
-def _training(held: Mapping[str, Any], test: bool) -> Training:
+def _training(row: Mapping[str, Any], test: bool) -> Training:
     return Training(
-        phase=str(held["phase"]),
+        phase=str(row["phase"]),
         test=test,
-        status=str(held["status"]),
-        score=known(held["score"]),
-        seconds=known(held["seconds"]) or 0.0,
-        parameters=known(held.get("parameters")),
-        macs_tick=known(held.get("macs_tick")),
-        label=str(held["label"] or ""),
+        status=str(row["status"]),
+        score=known(row["score"]),
+        seconds=known(row["seconds"]) or 0.0,
+        parameters=known(row.get("parameters")),
+        macs_tick=known(row.get("macs_tick")),
+        label=str(row["label"] or ""),
     )
 
 

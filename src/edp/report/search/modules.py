@@ -24,41 +24,41 @@ def modules_sheets(study: StudyFacts) -> tuple[Sheet, ...]:
     """Table 4.5: phases 2 and 3 side by side, and every test of phase 3."""
     if "screening" not in study.facts:
         return ()
-    made = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
-    return tuple(sheet for sheet in made if sheet is not None)
+    sheets = (_modules_thesis if study.mode == "thesis" else _modules_sound)(study)
+    return tuple(sheet for sheet in sheets if sheet is not None)
 
 
 def ordered(names: Sequence[str]) -> list[tuple[str, str]]:
     """Group and module in the thesis's order, unknown ones behind."""
-    held = set(names)
-    known_ones = [(group, name) for group, own in GROUPS.items() for name in own if name in held]
+    present = set(names)
+    known_ones = [(group, name) for group, own in GROUPS.items() for name in own if name in present]
     listed = {name for _, name in known_ones}
     return [*known_ones, *((OTHER, name) for name in names if name not in listed)]
 
 
 @of_phase("screening", ())
 def _modules_sound(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet | None, ...]:
-    found = _evidence(study)
+    evidence = _evidence(study)
     rows, marked = [], set()
     for group, name in ordered(facts["registered"]):
         effect = facts["modules"][name]
-        held = found.get(name)
-        tested = held is not None and held["change"] is not None
-        size = known(held["d_z"]["value"]) if held is not None and held["d_z"] else None
+        entry = evidence.get(name)
+        tested = entry is not None and entry["change"] is not None
+        size = known(entry["d_z"]["value"]) if entry is not None and entry["d_z"] else None
         rows.append(
             (
                 study.module(name),
                 group,
                 100 * real(effect["change"]),
-                100 * real(held["change"]) if held is not None and tested else None,
-                span(held) if held is not None and tested else None,
-                real(held["p"]) if held is not None and tested else None,
-                real(held["adjusted"]) if held is not None and tested else None,
+                100 * real(entry["change"]) if entry is not None and tested else None,
+                span(entry) if entry is not None and tested else None,
+                real(entry["p"]) if entry is not None and tested else None,
+                real(entry["adjusted"]) if entry is not None and tested else None,
                 size,
-                _verdict(study, name, held, name in facts["passed"]),
+                _verdict(study, name, entry, name in facts["passed"]),
             )
         )
-        if held is not None and held["confirmed"]:
+        if entry is not None and entry["confirmed"]:
             marked.add(len(rows) - 1)
     columns = (
         Column("Module"),
@@ -99,34 +99,34 @@ def _effects(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
 
 def _evidence(study: StudyFacts) -> dict[str, Mapping[str, Any]]:
     facts = study.facts.get("confirmation", {})
-    return {held["module"]: held for held in facts.get("evidence", ())}
+    return {entry["module"]: entry for entry in facts.get("evidence", ())}
 
 
-def _verdict(study: StudyFacts, name: str, held: Mapping[str, Any] | None, passed: bool) -> str:
+def _verdict(study: StudyFacts, name: str, entry: Mapping[str, Any] | None, passed: bool) -> str:
     if not passed:
         return "stopped"
-    if held is None:
+    if entry is None:
         return "not in phase 3" if "confirmation" in study.facts else "goes on"
-    if held["dropped_after"]:
-        return f"dropped after {held['dropped_after']} runs"
-    return "confirmed" if held["confirmed"] else "not confirmed"
+    if entry["dropped_after"]:
+        return f"dropped after {entry['dropped_after']} runs"
+    return "confirmed" if entry["confirmed"] else "not confirmed"
 
 
 @of_phase("confirmation", None)
 def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     """What other tests say of the modules that phase 3 tested."""
     rows = []
-    for held in facts["evidence"]:
-        if held["change"] is None:
+    for entry in facts["evidence"]:
+        if entry["change"] is None:
             continue
-        tests = (known(held[name]) for name in ("p", "resampled_p", "paired_p", "mixed_p"))
+        tests = (known(entry[name]) for name in ("p", "resampled_p", "paired_p", "mixed_p"))
         rows.append(
             (
-                study.module(held["module"]),
-                int(held["runs"]),
+                study.module(entry["module"]),
+                int(entry["runs"]),
                 *tests,
-                span(held["d_z"], 1.0) if held["d_z"] else None,
-                None if held["stability"] is None else 100 * real(held["stability"]),
+                span(entry["d_z"], 1.0) if entry["d_z"] else None,
+                None if entry["stability"] is None else 100 * real(entry["stability"]),
             )
         )
     columns = (
@@ -145,15 +145,15 @@ def _tests(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
 @of_phase("screening", ())
 def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet | None, ...]:
     evidence = study.facts.get("confirmation", {}).get("evidence", ())
-    metrics = list(dict.fromkeys(str(held["metric"]) for held in evidence))
-    by_cell = {(held["module"], held["metric"]): held for held in evidence}
+    metrics = list(dict.fromkeys(str(entry["metric"]) for entry in evidence))
+    by_cell = {(entry["module"], entry["metric"]): entry for entry in evidence}
     confirmed = set(study.facts.get("confirmation", {}).get("confirmed", ()))
     rows, every, marked = [], [], set()
     for group, name in ordered(facts["registered"]):
-        held = by_cell.get((name, metrics[0])) if metrics else None
-        tests = _thesis_cells(held)
+        entry = by_cell.get((name, metrics[0])) if metrics else None
+        tests = _thesis_cells(entry)
         verdict = "stopped" if name not in facts["passed"] else "goes on"
-        if held is not None:
+        if entry is not None:
             verdict = "confirmed" if name in confirmed else "not confirmed"
         rows.append((study.module(name), group, known(facts["modules"][name]["gain"]), *tests, verdict))
         if name in confirmed:
@@ -188,16 +188,16 @@ def _modules_thesis(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Sheet 
     )
 
 
-def _thesis_cells(held: Mapping[str, Any] | None) -> tuple[float | None, ...]:
-    if held is None:
+def _thesis_cells(entry: Mapping[str, Any] | None) -> tuple[float | None, ...]:
+    if entry is None:
         return (None,) * 5
-    tests = (real(held[name]) for name in ("printed_p", "p", "adjusted"))
-    return (*tests, known(held["d_z"]), 100 * real(held["stability"]))
+    tests = (real(entry[name]) for name in ("printed_p", "p", "adjusted"))
+    return (*tests, known(entry["d_z"]), 100 * real(entry["stability"]))
 
 
-def span(held: Mapping[str, Any], scale: float = 100.0) -> str | None:
+def span(entry: Mapping[str, Any], scale: float = 100.0) -> str | None:
     """An interval as text."""
-    if held.get("low") is None or held.get("high") is None:
+    if entry.get("low") is None or entry.get("high") is None:
         return None
-    low, high = (number(scale * real(held[end]), 2, signed=True) for end in ("low", "high"))
+    low, high = (number(scale * real(entry[end]), 2, signed=True) for end in ("low", "high"))
     return f"{low} to {high}"

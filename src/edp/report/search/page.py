@@ -57,12 +57,12 @@ def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool =
     target, document = folder / "report.html", folder / "report.md"
     write_bytes(target, page.encode("utf-8", "replace"))
     write_bytes(document, text.encode("utf-8", "replace"))
-    made = []
+    table_files = []
     for name, sheet in tables.items():
-        made.append(make_folder(folder / "tables") / f"{name}.csv")
-        write_bytes(made[-1], sheet.csv().encode("utf-8", "replace"))
+        table_files.append(make_folder(folder / "tables") / f"{name}.csv")
+        write_bytes(table_files[-1], sheet.csv().encode("utf-8", "replace"))
     drawn = reading("study.json", lambda: write_study_pictures(facts, folder / "pictures")) if pictures else []
-    return StudyReport(target, document, tuple(made), tuple(drawn))
+    return StudyReport(target, document, tuple(table_files), tuple(drawn))
 
 
 def _contents(facts: StudyFacts) -> tuple[str, str, dict[str, Sheet]]:

@@ -52,28 +52,28 @@ def write_study_pictures(study: StudyFacts, folder: str | Path) -> list[Path]:
 
 def drawings(study: StudyFacts) -> dict[str, Callable[[Figure], None]]:
     """What draws each picture, by the name of its file."""
-    made: dict[str, Callable[[Figure], None]] = {}
+    drawings: dict[str, Callable[[Figure], None]] = {}
     arms, points, history = arm_views(study), point_views(study), tracks(study)
     if arms:
-        made["variance"] = partial(_variance, arms=arms, unit=study.unit)
+        drawings["variance"] = partial(_variance, arms=arms, unit=study.unit)
     for cost in COSTS:
         if any(cost in point.costs for point in points):
-            made[f"pareto_{cost}"] = partial(_pareto, points=points, cost=cost, unit=study.unit)
+            drawings[f"pareto_{cost}"] = partial(_pareto, points=points, cost=cost, unit=study.unit)
     for forest in forests(study):
-        made[f"effects_{file_name(forest.key)}"] = partial(_forest, view=forest)
+        drawings[f"effects_{file_name(forest.key)}"] = partial(_forest, view=forest)
     if top_of(score for view in history for score in view.scores) is not None:
-        made["history"] = partial(_history, views=history, unit=study.unit)
-    return made
+        drawings["history"] = partial(_history, views=history, unit=study.unit)
+    return drawings
 
 
 def _variance(figure: Figure, arms: Sequence[ArmView], unit: str) -> None:
     figure.set_size_inches(max(1.5 * len(arms) + 1.2, 5.0), 4.4)
     axes = figure.subplots()
     named: set[bool] = set()
-    for place, arm in enumerate(arms):
+    for x_centre, arm in enumerate(arms):
         colour = BLUE if arm.chosen else SHADES[0]
-        x = spread_over(place, len(arm.scores))
-        axes.hlines(arm.composite.mean, place - 0.42, place + 0.42, color=INK, lw=1.4, zorder=1)
+        x = spread_over(x_centre, len(arm.scores))
+        axes.hlines(arm.composite.mean, x_centre - 0.42, x_centre + 0.42, color=INK, lw=1.4, zorder=1)
         for spot, seeds in zip(x, arm.scores):
             axes.plot([spot] * len(seeds), seeds, "-o", color=colour, lw=0.8, ms=2, alpha=0.6)
         label = None if arm.chosen in named else arm.features
@@ -93,11 +93,11 @@ def _pareto(figure: Figure, points: Sequence[PointView], cost: str, unit: str) -
     figure.set_size_inches(7.6, 4.8)
     axes = figure.subplots()
     best = front(points, cost)
-    for place, group in enumerate(dict.fromkeys(point.group for point in points)):
+    for index, group in enumerate(dict.fromkeys(point.group for point in points)):
         own = [point for point in points if point.group == group and cost in point.costs]
         axes.scatter(
             [p.costs[cost] for p in own], [p.score for p in own], s=[46 if p in best or p.picked else 22 for p in own],
-            marker=MARKERS[place % len(MARKERS)], color=SHADES[place % len(SHADES)], label=group, zorder=2,
+            marker=MARKERS[index % len(MARKERS)], color=SHADES[index % len(SHADES)], label=group, zorder=2,
             edgecolors=[BLUE if p in best else "none" for p in own], linewidths=1.3,
         )  # fmt: skip
     axes.step([p.costs[cost] for p in best], [p.score for p in best], where="post", color=BLUE, lw=1.6, zorder=1,
@@ -131,16 +131,14 @@ def _forest(figure: Figure, view: Forest) -> None:
     figure.set_size_inches(8.6, 1.4 + 0.3 * len(view.effects))
     axes = figure.subplots()
     axes.axvline(0, color=INK, lw=0.8)
-    if view.wanted is not None:
-        axes.axvline(view.wanted, color=SOFT, lw=0.9, ls=":")
-    for place, effect in enumerate(view.effects):
+    if view.gate is not None:
+        axes.axvline(view.gate, color=SOFT, lw=0.9, ls=":")
+    for y, effect in enumerate(view.effects):
         colour = BLUE if effect.good else DROPPED
         if effect.low is not None and effect.high is not None:
-            axes.plot(
-                [effect.low, effect.high], [place, place], "-|", color=BLUE if effect.good else SOFT, lw=1.3, ms=6
-            )
-        axes.plot([effect.value], [place], "s" if effect.good else "o", color=colour, ms=6)
-        axes.annotate(tests_of(effect), (1.02, place), xycoords=("axes fraction", "data"), va="center", fontsize=8)
+            axes.plot([effect.low, effect.high], [y, y], "-|", color=BLUE if effect.good else SOFT, lw=1.3, ms=6)
+        axes.plot([effect.value], [y], "s" if effect.good else "o", color=colour, ms=6)
+        axes.annotate(tests_of(effect), (1.02, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)
     axes.set_yticks(range(len(view.effects)), [effect.module for effect in view.effects], fontsize=8)
     axes.set_ylim(len(view.effects) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
@@ -154,16 +152,16 @@ def _history(figure: Figure, views: Sequence[PhaseTrack], unit: str) -> None:
     figure.set_size_inches(9.0, 4.4)
     axes = figure.subplots()
     top = _score_axis(axes, [score for view in views for score in view.scores], unit)
-    for place, view in enumerate(views):
-        axes.plot(view.places, view.scores, "o", color=SHADES[place % len(SHADES)], ms=3, label=view.heading)
+    for index, view in enumerate(views):
+        axes.plot(view.places, view.scores, "o", color=SHADES[index % len(SHADES)], ms=3, label=view.heading)
         axes.step(view.places, view.best, where="post", color=BLUE, lw=1.4)
-        if place:
+        if index:
             axes.axvline(view.places[0] - 0.5, color=RULE, lw=1)
     above, pruned, failed = outside(views, top)
     for marks, symbol, word in ((above, "^", "above the scale"), (pruned, "_", "pruned"), (failed, "x", "failed")):
         if marks:
             axes.plot(
-                [place for place, _ in marks], [top] * len(marks), symbol, color=SOFT, ms=4, label=word, clip_on=False
+                [index for index, _ in marks], [top] * len(marks), symbol, color=SOFT, ms=4, label=word, clip_on=False
             )
     axes.set_xlabel("Training")
     axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))

@@ -34,19 +34,19 @@ TICKS = [step * 10**power for power in range(1, 10) for step in (1, 2, 5)]
 
 def study_plots(study: StudyFacts) -> dict[str, Plot]:
     """Every figure that there are facts for, by name."""
-    made = [
+    plots = [
         variance_plot(arm_views(study), study.unit),
         pareto_plot(point_views(study), study.unit),
         forest_plot("confirmation", [view for view in forests(study) if view.key != "screening"]),
         forest_plot("screening", [view for view in forests(study) if view.key == "screening"]),
         history_plot(tracks(study), study.unit),
     ]
-    return {plot.name: plot for plot in made if plot is not None}
+    return {plot.name: plot for plot in plots if plot is not None}
 
 
-def spread_over(place: int, count: int) -> list[float]:
+def spread_over(centre: int, count: int) -> list[float]:
     """Horizontal places of the runs of an arm."""
-    return [place + 0.72 * ((run + 0.5) / count - 0.5) for run in range(count)]
+    return [centre + 0.72 * ((run + 0.5) / count - 0.5) for run in range(count)]
 
 
 def arm_caption(arm: ArmView) -> list[str]:
@@ -65,9 +65,9 @@ def variance_plot(arms: Sequence[ArmView], unit: str) -> Plot | None:
         return None
     figure = go.Figure()
     shown: set[bool] = set()
-    for place, arm in enumerate(arms):
+    for centre, arm in enumerate(arms):
         colour = BLUE if arm.chosen else MUTED[0]
-        x = spread_over(place, len(arm.scores))
+        x = spread_over(centre, len(arm.scores))
         means = [sum(seeds) / len(seeds) for seeds in arm.scores]
         joined_x = [value for spot, seeds in zip(x, arm.scores) for value in (*([spot] * len(seeds)), None)]
         joined_y = [value for seeds in arm.scores for value in (*sorted(seeds), None)]
@@ -83,7 +83,7 @@ def variance_plot(arms: Sequence[ArmView], unit: str) -> Plot | None:
         shown.add(arm.chosen)
         mean = arm.composite.mean
         line = {"color": INK, "width": 2}
-        figure.add_shape(type="line", x0=place - 0.42, x1=place + 0.42, y0=mean, y1=mean, line=line, layer="below")
+        figure.add_shape(type="line", x0=centre - 0.42, x1=centre + 0.42, y0=mean, y1=mean, line=line, layer="below")
     styled(figure, 440)
     figure.update_xaxes(
         tickvals=list(range(len(arms))),
@@ -110,7 +110,7 @@ def pareto_plot(points: Sequence[PointView], unit: str) -> Plot | None:
             x=[p.costs[cost] for p in best], y=[p.score for p in best], mode="lines", name="Pareto front",
             line={"color": BLUE, "width": 2, "shape": "hv"}, hoverinfo="skip", **shared,
         )  # fmt: skip
-        for place, group in enumerate(groups):
+        for index, group in enumerate(groups):
             own = [p for p in points if p.group == group and cost in p.costs]
             figure.add_scatter(
                 x=[p.costs[cost] for p in own],
@@ -119,8 +119,8 @@ def pareto_plot(points: Sequence[PointView], unit: str) -> Plot | None:
                 name=html.escape(group),
                 marker={
                     "size": [11 if p in best or p.picked else 7 for p in own],
-                    "symbol": MARKS[place % len(MARKS)],
-                    "color": SHADES[place % len(SHADES)],
+                    "symbol": MARKS[index % len(MARKS)],
+                    "color": SHADES[index % len(SHADES)],
                     "line": {"color": BLUE, "width": [2 if p in best else 0 for p in own]},
                 },
                 text=[html.escape(f"{p.label}{f' ({p.picked})' if p.picked else ''}") for p in own],
@@ -179,9 +179,9 @@ def forest_plot(name: str, views: Sequence[Forest]) -> Plot | None:
                 hovertemplate=f"%{{y}}: %{{x:.3~g}}<extra>{word}</extra>",
                 **shared,
             )
-        if view.wanted is not None:
+        if view.gate is not None:
             figure.add_scatter(
-                x=[view.wanted] * len(names), y=names, mode="lines", name="asked for at least",
+                x=[view.gate] * len(names), y=names, mode="lines", name="asked for at least",
                 line={"color": SOFT, "dash": "dot", "width": 1.2}, hoverinfo="skip", **shared,
             )  # fmt: skip
         figure.add_scatter(
@@ -228,8 +228,8 @@ def history_plot(views: Sequence[PhaseTrack], unit: str) -> Plot | None:
     figure = go.Figure()
     low = min(score for score in scores if math.isfinite(score))
     edge = top + 0.03 * (top - low)
-    for place, view in enumerate(views):
-        colour = SHADES[place % len(SHADES)]
+    for index, view in enumerate(views):
+        colour = SHADES[index % len(SHADES)]
         inside = [score if math.isfinite(score) and score <= top else None for score in view.scores]
         figure.add_scatter(
             x=view.places, y=inside, mode="markers", name=view.heading, legendgroup=view.name,
@@ -240,7 +240,7 @@ def history_plot(views: Sequence[PhaseTrack], unit: str) -> Plot | None:
             x=view.places, y=[_inside(value, top) for value in view.best], mode="lines", legendgroup=view.name,
             showlegend=False, line={"color": BLUE, "width": 2, "shape": "hv"}, hoverinfo="skip",
         )  # fmt: skip
-        if place:
+        if index:
             figure.add_vline(x=view.places[0] - 0.5, line={"color": RULE, "width": 1.5})
     above, pruned, failed = outside(views, top)
     kinds = ((above, "triangle-up", "above the scale"), (pruned, "line-ew-open", "pruned"), (failed, "x", "failed"))
@@ -263,13 +263,13 @@ def outside(views: Sequence[PhaseTrack], top: float) -> tuple[list[tuple[int, st
     """Trainings above the scale, those that were pruned, and those that failed: number and what they were."""
     above, pruned, failed = [], [], []
     for view in views:
-        for place, score, label in zip(view.places, view.scores, view.labels):
-            if place in view.pruned:
-                pruned.append((place, label))
+        for position, score, label in zip(view.places, view.scores, view.labels):
+            if position in view.pruned:
+                pruned.append((position, label))
             elif not math.isfinite(score):
-                failed.append((place, label))
+                failed.append((position, label))
             elif score > top:
-                above.append((place, f"{label}: {score:.4g}"))
+                above.append((position, f"{label}: {score:.4g}"))
     return above, pruned, failed
 
 

@@ -24,9 +24,9 @@ def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
             _mean(row["scores"], "mae"),
             _mean(row["scores"], "composite"),
             100 * (real(row["error"]) - 1),
-            "chosen" if place == facts["chosen"] else ", ".join(row["over"]) or "fits",
+            "chosen" if index == facts["chosen"] else ", ".join(row["over"]) or "fits",
         )
-        for place, row in enumerate(facts.get("rows", ()))
+        for index, row in enumerate(facts.get("rows", ()))
     )
     count = figures([], decimals=0)
     columns = (
@@ -46,7 +46,7 @@ def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
 
 
 def _mean(scores: Mapping[str, Mapping[str, Any]], name: str) -> float:
-    values = [real(held[name]) for held in scores.values()]
+    values = [real(entry[name]) for entry in scores.values()]
     return sum(values) / len(values)
 
 

@@ -17,7 +17,7 @@ from edp.report.search.views import arm_views, titled
 
 def sheets(study: StudyFacts) -> dict[str, Sheet]:
     """Every table that there are facts for, by name."""
-    made = (
+    sheets = (
         variance_sheet(study),
         features_sheet(study),
         calibration_sheet(study),
@@ -29,7 +29,7 @@ def sheets(study: StudyFacts) -> dict[str, Sheet]:
         openings_sheet(study),
         phases_sheet(study),
     )
-    return {sheet.name: sheet for sheet in made if sheet is not None and sheet.rows}
+    return {sheet.name: sheet for sheet in sheets if sheet is not None and sheet.rows}
 
 
 def variance_sheet(study: StudyFacts) -> Sheet | None:
@@ -45,7 +45,7 @@ def variance_sheet(study: StudyFacts) -> Sheet | None:
     facts = study.facts["isolation"]
     seeds = f"{facts['seeds']} seed{'s' * (facts['seeds'] != 1)}"
     caption = f"Variance by architecture and feature set: {facts['runs']} runs of {seeds} each"
-    marked = frozenset(place for place, row in enumerate(rows) if row[1] == facts["features"])
+    marked = frozenset(index for index, row in enumerate(rows) if row[1] == facts["features"])
     return Sheet("variance", caption, columns, tuple(rows), marked)
 
 
@@ -60,23 +60,23 @@ def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     rows: tuple[tuple[Value, ...], ...] = tuple(
         (
             titled(backbone),
-            f"{facts['features']} against {held['rival']}",
-            100 * real(held["change"]),
-            span(held),
-            real(held["p"]),
+            f"{facts['features']} against {comparison['rival']}",
+            100 * real(comparison["change"]),
+            span(comparison),
+            real(comparison["p"]),
         )
-        for backbone, held in facts["comparisons"].items()
+        for backbone, comparison in facts["comparisons"].items()
     )
     # No p-value of these: which is the best was seen first.
     rows += tuple(
         (
-            titled(held["best"]),
+            titled(comparison["best"]),
             f"against {titled(backbone)}, both {facts['features']}",
-            100 * real(held["change"]),
-            span(held),
+            100 * real(comparison["change"]),
+            span(comparison),
             None,
         )
-        for backbone, held in facts["backbones"].items()
+        for backbone, comparison in facts["backbones"].items()
     )
     columns = (
         Column("Architecture"),
@@ -93,20 +93,20 @@ def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | No
     """Table 4.4: scores of all questions of each architecture, and what the efficiency rule takes."""
     rows = []
     final = facts["final"]["scores"] if "final" in facts else {}
-    for backbone, held in facts["backbones"].items():
-        done = [trial for trial in held["trials"] if trial["score"] is not None]
+    for backbone, calibration in facts["backbones"].items():
+        done = [trial for trial in calibration["trials"] if trial["score"] is not None]
         scores = [real(trial["score"]) for trial in done]
         errors = [value for trial in done if (value := known(trial["mae"])) is not None]
         rows.append(
             (
                 titled(backbone),
-                f"{len(done)} of {len(held['trials'])}",
+                f"{len(done)} of {len(calibration['trials'])}",
                 *_spread(scores),
                 min(scores, default=None),
                 *_spread(errors),
-                real(held["score"]),
+                real(calibration["score"]),
                 known(final.get(backbone)),
-                real(held["parameters"]),
+                real(calibration["parameters"]),
             )
         )
     heads = [
@@ -138,10 +138,10 @@ def _count(value: Value) -> str:
 def selection_sheet(study: StudyFacts) -> Sheet | None:
     """Table 4.6: how often each module was on among the questions of phases 4 and 5."""
     on = {name: study.facts[name]["on"] for name in ("synthesis", "exploration") if name in study.facts}
-    names = list(dict.fromkeys(name for held in on.values() for name in held))
+    names = list(dict.fromkeys(name for counts in on.values() for name in counts))
     rows: list[tuple[str, list[float]]] = []
     for name in names:
-        shares = [100 * real(held[name]) if name in held else 0.0 for held in on.values()]
+        shares = [100 * real(counts[name]) if name in counts else 0.0 for counts in on.values()]
         rows.append((study.module(name), [*shares, float(np.mean(shares))]))
     rows.sort(key=lambda row: (-row[1][-1], row[0]))
     heads = {"synthesis": "Phase 4", "exploration": "Phase 5"}
@@ -156,7 +156,7 @@ def selection_sheet(study: StudyFacts) -> Sheet | None:
 
 def identifiers(study: StudyFacts) -> dict[str, str]:
     """Table 4.7: short names of the modules, in their order."""
-    return {name: f"M{place}" for place, (_, name) in enumerate(ordered(list(study.modules)), 1)}
+    return {name: f"M{number}" for number, (_, name) in enumerate(ordered(list(study.modules)), 1)}
 
 
 def identifiers_sheet(study: StudyFacts) -> Sheet | None:
@@ -210,12 +210,12 @@ def openings_sheet(study: StudyFacts) -> Sheet | None:
     """Every look at the test sessions."""
     rows = tuple(
         (
-            moment(held.get("time")),
-            str(held.get("why", "")),
-            len(held.get("judged", ())),
-            str(held.get("box", "")),
+            moment(opening.get("time")),
+            str(opening.get("why", "")),
+            len(opening.get("judged", ())),
+            str(opening.get("box", "")),
         )
-        for held in study.openings
+        for opening in study.openings
     )
     columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Box"))
     return Sheet("openings", "Looks at the sessions set apart", columns, rows)

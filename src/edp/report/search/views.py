@@ -51,22 +51,22 @@ class ArmView:
 @of_phase("isolation", ())
 def arm_views(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[ArmView, ...]:
     """The arms of phase 0 in their order."""
-    made = []
-    for name, held in facts["arms"].items():
+    views = []
+    for name, arm in facts["arms"].items():
         backbone, _, features = name.partition(" ")
-        scores = tuple(tuple(real(score) for score in seeds) for seeds in held["by_run"])
+        scores = tuple(tuple(real(score) for score in seeds) for seeds in arm["by_run"])
         if not all(scores):
             raise ValueError("an arm without a score")
         view = ArmView(
-            titled(backbone), features, features == facts["features"], scores, _spread(held), _spread(held["mae"])
+            titled(backbone), features, features == facts["features"], scores, _spread(arm), _spread(arm["mae"])
         )
-        made.append(view)
-    return tuple(made)
+        views.append(view)
+    return tuple(views)
 
 
-def _spread(held: Mapping[str, Any]) -> ArmSpread:
-    intervals = (pair(held["split_interval"]), pair(held["seed_interval"]))
-    return ArmSpread(real(held["mean"]), real(held["split"]), known(held["seed"]), *intervals)
+def _spread(arm: Mapping[str, Any]) -> ArmSpread:
+    intervals = (pair(arm["split_interval"]), pair(arm["seed_interval"]))
+    return ArmSpread(real(arm["mean"]), real(arm["split"]), known(arm["seed"]), *intervals)
 
 
 def titled(backbone: str) -> str:
@@ -95,29 +95,29 @@ class PointView:
 
 def point_views(study: StudyFacts) -> tuple[PointView, ...]:
     """Every network with a score and a cost; of a phase that has not decided yet, what the history holds."""
-    made = [*_calibrated(study), *_together(study), *_free(study)]
+    points = [*_calibrated(study), *_together(study), *_free(study)]
     for name in ("calibration", "synthesis", "exploration"):
         if name not in study.facts:
-            made += [
-                PointView(f"Phase {NUMBERS[name]}, so far", held.score, costs, held.label)
-                for held in study.history
-                if held.phase == name and held.score is not None
-                if (costs := _known({"parameters": held.parameters, "macs_tick": held.macs_tick}))
+            points += [
+                PointView(f"Phase {NUMBERS[name]}, so far", training.score, costs, training.label)
+                for training in study.history
+                if training.phase == name and training.score is not None
+                if (costs := _known({"parameters": training.parameters, "macs_tick": training.macs_tick}))
             ]
-    return tuple(made)
+    return tuple(points)
 
 
 @of_phase("calibration", ())
 def _calibrated(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[PointView, ...]:
-    made = []
-    for backbone, held in facts["backbones"].items():
-        for trial in held["trials"]:
+    points = []
+    for backbone, calibration in facts["backbones"].items():
+        for trial in calibration["trials"]:
             if trial["score"] is not None:
-                took = trial["number"] == held["number"]
+                took = trial["number"] == calibration["number"]
                 what = "baseline" if backbone == facts["backbone"] else f"taken of {titled(backbone)}"
                 values = (trial["score"], {name: trial.get(name) for name in COSTS}, valued(trial["values"]))
-                made.append(_point(f"Phase 1, {titled(backbone)}", *values, what if took else ""))
-    return tuple(made)
+                points.append(_point(f"Phase 1, {titled(backbone)}", *values, what if took else ""))
+    return tuple(points)
 
 
 @of_phase("synthesis", ())
@@ -133,13 +133,13 @@ def _free(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[PointView, ...]:
 def _joint(study: StudyFacts, facts: Mapping[str, Any], group: str, winner: str) -> tuple[PointView, ...]:
     done = [trial for trial in facts["trials"] if trial["score"] is not None]
     best = min(done, key=lambda trial: (real(trial["score"]), trial["number"]), default=None)
-    made = []
+    points = []
     for trial in done:
         modules = ", ".join(study.module(name) for name in trial["modules"]) or "no module"
         label = f"{modules}; {valued(trial['values'])}"
         costs = {name: trial.get(name) for name in COSTS}
-        made.append(_point(group, trial["score"], costs, label, winner if trial is best else ""))
-    return tuple(made)
+        points.append(_point(group, trial["score"], costs, label, winner if trial is best else ""))
+    return tuple(points)
 
 
 def _point(group: str, score: Any, costs: Mapping[str, Any], label: str, picked: str) -> PointView:
@@ -159,11 +159,11 @@ def valued(values: Mapping[str, Any]) -> str:
 
 def front(points: Sequence[PointView], cost: str) -> tuple[PointView, ...]:
     """Points that no other one betters in score without costing more, in ascending order of cost."""
-    kept: list[PointView] = []
+    front_points: list[PointView] = []
     for point in sorted((p for p in points if cost in p.costs), key=lambda p: (p.costs[cost], p.score)):
-        if not kept or point.score < kept[-1].score:
-            kept.append(point)
-    return tuple(kept)
+        if not front_points or point.score < front_points[-1].score:
+            front_points.append(point)
+    return tuple(front_points)
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ class Forest:
         short: for a selector.
         axis: title of the horizontal axis.
         effects: of the modules, the best first.
-        wanted: effect that the practical gate asks for; None for no gate.
+        gate: effect that the practical gate asks for; None for no gate.
     """
 
     key: str
@@ -207,22 +207,22 @@ class Forest:
     short: str
     axis: str
     effects: tuple[EffectView, ...]
-    wanted: float | None = None
+    gate: float | None = None
 
 
 def forests(study: StudyFacts) -> tuple[Forest, ...]:
     """Phase 3 and phase 2, as far as they are decided; in the thesis's mode phase 3 by metric."""
-    made = (*_confirmed(study), *_screened(study))
-    return tuple(forest for forest in made if forest.effects)
+    candidates = (*_confirmed(study), *_screened(study))
+    return tuple(forest for forest in candidates if forest.effects)
 
 
 @of_phase("confirmation", ())
 def _confirmed(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Forest, ...]:
     evidence = facts["evidence"]
     if study.mode == "sound":
-        effects = [_sound(study, held) for held in evidence if held["change"] is not None]
-        wanted = -100.0 * real(study.spec["least_gain"])
-        return (Forest("confirmation", "Phase 3: confirmation", "", CHANGE, _ranked(effects), wanted),)
+        effects = [_sound(study, entry) for entry in evidence if entry["change"] is not None]
+        gate = -100.0 * real(study.spec["least_gain"])
+        return (Forest("confirmation", "Phase 3: confirmation", "", CHANGE, _ranked(effects), gate),)
     splits = int(study.facts["planning"]["runs"])
     return tuple(
         Forest(
@@ -230,32 +230,32 @@ def _confirmed(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Forest, ...
             f"Phase 3: confirmation, {METRICS.get(metric, metric)}",
             METRICS.get(metric, metric),
             "Cohen's d_z of the splits; left is better",
-            _ranked(_thesis(study, held, splits) for held in evidence if held["metric"] == metric),
+            _ranked(_thesis(study, entry, splits) for entry in evidence if entry["metric"] == metric),
             -0.5,
         )
-        for metric in dict.fromkeys(str(held["metric"]) for held in evidence)
+        for metric in dict.fromkeys(str(entry["metric"]) for entry in evidence)
     )
 
 
 CHANGE = "Change of the baseline's mean score [%]; left is better"
 
 
-def _sound(study: StudyFacts, held: Mapping[str, Any]) -> EffectView:
-    after = int(held["dropped_after"])
-    remark = "confirmed" if held["confirmed"] else f"dropped after {after} runs" if after else "not confirmed"
-    value, low, high = (100.0 * real(held[name]) for name in ("change", "low", "high"))
-    p, adjusted = real(held["p"]), real(held["adjusted"])
-    return EffectView(study.module(held["module"]), value, low, high, p, adjusted, bool(held["confirmed"]), remark)
+def _sound(study: StudyFacts, entry: Mapping[str, Any]) -> EffectView:
+    after = int(entry["dropped_after"])
+    remark = "confirmed" if entry["confirmed"] else f"dropped after {after} runs" if after else "not confirmed"
+    value, low, high = (100.0 * real(entry[name]) for name in ("change", "low", "high"))
+    p, adjusted = real(entry["p"]), real(entry["adjusted"])
+    return EffectView(study.module(entry["module"]), value, low, high, p, adjusted, bool(entry["confirmed"]), remark)
 
 
-def _thesis(study: StudyFacts, held: Mapping[str, Any], splits: int) -> EffectView:
-    size = known(held["d_z"])
-    found = effect_interval(math.copysign(math.inf, real(held["beta"])) if size is None else size, splits)
-    low, high = (bound if math.isfinite(bound) else None for bound in (found.low, found.high))
-    value = size if size is not None else math.copysign(99.0, real(held["beta"]))
-    p, adjusted, good = real(held["printed_p"]), real(held["adjusted"]), bool(held["passed"])
+def _thesis(study: StudyFacts, entry: Mapping[str, Any], splits: int) -> EffectView:
+    size = known(entry["d_z"])
+    interval = effect_interval(math.copysign(math.inf, real(entry["beta"])) if size is None else size, splits)
+    low, high = (bound if math.isfinite(bound) else None for bound in (interval.low, interval.high))
+    value = size if size is not None else math.copysign(99.0, real(entry["beta"]))
+    p, adjusted, good = real(entry["printed_p"]), real(entry["adjusted"]), bool(entry["passed"])
     remark = "passed" if good else "not passed"
-    return EffectView(study.module(held["module"]), value, low, high, p, adjusted, good, remark)
+    return EffectView(study.module(entry["module"]), value, low, high, p, adjusted, good, remark)
 
 
 @of_phase("screening", ())
@@ -263,18 +263,18 @@ def _screened(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[Forest, ...]
     passed = set(facts["passed"])
     title = "Phase 2: screening"
     effects = []
-    for name, held in facts["modules"].items():
+    for name, entry in facts["modules"].items():
         good = name in passed
         remark = "goes on" if good else "stops"
         if study.mode == "thesis":
-            gain = known(held["gain"])
+            gain = known(entry["gain"])
             if gain is not None:
                 effects.append(EffectView(study.module(name), -gain, None, None, None, None, good, remark))
         else:
-            value, effect, error = (real(held[key]) for key in ("change", "effect", "error"))
+            value, effect, error = (real(entry[key]) for key in ("change", "effect", "error"))
             reach = 1.96 * error * abs(value / effect) if effect else 0.0
             ends = (100.0 * (value - reach), 100.0 * (value + reach))
-            effects.append(EffectView(study.module(name), 100.0 * value, *ends, real(held["p"]), None, good, remark))
+            effects.append(EffectView(study.module(name), 100.0 * value, *ends, real(entry["p"]), None, good, remark))
     axis = f"Best question less the baseline's median [{study.unit}]; left is better"
     return (Forest("screening", title, "", axis if study.mode == "thesis" else CHANGE, _ranked(effects)),)
 
@@ -307,19 +307,19 @@ class PhaseTrack:
 
 def tracks(study: StudyFacts) -> tuple[PhaseTrack, ...]:
     """The search's history by phase."""
-    made = []
-    for name, test in dict.fromkeys((held.phase, held.test) for held in study.history):
-        own = [(place, h) for place, h in enumerate(study.history, 1) if (h.phase, h.test) == (name, test)]
-        scores = [math.nan if held.score is None else held.score for _, held in own]
+    views = []
+    for name, test in dict.fromkeys((training.phase, training.test) for training in study.history):
+        own = [(position, h) for position, h in enumerate(study.history, 1) if (h.phase, h.test) == (name, test)]
+        scores = [math.nan if training.score is None else training.score for _, training in own]
         best = np.fmin.accumulate(np.array(scores))
         phase = study.phase(name)
         heading = f"Phase {NUMBERS[name]}" if name in NUMBERS else (phase.title if phase else name)
         heading += ", test sessions" if test else ""
-        labels = tuple(f"{held.label}, {held.status}" for _, held in own)
+        labels = tuple(f"{training.label}, {training.status}" for _, training in own)
         key = f"{name} test" if test else name
-        places, pruned = tuple(p for p, _ in own), frozenset(p for p, held in own if held.status == "pruned")
-        made.append(PhaseTrack(key, heading, places, tuple(scores), labels, tuple(best.tolist()), pruned))
-    return tuple(made)
+        places, pruned = tuple(p for p, _ in own), frozenset(p for p, training in own if training.status == "pruned")
+        views.append(PhaseTrack(key, heading, places, tuple(scores), labels, tuple(best.tolist()), pruned))
+    return tuple(views)
 
 
 def top_of(scores: Iterable[float]) -> float | None:

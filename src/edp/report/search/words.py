@@ -44,7 +44,7 @@ def _result(study: StudyFacts, facts: Mapping[str, Any]) -> str:
 
 def verdict(study: StudyFacts) -> list[str]:
     """What was decided, in short."""
-    made = [
+    lines = [
         _how_sure(study),
         _features(study),
         _baseline(study),
@@ -54,10 +54,10 @@ def verdict(study: StudyFacts) -> list[str]:
     ]
     if study.state != "finished":
         where = next((phase for phase in study.phases if phase.name not in study.facts), None)
-        made.append(f"The search {'is' if study.state == 'running' else 'was'} {study.state}")
-        made[-1] += f" in {where.heading.lower()}" if where else ""
-        made[-1] += "." if study.state == "running" else "; the same command goes on with it."
-    return [line for line in made if line]
+        lines.append(f"The search {'is' if study.state == 'running' else 'was'} {study.state}")
+        lines[-1] += f" in {where.heading.lower()}" if where else ""
+        lines[-1] += "." if study.state == "running" else "; the same command goes on with it."
+    return [line for line in lines if line]
 
 
 @of_phase("synthesis", "")
@@ -75,7 +75,7 @@ def _features(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     means = facts["mean_scores"]
     if len(means) < 2:
         return ""
-    sure = all(real(held["p"]) < real(study.spec["alpha"]) for held in facts["comparisons"].values())
+    sure = all(real(comparison["p"]) < real(study.spec["alpha"]) for comparison in facts["comparisons"].values())
     return f"Feature set {facts['features']} goes on" + (
         ", better with every backbone." if sure else ", though not every backbone shows that it is better."
     )
@@ -83,8 +83,8 @@ def _features(study: StudyFacts, facts: Mapping[str, Any]) -> str:
 
 @of_phase("calibration", "")
 def _baseline(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    held = facts["backbones"][facts["backbone"]]
-    return f"The baseline is {titled(facts['backbone'])} with {whole(real(held['parameters']))} parameters."
+    calibration = facts["backbones"][facts["backbone"]]
+    return f"The baseline is {titled(facts['backbone'])} with {whole(real(calibration['parameters']))} parameters."
 
 
 @of_phase("confirmation", "")
@@ -107,22 +107,22 @@ def _teacher(study: StudyFacts, facts: Mapping[str, Any]) -> str:
 
 def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what."""
-    pruned = sum(held.status == "pruned" for held in study.history)
-    failed = sum(held.status not in ("done", "pruned") for held in study.history)
+    pruned = sum(training.status == "pruned" for training in study.history)
+    failed = sum(training.status not in ("done", "pruned") for training in study.history)
     trained = sum(phase.seconds for phase in study.phases)
-    said = [f"{count} of them {what}" for count, what in ((pruned, "pruned"), (failed, "failed")) if count]
-    made = [(whole(len(study.history)), "", ", ".join(["trainings", *said]))]
+    exceptions = [f"{count} of them {what}" for count, what in ((pruned, "pruned"), (failed, "failed")) if count]
+    tiles = [(whole(len(study.history)), "", ", ".join(["trainings", *exceptions]))]
     if trained:
         clock = duration(sum(phase.wall_s for phase in study.phases))
         value, _, unit = duration(trained).partition(" ")
-        made.append((value, unit, f"of training, {clock} by the clock"))
+        tiles.append((value, unit, f"of training, {clock} by the clock"))
     if "confirmation" in study.facts:
         confirmed, asked = study.facts["confirmation"]["confirmed"], study.facts["screening"]["registered"]
-        made.append((whole(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
+        tiles.append((whole(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
     looks = len(study.openings)
     sealed = _count(len(study.test) + len(study.second), "session")
-    made.append((whole(looks), "", f"look{'s' * (looks != 1)} at {sealed} set apart"))
-    return made
+    tiles.append((whole(looks), "", f"look{'s' * (looks != 1)} at {sealed} set apart"))
+    return tiles
 
 
 def caveats(study: StudyFacts) -> list[str]:
@@ -130,7 +130,7 @@ def caveats(study: StudyFacts) -> list[str]:
     spec = study.spec
     updates, final = int(spec["updates"]), int(spec["final_updates"])
     horizon = _count(int(spec["horizon"]), "sample")
-    made = [
+    caveats = [
         f"Every comparison is between trainings of {_length(spec, updates)}, judged {horizon} ahead. It shows which "
         "part learns more from so little: a part that pays only after long training is missed, and one that only "
         "speeds up the start is favoured.",
@@ -149,12 +149,12 @@ def caveats(study: StudyFacts) -> list[str]:
         "good. Only test sessions and fresh folds count.",
     ]
     if study.mode == "thesis":
-        made.append(
+        caveats.append(
             "This study follows the thesis's tests, to be compared with it. They take splits that share "
             "most of their training data as independent, and accept a module on any of four metrics, so they confirm "
             "useless modules more often than their level says; conclusions want the sound mode."
         )
-    return made
+    return caveats
 
 
 def _length(spec: Mapping[str, Any], updates: int) -> str:
@@ -194,14 +194,14 @@ def _thesis_power(study: StudyFacts, facts: Mapping[str, Any]) -> tuple[str, ...
 
 def decided(study: StudyFacts) -> list[tuple[str, tuple[str, ...]]]:
     """Each phase with what it decided and why, or how far it is."""
-    made = []
+    decisions = []
     for phase in study.phases:
         lines = study.sentences.get(phase.name)
         if lines is None:
-            count = sum(held.phase == phase.name for held in study.history)
+            count = sum(training.phase == phase.name for training in study.history)
             lines = (f"Under way: {_count(count, 'training')} done." if phase.began else "Has not begun.",)
-        made.append((phase.heading, _grouped(lines)))
-    return made
+        decisions.append((phase.heading, _grouped(lines)))
+    return decisions
 
 
 def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
@@ -210,8 +210,8 @@ def _grouped(lines: Sequence[str]) -> tuple[str, ...]:
     for line in lines:
         name, colon, rest = line.partition(": ")
         names.setdefault(rest if colon else line, []).append(name if colon else "")
-    made = [f"{', '.join(own)}: {rest}" if own[0] else rest for rest, own in names.items()]
-    return tuple(re.sub(r"(?<![\w-])-(?=\d)", "−", line) for line in made)
+    grouped = [f"{', '.join(own)}: {rest}" if own[0] else rest for rest, own in names.items()]
+    return tuple(re.sub(r"(?<![\w-])-(?=\d)", "−", line) for line in grouped)
 
 
 def missing(study: StudyFacts, *names: str) -> str:
@@ -229,7 +229,7 @@ def settings(study: StudyFacts) -> list[tuple[str, str]]:
 
 def _plain(value: object) -> str:
     if isinstance(value, dict):
-        return "; ".join(f"{key}: {_plain(held)}" for key, held in value.items()) or "none"
+        return "; ".join(f"{key}: {_plain(inner)}" for key, inner in value.items()) or "none"
     if isinstance(value, list | tuple):
         return ", ".join(map(_plain, value)) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value)

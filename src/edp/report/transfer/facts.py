@@ -28,25 +28,25 @@ class Transfer:
     """Content of ``transfer.json`` and of the excerpts beside it.
 
     Attributes:
-        held: plain values.
+        content: plain values.
         shown: truth and predictions of excerpts by ``NAME/truth`` and ``NAME/METHOD``, ``(time, horizon, target)``, SI.
         folder: where they lie.
     """
 
-    held: Mapping[str, Any]
+    content: Mapping[str, Any]
     shown: Mapping[str, NDArray[np.float32]]
     folder: Path
 
     @property
     def horizons(self) -> list[str]:
         """Look-aheads in samples, as keys of scores."""
-        return [str(horizon) for horizon in self.held["task"]["horizons"]]
+        return [str(horizon) for horizon in self.content["task"]["horizons"]]
 
     @property
     def targets(self) -> Sequence[Mapping[str, Any]]:
         """Name, description, unit and factor of each target."""
-        held: Sequence[Mapping[str, Any]] = self.held["targets"]
-        return held
+        targets: Sequence[Mapping[str, Any]] = self.content["targets"]
+        return targets
 
     @property
     def unit(self) -> str:
@@ -57,23 +57,23 @@ class Transfer:
     @property
     def methods(self) -> Mapping[str, Mapping[str, Any]]:
         """All methods by name."""
-        held: Mapping[str, Mapping[str, Any]] = self.held["methods"]
-        return held
+        methods: Mapping[str, Mapping[str, Any]] = self.content["methods"]
+        return methods
 
     @property
     def pair(self) -> tuple[str, str]:
         """Names of the methods that stand for before and after."""
-        return self.held["before"], self.held["method"]
+        return self.content["before"], self.content["method"]
 
     @property
     def worlds(self) -> list[str]:
         """Where methods were judged: on the target, and on the source where its recordings are at hand."""
-        return list(self.methods[self.held["method"]]["worlds"])
+        return list(self.methods[self.content["method"]]["worlds"])
 
     def score(self, method: str, horizon: str, target: str = MEAN, world: str = TARGET) -> Mapping[str, Any]:
         """Scores of a method."""
-        held: Mapping[str, Any] = self.methods[method]["worlds"][world][horizon][target]
-        return held
+        scores: Mapping[str, Any] = self.methods[method]["worlds"][world][horizon][target]
+        return scores
 
     def gain(self, horizon: str) -> float:
         """Share of the MAE of direct transfer that is gone."""
@@ -82,7 +82,7 @@ class Transfer:
 
     def ahead(self, horizon: str) -> str:
         """A horizon in words."""
-        return f"{1e3 * int(horizon) / self.held['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
+        return f"{1e3 * int(horizon) / self.content['task']['rate_hz']:.0f} ms ahead (k = {horizon})"
 
     def name(self, target: Mapping[str, Any]) -> str:
         """What a target is called."""
@@ -98,14 +98,14 @@ def read_transfer(folder: str | Path) -> Transfer:
     file = Path(folder) / RESULT
     if not file.is_file():
         raise StorageError(f"'{folder}' holds no {RESULT}; give the folder of edp finetune")
-    held = read_json(file)
-    if not isinstance(held, dict) or held.get("schema") != SCHEMA:
+    content = read_json(file)
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise StorageError(f"'{file}' is of another version of EDP; run edp finetune again")
     try:
         shown = load_file(Path(folder) / SHOWN)
     except (OSError, SafetensorError) as error:
         raise StorageError(f"'{Path(folder) / SHOWN}' cannot be read ({error}); run edp finetune again") from error
-    return Transfer(held, shown, Path(folder))
+    return Transfer(content, shown, Path(folder))
 
 
 def sheets_of(facts: Transfer, horizon: str) -> list[Sheet]:
@@ -118,16 +118,16 @@ def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
     rows: list[tuple[Value, ...]] = []
     for method in facts.pair:
         for target in facts.targets:
-            found = facts.score(method, horizon, target["name"])
+            scores = facts.score(method, horizon, target["name"])
             keys = ("mse", "mae", "r2", "p95", "p99", "bias", "skew")
-            rows.append((facts.methods[method]["label"], facts.name(target), *(found[key] for key in keys)))
+            rows.append((facts.methods[method]["label"], facts.name(target), *(scores[key] for key in keys)))
     unit = facts.unit
     square = f"({unit})²" if unit != "mixed units" else unit
     heads = (("MSE", square), ("MAE", unit), ("R²", ""), ("P95", unit), ("P99", unit), ("Bias", unit), ("Skew", ""))
-    shows = [figures([row[2 + place] for row in rows]) for place in range(len(heads))]
+    shows = [figures([row[2 + column] for row in rows]) for column in range(len(heads))]
     shows[2] = figures([], decimals=4)
-    for place in (5, 6):
-        shows[place] = figures([], signed=True, decimals=2)
+    for column in (5, 6):
+        shows[column] = figures([], signed=True, decimals=2)
     columns = (
         Column("Model variant"),
         Column("Target"),
@@ -139,22 +139,22 @@ def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
 
 def method_sheet(facts: Transfer, horizon: str) -> Sheet:
     """All methods on the same ticks, least error first, in both worlds where both were judged."""
-    direct = float(facts.score(facts.held["before"], horizon)["mae"])
+    direct = float(facts.score(facts.content["before"], horizon)["mae"])
     both = SOURCE in facts.worlds
     rows: list[tuple[Value, ...]] = []
     names = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
     for name in names:
-        found = facts.score(name, horizon)
+        scores = facts.score(name, horizon)
         each = [facts.score(name, horizon, target["name"]) for target in facts.targets]
-        known = [row["r2"] for row in each if row["r2"] is not None]
+        r2_values = [row["r2"] for row in each if row["r2"] is not None]
         rows.append(
             (
                 facts.methods[name]["label"],
-                found["mae"],
-                100 * (found["mae"] / direct - 1),
-                min(known, default=None),
-                found["p95"],
-                found["p99"],
+                scores["mae"],
+                100 * (scores["mae"] / direct - 1),
+                min(r2_values, default=None),
+                scores["p95"],
+                scores["p99"],
                 max((row["bias"] for row in each), key=abs),
                 facts.methods[name]["learned"],
                 *([facts.score(name, horizon, world=SOURCE)["mae"]] if both else []),
@@ -172,7 +172,7 @@ def method_sheet(facts: Transfer, horizon: str) -> Sheet:
         Column("Learned", "parameters", figures([], decimals=0)),
         *([Column("MAE on the source", unit, figures([row[8] for row in rows]))] if both else []),
     )
-    mark = frozenset({names.index(facts.held["method"])})
+    mark = frozenset({names.index(facts.content["method"])})
     return Sheet(f"methods_k{horizon}", f"{facts.ahead(horizon)}, means over targets", columns, tuple(rows), mark)
 
 
@@ -185,15 +185,15 @@ def headline(facts: Transfer) -> str:
         return "No epoch was better on the validation part than the source's network as it is, so that one is kept"
     how = f"{percent(abs(gain))} {'less' if gain > 0 else 'more'}"
     words = f"{number(after)} instead of {number(before)} {facts.unit}"
-    return f"{facts.methods[facts.held['method']]['label']}: {how} error than direct transfer, {words}"
+    return f"{facts.methods[facts.content['method']]['label']}: {how} error than direct transfer, {words}"
 
 
 def verdict(facts: Transfer) -> list[str]:
     """Sentences under the headline: R2 and bias of each target, the best rival, the source's world."""
-    horizon, method = facts.horizons[-1], facts.held["method"]
+    horizon, method = facts.horizons[-1], facts.content["method"]
     each = {facts.name(target): facts.score(method, horizon, target["name"]) for target in facts.targets}
-    known = listed(f"{number(row['r2'], 4)} ({name})" for name, row in each.items())
-    lines = [f"R² is {known}."]
+    r2_texts = listed(f"{number(row['r2'], 4)} ({name})" for name, row in each.items())
+    lines = [f"R² is {r2_texts}."]
     leaning = [name for name, row in each.items() if abs(row["bias"]) > SIGNIFICANT * row["mae"]]
     if leaning:
         lines.append(f"The errors of {listed(leaning)} have a bias above {percent(SIGNIFICANT)} of their MAE.")
@@ -211,13 +211,14 @@ def verdict(facts: Transfer) -> list[str]:
 
 def caveats(facts: Transfer) -> list[str]:
     """What the figures can and cannot show."""
-    minutes = facts.held["data"]["minutes"]
+    minutes = facts.content["data"]["minutes"]
     return [
         f"Trained on {minutes['train']:.1f} min, epochs chosen on {minutes['validation']:.1f} min, judged on "
-        f"{minutes['test']:.1f} min: the end of each of {facts.held['data']['recordings']} logs, a gap of W + k apart.",
+        f"{minutes['test']:.1f} min: the end of each of {facts.content['data']['recordings']} logs, a gap of W + k "
+        "apart.",
         "The test part holds the conditions of the logs, not others: another soil, load or temperature is not in it.",
         "One training each: differences of a percent between methods may be chance.",
-        *facts.held["notes"],
+        *facts.content["notes"],
     ]
 
 
@@ -230,5 +231,5 @@ def tiles(facts: Transfer) -> list[tuple[str, str, str]]:
         (number(was["mae"]), facts.unit, "MAE of direct transfer"),
         (percent(facts.gain(horizon)), "", "less error"),
         (number(now["p99"]), facts.unit, "99th percentile of the error"),
-        (f"{facts.held['data']['minutes']['train']:.1f}", "min", "of logs trained on"),
+        (f"{facts.content['data']['minutes']['train']:.1f}", "min", "of logs trained on"),
     ]

@@ -40,7 +40,7 @@ def render(facts: Transfer, tables: list[Sheet]) -> str:
     plots = transfer_plots(facts)
     context: dict[str, Any] = {
         "title": facts.folder.resolve().name,
-        "network": facts.held["network"],
+        "network": facts.content["network"],
         "headline": unbroken(words.headline(facts)),
         "verdict": words.verdict(facts),
         "tiles": words.tiles(facts),

@@ -25,8 +25,8 @@ WORLDS = {TARGET: "on the target's logs", SOURCE: "on the source's recordings"}
 
 def transfer_plots(facts: Transfer) -> dict[str, Plot]:
     """Every figure by name."""
-    made = [prediction_plot(facts), error_plot(facts), method_plot(facts)]
-    return {plot.name: plot for plot in made}
+    plots = [prediction_plot(facts), error_plot(facts), method_plot(facts)]
+    return {plot.name: plot for plot in plots}
 
 
 def _curves(facts: Transfer) -> list[tuple[str, str, str, float]]:
@@ -53,12 +53,12 @@ def prediction_plot(facts: Transfer) -> Plot:
     names = _excerpts(facts)
     for name in names:
         start = float(facts.shown[f"{name}/start"][0])
-        for place, horizon in enumerate(facts.horizons):
+        for horizon_index, horizon in enumerate(facts.horizons):
             for key, label, ink, width in _curves(facts):
-                values = facts.shown[f"{name}/{key}"][:, place]
+                values = facts.shown[f"{name}/{key}"][:, horizon_index]
                 for row, target in enumerate(facts.targets):
                     figure.add_scatter(
-                        x0=start, dx=1 / facts.held["task"]["rate_hz"], row=row + 1, col=1, mode="lines",
+                        x0=start, dx=1 / facts.content["task"]["rate_hz"], row=row + 1, col=1, mode="lines",
                         y=(values[:, row] * target["factor"]).round(3), name=label, legendgroup=key,
                         showlegend=row == 0, line={"color": ink, "width": width}, hovertemplate="%{y:.4~g}",
                         meta={RECORDING: name, AHEAD: horizon},
@@ -77,13 +77,13 @@ def error_plot(facts: Transfer) -> Plot:
     columns = len(facts.targets)
     titles = [html.escape(short_label(facts.name(target))) for target in facts.targets]
     figure = make_subplots(rows=1, cols=columns, horizontal_spacing=0.06, subplot_titles=titles)
-    for horizon, held in facts.held["distributions"].items():
+    for horizon, by_target in facts.content["distributions"].items():
         for key, label, ink, _ in _curves(facts)[1:]:
             for column, target in enumerate(facts.targets):
-                found, row = held[target["name"]], facts.score(key, horizon, target["name"])
-                edges = np.array(found["edges"])
+                distribution, row = by_target[target["name"]], facts.score(key, horizon, target["name"])
+                edges = np.array(distribution["edges"])
                 figure.add_scatter(
-                    x=((edges[:-1] + edges[1:]) / 2).round(4), y=(100 * np.array(found["shares"][key])).round(4),
+                    x=((edges[:-1] + edges[1:]) / 2).round(4), y=(100 * np.array(distribution["shares"][key])).round(4),
                     row=1, col=column + 1, name=label, legendgroup=key, showlegend=column == 0, mode="lines",
                     line={"shape": "hvh", "color": ink, "width": 1.6}, fill="tozeroy", opacity=0.7,
                     meta={AHEAD: horizon}, visible=horizon == facts.horizons[0],
@@ -109,11 +109,11 @@ def method_plot(facts: Transfer) -> Plot:
         order = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
         labels = [html.escape(facts.methods[name]["label"]) for name in order]
         for row, world in enumerate(facts.worlds, start=1):
-            for place, target in enumerate(facts.targets):
+            for index, target in enumerate(facts.targets):
                 figure.add_bar(
                     x=labels, y=[facts.score(name, horizon, target["name"], world)["mae"] for name in order],
                     row=row, col=1, name=html.escape(short_label(facts.name(target))), legendgroup=target["name"],
-                    showlegend=row == 1, marker={"color": MUTED[place % len(MUTED)]}, meta={AHEAD: horizon},
+                    showlegend=row == 1, marker={"color": MUTED[index % len(MUTED)]}, meta={AHEAD: horizon},
                     visible=horizon == facts.horizons[0], hovertemplate="%{y:.4~g}",
                 )  # fmt: skip
     styled(figure, 120 + 240 * len(facts.worlds), bargap=0.3)
@@ -124,24 +124,26 @@ def method_plot(facts: Transfer) -> Plot:
 
 def drawings(facts: Transfer) -> dict[str, Callable[[Figure], None]]:
     """What draws each picture, by the name of its file."""
-    made: dict[str, Callable[[Figure], None]] = {}
-    for place, horizon in enumerate(facts.horizons):
+    drawings: dict[str, Callable[[Figure], None]] = {}
+    for horizon_index, horizon in enumerate(facts.horizons):
         for name in facts.pair:
-            made[f"prediction_{name}_k{horizon}"] = partial(_draw_course, facts=facts, method=name, place=place)
-            made[f"errors_{name}_k{horizon}"] = partial(_draw_errors, facts=facts, method=name, horizon=horizon)
-    return made
+            drawings[f"prediction_{name}_k{horizon}"] = partial(
+                _draw_course, facts=facts, method=name, horizon_index=horizon_index
+            )
+            drawings[f"errors_{name}_k{horizon}"] = partial(_draw_errors, facts=facts, method=name, horizon=horizon)
+    return drawings
 
 
-def _draw_course(figure: Figure, facts: Transfer, method: str, place: int) -> None:
+def _draw_course(figure: Figure, facts: Transfer, method: str, horizon_index: int) -> None:
     figure.set_size_inches(8.0, 1.7 * len(facts.targets) + 0.8)
     rows: Any = figure.subplots(nrows=len(facts.targets), sharex=True, squeeze=False)
     name = _excerpts(facts)[0]
-    truth, said = facts.shown[f"{name}/truth"], facts.shown[f"{name}/{method}"]
-    time = facts.shown[f"{name}/start"][0] + np.arange(len(truth)) / facts.held["task"]["rate_hz"]
+    truth, predicted = facts.shown[f"{name}/truth"], facts.shown[f"{name}/{method}"]
+    time = facts.shown[f"{name}/start"][0] + np.arange(len(truth)) / facts.content["task"]["rate_hz"]
     for row, target in enumerate(facts.targets):
         axes, factor = rows[row, 0], target["factor"]
-        axes.plot(time, truth[:, place, row] * factor, color=DROPPED, linewidth=2.4, label="measured")
-        axes.plot(time, said[:, place, row] * factor, color=DRAWN_BLUE, linewidth=0.9, label="predicted")
+        axes.plot(time, truth[:, horizon_index, row] * factor, color=DROPPED, linewidth=2.4, label="measured")
+        axes.plot(time, predicted[:, horizon_index, row] * factor, color=DRAWN_BLUE, linewidth=0.9, label="predicted")
         axes.set(ylabel=f"{short_label(facts.name(target))}\n[{target['unit']}]")
     rows[0, 0].legend(frameon=False, fontsize=7, ncols=2)
     rows[-1, 0].set(xlabel="Time in the test part [s]")
@@ -152,9 +154,15 @@ def _draw_errors(figure: Figure, facts: Transfer, method: str, horizon: str) -> 
     figure.set_size_inches(2.8 * len(facts.targets) + 0.6, 2.8)
     panels: Any = figure.subplots(ncols=len(facts.targets), squeeze=False)
     for column, target in enumerate(facts.targets):
-        axes, held = panels[0, column], facts.held["distributions"][horizon][target["name"]]
+        axes, distribution = panels[0, column], facts.content["distributions"][horizon][target["name"]]
         row = facts.score(method, horizon, target["name"])
-        axes.stairs(100 * np.array(held["shares"][method]), held["edges"], fill=True, color=DRAWN_BLUE, alpha=0.7)
+        axes.stairs(
+            100 * np.array(distribution["shares"][method]),
+            distribution["edges"],
+            fill=True,
+            color=DRAWN_BLUE,
+            alpha=0.7,
+        )
         axes.axvline(row["bias"], color=INK, linewidth=0.8, linestyle=":")
         axes.set(xlabel=f"Error [{target['unit']}]", title=short_label(facts.name(target)))
         axes.text(0.02, 0.97, f"bias {row['bias']:.2f}\nskew {row['skew']:.2f}", transform=axes.transAxes, va="top")

@@ -86,9 +86,9 @@ def code_version() -> str:
     state = hashlib.blake2b(digest_size=16)
     root = Path(__file__).parents[2]
     for file in sorted([*root.rglob("*.py"), *root.rglob("*.toml")]):
-        place = file.relative_to(root).as_posix()
-        if not _below(place, UNREAD) or _below(place, READ):
-            state.update(f"{place}\0".encode() + file.read_bytes() + b"\0")
+        relative_path = file.relative_to(root).as_posix()
+        if not _below(relative_path, UNREAD) or _below(relative_path, READ):
+            state.update(f"{relative_path}\0".encode() + file.read_bytes() + b"\0")
     return f"{__version__}+{state.hexdigest()}"
 
 
@@ -181,13 +181,13 @@ class Record:
             raise StorageError(f"a record of schema {plain['schema']} was written by a later version of EDP; update it")
         object_with(plain, PARTS, "a record")
         parts = [one.name for one in fields(TrainingIdentity)]
-        held = object_with(plain["identity"], parts, "a record's identity")
+        identity_parts = object_with(plain["identity"], parts, "a record's identity")
         measured = object_with(plain["measured"], (), "a record's measured part")
         if not isinstance(plain["key"], str) or not isinstance(plain["message"], str):
             raise StorageError("a record is damaged: its key or message is no text")
         if not isinstance(plain["result"], dict | None):
             raise StorageError("a record is damaged: its result is no table")
-        identity = TrainingIdentity(**{name: held[name] for name in parts})
+        identity = TrainingIdentity(**{name: identity_parts[name] for name in parts})
         identity.__dict__["key"] = plain["key"]  # the checksum covers it, so it is not hashed again
         return Record(identity, TrainingStatus(plain["status"]), plain["result"], plain["message"], measured)
 

@@ -46,7 +46,7 @@ def _taken_apart(file: Path, data: bytes) -> Record:
 
 def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
     """Bytes of the whole records by key, not yet taken apart: with ten thousand that is most of the time."""
-    found: dict[str, bytes] = {}
+    record_bytes: dict[str, bytes] = {}
     damaged = []
     names = sorted(name for name in os.listdir(folder) if name.endswith(".json")) if folder.is_dir() else []
     for name in names:
@@ -58,7 +58,7 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
                 Record.from_bytes(data)  # says which schema it is
             if f'"key":"{key}"'.encode() not in body:
                 raise ValueError("it holds the record of another training")
-            found[key] = data
+            record_bytes[key] = data
         except (ValueError, KeyError, TypeError) as error:
             damaged.append(Damage(Path(file), str(error)))
         except StorageError as error:
@@ -67,7 +67,7 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
             if os.path.isfile(file):
                 raise
             damaged.append(Damage(Path(file), str(error)))
-    return found, damaged
+    return record_bytes, damaged
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,11 @@ class Opening:
 
 
 def _opening(file: Path) -> Opening:
-    held = read_object(file, (part.name for part in fields(Opening)))
-    judged = held["judged"]
+    content = read_object(file, (part.name for part in fields(Opening)))
+    judged = content["judged"]
     if not isinstance(judged, list) or not all(isinstance(key, str) for key in judged):
         raise StorageError(f"'{file}' is damaged: judged must be a list of keys; restore it")
-    return Opening(str(held["box"]), tuple(judged), str(held["why"]), str(held["time"]))
+    return Opening(str(content["box"]), tuple(judged), str(content["why"]), str(content["time"]))
 
 
 class Ledger:
@@ -170,14 +170,14 @@ class Ledger:
                 another end of the same training.
         """
         check_held(self.path / ".lock", self._lock)
-        held = self.finished(record.key)
-        if held is not None and held.told() != record.told():
+        existing = self.finished(record.key)
+        if existing is not None and existing.told() != record.told():
             raise StorageError(
-                f"training {record.key} is in '{self.path}' as {held.status} and came again, {record.status}, with "
+                f"training {record.key} is in '{self.path}' as {existing.status} and came again, {record.status}, with "
                 "another result; equal trainings must give equal results: is something not in its key?"
             )
         self._take_state(record.key)
-        if held is None:
+        if existing is None:
             write_bytes(self.path / "records" / f"{record.key}.json", record.to_bytes())
             self._records[record.key] = record
         (self.path / "arrived" / f"{record.key}.json").unlink(missing_ok=True)
@@ -218,12 +218,12 @@ class Ledger:
         """
         file = self.path / "about.json"
         canonical(facts)
-        wanted = json.loads(json.dumps(facts))
+        expected = json.loads(json.dumps(facts))
         if not file.exists():
-            write_json(file, wanted)
+            write_json(file, expected)
             return False
-        held = read_object(file)
-        other = sorted(part for part in {*held, *wanted} if held.get(part) != wanted.get(part))
+        stored = read_object(file)
+        other = sorted(part for part in {*stored, *expected} if stored.get(part) != expected.get(part))
         if other:
             raise ConfigError(
                 f"'{self.path}' was begun with other {' and '.join(other)}; nothing was changed. Go on with the same "
@@ -258,8 +258,8 @@ class Ledger:
 
     def openings(self, box: str | None = None) -> list[Opening]:
         """Looks into one lock-box or all, oldest first."""
-        found = [_opening(file) for file in sorted((self.path / "openings").glob("*.json"))]
-        return [one for one in found if box in (None, one.box)]
+        openings = [_opening(file) for file in sorted((self.path / "openings").glob("*.json"))]
+        return [one for one in openings if box in (None, one.box)]
 
     def _enter_arrivals(self) -> None:
         """Enter what workers had finished when the last coordinator was killed."""
