@@ -68,8 +68,18 @@ def rows_of(found: CompressionResult, horizon: int) -> list[list[object]]:
     for place, row in enumerate([found.teacher, *found.rows]):
         mae = row.scores[str(horizon)]["mae"]
         mark = "* " if place and place - 1 == found.chosen else "  "
-        cells = [mark + row.name, mae, 100.0 * (row.error - 1.0), row.taken.parameters, row.taken.parameter_bytes]
-        cells += [FORMATS[row.number_format].label, row.taken.cycles[2], "fits" if row.fits else ", ".join(row.over)]
+        cells = [
+            mark + row.name,
+            mae,
+            100.0 * (row.error - 1.0),
+            row.resource_usage.parameters,
+            row.resource_usage.parameter_bytes,
+        ]
+        cells += [
+            FORMATS[row.number_format].label,
+            row.resource_usage.cycles[2],
+            "fits" if row.fits else ", ".join(row.over),
+        ]
         lines.append(cells)
     return lines
 
@@ -80,8 +90,8 @@ def facts_of(found: CompressionResult, horizon: int, made: dict[str, int]) -> di
     def plain(row: Judged) -> dict[str, Any]:
         mae = row.scores[str(horizon)]["mae"]
         return {"name": row.name, "format": row.number_format, "mae": mae, "over_teacher": row.error, "fits": row.fits,
-                "parameters": row.taken.parameters, "bytes": row.taken.parameter_bytes,
-                "cycles": list(row.taken.cycles), "memory": memory(row)}  # fmt: skip
+                "parameters": row.resource_usage.parameters, "bytes": row.resource_usage.parameter_bytes,
+                "cycles": list(row.resource_usage.cycles), "memory": memory(row)}  # fmt: skip
 
     box = {"error": found.box["error"], "scores": found.box["scores"]} if found.best else {}
     return {"teacher": plain(found.teacher), "rows": [plain(row) for row in found.rows], "box": box,
@@ -103,7 +113,7 @@ def compiled(best: Judged, folder: Path) -> dict[str, int]:
 
 def memory(row: Judged) -> int:
     """Bytes of state and stack: the weights of a stored network stay in flash."""
-    return row.taken.ram_bytes - row.taken.parameter_bytes
+    return row.resource_usage.ram_bytes - row.resource_usage.parameter_bytes
 
 
 def verdicts_of(
@@ -125,11 +135,11 @@ def verdicts_of(
     def boxed(name: str) -> float:
         return statistics.median(one.box["scores"][name][key]["mae"] for one in found)
 
-    taken = [(row.taken.parameter_bytes, memory(row)) for row in best]
+    taken = [(row.resource_usage.parameter_bytes, memory(row)) for row in best]
     if all(objects):
         taken = [(one["constants"], one["state"] + one["stack"]) for one in objects]
     bytes_, used = (max(column) for column in zip(*taken, strict=True))
-    cycles = max(row.taken.cycles[2] for row in best)
+    cycles = max(row.resource_usage.cycles[2] for row in best)
     told = [
         verdict(f"k={horizon}: constants", bytes_, 100_000, "<= 1.0", "bytes", quick),
         verdict(f"k={horizon}: cycles, high estimate, M4F", cycles, BUDGET.cycles, "<= 1.0", "cycles", quick),
@@ -137,7 +147,7 @@ def verdicts_of(
         verdict(f"k={horizon}: lock-box MAE against the teacher", boxed("chosen"), boxed("teacher"), "<= 1.05",
                 "mm/s", quick),
     ]  # fmt: skip
-    tight = [[row for row in one.rows if row.fits and row.taken.cycles[2] <= TIGHT] for one in found]
+    tight = [[row for row in one.rows if row.fits and row.resource_usage.cycles[2] <= TIGHT] for one in found]
     if all(tight):
         error = statistics.median(min(row.error for row in rows) for rows in tight)
         told.append(verdict(f"k={horizon}: validation MAE within {TIGHT:,} cycles", error, 1.0, "<= 1.1", "1", quick))

@@ -33,7 +33,7 @@ from edp.signals import TABLE_A1, ChannelMap, SignalMap
 from edp.sim import simulate_many
 from edp.sim.data_set import SimulationOrder
 from edp.workflows.feature_selection.trials import Trials, TrialSpec, try_feature_sets, with_differences
-from edp.workflows.train_evaluate import channel_worths
+from edp.workflows.train_evaluate import channel_importance
 from m22_truth import Cause, causes
 from screening_thesis import TARGETS, only_table_a1
 
@@ -151,9 +151,9 @@ def show_trials(trials: Trials) -> None:
     table(["set", "channels", "features", "parameters", "MAE", "difference (95 %)"], rows)
 
 
-def show_worths(run: Path, truth: Sequence[Cause], quick: bool) -> dict[str, Any]:
+def show_importance(run: Path, truth: Sequence[Cause], quick: bool) -> dict[str, Any]:
     """Take every channel from the network that read FG1, and print the growth beside the truth."""
-    found, _ = channel_worths(run)
+    found, _ = channel_importance(run)
     matter = {cause.name: cause for cause in truth}
     rows = []
     for row in found.ranked(10):
@@ -202,7 +202,7 @@ def main() -> None:
         source = on_disk(first, folder / "logs")
         trials = tried(source, first_screening, truth, folder / "trials", given)
         show_trials(trials)
-        worths = show_worths(folder / "trials" / f"FG1_seed{seed}", truth, quick)
+        importances = show_importance(folder / "trials" / f"FG1_seed{seed}", truth, quick)
     errors = {trial.name: trial.error["10"] for trial in trials.trials}
     drawn = min(value for name, value in errors.items() if name.startswith("random"))
     verdicts += [
@@ -210,7 +210,7 @@ def main() -> None:
         verdict("MAE of the proposal against the best random set", errors["proposed"], drawn, "<= 0.9", trials.unit,
                 quick),
     ]  # fmt: skip
-    details |= {"trials": trials.to_json(), "worths": worths}
+    details |= {"trials": trials.to_json(), "importances": importances}
     finish(Path(__file__).stem, verdicts, seed, _plain(details))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from edp.errors import ConfigError, DataError, ExportError
 from edp.workflows.parity import FORMS, Broken, Missing, Ran, compare, golden_case
-from edp.workflows.parity.base import held
+from edp.workflows.parity.base import compared
 
 WHOLE = {"c", "torch_ticks"}
 """Forms that whole numbers have at least."""
@@ -53,14 +53,14 @@ def test_forms_that_differ_fail_break_or_are_missing_are_told_apart(case, monkey
 
         return Form
 
-    far, gone = case.wanted.copy(), case.wanted.copy()
+    far, gone = case.expected.copy(), case.expected.copy()
     far[7] += 1.5 * case.allowed
     gone[3, 0] = np.nan
     wanted = {
         "far": (far, "different"),
         "gone": (gone, "different"),
-        "short": (case.wanted[:-1], "different"),
-        "near": (case.wanted + 0.5 * case.allowed, "same"),
+        "short": (case.expected[:-1], "different"),
+        "near": (case.expected + 0.5 * case.allowed, "same"),
         "refused": (ExportError("no such layer"), "refused"),
         "missing": (Missing("needs a program"), "not run"),
         "broken": (Broken("does not compile"), "failed"),
@@ -76,10 +76,10 @@ def test_forms_that_differ_fail_break_or_are_missing_are_told_apart(case, monkey
 
 def test_a_single_other_bit_differs_where_bits_must_agree(case):
     zero = np.zeros_like(case.allowed)
-    other = case.wanted.copy()
+    other = case.expected.copy()
     other[0, 0] = np.nextafter(other[0, 0], np.float32(9))
-    assert held("bits", "bits", case, Ran(case.wanted, 1e-6, allowed=zero)).verdict == "same"
-    found = held("bits", "bits", case, Ran(other, 1e-6, allowed=zero))
+    assert compared("bits", "bits", case, Ran(case.expected, 1e-6, allowed=zero)).verdict == "same"
+    found = compared("bits", "bits", case, Ran(other, 1e-6, allowed=zero))
     assert (found.verdict, found.largest) == ("different", 1.0)
 
 

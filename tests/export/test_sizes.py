@@ -24,7 +24,7 @@ from edp.ir.rls import Adaptation, AdaptationSpec
 from edp.ir.w8a16.quantise import outline
 from edp.networks.input_range import usual_range
 from edp.workflows.compression.formats import FORMATS
-from edp.workflows.compression.formats.base import taken
+from edp.workflows.compression.formats.base import resource_usage
 
 ARM = ("-std=c99", "-O2", "-ffp-contract=off", "-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16",
        "-ffunction-sections", "-fdata-sections")  # fmt: skip
@@ -189,7 +189,7 @@ def test_every_figure_of_a_network_is_the_same(predictor_of, integers_of):
     predictor = predictor_of("hybrid", dtype=torch.float32)
     counts, integers = footprint(predictor), integers_of("hybrid").integers
     for name, graph in (("float32", predictor.graph()), ("w8a16", integers)):
-        said = taken(predictor, name, Budget())
+        said = resource_usage(predictor, name, Budget())
         entry = counts.estimate(name)
         rows = {row["what"]: row["value"] for row in counts.verdict(Budget())}
         assert said.parameter_bytes == entry.parameter_bytes == rows[f"parameters, {name}"] == constant_bytes(graph)

@@ -17,7 +17,7 @@ def full(target: Path) -> tuple[int, str]:
     raise OSError(30, "Read-only file system")
 
 
-@pytest.mark.parametrize("command", ["evaluate", "channel_worths"])
+@pytest.mark.parametrize("command", ["evaluate", "channel_importance"])
 def test_a_run_that_cannot_be_written_is_told_before_it_is_read(command, tmp_path, monkeypatch):
     monkeypatch.setattr(edp.storage.writing, "_temporary", full)
     monkeypatch.setattr(edp.workflows.train_evaluate, "trained_run", lambda folder: pytest.fail("it was read first"))

@@ -16,7 +16,7 @@ from edp.data.chunks import ChunkSpec
 from edp.data.screening.spec import ForestSpec, ScreeningSpec
 from edp.data.series import Series
 from edp.errors import ConfigError, EdpError
-from edp.evaluation.channel_importance import WorthSpec
+from edp.evaluation.channel_importance import ChannelImportanceSpec
 from edp.evaluation.controller import Budget
 from edp.evaluation.judge import JudgeSpec
 from edp.ir.rls import AdaptationSpec
@@ -46,7 +46,7 @@ OTHERS = [
     FinetuneSpec,
     MetaSpec,
     Budget,
-    WorthSpec,
+    ChannelImportanceSpec,
     TrialSpec,
     BothSpec,
     DistillationSpec,

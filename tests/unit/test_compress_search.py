@@ -24,7 +24,7 @@ from edp.report import read_compression, write_compression_page
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler
-from edp.workflows.compression import CompressionCallbacks, CompressionSearchSpec, search, searching, taken
+from edp.workflows.compression import CompressionCallbacks, CompressionSearchSpec, resource_usage, search, searching
 from edp.workflows.compression.planning import make_plan
 from edp.workflows.train_evaluate import train
 
@@ -54,7 +54,7 @@ def run(lever_sessions, tmp_path_factory):
 @pytest.fixture(scope="module")
 def tight(run):
     """Half of what the teacher takes in whole numbers."""
-    need = taken(load_bundle(run).predictor, "w8a16", Budget())
+    need = resource_usage(load_bundle(run).predictor, "w8a16", Budget())
     return Budget(name="tight", cycles=need.cycles[2] // 2, parameter_bytes=need.parameter_bytes // 2)
 
 
@@ -70,10 +70,10 @@ def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight)
     assert best is not None
     assert best.fits
     assert best.error == min(row.error for row in found.rows if row.fits)
-    assert best.taken.cycles[2] <= tight.cycles
+    assert best.resource_usage.cycles[2] <= tight.cycles
     for place, row in enumerate(found.rows):
-        point = (row.error, row.taken.cycles[2], row.taken.parameter_bytes)
-        others = [(r.error, r.taken.cycles[2], r.taken.parameter_bytes) for r in found.rows]
+        point = (row.error, row.resource_usage.cycles[2], row.resource_usage.parameter_bytes)
+        others = [(r.error, r.resource_usage.cycles[2], r.resource_usage.parameter_bytes) for r in found.rows]
         beaten = any(all(a <= b for a, b in zip(other, point)) and other != point for other in others)
         assert (place in found.front) != beaten
     assert {row.way for row in found.rows} >= {"teacher", "distilled", "pruned and distilled"}
@@ -157,7 +157,7 @@ def test_widths_reach_from_the_widest_that_fits_to_a_quarter_of_it(run):
     teacher = load_bundle(run).predictor
     plan = make_plan(teacher, Budget(), formats=("float32",))
     assert tuple(plan.orders) == (8, 4)
-    need = taken(teacher, "float32", Budget())
+    need = resource_usage(teacher, "float32", Budget())
     narrow = make_plan(teacher, Budget(cycles=need.cycles[2] - 1), formats=("float32",))
     assert tuple(narrow.orders) == (12, 4, 2)
 
@@ -174,7 +174,7 @@ def test_ways_can_be_left_out(run):
 def test_the_widest_network_fits_with_all_of_its_constants(run):
     """A budget of one byte less than a width's constants takes the next narrower one."""
     teacher = load_bundle(run).predictor
-    need = taken(teacher, "w8a16", Budget())
+    need = resource_usage(teacher, "w8a16", Budget())
     graph = outline(teacher.graph())
     assert need.parameter_bytes == constant_bytes(graph) > sum(values.nbytes for _, _, values in graph.tensors())
     fits = make_plan(teacher, Budget(parameter_bytes=need.parameter_bytes), formats=("w8a16",))

@@ -81,7 +81,7 @@ def smaller_outcome(order, score):
         taken = {"parameters": 100 * width, "macs_tick": 100 * width, "macs_window": 900 * width}
         taken |= {"cycles": [900 * width] * 3, "parameter_bytes": size, "ram_bytes": size, "flash_bytes": size}
         over = {"cycles": [900 * width, 1]} if recipe.units is None else {}
-        formats[name] = {"scores": {"10": {"mae": mae, "composite": mae}}, "taken": taken, "over": over}
+        formats[name] = {"scores": {"10": {"mae": mae, "composite": mae}}, "resource_usage": taken, "over": over}
     plain = {"10": {"mae": score * (1 + 1 / width), "composite": score}}
     return {"formats": formats, "plain": plain, "left_out": {}}
 

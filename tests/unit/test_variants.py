@@ -22,7 +22,7 @@ from edp.workflows.compression import (
     CompressedCandidate,
     CompressionRequest,
     deploy,
-    taken,
+    resource_usage,
     weight_levels,
 )
 from edp.workflows.compression.bench import tuning
@@ -86,12 +86,12 @@ def test_bytes_are_those_of_table_4_9(name, number_format, size):
     experiment = load_experiment(THESIS / f"{name}.toml")
     task = experiment.task.resolve(100.0)
     net = build_model(task, experiment.model, blank_scaler(task), seed=0)
-    assert f"{taken(net, number_format, Budget()).parameter_bytes / 1e6:.4f}" == size
+    assert f"{resource_usage(net, number_format, Budget()).parameter_bytes / 1e6:.4f}" == size
 
 
 def test_what_is_over_budget_is_named(bench):
-    found = taken(bench.teacher, "float32", Budget(cycles=1000, parameter_bytes=100))
+    found = resource_usage(bench.teacher, "float32", Budget(cycles=1000, parameter_bytes=100))
     assert set(found.over(Budget(cycles=1000, parameter_bytes=100))) == {"cycles", "parameter_bytes"}
-    assert taken(bench.teacher, "w8a16", Budget()).over(Budget()) == {}
+    assert resource_usage(bench.teacher, "w8a16", Budget()).over(Budget()) == {}
     orders = CompressionRequest(name="a", units=8), CompressionRequest(name="a", units=8)
     assert orders[0] == orders[1]

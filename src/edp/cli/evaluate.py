@@ -12,7 +12,7 @@ from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progr
 from edp.cli.train import MapOption, RepairOption, source_of
 
 if TYPE_CHECKING:
-    from edp.evaluation.channel_importance import Worths
+    from edp.evaluation.channel_importance import ChannelImportances
     from edp.logs.source import DataSource
 
 
@@ -24,7 +24,7 @@ def evaluate(
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
-    worth: Annotated[
+    channel_importance: Annotated[
         bool, typer.Option(help="Also take each channel away from the model, and say how much the error grows.")
     ] = False,
     as_json: JsonFlag = False,
@@ -36,17 +36,18 @@ def evaluate(
     names = None if baselines is None else [n for n in baselines.split(",") if n and n != "none"]
     source = None if data is None else source_of(data, signal_map, repair)
     folder, scores = run_evaluation(run, source, names, as_json)
-    worths = run_worths(run, source, as_json) if worth else None
+    importances = run_importance(run, source, as_json) if channel_importance else None
 
     def show() -> None:
         score_table(scores)
         out.print(f"scores in {folder / 'scores.json'}")
-        if worths is not None:
-            worth_table(worths)
-            out.print(f"worth of the channels in {folder / 'worth.json'}")
+        if importances is not None:
+            importance_table(importances)
+            out.print(f"importance of the channels in {folder / 'channel_importance.json'}")
         out.print(f"next: edp report {folder}")
 
-    emit(as_json, {"folder": str(folder), **scores} | ({} if worths is None else {"worth": worths.to_json()}), show)
+    importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
+    emit(as_json, {"folder": str(folder), **scores} | importance_json, show)
 
 
 def run_evaluation(
@@ -68,22 +69,22 @@ def run_evaluation(
     return folder, read_object(folder / "scores.json")
 
 
-def run_worths(run: Path, source: DataSource | None = None, quiet: bool = False) -> Worths:
+def run_importance(run: Path, source: DataSource | None = None, quiet: bool = False) -> ChannelImportances:
     """Take channels away with a progress display."""
-    from edp.workflows.train_evaluate import channel_worths
+    from edp.workflows.train_evaluate import channel_importance
 
     with progress(quiet) as shown:
-        on_group = counted(shown, Steps(quiet), "worth", "taken away")
-        importances, _ = channel_worths(run, source, on_group=on_group)
+        on_group = counted(shown, Steps(quiet), "channel importance", "removed")
+        importances, _ = channel_importance(run, source, on_group=on_group)
     return importances
 
 
-def worth_table(worths: Worths) -> None:
+def importance_table(importances: ChannelImportances) -> None:
     """Print a table a horizon: what the error grows by without each channel, most first."""
-    unit = worths.units["mean"]
-    for horizon, error in worths.error.items():
+    unit = importances.units["mean"]
+    for horizon, error in importances.error.items():
         rows = []
-        for row in worths.ranked(int(horizon)):
+        for row in importances.ranked(int(horizon)):
             bounds = f"{row.renewed.low:.3g} to {row.renewed.high:.3g}"
             figures = [f"{row.renewed.mean:.3g}", bounds, f"{row.exchanged.mean:.3g}", f"{row.explained:.0%}"]
             rows.append([", ".join(row.members), *figures])

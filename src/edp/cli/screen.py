@@ -127,7 +127,7 @@ class ScreeningDisplay:
 
 def show_selection(selection: Selection) -> None:
     """Print the proposal, the flags and where everything is."""
-    screening = selection.found
+    screening = selection.screening
     rows = [(c.channel, f"{c.score:.2f}", c.reason) for c in screening.proposal.choices if c.keep]
     listing(f"keep: {len(rows)} of {len(screening.channels)} channels", ["channel", "score", "why"], rows[:SHOWN])
     if len(rows) > SHOWN:
@@ -157,7 +157,7 @@ def _show_lags(selection: Selection) -> None:
 
     rows = [
         (row.group, "-" if row.low is None else f"{row.low} to {row.high}", f"{row.certain} of {row.curves}")
-        for row in lag_ranges(selection.found)
+        for row in lag_ranges(selection.screening)
     ]
     table("best lags, samples; negative: the channel leads", ["kind of signal", "range", "certain"], rows)
     out.print()
@@ -180,19 +180,19 @@ def _show_trials(selection: Selection) -> None:
 
 def facts_of(selection: Selection) -> dict[str, Any]:
     """What a machine needs; the whole is in the files."""
-    proposal = selection.found.proposal
+    proposal = selection.screening.proposal
     return {
         "kept": list(proposal.kept),
         "dropped": list(proposal.dropped),
         "window": proposal.window,
         "flags": [
             {"channel": flag.channel, "kind": str(flag.kind), "source": flag.source, "lag": flag.lag}
-            for flag in selection.found.flags
+            for flag in selection.screening.flags
         ],
         "verdict": selection.quality.verdict,
         "repeats": [repeat.to_json() for repeat in selection.quality.repeats],
         "notes": [*proposal.notes, *selection.notes],
-        "seconds": selection.found.seconds,
+        "seconds": selection.screening.seconds,
         "trials": None if selection.trials is None else selection.trials.to_json(),
         "files": {name: str(path) for name, path in selection.files.items()},
     }

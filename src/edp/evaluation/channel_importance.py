@@ -1,4 +1,4 @@
-"""What each channel is worth to a trained predictor: how much its error grows when the channel is taken from it.
+"""Importance of each channel to a trained predictor: growth of its error when the channel is removed.
 
 A channel is taken away without training again, in two ways. *Exchanged*, its whole course is that of another recording
 (eq. 2.14 with recordings in place of rows, so that the course stays a plausible one and the stream can be run over it);
@@ -37,7 +37,7 @@ COVERAGE = 0.95
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorthSpec:
+class ChannelImportanceSpec:
     """How channels are taken away.
 
     Attributes:
@@ -58,7 +58,7 @@ class WorthSpec:
 
     def __post_init__(self) -> None:
         check_bounds(
-            "worth",
+            "channel importance",
             self,
             repeats=whole(1, MOST_NAMES),
             lags=whole(0, MOST_TICKS),
@@ -67,7 +67,9 @@ class WorthSpec:
             seed=SEED,
         )
         if 0 not in self.lags or min(self.lags) < 0:
-            raise ConfigError(f"worth: lags = {list(self.lags)}; 0 must be among them, and nothing from the future")
+            raise ConfigError(
+                f"channel importance: lags = {list(self.lags)}; 0 must be among them, and nothing from the future"
+            )
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,11 @@ class Growth:
 
 
 @dataclass(frozen=True)
-class Worth:
-    """What a channel, or a group of them, is worth at one horizon for one target or for their mean.
+class ChannelImportance:
+    """Importance of a channel, or of a group, at one horizon for one target or for their mean.
 
     Attributes:
-        members: the channels taken away.
+        members: the removed channels.
         horizon: samples ahead.
         target: name, or ``mean``.
         exchanged: growth of the error with another recording's course.
@@ -101,7 +103,7 @@ class Worth:
 
 
 @dataclass(frozen=True)
-class Worths:
+class ChannelImportances:
     """All of them, with the error that they are compared with.
 
     Attributes:
@@ -111,12 +113,12 @@ class Worths:
         recordings: names of the judged recordings.
     """
 
-    rows: tuple[Worth, ...]
+    rows: tuple[ChannelImportance, ...]
     error: dict[str, dict[str, float]]
     units: dict[str, str]
     recordings: tuple[str, ...]
 
-    def ranked(self, horizon: int) -> list[Worth]:
+    def ranked(self, horizon: int) -> list[ChannelImportance]:
         """Means over the targets at a horizon, the largest renewed growth first."""
         chosen = [row for row in self.rows if row.horizon == horizon and row.target == "mean"]
         return sorted(chosen, key=lambda row: -row.renewed.mean)
@@ -126,12 +128,12 @@ class Worths:
         return asdict(self)
 
 
-def channel_worths(
+def measure_channel_importance(
     predictor: Predictor,
     data: Prepared,
-    spec: WorthSpec | None = None,
+    spec: ChannelImportanceSpec | None = None,
     on_group: OnGroup | None = None,
-) -> Worths:
+) -> ChannelImportances:
     """Take every input channel of a predictor away, one at a time and in groups, on ``data.test``.
 
     Args:
@@ -144,7 +146,7 @@ def channel_worths(
         ConfigError: a group names what is no input.
         DataError: no tick can be scored.
     """
-    spec = spec or WorthSpec()
+    spec = spec or ChannelImportanceSpec()
     groups = _groups(data.task.inputs, spec.groups)
     ruler = _Ruler(data, predictor.spec.window if spec.skip is None else spec.skip)
     others = OthersModel.fit([part.inputs for part in data.train], spec.lags, spec.rows)
@@ -152,7 +154,7 @@ def channel_worths(
     expected, explained = others.expect(places, [part.inputs for part in data.test])
     plain = ruler.errors(stream_predictions(predictor, data.test))
     donors = [_donors(data.test, np.random.default_rng([spec.seed, turn])) for turn in range(spec.repeats)]
-    rows: list[Worth] = []
+    rows: list[ChannelImportance] = []
     for done, (members, columns) in enumerate(zip(groups, places, strict=True)):
         if on_group is not None:
             on_group(", ".join(members), done, len(groups))
@@ -163,7 +165,7 @@ def channel_worths(
             each = [ruler.errors(predictions[i * count : (i + 1) * count]) for i in range(spec.repeats)]
             growths.append(np.mean(each, axis=0) - plain)
         rows += ruler.rows(members, growths[0], growths[1], explained[done])
-    return Worths(tuple(rows), ruler.table(plain), ruler.units(), tuple(part.name for part in data.test))
+    return ChannelImportances(tuple(rows), ruler.table(plain), ruler.units(), tuple(part.name for part in data.test))
 
 
 def _groups(inputs: Sequence[str], asked_groups: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
@@ -172,7 +174,7 @@ def _groups(inputs: Sequence[str], asked_groups: Sequence[Sequence[str]]) -> lis
         for name in group:
             if name not in inputs:
                 raise ConfigError(
-                    f"worth: group {list(group)} names '{name}', which is no input{closest(name, inputs)}"
+                    f"channel importance: group {list(group)} names '{name}', which is no input{closest(name, inputs)}"
                 )
     alone = [(name,) for name in inputs]
     return alone + [tuple(group) for group in asked_groups if len(group) > 1]
@@ -240,10 +242,14 @@ class _Ruler:
                 errors[n, h] = np.abs(predictions[i][start:stop, h] - truth).mean(axis=0) * self.factors
         return np.concatenate([errors.mean(axis=2, keepdims=True), errors], axis=2)
 
-    def rows(self, members: tuple[str, ...], exchanged: Array, renewed: Array, explained: float) -> list[Worth]:
+    def rows(
+        self, members: tuple[str, ...], exchanged: Array, renewed: Array, explained: float
+    ) -> list[ChannelImportance]:
         """A row for each horizon and target from growths by stretch."""
         return [
-            Worth(members, horizon, name, self._growth(exchanged[:, h, n]), self._growth(renewed[:, h, n]), explained)
+            ChannelImportance(
+                members, horizon, name, self._growth(exchanged[:, h, n]), self._growth(renewed[:, h, n]), explained
+            )
             for h, horizon in enumerate(self.task.horizons)
             for n, name in enumerate(("mean", *self.task.targets))
         ]

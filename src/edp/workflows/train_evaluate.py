@@ -25,8 +25,7 @@ from edp.data.prepared import Prepared, prepare
 from edp.data.spectrum import LAGS
 from edp.data.splits import SPLITS
 from edp.errors import DataError
-from edp.evaluation.channel_importance import Worths, WorthSpec
-from edp.evaluation.channel_importance import channel_worths as measure_worths
+from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import Footprint, check_possible, footprint
@@ -163,14 +162,14 @@ def _keep(run: RunFolder, fitted: Fitted, provenance: dict[str, Any], data: Prep
 
 def _refuse_diverged(run: RunFolder) -> None:
     """A run that diverged would do so again, to the same bits."""
-    held = run.status()
-    if held.get("status") == "diverged":
-        kept = " Its bundle holds the weights from before." if run.file("bundle").exists() else ""
+    status = run.status()
+    if status.get("status") == "diverged":
+        bundle_note = " Its bundle holds the weights from before." if run.file("bundle").exists() else ""
         raise Diverged(
-            f"the run in '{run.path}' diverged on {held['time']}: {held['message']}. The same settings would do so "
-            f"again.{kept} Change them and choose another folder with --out, or remove this one",
+            f"the run in '{run.path}' diverged on {status['time']}: {status['message']}. The same settings would do so "
+            f"again.{bundle_note} Change them and choose another folder with --out, or remove this one",
             None,
-            {name: held[name] for name in ("epoch", "update", "kept_epoch")},
+            {name: status[name] for name in ("epoch", "update", "kept_epoch")},
         )
 
 
@@ -239,9 +238,10 @@ def evaluate(
     key = run_key({"judge": settings, "weights": weights_digest(bundle.predictor)}, " ".join(judged))
     scores = _kept(target, key)
     if scores is None:
-        found = judge(bundle.predictor, data, chosen, describe(bundle.predictor.spec), provenance["seconds"], on_step)
-        scores = found.scores | {"key": key}
-        write_bytes(target / "predictions.safetensors", save(_shown(found)))
+        label, seconds = describe(bundle.predictor.spec), provenance["seconds"]
+        evaluation = judge(bundle.predictor, data, chosen, label, seconds, on_step)
+        scores = evaluation.scores | {"key": key}
+        write_bytes(target / "predictions.safetensors", save(_shown(evaluation)))
         write_json(target / "scores.json", scores)
     if source is None:
         save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
@@ -273,13 +273,13 @@ def trained_run(folder: Path) -> tuple[Bundle, Experiment, dict[str, Any], Prepa
     return bundle, experiment, provenance, data
 
 
-def channel_worths(
+def channel_importance(
     run: str | Path,
     source: DataSource | None = None,
-    spec: WorthSpec | None = None,
+    spec: ChannelImportanceSpec | None = None,
     on_group: Callable[[str, int, int], None] | None = None,
-) -> tuple[Worths, Path]:
-    """What each input channel is worth to the network of a run, on its held-out recordings or on other ones.
+) -> tuple[ChannelImportances, Path]:
+    """Importance of each input channel to the network of a run, on its held-out recordings or on other ones.
 
     Args:
         run: run folder.
@@ -288,7 +288,7 @@ def channel_worths(
         on_group: called with the channels, how many groups are done and of how many.
 
     Returns:
-        The figures, and the file ``worth.json`` with them: in the run folder, or in the folder in it for `source`.
+        The figures, and their file ``channel_importance.json`` in the run folder, or in its subfolder for `source`.
     """
     folder = Path(run)
     _check_run_writable(folder)
@@ -299,10 +299,10 @@ def channel_worths(
         target = make_folder(folder / f"on_{source.path.stem}")
     if spec is None:
         groups = collinear([part.inputs for part in data.train])
-        spec = WorthSpec(groups=tuple(tuple(data.task.inputs[i] for i in group) for group in groups))
-    found = measure_worths(bundle.predictor, data, spec, on_group)
-    write_json(target / "worth.json", {"schema": 1} | found.to_json())
-    return found, target / "worth.json"
+        spec = ChannelImportanceSpec(groups=tuple(tuple(data.task.inputs[i] for i in group) for group in groups))
+    importances = measure_channel_importance(bundle.predictor, data, spec, on_group)
+    write_json(target / "channel_importance.json", {"schema": 1} | importances.to_json())
+    return importances, target / "channel_importance.json"
 
 
 def _kept(folder: Path, key: str) -> dict[str, Any] | None:
@@ -313,14 +313,14 @@ def _kept(folder: Path, key: str) -> dict[str, Any] | None:
     return scores if scores.get("key") == key else None
 
 
-def _shown(found: Evaluation) -> dict[str, np.ndarray]:
+def _shown(evaluation: Evaluation) -> dict[str, np.ndarray]:
     """Truth and predictions of a few recordings, for the report."""
     tensors: dict[str, np.ndarray] = {}
-    for i, series in enumerate(found.series[:SHOWN_RECORDINGS]):
+    for i, series in enumerate(evaluation.series[:SHOWN_RECORDINGS]):
         tensors[f"{series.name}/truth"] = np.ascontiguousarray(series.targets[:SHOWN_TICKS])
         for name in ("network", "ridge_arx"):
-            if name in found.predictions:
-                tensors[f"{series.name}/{name}"] = np.ascontiguousarray(found.predictions[name][i][:SHOWN_TICKS])
+            if name in evaluation.predictions:
+                tensors[f"{series.name}/{name}"] = np.ascontiguousarray(evaluation.predictions[name][i][:SHOWN_TICKS])
     return tensors
 
 
@@ -386,7 +386,7 @@ __all__ = [
     "SimulationOrder",
     "StrategyFactory",
     "build_report",
-    "channel_worths",
+    "channel_importance",
     "coverage",
     "evaluate",
     "export_bundle",

@@ -143,17 +143,19 @@ def test_other_recordings_can_be_judged(edp, logs, trained):
     assert (trained / "on_drive_1" / "scores.json").is_file()
 
 
-def test_the_worth_of_channels_is_told(edp, logs, trained):
-    few = ("--baselines", "persistence", "--worth")
+def test_the_importance_of_channels_is_reported(edp, logs, trained):
+    few = ("--baselines", "persistence", "--channel-importance")
     found = edp("evaluate", trained, *few, "--json").json
-    assert found["worth"] == {k: v for k, v in read_json(trained / "worth.json").items() if k != "schema"}
-    assert {tuple(row["members"]) for row in found["worth"]["rows"]} >= {(name,) for name in TABLE_A1}
+    assert found["channel_importance"] == {
+        k: v for k, v in read_json(trained / "channel_importance.json").items() if k != "schema"
+    }
+    assert {tuple(row["members"]) for row in found["channel_importance"]["rows"]} >= {(name,) for name in TABLE_A1}
     told = edp("evaluate", trained, *few)
-    assert "worth: 0/24 taken away" in told.err
+    assert "channel importance: 0/24 removed" in told.err
     assert "without the channel" in told.out
     other = edp("evaluate", trained, *few, "--data", logs / "drive_1.parquet", "--json").json
-    assert (trained / "on_drive_1" / "worth.json").is_file()
-    assert other["worth"]["recordings"] == ["drive_1"]
+    assert (trained / "on_drive_1" / "channel_importance.json").is_file()
+    assert other["channel_importance"]["recordings"] == ["drive_1"]
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def study(folder, cost="none", decisions=True):
         {"phase": "synthesis", "facts": {"trials": JOINT, "on": {"stanh": 1.0, "zoneout": 0.0}}},
     ]
     held = {
-        "schema": 1,
+        "schema": 2,
         "state": "finished",
         "mode": "sound",
         "unit": "bar",

@@ -18,7 +18,7 @@ from edp.storage.ledger import Ledger
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.fit import Loop
-from edp.workflows.compression import CompressionSearchSpec, DistilSpec, distil, search, taken
+from edp.workflows.compression import CompressionSearchSpec, DistilSpec, distil, resource_usage, search
 from edp.workflows.compression.quantise import quantise
 from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_settings
 from edp.workflows.search.plan import load_plan
@@ -166,7 +166,7 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
         opened = {key for one in ledger.openings() for key in one.judged}
         assert {r.key for r in ledger if frozen & set(r.identity.split["judged"])} == opened
         assert [one.box for one in ledger.openings()] == ["test sessions", SECOND_BOX]
-    need = taken(load_bundle(run).predictor, "float32", Budget())
+    need = resource_usage(load_bundle(run).predictor, "float32", Budget())
     budget = Budget(name="tight", parameter_bytes=need.parameter_bytes - 1)
     spec = CompressionSearchSpec(budget=budget, units=(2,), formats=("float32",), again=True)
     with watching(seen):

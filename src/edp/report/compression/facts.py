@@ -12,7 +12,7 @@ from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
 
-RESULT, SCHEMA = "compression.json", 1
+RESULT, SCHEMA = "compression.json", 2
 LIMITS = {"cycles": "cycles", "parameter_bytes": "parameters", "ram_bytes": "memory", "flash_bytes": "flash"}
 COSTS = {"cycles": "Cycles per tick, high estimate", "parameter_bytes": "Memory for parameters [bytes]"}
 
@@ -41,7 +41,10 @@ class CompressionFacts:
         for index, row in enumerate(self.rows):
             whole = row["way"] == "teacher" and row["number_format"] == "float32"
             best = smallest.get((row["run"], whole))
-            if best is None or row["taken"]["parameter_bytes"] < self.rows[best]["taken"]["parameter_bytes"]:
+            if (
+                best is None
+                or row["resource_usage"]["parameter_bytes"] < self.rows[best]["resource_usage"]["parameter_bytes"]
+            ):
                 smallest[row["run"], whole] = index
         return sorted(smallest.values(), key=lambda index: (self.rows[index]["way"] != "teacher", index))
 
@@ -62,7 +65,7 @@ class CompressionFacts:
 
     def cost(self, row: Mapping[str, Any], name: str) -> float:
         """A name of `COSTS`."""
-        usage = row["taken"][name]
+        usage = row["resource_usage"][name]
         return float(usage[2] if name == "cycles" else usage)
 
     def ahead(self, horizon: str) -> str:
@@ -90,7 +93,7 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
     teacher = facts.mae(facts.content["teacher"], horizon)
     rows: list[tuple[Value, ...]] = []
     for row in facts.rows:
-        usage, mae = row["taken"], facts.mae(row, horizon)
+        usage, mae = row["resource_usage"], facts.mae(row, horizon)
         rows.append(
             (
                 row["name"],
@@ -163,7 +166,7 @@ def verdict(facts: CompressionFacts) -> list[str]:
         near = min(facts.rows, key=lambda row: max(value / limit for value, limit in row["over"].values()))
         over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near["over"].items())
         return [f"The nearest is {near['name']}: {over}."]
-    usage, budget = best["taken"], facts.content["budget"]
+    usage, budget = best["resource_usage"], facts.content["budget"]
     lines = [
         f"It takes {usage['cycles'][2]:,} of {budget['cycles']:,} cycles a tick (high estimate) and "
         f"{usage['parameter_bytes']:,} of {budget['parameter_bytes']:,} bytes for parameters."
@@ -200,7 +203,7 @@ def tiles(facts: CompressionFacts) -> list[tuple[str, str, str]]:
     best = facts.chosen
     if best is None:
         return []
-    horizon, usage, teacher = facts.horizons[-1], best["taken"], facts.content["teacher"]
+    horizon, usage, teacher = facts.horizons[-1], best["resource_usage"], facts.content["teacher"]
     return [
         (number(facts.mae(best, horizon)), facts.content["unit"], f"MAE {facts.ahead(horizon)}"),
         (number(facts.mae(teacher, horizon)), facts.content["unit"], "MAE of the teacher"),

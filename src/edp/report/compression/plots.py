@@ -35,7 +35,7 @@ def profile_plot(facts: CompressionFacts) -> Plot:
     places = facts.smallest()
     rows = [facts.rows[index] for index in places]
     names = [html.escape(row["name"]) for row in rows]
-    sizes = [row["taken"]["parameters"] for row in rows]
+    sizes = [row["resource_usage"]["parameters"] for row in rows]
     bars = {"marker": {"color": RULE}, "name": "parameters", "hovertemplate": "%{y:,}"}
     figure.add_bar(x=names, y=sizes, row=1, col=1, **bars)
     for horizon in facts.horizons:
@@ -119,7 +119,7 @@ def _draw(figure: Figure, facts: CompressionFacts, horizon: str) -> None:
     figure.set_size_inches(max(8.0, 0.5 * len(rows) + 4), 4.2)
     left, right = figure.subplots(ncols=2)
     places = range(len(rows))
-    left.bar(places, [row["taken"]["parameters"] for row in rows], color=RULE)
+    left.bar(places, [row["resource_usage"]["parameters"] for row in rows], color=RULE)
     left.set(yscale="log", ylabel="Parameters (bars)")
     errors = left.twinx()
     for when, text, size in (("before", "MAE in float32", 60), ("scores", "MAE in its format", 16)):

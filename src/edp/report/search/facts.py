@@ -13,7 +13,7 @@ from edp.data.frozen import SECOND_BOX
 from edp.errors import StorageError
 from edp.storage import read_json
 
-SCHEMA = 1
+SCHEMA = 2
 STATES = ("running", "stopped", "killed", "finished")
 TITLES = {
     "isolation": "isolation and variance",

@@ -17,10 +17,10 @@ def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
         (
             str(row["name"]),
             str(row["way"]),
-            real(row["taken"]["parameters"]),
-            real(row["taken"]["parameter_bytes"]),
-            real(row["taken"]["cycles"][2]),
-            real(row["taken"]["macs_tick"]),
+            real(row["resource_usage"]["parameters"]),
+            real(row["resource_usage"]["parameter_bytes"]),
+            real(row["resource_usage"]["cycles"][2]),
+            real(row["resource_usage"]["macs_tick"]),
             _mean(row["scores"], "mae"),
             _mean(row["scores"], "composite"),
             100 * (real(row["error"]) - 1),
@@ -58,7 +58,7 @@ def chosen_words(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     if facts["chosen"] is None:
         return f"No network fits the budget '{facts['budget']['name']}'."
     row = facts["rows"][int(facts["chosen"])]
-    size = number(real(row["taken"]["parameter_bytes"]) / 1000, 1)
+    size = number(real(row["resource_usage"]["parameter_bytes"]) / 1000, 1)
     text = f"For the controller {row['name']} is chosen, with {size} kB of parameters"
     if facts["box"] is None:
         return f"{text}; it could not be judged on the second lock-box."

@@ -48,17 +48,17 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     bundle, _, provenance, data = trained_run(folder)
     if (Path(out) / "run.json").exists():
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
-    made = fit_adaptation(bundle.predictor, data, spec or AdaptationSpec())
+    adaptation = fit_adaptation(bundle.predictor, data, spec or AdaptationSpec())
     with RunFolder(out) as target:
         for name in COPIED:
             if (folder / name).is_file():
                 write_bytes(target.file(name), (folder / name).read_bytes())
-        write_json(target.file("provenance.json"), provenance | {"adaptation": made.digest})
-        save_bundle(replace(bundle, adaptation=made), target.file("bundle"))
+        write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})
+        save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json(Budget()))
-        facts = replay(bundle.predictor, made, data.test).to_json(data.task, data.target_kinds)
+        facts = replay(bundle.predictor, adaptation, data.test).to_json(data.task, data.target_kinds)
         write_json(target.file("adaptation.json"), facts)
-    return made, facts
+    return adaptation, facts
 
 
 def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -> Adaptation:
@@ -93,14 +93,14 @@ def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -
         "change": change,
         "unit": unit,
     }
-    found = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in arrays.items()}
-    return Adaptation(spec=spec, rate_hz=task.rate_hz, horizons=task.horizons, columns=columns, **found)
+    float_arrays = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in arrays.items()}
+    return Adaptation(spec=spec, rate_hz=task.rate_hz, horizons=task.horizons, columns=columns, **float_arrays)
 
 
 def _widths(rows: Rows) -> Rows:
     """Standard deviations; 1 where nothing moves."""
-    found = rows.std(axis=0)
-    return np.where(found > 1e-9 * (1.0 + np.abs(rows).max(axis=0)), found, 1.0)
+    deviations = rows.std(axis=0)
+    return np.where(deviations > 1e-9 * (1.0 + np.abs(rows).max(axis=0)), deviations, 1.0)
 
 
 def _directions(scaled: Rows, columns: Sequence[int], rank: int) -> Rows:
@@ -124,9 +124,9 @@ def _of_predictions(predictor: Predictor, parts: Sequence[Series]) -> tuple[Rows
     errors: list[list[Rows]] = [[] for _ in horizons]
     for predicted, series in zip(stream_predictions(predictor, parts), parts, strict=True):
         for h, k in enumerate(horizons):
-            made = predicted[skip : series.samples - k, h].astype(np.float64)
-            changes[h].append(made - series.targets[skip : series.samples - k])
-            errors[h].append(made - series.targets[skip + k :])
+            predictions = predicted[skip : series.samples - k, h].astype(np.float64)
+            changes[h].append(predictions - series.targets[skip : series.samples - k])
+            errors[h].append(predictions - series.targets[skip + k :])
     return _spreads(changes), _spreads(errors)
 
 

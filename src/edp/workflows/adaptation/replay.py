@@ -64,17 +64,17 @@ class Replay:
 
     def errors(self, of: str, horizon: int) -> list[tuple[Rows, NDArray[np.float64]]]:
         """Absolute errors ``(tick, target)`` of ``base`` or ``adapted``, with the seconds of motion before each."""
-        place, found = self.horizons.index(horizon), []
+        horizon_index, errors = self.horizons.index(horizon), []
         for part in self.recordings:
-            made = getattr(part, of)[self.skip : len(part.targets) - horizon, place]
-            error = np.abs(made - part.targets[self.skip + horizon :])
-            found.append((error, part.motion_s[self.skip : len(part.targets) - horizon]))
-        return found
+            predictions = getattr(part, of)[self.skip : len(part.targets) - horizon, horizon_index]
+            error = np.abs(predictions - part.targets[self.skip + horizon :])
+            errors.append((error, part.motion_s[self.skip : len(part.targets) - horizon]))
+        return errors
 
     def mae(self, of: str, horizon: int, low: float = 0.0, high: float = np.inf) -> NDArray[np.float64] | None:
         """MAE of each target ``(target,)`` from `low` to `high` seconds of motion, SI units; None without ticks."""
-        held = [error[(at >= low) & (at < high)] for error, at in self.errors(of, horizon)]
-        rows = np.concatenate(held)
+        selected = [error[(at >= low) & (at < high)] for error, at in self.errors(of, horizon)]
+        rows = np.concatenate(selected)
         return rows.mean(axis=0, dtype=np.float64) if len(rows) else None
 
     def to_json(self, task: Task, kinds: Sequence[Kind]) -> dict[str, Any]:
@@ -132,7 +132,7 @@ def replay(
         raise DataError(
             f"no recording is longer than {skip + adaptation.reach} ticks, which start-up and horizon take; give longer"
         )
-    adapter, made = RlsCorrector(adaptation), []
+    adapter, replayed = RlsCorrector(adaptation), []
     for done, (part, base) in enumerate(zip(series, stream_predictions(predictor, series), strict=True)):
         if on_recording is not None:
             on_recording(part.name, done, len(series))
@@ -142,8 +142,8 @@ def replay(
         adapted, status = np.empty_like(base), np.zeros(len(base), dtype=np.int64)
         for tick, (x, y) in enumerate(zip(part.inputs, base, strict=True)):
             adapted[tick], status[tick] = adapter.step(x, y, fresh=tick + 1 >= skip, learn=learn)
-        made.append(Replayed(part.name, base, adapted, motion_s(adaptation, part.targets), status, part.targets))
-    return Replay(made, adaptation.horizons, skip, adapter.learned)
+        replayed.append(Replayed(part.name, base, adapted, motion_s(adaptation, part.targets), status, part.targets))
+    return Replay(replayed, adaptation.horizons, skip, adapter.learned)
 
 
 def replay_run(
@@ -162,5 +162,5 @@ def replay_run(
     if bundle.adaptation is None:
         raise BundleError(f"'{run}' has no adaptation; edp adapt {run} --out FOLDER makes a run that has one")
     series = [bundle.task.series(recording) for recording in source.read()]
-    found = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording)
-    return found.to_json(bundle.task, bundle.target_kinds)
+    result = replay(bundle.predictor, bundle.adaptation, series, carry, learn, on_recording)
+    return result.to_json(bundle.task, bundle.target_kinds)

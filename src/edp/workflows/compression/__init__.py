@@ -3,7 +3,7 @@
 from edp.workflows.compression.bench import Bench, CompressionRequest, tuning
 from edp.workflows.compression.distil import DistilSpec, distil
 from edp.workflows.compression.distillation import Distillation, DistillationSpec, SoftmaxDivergence
-from edp.workflows.compression.formats import FORMATS, Deployed, ResourceUsage, deploy, taken
+from edp.workflows.compression.formats import FORMATS, Deployed, ResourceUsage, deploy, resource_usage
 from edp.workflows.compression.int8 import Quantised, dynamic_int8
 from edp.workflows.compression.judged import CompressionResult, Judged
 from edp.workflows.compression.pruning import prune
@@ -39,8 +39,8 @@ __all__ = [
     "dynamic_int8",
     "importance",
     "prune",
+    "resource_usage",
     "search",
-    "taken",
     "tuning",
     "weight_levels",
 ]

@@ -90,8 +90,8 @@ def distil(
     def lesson(data: Prepared) -> TrainingStrategy:
         return order.lesson(teachers, data, None, series)
 
-    made = replace(experiment, model=model)
-    return train(source or own, made, out, on_event, StrategyFactory(facts, lesson, frozen))
+    student_experiment = replace(experiment, model=model)
+    return train(source or own, student_experiment, out, on_event, StrategyFactory(facts, lesson, frozen))
 
 
 def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, Experiment, DataSource]:

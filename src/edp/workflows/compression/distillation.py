@@ -115,12 +115,12 @@ class Distillation:
         self.said = len(task.horizons) * len(task.targets)
         self.components: Components | None = None
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """All series with their lesson: a mark whether there is truth, predictions in SI units, hidden components."""
         check_same_ends(task, self.teachers[0].task, "the student", "the teacher")
         if self.spec.hint and self.components is None:
-            self.components = Components.fitted((self._hidden(part) for part in known), self.spec.components)
-        marked = [(part, True) for part in known] + [(part, False) for part in self.further]
+            self.components = Components.fitted((self._hidden(part) for part in own_series), self.spec.components)
+        marked = [(part, True) for part in own_series] + [(part, False) for part in self.further]
         return [self._taught(part, truth) for part, truth in marked]
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
@@ -144,8 +144,8 @@ class Distillation:
         """The dual objective of a batch; ticks without truth count for the teachers only."""
         spec, teacher_targets = self.spec, moment.teacher_targets
         labelled = moment.valid & (teacher_targets[..., 0] > 0.5)
-        said = teacher_targets[..., 1 : 1 + self.said].unflatten(-1, moment.future.shape[2:])
-        target = objective.code.encode(said, moment.features)
+        teacher_predictions = teacher_targets[..., 1 : 1 + self.said].unflatten(-1, moment.future.shape[2:])
+        target = objective.code.encode(teacher_predictions, moment.features)
         loss = (1.0 - spec.truth) * masked_loss(spec.soft, moment.answer, target, moment.valid, objective.weights)
         if spec.truth:
             loss = loss + spec.truth * objective.evaluate(moment.answer, moment.future, moment.features, labelled)

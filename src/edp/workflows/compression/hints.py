@@ -34,16 +34,16 @@ class Components:
             count, total, squares = count + len(values), total + values.sum(axis=0), squares + values.T @ values
         mean = total / count
         variances, vectors = np.linalg.eigh(squares / count - np.outer(mean, mean))
-        kept = np.argsort(variances)[::-1][:components]
-        scale = np.sqrt(max(float(variances[kept].mean()), 1e-12))
-        return cls(mean, vectors[:, kept] / scale)
+        strongest = np.argsort(variances)[::-1][:components]
+        scale = np.sqrt(max(float(variances[strongest].mean()), 1e-12))
+        return cls(mean, vectors[:, strongest] / scale)
 
     def project(self, values: NDArray[np.float32]) -> NDArray[np.float64]:
         """Components ``(time, component)`` of features ``(time, width)``."""
         return (values - self.mean) @ self.map
 
 
-def hint_error(hidden: Tensor, wanted: Tensor, valid: Tensor) -> Tensor:
+def hint_error(hidden: Tensor, teacher_components: Tensor, valid: Tensor) -> Tensor:
     """Mean square of what the best linear map of the student's hidden features leaves of the wanted ones.
 
     The map (ridge regression with a constant) is found anew in each batch and held fixed for the gradient, which is
@@ -52,17 +52,17 @@ def hint_error(hidden: Tensor, wanted: Tensor, valid: Tensor) -> Tensor:
 
     Args:
         hidden: of the student, ``(batch, time, width)``.
-        wanted: components of the teachers' features, ``(batch, time, component)``.
+        teacher_components: components of the teachers' features, ``(batch, time, component)``.
         valid: ``(batch, time)``.
     """
     rows = hidden[valid]
     if len(rows) < 4 * rows.shape[1]:
         return hidden.sum() * 0.0
     rows = torch.cat([rows, rows.new_ones(len(rows), 1)], dim=1)
-    goal = wanted[valid]
+    goal = teacher_components[valid]
     with torch.no_grad():
-        known = rows.double()
-        gram = known.T @ known
+        student_features = rows.double()
+        gram = student_features.T @ student_features
         gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
-        best = torch.linalg.solve(gram, known.T @ goal.double()).to(rows)
+        best = torch.linalg.solve(gram, student_features.T @ goal.double()).to(rows)
     return (rows @ best - goal).square().mean()

@@ -39,12 +39,12 @@ def dynamic_int8(predictor: Predictor) -> Quantised:
     their layer. What a layer reads is rounded to 256 levels between its least and largest value, zero included, at each
     tick by itself: so a stream, a chunk and a window see the same numbers.
     """
-    made = copy.deepcopy(predictor).eval()
-    convolutions = {part.shortcut for part in made.modules() if isinstance(part, TemporalBlock)}
+    quantised = copy.deepcopy(predictor).eval()
+    convolutions = {part.shortcut for part in quantised.modules() if isinstance(part, TemporalBlock)}
     errors: dict[str, float] = {}
     count = 0
     with torch.no_grad():
-        for name, part in made.named_modules():
+        for name, part in quantised.named_modules():
             if isinstance(part, nn.Linear) and part not in convolutions:
                 errors[name] = _round_weight(part.weight, dim=1)
                 count += part.weight.numel()
@@ -54,8 +54,8 @@ def dynamic_int8(predictor: Predictor) -> Quantised:
                     errors[f"{name}.weights.{layer}"] = _round_weight(weight, dim=1)
                     count += weight.numel()
                 _round_heads(part)
-    made.number_format = "dynamic int8"
-    return Quantised(made, 4 * parameters_of(made) - 3 * count, errors)
+    quantised.number_format = "dynamic int8"
+    return Quantised(quantised, 4 * parameters_of(quantised) - 3 * count, errors)
 
 
 def _round_heads(heads: Heads) -> None:
@@ -64,7 +64,7 @@ def _round_heads(heads: Heads) -> None:
     units = [_rounded(unit) for unit in heads.units]
     if heads.mix is not None:
         units[-1] = heads.units[-1]
-        heads.mix.register_forward_hook(lambda module, given, result: (round_tick(result[0]), result[1]))
+        heads.mix.register_forward_hook(lambda module, arguments, result: (round_tick(result[0]), result[1]))
     heads.units = tuple(units)
 
 
@@ -72,8 +72,8 @@ def _rounded(unit: GatedUnit) -> GatedUnit:
     return replace(unit, apply=lambda x: round_tick(unit.apply(x)))
 
 
-def _round_input(module: nn.Module, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    return (round_tick(given[0]), *given[1:])
+def _round_input(module: nn.Module, arguments: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return (round_tick(arguments[0]), *arguments[1:])
 
 
 def _round_weight(weight: Tensor, dim: int) -> float:

@@ -24,7 +24,7 @@ class Judged:
         name: of the network and its format.
         way: how it was made, in words.
         number_format: a name of `FORMATS`.
-        taken: what it takes of the controller.
+        resource_usage: what it takes of the controller.
         over: limits that it exceeds: what it takes, and what is granted.
         scores: on the validation part in its format, by horizon: ``mae`` and ``composite``, report units.
         before: the same in float32.
@@ -35,7 +35,7 @@ class Judged:
     name: str
     way: str
     number_format: str
-    taken: ResourceUsage
+    resource_usage: ResourceUsage
     over: Mapping[str, tuple[int, int]]
     scores: Mapping[str, Mapping[str, float]]
     before: Mapping[str, Mapping[str, float]]
@@ -50,7 +50,7 @@ class Judged:
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
         label = FORMATS[self.number_format].label
-        return vars(self) | {"taken": vars(self.taken), "fits": self.fits, "label": label}
+        return vars(self) | {"resource_usage": vars(self.resource_usage), "fits": self.fits, "label": label}
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,8 @@ def measure(deployed: Deployed, data: Prepared, skip: int) -> dict[str, dict[str
     """Mean absolute error and composite score on ``data.test`` by horizon, the mean over outputs, report units."""
     overall = score_predictions(deployed.predict(data.test), data, skip)["overall"]
     return {
-        horizon: {key: float(found["mean"][key]) for key in ("mae", "composite")} for horizon, found in overall.items()
+        horizon: {key: float(by_target["mean"][key]) for key in ("mae", "composite")}
+        for horizon, by_target in overall.items()
     }
 
 
@@ -99,9 +100,9 @@ def relative(scores: Mapping[str, Mapping[str, float]], teacher: Mapping[str, Ma
 
 def choose(rows: Sequence[Judged]) -> tuple[list[int], int | None]:
     """The front of error, cycles and bytes, and of what fits the row with the least error (of equals the cheapest)."""
-    points = [(row.error, row.taken.cycles[2], row.taken.parameter_bytes) for row in rows]
-    fitting = [place for place, row in enumerate(rows) if row.fits]
-    best = min(fitting, key=lambda place: points[place], default=None)
+    points = [(row.error, row.resource_usage.cycles[2], row.resource_usage.parameter_bytes) for row in rows]
+    fitting = [index for index, row in enumerate(rows) if row.fits]
+    best = min(fitting, key=points.__getitem__, default=None)
     return pareto(points), best
 
 
@@ -119,5 +120,7 @@ def deployed_row(
 ) -> Judged:
     """A row without its error, which needs the teacher; `scores` are in its format and in float32."""
     way = "teacher" if order is None else way_of(order)
-    over = deployed.taken.over(budget)
-    return Judged(name, way, deployed.number_format, deployed.taken, over, scores[0], scores[1], float("nan"), run)
+    over = deployed.resource_usage.over(budget)
+    return Judged(
+        name, way, deployed.number_format, deployed.resource_usage, over, scores[0], scores[1], float("nan"), run
+    )

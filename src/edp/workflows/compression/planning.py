@@ -15,7 +15,7 @@ from edp.networks.narrow import student, width_of
 from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.training.bundle import blank_scaler
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.formats.base import FORMATS, ResourceUsage, taken
+from edp.workflows.compression.formats.base import FORMATS, ResourceUsage, resource_usage
 from edp.workflows.compression.pruning import check_pruning
 from edp.workflows.compression.variants import rounded_order
 
@@ -156,8 +156,8 @@ def _untrained(model: ModelSpec, task: Task) -> Predictor:
     return build_model(task, model, blank_scaler(task), seed=0)
 
 
-def _taken(teacher: Predictor, units: int, name: str, budget: Budget) -> ResourceUsage:
-    return taken(_untrained(_narrow(teacher.spec, units), teacher.task), name, budget)
+def _usage_at(teacher: Predictor, units: int, name: str, budget: Budget) -> ResourceUsage:
+    return resource_usage(_untrained(_narrow(teacher.spec, units), teacher.task), name, budget)
 
 
 def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]) -> int:
@@ -165,7 +165,7 @@ def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]
     low, high = 0, len(widths)  # those before `low` fit, those from `high` on do not
     while low < high:
         middle = (low + high) // 2
-        if _taken(teacher, widths[middle], name, budget).over(budget):
+        if _usage_at(teacher, widths[middle], name, budget).over(budget):
             high = middle
         else:
             low = middle + 1
@@ -174,7 +174,7 @@ def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]
 
 def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str], least_width: int) -> str:
     """What the nearest network takes, and what the limits would have to be."""
-    least = {name: _taken(teacher, least_width, name, budget) for name in formats}
+    least = {name: _usage_at(teacher, least_width, name, budget) for name in formats}
 
     def worst(name: str) -> float:
         return max(value / limit for value, limit in least[name].over(budget).values())

@@ -48,55 +48,55 @@ def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> P
             if part is not None:
                 part.load_state_dict(getattr(predictor, name).state_dict())
         features = torch.arange(len(predictor.task.features.features))
-        kept = _backbone(predictor.backbone, small.backbone, features, worth)
+        kept_features = _backbone(predictor.backbone, small.backbone, features, worth)
         if small.gate is not None:
             for own, its in zip(small.gate.parameters(), predictor.gate.parameters(), strict=True):  # type: ignore[union-attr]
-                own.copy_(its[:, kept])
-        _heads(predictor.heads, small.heads, kept, worth.hidden)
+                own.copy_(its[:, kept_features])
+        _heads(predictor.heads, small.heads, kept_features, worth.hidden)
     return small
 
 
-def _backbone(big: nn.Module, small: nn.Module, kept: Tensor, worth: FeatureImportance) -> Tensor:
+def _backbone(big: nn.Module, small: nn.Module, input_features: Tensor, worth: FeatureImportance) -> Tensor:
     """Copy what is kept; the features kept of the representation."""
     if isinstance(big, ConvolutionStack) and isinstance(small, ConvolutionStack):
-        return _stack(big, small, kept, worth)
+        return _stack(big, small, input_features, worth)
     if not isinstance(big, RecurrentBackbone) or not isinstance(small, RecurrentBackbone):
         pairs = list(zip(_children(big, "branches"), _children(small, "branches"), strict=True))
-        return _side_by_side([(_backbone(one, other, kept, worth), _width(one)) for one, other in pairs])
+        return _side_by_side([(_backbone(one, other, input_features, worth), _width(one)) for one, other in pairs])
     if big.encoder is not None and small.encoder is not None:
-        kept = _backbone(big.encoder, small.encoder, kept, worth)
-    units = kept
+        input_features = _backbone(big.encoder, small.encoder, input_features, worth)
+    units = input_features
     for layer, narrow in zip(_children(big.recurrent, "layers"), _children(small.recurrent, "layers"), strict=True):
         units = _best(worth.sites[layer], _units(narrow))
-        _recurrent(layer, narrow, kept, units)
-        kept = units
+        _recurrent(layer, narrow, input_features, units)
+        input_features = units
     small.pooling.score.weight.copy_(big.pooling.score.weight[:, units])
     small.pooling.score.bias.copy_(big.pooling.score.bias)
     return _side_by_side([(units, big.pooling.units)] * (2 + len(big.extras)))
 
 
-def _stack(big: ConvolutionStack, small: ConvolutionStack, kept: Tensor, worth: FeatureImportance) -> Tensor:
+def _stack(big: ConvolutionStack, small: ConvolutionStack, input_features: Tensor, worth: FeatureImportance) -> Tensor:
     pairs = list(zip(big._blocks(), small._blocks(), strict=True))
-    for place, (block, narrow) in enumerate(pairs):
+    for index, (block, narrow) in enumerate(pairs):
         if block.shortcut is None and narrow.shortcut is None:
-            out = kept
+            out = input_features
         else:
             total = worth.sites[block].clone()
-            for later, other in pairs[place + 1 :]:  # what follows without weights on its path keeps the same channels
+            for later, other in pairs[index + 1 :]:  # what follows without weights on its path keeps the same channels
                 if later.shortcut is not None or other.shortcut is not None:
                     break
                 total += worth.sites[later]
             out = _best(total, len(narrow.second.bias))
         inner = _best(worth.sites[block.first], len(narrow.first.bias))
-        _convolution(block.first, narrow.first, kept, inner)
+        _convolution(block.first, narrow.first, input_features, inner)
         _convolution(block.second, narrow.second, inner, out)
-        _shortcut(block, narrow, kept, out)
-        kept = out
-    return kept
+        _shortcut(block, narrow, input_features, out)
+        input_features = out
+    return input_features
 
 
-def _convolution(big: CausalConv, small: CausalConv, kept: Tensor, out: Tensor) -> None:
-    weight = big.weight()[out][:, kept]
+def _convolution(big: CausalConv, small: CausalConv, input_features: Tensor, out: Tensor) -> None:
+    weight = big.weight()[out][:, input_features]
     norm = weight.flatten(1).norm(dim=1)
     small.gain.copy_(norm)
     # A direction of length zero would divide by zero; with a gain of zero any other one gives the same weights.
@@ -104,29 +104,29 @@ def _convolution(big: CausalConv, small: CausalConv, kept: Tensor, out: Tensor) 
     small.bias.copy_(big.bias[out])
 
 
-def _shortcut(big: TemporalBlock, small: TemporalBlock, kept: Tensor, out: Tensor) -> None:
+def _shortcut(big: TemporalBlock, small: TemporalBlock, input_features: Tensor, out: Tensor) -> None:
     if small.shortcut is None:
         return
     if big.shortcut is None:  # channels passed on as they were: ones where a channel is kept on both sides
-        small.shortcut.weight.copy_((out[:, None] == kept[None, :]).to(small.shortcut.weight))
+        small.shortcut.weight.copy_((out[:, None] == input_features[None, :]).to(small.shortcut.weight))
         small.shortcut.bias.zero_()
     else:
-        small.shortcut.weight.copy_(big.shortcut.weight[out][:, kept])
+        small.shortcut.weight.copy_(big.shortcut.weight[out][:, input_features])
         small.shortcut.bias.copy_(big.shortcut.bias[out])
 
 
-def _recurrent(big: nn.Module, small: nn.Module, kept: Tensor, units: Tensor) -> None:
+def _recurrent(big: nn.Module, small: nn.Module, input_features: Tensor, units: Tensor) -> None:
     """Matrices with one row a unit for each gate; those of the state have a column a unit, the others one an input."""
     full = _units(big)
     for (name, its), own in zip(big.named_parameters(), small.parameters(), strict=True):
         rows = torch.cat([units + gate * full for gate in range(its.shape[0] // full)])
-        own.copy_(its[rows] if its.ndim == 1 else its[rows][:, units if "_hh" in name else kept])
+        own.copy_(its[rows] if its.ndim == 1 else its[rows][:, units if "_hh" in name else input_features])
 
 
-def _heads(big: Heads, small: Heads, kept: Tensor, worth: Sequence[Tensor]) -> None:
+def _heads(big: Heads, small: Heads, input_features: Tensor, worth: Sequence[Tensor]) -> None:
     """Each output keeps hidden features of its own."""
     for output in range(big.outputs):
-        into = kept
+        into = input_features
         for layer in range(len(big.weights)):
             if layer < len(big.units):
                 best = _best(worth[layer][output], small.widths[layer + 1])
@@ -146,8 +146,8 @@ def _best(worth: Tensor, count: int) -> Tensor:
 
 def _side_by_side(parts: Sequence[tuple[Tensor, int]]) -> Tensor:
     """Places of kept features in a concatenation of parts of the given full widths."""
-    starts = [sum(width for _, width in parts[:place]) for place in range(len(parts))]
-    return torch.cat([kept + start for (kept, _), start in zip(parts, starts, strict=True)])
+    starts = [sum(width for _, width in parts[:index]) for index in range(len(parts))]
+    return torch.cat([part_features + start for (part_features, _), start in zip(parts, starts, strict=True)])
 
 
 def _children(module: nn.Module, name: str) -> list[nn.Module]:
@@ -203,8 +203,8 @@ def _differences(big: ModelSpec, small: ModelSpec) -> list[str]:
     for name in names:
         full, narrow = getattr(big.backbone, name), getattr(small.backbone, name)
         pairs.append((name, full, narrow) if name == "channels" else (name, (full,), (narrow,)))
-    found = []
+    differences = []
     for name, full, narrow in pairs:
         if len(full) != len(narrow) or any(n > f for f, n in zip(full, narrow, strict=False)):
-            found.append(f"{name} = {narrow} is not narrower than {full}, level by level")
-    return found
+            differences.append(f"{name} = {narrow} is not narrower than {full}, level by level")
+    return differences

@@ -57,10 +57,10 @@ class QuantisationAware:
         self._known: Sequence[Series] = ()
         self._rounding: NetworkRounding | None = None
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series with what the teachers say of them, where there are any."""
-        self._known = known
-        return list(known) if self.lesson is None else self.lesson.series(task, known)
+        self._known = own_series
+        return list(own_series) if self.lesson is None else self.lesson.series(task, own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Go on from the start, rounded; ranges of activations are found on the training series.

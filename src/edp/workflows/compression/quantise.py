@@ -38,12 +38,15 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         raise ExportError(f"'{folder}' computes in {bundle.predictor.number_format} already; give the float run")
     if (Path(out) / "run.json").exists():
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
-    made = integer_predictor(bundle.predictor, data.train, ticks)
-    found = {name: mean_error(one, data.validation) for name, one in (("float", bundle.predictor), ("integer", made))}
+    integer_network = integer_predictor(bundle.predictor, data.train, ticks)
+    errors = {
+        name: mean_error(one, data.validation)
+        for name, one in (("float", bundle.predictor), ("integer", integer_network))
+    }
     with RunFolder(out) as target:
         for name in ("config.toml", "history.jsonl", "footprint.json"):
             if (folder / name).is_file():
                 write_bytes(target.file(name), (folder / name).read_bytes())
-        write_json(target.file("provenance.json"), provenance | {"number_format": made.number_format})
-        save_bundle(replace(bundle, predictor=made, scores={}), target.file("bundle"))
-    return found | {"bytes": float(constant_bytes(made.integers, bundle.adaptation))}
+        write_json(target.file("provenance.json"), provenance | {"number_format": integer_network.number_format})
+        save_bundle(replace(bundle, predictor=integer_network, scores={}), target.file("bundle"))
+    return errors | {"bytes": float(constant_bytes(integer_network.integers, bundle.adaptation))}

@@ -152,15 +152,15 @@ class NetworkRounding:
 
     def _swap(self, matrices: list[Matrix], part: nn.Module) -> None:
         """Let a part compute with rounded weights whenever it is called."""
-        held = [(matrix.holder._parameters, matrix.key, matrix.values, matrix.axes) for matrix in matrices]
+        replaced = [(matrix.holder._parameters, matrix.key, matrix.values, matrix.axes) for matrix in matrices]
 
         def enter(*_: object) -> None:
-            for parameters, key, weight, axes in held:
+            for parameters, key, weight, axes in replaced:
                 levels, steps = weight_levels(weight.detach(), axes)
                 parameters[key] = _through(weight, levels * steps)  # type: ignore[assignment]
 
         def leave(*_: object) -> None:
-            for parameters, key, weight, _axes in held:
+            for parameters, key, weight, _axes in replaced:
                 parameters[key] = weight  # type: ignore[assignment]
 
         self._handles.append(part.register_forward_pre_hook(enter))
@@ -169,7 +169,9 @@ class NetworkRounding:
     def _watch(self, part: nn.Module) -> None:
         """Round what a part reads; of the heads, what each of their layers reads."""
         site = self._site()
-        self._handles.append(part.register_forward_pre_hook(lambda module, given: (site(given[0]), *given[1:])))
+        self._handles.append(
+            part.register_forward_pre_hook(lambda module, arguments: (site(arguments[0]), *arguments[1:]))
+        )
         if not isinstance(part, Heads):
             return
         self._units[part] = part.units
@@ -178,7 +180,7 @@ class NetworkRounding:
         if part.mix is not None:  # it stands between the last unit and the last layer
             units[-1] = part.units[-1]
             last = sites[-1]
-            hook = part.mix.register_forward_hook(lambda module, given, result: (last(result[0]), result[1]))
+            hook = part.mix.register_forward_hook(lambda module, arguments, result: (last(result[0]), result[1]))
             self._handles.append(hook)
         part.units = tuple(units)
 

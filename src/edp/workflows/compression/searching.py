@@ -127,11 +127,16 @@ class DiskBench(Bench):
             return order.lesson([self.teacher], data, start)
 
         model, training = order.model(self.teacher.spec), order.training(self.training)
-        made = replace(self.experiment, model=model, training=training)
+        student_experiment = replace(self.experiment, model=model, training=training)
         tell = self.watchers.on_training
         teaching = StrategyFactory(facts, lesson, self.frozen)
         return train(
-            self.source, made, run, lambda event: tell(order.name, done, self.count, event), teaching, self.data
+            self.source,
+            student_experiment,
+            run,
+            lambda event: tell(order.name, done, self.count, event),
+            teaching,
+            self.data,
         ).predictor
 
 
@@ -161,9 +166,9 @@ def search(
     """
     teacher, experiment, own = read_run(run, spec.changes)
     plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.ways)
-    told = watchers or CompressionCallbacks()
+    callbacks = watchers or CompressionCallbacks()
     for note in plan.notes:
-        told.on_note(note)
+        callbacks.on_note(note)
     frozen = frozen_sessions(run, experiment)
     data = prepare_data(source or own, experiment, frozen)
     box = _box_of(source or own, experiment, data)
@@ -171,17 +176,17 @@ def search(
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
     with RunFolder(out) as folder:
         folder.claim(key, experiment_toml(experiment))
-        bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), told)
+        bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), callbacks)
         bench.frozen = frozen
         court = _Evaluator(bench, spec.budget, Path(run), box.data)
         rows, notes = _rows(bench, court, plan, spec)
         front, chosen = choose(rows)
-        found = CompressionResult(court.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
-        if found.best is not None:
-            found = replace(found, box=_open_box(found, court, folder, box, spec.again))
-        seen = box.seen(found.box.get("openings", ())) or _seen(Path(run), source, own, box)
-        write_json(folder.file(RESULT), _plain(found, spec, data, seen, len(box.data.test)))
-    return found
+        result = CompressionResult(court.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
+        if result.best is not None:
+            result = replace(result, box=_open_box(result, court, folder, box, spec.again))
+        seen = box.seen(result.box.get("openings", ())) or _seen(Path(run), source, own, box)
+        write_json(folder.file(RESULT), _plain(result, spec, data, seen, len(box.data.test)))
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,17 +197,17 @@ class _Box:
         data: they are its test part.
         name: of the lock-box.
         study: folder of the model search that set it apart and records each look; None where none did, or it is gone.
-        known: whether a model search judged on it already.
+        opened_before: whether a model search judged on it already.
     """
 
     data: Prepared
     name: str = BOX
     study: Path | None = None
-    known: bool = False
+    opened_before: bool = False
 
     def seen(self, openings: Sequence[Mapping[str, Any]]) -> bool:
         """Whether other networks were judged on it before these."""
-        return self.known or len(openings) > 1
+        return self.opened_before or len(openings) > 1
 
 
 def _box_of(source: DataSource, experiment: Experiment, data: Prepared) -> _Box:
@@ -212,7 +217,7 @@ def _box_of(source: DataSource, experiment: Experiment, data: Prepared) -> _Box:
         return _Box(data)
     there = {recording.digest for recording in source.read()}
     if not any(session.digest in there for session in split.second):
-        return _Box(data, known=any(session.digest in there for session in split.test))
+        return _Box(data, opened_before=any(session.digest in there for session in split.test))
     study = Path(split.study)
     recorded = split.study and (study / "study.json").is_file() and (study / "ledger" / "about.json").is_file()
     opened = prepare_data(source, replace(experiment, split=split.opened()))
@@ -236,10 +241,10 @@ def _rows(
 
     judge(None, bench.teacher, plan.formats)
     for orders in plan.orders.values():
-        made = {order: bench.network(order) for order in orders}
-        for order, network in made.items():
+        networks = {order: bench.network(order) for order in orders}
+        for order, network in networks.items():
             judge(order, network, plan.formats)
-        plain = {order: court.float_error(network) for order, network in made.items()}
+        plain = {order: court.float_error(network) for order, network in networks.items()}
         for order in plan.tuned(min(plain, key=plain.__getitem__)):
             judge(order, bench.network(order), [name for name in plan.formats if FORMATS[name].rounded])
     for name in names:
@@ -293,8 +298,8 @@ class _Evaluator:
 
     def _plain(self, network: Predictor) -> dict[str, dict[str, float]]:
         if id(network) not in self._float:
-            made = deploy(network, "float32", self.bench.data.train, self.budget)
-            self._float[id(network)] = measure(made, self.data, self.skip)
+            deployed = deploy(network, "float32", self.bench.data.train, self.budget)
+            self._float[id(network)] = measure(deployed, self.data, self.skip)
         return self._float[id(network)]
 
     def _row(
@@ -305,23 +310,25 @@ class _Evaluator:
         number_format: str,
         stored: int | None = None,
     ) -> Judged:
-        made = deploy(network, number_format, self.bench.data.train, self.budget, stored)
-        self.deployed[name] = made, network
+        deployed = deploy(network, number_format, self.bench.data.train, self.budget, stored)
+        self.deployed[name] = deployed, network
         before = self._plain(network)
-        scores = before if number_format == "float32" else measure(made, self.data, self.skip)
+        scores = before if number_format == "float32" else measure(deployed, self.data, self.skip)
         run = self.run if order is None else self.bench.folder / order.name
-        return deployed_row(name, order, made, (scores, before), self.budget, str(run))
+        return deployed_row(name, order, deployed, (scores, before), self.budget, str(run))
 
 
-def _open_box(found: CompressionResult, court: _Evaluator, folder: RunFolder, box: _Box, again: bool) -> dict[str, Any]:
+def _open_box(
+    result: CompressionResult, court: _Evaluator, folder: RunFolder, box: _Box, again: bool
+) -> dict[str, Any]:
     """Judge teacher and chosen on the lock-box, once; the look is recorded before it is taken."""
-    pair = {"teacher": found.teacher, "chosen": found.best}
+    pair = {"teacher": result.teacher, "chosen": result.best}
     keys = [court.key(row) for row in pair.values() if row is not None]
     why = "the network chosen by edp compress, and its teacher"
     ledgers = [folder.file("ledger")] if box.study is None else [box.study / "ledger", folder.file("ledger")]
     openings: list[dict[str, Any]] = []
-    for place in ledgers:  # that of the search first: it knows of looks from other folders
-        with Ledger(place) as ledger:
+    for ledger_folder in ledgers:  # that of the search first: it knows of looks from other folders
+        with Ledger(ledger_folder) as ledger:
             opening = ledger.open_box(box.name, keys, why, again)
             openings = openings or [asdict(one) for one in ledger.openings(box.name)]
     scores = {name: court.on_box(row) for name, row in pair.items() if row is not None}
@@ -336,19 +343,19 @@ def _seen(run: Path, source: DataSource | None, own: DataSource, box: _Box) -> b
 
 
 def _plain(
-    found: CompressionResult, spec: CompressionSearchSpec, data: Prepared, seen: bool, sealed: int
+    result: CompressionResult, spec: CompressionSearchSpec, data: Prepared, seen: bool, sealed: int
 ) -> dict[str, Any]:
     units = sorted({KINDS[kind].report_unit for kind in data.target_kinds})
     return {
-        "schema": 1,
+        "schema": 2,
         "budget": asdict(spec.budget),
         "task": {"horizons": list(data.task.horizons), "rate_hz": data.task.rate_hz},
         "unit": units[0] if len(units) == 1 else "mixed units",
         "recordings": {"train": len(data.train), "validation": len(data.validation), "test": sealed},
-        "teacher": found.teacher.to_json(),
-        "rows": [row.to_json() for row in found.rows],
-        "front": found.front,
-        "chosen": found.chosen,
-        "box": dict(found.box) | {"seen_before": seen},
-        "notes": list(found.notes),
+        "teacher": result.teacher.to_json(),
+        "rows": [row.to_json() for row in result.rows],
+        "front": result.front,
+        "chosen": result.chosen,
+        "box": dict(result.box) | {"seen_before": seen},
+        "notes": list(result.notes),
     }

@@ -46,7 +46,7 @@ def importance(predictor: Predictor, series: Sequence[Series], pieces: int = 64)
     Raises:
         DataError: no series is longer than the largest horizon.
     """
-    found: dict[nn.Module, Tensor] = {}
+    by_module: dict[nn.Module, Tensor] = {}
     hidden = [torch.zeros(weight.shape[0], 0) for weight in predictor.heads.weights[:-1]]
     chosen = _pieces(predictor, series, pieces)
     with _recorded(predictor) as outputs:
@@ -56,11 +56,11 @@ def importance(predictor: Predictor, series: Sequence[Series], pieces: int = 64)
             for module, value in outputs.items():
                 if value.grad is not None:
                     change = (value * value.grad).sum(dim=(0, 1)).detach().square()
-                    found[module] = found.get(module, torch.zeros_like(change)) + change
+                    by_module[module] = by_module.get(module, torch.zeros_like(change)) + change
             for layer, change in enumerate(_hidden_changes(predictor)):
                 hidden[layer] = change.square() + (hidden[layer] if hidden[layer].numel() else 0.0)
     predictor.zero_grad(set_to_none=True)
-    return FeatureImportance(found, hidden)
+    return FeatureImportance(by_module, hidden)
 
 
 def _pieces(predictor: Predictor, series: Sequence[Series], most: int) -> list[tuple[Series, int, int]]:

@@ -72,7 +72,7 @@ class Selection:
     """What a selection found and wrote.
 
     Attributes:
-        found: the screening.
+        screening: the screening.
         quality: of the recordings.
         notes: what a reader must know of how the data were read.
         sets: the feature sets by name, the proposed one first.
@@ -81,7 +81,7 @@ class Selection:
         trials: errors of the sets, where they were tried.
     """
 
-    found: ScreeningResult
+    screening: ScreeningResult
     quality: DataQuality
     notes: tuple[str, ...]
     sets: dict[str, FeatureSettings]
@@ -114,24 +114,24 @@ def select_features(
     quality = mapped.inspect(listeners.on_log)
     recordings, notes = _read(mapped, quality)
     spec, more = _candidates(recordings[0], order)
-    found = screen(recordings, spec, listeners.on_progress)
+    screening = screen(recordings, spec, listeners.on_progress)
     notes += more
-    sets = _sets(found, recordings[0])
-    files = _write(folder, found, quality, sets)
-    needed = _needed_map(source, found, recordings[0])
+    sets = _sets(screening, recordings[0])
+    files = _write(folder, screening, quality, sets)
+    needed = _needed_map(source, screening, recordings[0])
     if needed is not None:
         files["map"] = folder / "map.toml"
         write_bytes(files["map"], needed.encode())
-    trials = _tried(mapped, folder, (order, found, sets), listeners.on_trial)
+    trials = _tried(mapped, folder, (order, screening, sets), listeners.on_trial)
     if trials is not None:
         files["trials"] = folder / "trials"
     if order.pictures:
-        write_pictures(found, folder / "pictures")
+        write_pictures(screening, folder / "pictures")
         files["pictures"] = folder / "pictures"
     title = source.path.resolve().stem
     tried = None if trials is None else trials.to_json()
-    files["page"] = build_screening_page(found, folder / "report.html", title, quality, tried, notes)
-    return Selection(found, quality, tuple(notes), sets, files, trials)
+    files["page"] = build_screening_page(screening, folder / "report.html", title, quality, tried, notes)
+    return Selection(screening, quality, tuple(notes), sets, files, trials)
 
 
 def _lists_maps(source: DataSource) -> bool:
@@ -180,16 +180,16 @@ def _candidates(first: Recording, order: SelectionOrder) -> tuple[ScreeningSpec,
     return replace(spec, candidates=tuple(chosen)), notes
 
 
-def _sets(found: ScreeningResult, first: Recording) -> dict[str, FeatureSettings]:
+def _sets(screening: ScreeningResult, first: Recording) -> dict[str, FeatureSettings]:
     """The proposed set with the targets in it, as the delta mode needs them; with pressure changes; the usual sets."""
-    kept = found.proposal.kept
-    channels = (*(target for target in found.targets if target not in kept), *kept)
+    names = screening.proposal.kept
+    channels = (*(target for target in screening.targets if target not in names), *names)
     proposed = FeatureSettings(name=PROPOSED, channels=channels)
     sets = {PROPOSED: proposed}
     differences = with_differences(proposed, first, DIFFERENCES)
     if differences.derived:
         sets[DIFFERENCES] = differences
-    sets[ALL] = FeatureSettings(name=ALL, channels=found.channels)
+    sets[ALL] = FeatureSettings(name=ALL, channels=screening.channels)
     for name, usual in FEATURE_SETS.items():
         if all(channel in first.channel_names for channel in usual.inputs):
             sets[name] = FeatureSettings(name=name, channels=usual.channels, derived=usual.derived, hidden=usual.hidden)
@@ -197,18 +197,18 @@ def _sets(found: ScreeningResult, first: Recording) -> dict[str, FeatureSettings
 
 
 def _write(
-    folder: Path, found: ScreeningResult, quality: DataQuality, sets: Mapping[str, FeatureSettings]
+    folder: Path, screening: ScreeningResult, quality: DataQuality, sets: Mapping[str, FeatureSettings]
 ) -> dict[str, Path]:
     """Everything but page and pictures."""
     files = {name: folder / f"{name}.json" for name in ("screening", "quality")}
-    write_json(files["screening"], {"schema": 1, "command": command_line()} | found.to_json())
+    write_json(files["screening"], {"schema": 1, "command": command_line()} | screening.to_json())
     write_json(files["quality"], {"schema": 1} | quality.to_json())
     files["sets"] = make_folder(folder / "sets")
     for name, features in sets.items():
-        text = _proposal_text(found, features) if name == PROPOSED else set_text(_plain(features))
+        text = _proposal_text(screening, features) if name == PROPOSED else set_text(_plain(features))
         write_bytes(files["sets"] / f"{_file_name(name)}.toml", text.encode())
     files["settings"] = folder / "settings.toml"
-    write_bytes(files["settings"], _settings_text(found).encode())
+    write_bytes(files["settings"], _settings_text(screening).encode())
     return files
 
 
@@ -216,41 +216,43 @@ def _plain(features: FeatureSettings) -> FeatureSet:
     return FeatureSet(features.name, features.channels, features.derived, features.hidden)
 
 
-def _proposal_text(found: ScreeningResult, features: FeatureSettings) -> str:
+def _proposal_text(screening: ScreeningResult, features: FeatureSettings) -> str:
     """The proposed set with the reason beside each channel, and below what was dropped and why."""
-    reasons = {choice.channel: choice.reason for choice in found.proposal.choices}
-    for target in found.targets:
-        if target not in found.proposal.kept:
+    reasons = {choice.channel: choice.reason for choice in screening.proposal.choices}
+    for target in screening.targets:
+        if target not in screening.proposal.kept:
             reasons[target] = "a target: its present value, which mode = 'delta' needs"
     head = [
-        f"Proposed by edp screen: {len(features.channels)} of {len(found.channels)} channels, most useful first.",
+        f"Proposed by edp screen: {len(features.channels)} of {len(screening.channels)} channels, most useful first.",
         "edp train DATA --set task.features=THIS_FILE",
     ]
-    dropped = [choice for choice in found.proposal.choices if not choice.keep and choice.channel not in found.targets]
+    dropped = [
+        choice for choice in screening.proposal.choices if not choice.keep and choice.channel not in screening.targets
+    ]
     tail = [f"dropped: {choice.channel}: {choice.reason}" for choice in dropped[:_MOST_DROPPED]]
     return set_text(_plain(features), head, reasons, tail)
 
 
-def _settings_text(found: ScreeningResult) -> str:
+def _settings_text(screening: ScreeningResult) -> str:
     """Settings of a training on the proposed set, to lay over a preset."""
     table = {
-        "task": {"features": "sets/proposed.toml", "targets": list(found.targets), "horizons": [found.horizon]},
-        "model": {"window": found.proposal.window},
+        "task": {"features": "sets/proposed.toml", "targets": list(screening.targets), "horizons": [screening.horizon]},
+        "model": {"window": screening.proposal.window},
     }
-    why = " ".join(found.proposal.window_reason.split())
+    why = " ".join(screening.proposal.window_reason.split())
     return f"# Settings for a training on what edp screen proposed.\n# window: {why}\n\n{tomli_w.dumps(table)}"
 
 
-def _needed_map(source: DataSource, found: ScreeningResult, first: Recording) -> str | None:
+def _needed_map(source: DataSource, screening: ScreeningResult, first: Recording) -> str | None:
     """A signal map of the proposed channels, where a training without one would not read them."""
     if source.signal_map is not None or _lists_maps(source):
         return None
-    names = tuple(dict.fromkeys((*found.targets, *found.proposal.kept)))
-    known = []
+    names = tuple(dict.fromkeys((*screening.targets, *screening.proposal.kept)))
+    resolved_names = []
     for log in source.logs():
-        wanted, problems = resolve(open_log(log.path, SignalMap()), SignalMap())
-        known.append(() if problems else tuple(entry.channel.name for entry in wanted))
-    if all(set(names) <= set(own) and own == known[0] for own in known):
+        log_entries, problems = resolve(open_log(log.path, SignalMap()), SignalMap())
+        resolved_names.append(() if problems else tuple(entry.channel.name for entry in log_entries))
+    if all(set(names) <= set(own) and own == resolved_names[0] for own in resolved_names):
         return None
     entries: dict[str, Any] = {}
     for name in names:
@@ -265,10 +267,10 @@ def _needed_map(source: DataSource, found: ScreeningResult, first: Recording) ->
 def _tried(
     source: DataSource,
     folder: Path,
-    found: tuple[SelectionOrder, ScreeningResult, Mapping[str, FeatureSettings]],
+    selected: tuple[SelectionOrder, ScreeningResult, Mapping[str, FeatureSettings]],
     on_trial: OnTrial | None,
 ) -> Trials | None:
-    order, screening, sets = found
+    order, screening, sets = selected
     if order.experiment is None:
         return None
     experiment = replace(order.experiment, task=trial_task(order.experiment.task, screening))
@@ -280,9 +282,9 @@ def _tried(
     )
 
 
-def trial_task(task: TaskSettings, found: ScreeningResult) -> TaskSettings:
+def trial_task(task: TaskSettings, screening: ScreeningResult) -> TaskSettings:
     """The task of the trials: the screening's targets and horizon."""
-    return replace(task, targets=found.targets, horizons=(found.horizon,))
+    return replace(task, targets=screening.targets, horizons=(screening.horizon,))
 
 
 def _some(names: Sequence[str], count: int = 6) -> str:

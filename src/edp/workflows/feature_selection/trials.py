@@ -153,7 +153,7 @@ def try_feature_sets(
     chosen |= drawn
     folder = make_folder(out)
     total, done = len(chosen) * len(spec.seeds), 0
-    found: dict[str, list[_Finished]] = {}
+    finished: dict[str, list[_Finished]] = {}
     for name, features in chosen.items():
         for seed in spec.seeds:
             settings = replace(
@@ -170,18 +170,18 @@ def try_feature_sets(
             run = folder / f"{_slug(name)}_seed{seed}"
             bundle = train(source, settings, run, tell)
             evaluate(run, baselines=["persistence"])
-            found.setdefault(name, []).append(_Finished.of(bundle, run))
+            finished.setdefault(name, []).append(_Finished.of(bundle, run))
             done += 1
-    trials = _compared(found, notes, experiment.task.horizons)
+    trials = _compared(finished, notes, experiment.task.horizons)
     write_json(folder / FILE, trials.to_json())
     return trials
 
 
 def with_differences(settings: FeatureSettings, recording: Recording, name: str) -> FeatureSettings:
     """The set with the change of each of its cylinder pressures since the tick before, as FG2 has them (eq. 3.1)."""
-    known = {entry.source for entry in settings.derived}
-    wanted = [c for c in settings.channels if c not in known]
-    pressures = [c for c in wanted if recording.channels[recording.index(c)].kind is Kind.PRESSURE]
+    derived_sources = {entry.source for entry in settings.derived}
+    candidates = [c for c in settings.channels if c not in derived_sources]
+    pressures = [c for c in candidates if recording.channels[recording.index(c)].kind is Kind.PRESSURE]
     added = tuple(Derived(f"d{c}", c, "difference", Kind.PRESSURE) for c in pressures)
     return replace(settings, name=name, derived=settings.derived + added)
 
@@ -233,12 +233,12 @@ def _drawn(
     free = [name for name in first.channel_names if name not in {*always, *spec.barred}]
     rng = np.random.default_rng(spec.draw)
     drawn: dict[str, str | FeatureSettings] = {}
-    known = {frozenset(first_inputs)}
+    drawn_sets = {frozenset(first_inputs)}
     for _ in range(_DRAWS * spec.random):
         picked = sorted(rng.choice(len(free), max(0, min(size - len(always), len(free))), replace=False))
         channels = (*always, *(free[i] for i in picked))
-        if frozenset(channels) not in known:
-            known.add(frozenset(channels))
+        if frozenset(channels) not in drawn_sets:
+            drawn_sets.add(frozenset(channels))
             name = f"random {len(drawn) + 1}"
             drawn[name] = FeatureSettings(name=name, channels=channels)
         if len(drawn) == spec.random:
@@ -272,19 +272,19 @@ class _Finished:
         )
 
 
-def _compared(found: Mapping[str, Sequence[_Finished]], notes: Sequence[str], horizons: Sequence[int]) -> Trials:
+def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str], horizons: Sequence[int]) -> Trials:
     """The table from the kept scores."""
     ahead = [str(horizon) for horizon in horizons]
-    names = list(found)
-    by_recording = {name: _recordings(found[name], ahead) for name in names}
+    names = list(finished)
+    by_recording = {name: _recordings(finished[name], ahead) for name in names}
     trials = []
     for name in names:
-        models = [run.scores["models"]["network"] for run in found[name]]
+        models = [run.scores["models"]["network"] for run in finished[name]]
         by_seed = {h: tuple(float(m["overall"][h]["mean"]["mae"]) for m in models) for h in ahead}
         difference = None
         if name != names[0] and len(by_recording[name][ahead[0]]) > 1:
             difference = {h: _difference(by_recording[name][h], by_recording[names[0]][h]) for h in ahead}
-        one = found[name][0]
+        one = finished[name][0]
         trials.append(
             FeatureSetTrial(
                 name,
@@ -294,10 +294,10 @@ def _compared(found: Mapping[str, Sequence[_Finished]], notes: Sequence[str], ho
                 {h: float(np.mean(values)) for h, values in by_seed.items()},
                 by_seed,
                 difference,
-                sum(run.seconds for run in found[name]),
+                sum(run.seconds for run in finished[name]),
             )
         )
-    scores = found[names[0]][0].scores
+    scores = finished[names[0]][0].scores
     persistence = {h: float(scores["models"]["persistence"]["overall"][h]["mean"]["mae"]) for h in ahead}
     units = {target["unit"] for target in scores["targets"]}
     unit = units.pop() if len(units) == 1 else "mixed units"

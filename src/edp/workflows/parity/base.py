@@ -35,14 +35,14 @@ class ParityCase:
     Attributes:
         bundle: the trained network.
         inputs: golden recording ``(tick, input)``, SI units.
-        wanted: what PyTorch streams from it, ``(tick, number)``: predictions, then lower and upper bounds, SI units.
+        expected: what PyTorch streams from it, ``(tick, number)``: predictions, then lower and upper bounds, SI units.
         allowed: how far a form may be from that, ``(number,)``.
         interpreters: Python programs with another ONNX Runtime.
     """
 
     bundle: Bundle
     inputs: Rows
-    wanted: Rows
+    expected: Rows
     allowed: Rows
     interpreters: tuple[str, ...] = ()
 
@@ -63,16 +63,16 @@ class Ran:
     """What a form made of the golden recording.
 
     Attributes:
-        found: its numbers ``(row, number)``, SI units.
+        numbers: its numbers ``(row, number)``, SI units.
         seconds: for a tick; for a window where it computes windows.
-        wanted: what they are compared with, where that is not PyTorch's stream.
+        expected: what they are compared with, where that is not PyTorch's stream.
         allowed: how far they may be from it ``(number,)``; the case's where it is None.
         note: a remark for the table.
     """
 
-    found: Rows
+    numbers: Rows
     seconds: float
-    wanted: Rows | None = None
+    expected: Rows | None = None
     allowed: Rows | None = None
     note: str = ""
 
@@ -130,24 +130,24 @@ class Row:
         return dict(vars(self))
 
 
-def held(form: str, title: str, case: ParityCase, ran: Ran) -> Row:
-    """Compare what a form found with what is wanted."""
-    wanted = case.wanted if ran.wanted is None else ran.wanted
+def compared(form: str, title: str, case: ParityCase, ran: Ran) -> Row:
+    """Compare the numbers of a form with the expected ones."""
+    expected = case.expected if ran.expected is None else ran.expected
     allowed = case.allowed if ran.allowed is None else ran.allowed
-    found = np.asarray(ran.found, dtype=np.float64)
+    computed = np.asarray(ran.numbers, dtype=np.float64)
     rest = {"microseconds": 1e6 * ran.seconds, "note": ran.note}
-    if found.shape != wanted.shape:
-        why = f"shape {found.shape} instead of {wanted.shape}"
+    if computed.shape != expected.shape:
+        why = f"shape {computed.shape} instead of {expected.shape}"
         return Row(form, title, "different", why, **rest)  # type: ignore[arg-type]
-    apart = np.abs(found - wanted)
+    apart = np.abs(computed - expected)
     exact = not allowed.any()
-    share = (found != wanted).astype(float) if exact else apart / allowed
-    share = np.where(np.isfinite(found), share, np.inf)
+    share = (computed != expected).astype(float) if exact else apart / allowed
+    share = np.where(np.isfinite(computed), share, np.inf)
     largest = float(share.sum() if exact else share.max())
     same = largest == 0.0 if exact else largest <= 1.0
-    said = "bits" if exact else f"{SHARE:.0e}"
+    bound = "bits" if exact else f"{SHARE:.0e}"
     verdict = "same" if same else "different"
-    return Row(form, title, verdict, "", largest, float(share.mean()), said, **rest)  # type: ignore[arg-type]
+    return Row(form, title, verdict, "", largest, float(share.mean()), bound, **rest)  # type: ignore[arg-type]
 
 
 def need(program: str, package: str) -> str:
@@ -156,10 +156,10 @@ def need(program: str, package: str) -> str:
     Raises:
         Missing: it is not there.
     """
-    found = shutil.which(program)
-    if found is None:
+    program_path = shutil.which(program)
+    if program_path is None:
         raise Missing(f"needs {program} (Debian package {package})")
-    return found
+    return program_path
 
 
 def called(command: Sequence[object], folder: Path, feed: bytes = b"") -> bytes:
@@ -170,8 +170,8 @@ def called(command: Sequence[object], folder: Path, feed: bytes = b"") -> bytes:
     """
     done = subprocess.run([str(part) for part in command], cwd=folder, input=feed, capture_output=True)
     if done.returncode:
-        said = (done.stdout + done.stderr).decode(errors="replace").strip()[-600:]
-        raise Broken(f"{Path(str(command[0])).name} ended with {done.returncode}: {said}")
+        output = (done.stdout + done.stderr).decode(errors="replace").strip()[-600:]
+        raise Broken(f"{Path(str(command[0])).name} ended with {done.returncode}: {output}")
     return done.stdout
 
 
@@ -180,6 +180,6 @@ def timed(run: Callable[[], Rows]) -> tuple[Rows, float]:
     spent = []
     for _ in range(ROUNDS):
         began = time.perf_counter()
-        found = run()
+        result = run()
         spent.append(time.perf_counter() - began)
-    return found, min(spent)
+    return result, min(spent)

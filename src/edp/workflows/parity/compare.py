@@ -14,7 +14,7 @@ from edp.errors import DataError, ExportError
 from edp.export.golden import Rows, random_inputs, stream, tolerance
 from edp.logs.source import DataSource
 from edp.training.bundle import Bundle
-from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Row, held
+from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Row, compared
 
 
 def golden_case(bundle: Bundle, ticks: int = 400, seed: int = 0) -> ParityCase:
@@ -43,8 +43,8 @@ def _case(bundle: Bundle, inputs: Rows) -> ParityCase:
             f"golden recording: {len(inputs)} ticks; it must hold at least a window, {predictor.spec.window}: give "
             "more ticks or a longer recording"
         )
-    wanted = stream(predictor, inputs)
-    return ParityCase(bundle, inputs, wanted, tolerance(predictor, inputs, wanted))
+    expected = stream(predictor, inputs)
+    return ParityCase(bundle, inputs, expected, tolerance(predictor, inputs, expected))
 
 
 def compare(
@@ -65,14 +65,14 @@ def compare(
         with tempfile.TemporaryDirectory() as temporary:
             try:
                 runs = form.run(case, Path(temporary))
-                made = [held(name, f"{form.title}{more and ', '}{more}", case, ran) for more, ran in runs]
+                form_rows = [compared(name, f"{form.title}{more and ', '}{more}", case, ran) for more, ran in runs]
             except ExportError as error:
-                made = [Row(name, form.title, "refused", str(error))]
+                form_rows = [Row(name, form.title, "refused", str(error))]
             except Missing as error:
-                made = [Row(name, form.title, "not run", str(error))]
+                form_rows = [Row(name, form.title, "not run", str(error))]
             except Broken as error:
-                made = [Row(name, form.title, "failed", str(error))]
-        for row in made:
+                form_rows = [Row(name, form.title, "failed", str(error))]
+        for row in form_rows:
             on_row(row)
-        rows += made
+        rows += form_rows
     return rows

@@ -18,4 +18,6 @@ def from_own_run(path: str | Path) -> bool:
     A convenience and no proof: a folder that somebody sent whole looks like one of your own.
     """
     folder = Path(path)
-    return any((place / RUN).is_file() for place in (folder, *([folder.parent] if folder.name == "bundle" else [])))
+    return any(
+        (candidate / RUN).is_file() for candidate in (folder, *([folder.parent] if folder.name == "bundle" else []))
+    )

@@ -43,9 +43,9 @@ class Meta(ABC):
         """Through the network that an update goes back through."""
         return 1 + self.spec.inner_steps
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series as they are."""
-        return list(known)
+        return list(own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Take over the weights and scaling of the start, which then is a candidate itself."""
@@ -94,20 +94,20 @@ class Meta(ABC):
         """
         total, ticks = np.zeros(3), 0
         for places in by_machine(data.validation).values():
-            parts = [data.validation[place] for place in places]
+            parts = [data.validation[index] for index in places]
             support, rest = self._halves(net, parts)
-            held = self.start_of(net)
-            kept = {name: tensor.detach().clone() for name, tensor in held.items()}
-            found = adapt(net, held, objective, support, self.spec.steps)
+            adapted_parameters = self.start_of(net)
+            saved_parameters = {name: tensor.detach().clone() for name, tensor in adapted_parameters.items()}
+            adapted_values = adapt(net, adapted_parameters, objective, support, self.spec.steps)
             with torch.no_grad():
-                for name, tensor in held.items():
-                    tensor.copy_(found[name])
+                for name, tensor in adapted_parameters.items():
+                    tensor.copy_(adapted_values[name])
             try:
                 scores = validation_scores(net, rest, self.training, data)
             finally:
                 with torch.no_grad():
-                    for name, tensor in held.items():
-                        tensor.copy_(kept[name])
+                    for name, tensor in adapted_parameters.items():
+                        tensor.copy_(saved_parameters[name])
             count = sum(part.samples for part in rest)
             total, ticks = total + count * np.array(scores), ticks + count
         score, report, loss = (float(value) for value in total / ticks)
@@ -117,7 +117,7 @@ class Meta(ABC):
         """Pieces of the first halves, as many as an episode has, and the second halves."""
         chunks, horizons = self.training.chunks, net.task.horizons
         starts, rest = [], []
-        for place, part in enumerate(parts):
+        for index, part in enumerate(parts):
             half = part.samples // 2
             if half <= chunks.length + net.task.max_horizon:
                 raise DataError(
@@ -125,7 +125,7 @@ class Meta(ABC):
                     f"longer than a piece of {chunks.length} plus the horizon: give longer recordings or a smaller "
                     "training.chunks.length"
                 )
-            starts += [(place, at) for at in range(0, half - chunks.length - net.task.max_horizon, chunks.length)]
+            starts += [(index, at) for at in range(0, half - chunks.length - net.task.max_horizon, chunks.length)]
             rest.append(replace(part, inputs=part.inputs[half:], targets=part.targets[half:]))
         chosen = [starts[i * len(starts) // self.spec.shots] for i in range(min(self.spec.shots, len(starts)))]
         rows = [cut(parts[i], range(at, at + chunks.length), horizons, chunks.burn_in) for i, at in chosen]

@@ -91,13 +91,13 @@ def pretrain(
     if lesson is not None:
         facts: dict[str, Any] = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
         facts |= {"meta": asdict(order.meta)} if method.episodic else {}
-        made = lesson
-        teaching = StrategyFactory(facts, lambda prepared: made, frozen)
+        strategy = lesson
+        teaching = StrategyFactory(facts, lambda prepared: strategy, frozen)
     network = train(source, experiment, out, on_event, teaching, data).predictor
     if on_step is not None:
         on_step("judging on machines that were never seen")
-    found = context_errors(network, data.test, data.target_kinds)
-    result = _result(order, experiment, data, found)
+    contexts = context_errors(network, data.test, data.target_kinds)
+    result = _result(order, experiment, data, contexts)
     write_json(Path(out) / RESULT, result)
     return result
 
@@ -124,7 +124,7 @@ def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experim
     return replace(experiment, training=replace(experiment.training, chunks=replace(chunks, carried=carried)))
 
 
-def _result(order: Pretrain, experiment: Experiment, data: Prepared, found: Contexts) -> dict[str, Any]:
+def _result(order: Pretrain, experiment: Experiment, data: Prepared, contexts: Contexts) -> dict[str, Any]:
     parts = {part: by_machine(getattr(data, part)) for part in ("train", "validation", "test")}
     return {
         "schema": 1,
@@ -143,5 +143,5 @@ def _result(order: Pretrain, experiment: Experiment, data: Prepared, found: Cont
             }
             for part, owned in parts.items()
         },
-        "unseen": found.to_json(),
+        "unseen": contexts.to_json(),
     }

@@ -24,15 +24,15 @@ def complete(
         StorageError: a record could not be written; what ran is stopped, and what was entered stays.
     """
     tell = on_record or (lambda record, trained: None)
-    wanted = {job.key: job for job in jobs}
-    found: dict[str, Record] = {}
+    jobs_by_key = {job.key: job for job in jobs}
+    records: dict[str, Record] = {}
     waiting: set[str] = set()
     try:
-        for key, job in wanted.items():
-            held = ledger.finished(key)
-            if held is not None:
-                found[key] = held
-                tell(held, False)
+        for key, job in jobs_by_key.items():
+            finished_record = ledger.finished(key)
+            if finished_record is not None:
+                records[key] = finished_record
+                tell(finished_record, False)
             else:
                 executor.submit(replace(job, folder=str(ledger.path)))
                 waiting.add(key)
@@ -42,9 +42,9 @@ def complete(
                 raise RuntimeError(f"the executor gave up {len(waiting)} trainings without a word")
             waiting.discard(record.key)
             ledger.put(record)
-            found[record.key] = record
+            records[record.key] = record
             tell(record, True)
     finally:
         for key in waiting:
             executor.cancel(key)
-    return {key: found[key] for key in wanted}
+    return {key: records[key] for key in jobs_by_key}

@@ -100,7 +100,7 @@ class RayPool(ClosedAtExit):
         if self._jobs.pop(key, None) is None:
             return
         self._ready = deque(record for record in self._ready if record.key != key)
-        for reference in [one for one, held in self._refs.items() if held == key]:
+        for reference in [one for one, job_key in self._refs.items() if job_key == key]:
             del self._refs[reference]
             with contextlib.suppress(Exception):  # a node that is gone has nothing to cancel
                 self.ray.cancel(reference, force=True)
@@ -157,8 +157,8 @@ class RayPool(ClosedAtExit):
             answered += 1
             other = sorted(part for part in here if here[part] != there.get(part))
             if other:
-                told = ", ".join(f"{part} {there.get(part)} (here {here[part]})" for part in other)
-                raise ConfigError(f"node {name} has other code or versions: {told}; install the same there")
+                differences = ", ".join(f"{part} {there.get(part)} (here {here[part]})" for part in other)
+                raise ConfigError(f"node {name} has other code or versions: {differences}; install the same there")
         if not answered:
             raise ConfigError("no node of the cluster answers; start one, then give the same command again")
 

@@ -169,11 +169,11 @@ class SearchContext:
 
     def table(self, outcomes: Sequence[Outcome], name: str = "composite") -> Array:
         """Scores ``(run, session)`` of runs 0, 1, ...; NaN where a run is not judged on a session, or failed."""
-        place = {session: column for column, session in enumerate(self.development)}
-        scores = np.full((len(outcomes), len(place)), np.nan)
+        columns = {session: column for column, session in enumerate(self.development)}
+        scores = np.full((len(outcomes), len(columns)), np.nan)
         for row, outcome in enumerate(outcomes):
             for session in outcome.order.judged:
-                scores[row, place[session]] = outcome.score(session, self.spec.horizon, name)
+                scores[row, columns[session]] = outcome.score(session, self.spec.horizon, name)
         return scores
 
 
@@ -222,18 +222,20 @@ def set_apart(
     return development, test, second
 
 
-def _drawn(sessions: Sequence[str], families: Mapping[str, str], seed: list[int], wanted: int) -> tuple[str, ...]:
+def _drawn(
+    sessions: Sequence[str], families: Mapping[str, str], seed: list[int], session_count: int
+) -> tuple[str, ...]:
     rng = np.random.default_rng(seed)
-    if wanted >= len(sessions):
+    if session_count >= len(sessions):
         return tuple(sessions)
     kinds: dict[str, list[str]] = {}
     for name in sessions:
         kinds.setdefault(families.get(name, ""), []).append(name)
     queues = [list(rng.permutation(names)) for names in kinds.values()]
     # Largest remainder: every kind gives its share, the rest comes from those with the largest part left over.
-    shares = [len(queue) * wanted / len(sessions) for queue in queues]
-    taken = [int(share) for share in shares]
-    for which in sorted(range(len(queues)), key=lambda i: taken[i] - shares[i])[: wanted - sum(taken)]:
-        taken[which] += 1
-    chosen = {str(name) for queue, count in zip(queues, taken, strict=True) for name in queue[:count]}
+    shares = [len(queue) * session_count / len(sessions) for queue in queues]
+    counts = [int(share) for share in shares]
+    for which in sorted(range(len(queues)), key=lambda i: counts[i] - shares[i])[: session_count - sum(counts)]:
+        counts[which] += 1
+    chosen = {str(name) for queue, count in zip(queues, counts, strict=True) for name in queue[:count]}
     return tuple(name for name in sessions if name in chosen)

@@ -27,7 +27,7 @@ class Dispatcher:
         memory_mb: cap on its memory.
         on_record: told of each record and whether it was trained now.
         on_orders: told of each batch before it is done: keys and orders.
-        kept: keys of the networks of phase 6, whose states later ones are made of.
+        teacher_keys: keys of the networks of phase 6, whose states later ones are made of.
     """
 
     ledger: Ledger
@@ -38,7 +38,7 @@ class Dispatcher:
     memory_mb: float | None = None
     on_record: Callable[[Record, bool], None] | None = None
     on_orders: Callable[[list[str], list[TrainingRequest]], None] | None = None
-    kept: set[str] = field(default_factory=set)
+    teacher_keys: set[str] = field(default_factory=set)
 
     def __call__(self, orders: list[TrainingRequest]) -> list[Outcome]:
         """Outcomes in the order of the orders; equal orders are done once.
@@ -50,12 +50,14 @@ class Dispatcher:
         if self.on_orders is not None:
             self.on_orders([job.key for job in jobs], orders)
         new = any(self.ledger.finished(job.key) is None for job in jobs)
-        found = complete(self.ledger, self.executor, [self._begun(*pair) for pair in zip(jobs, orders)], self.on_record)
-        self.kept.update(job.key for job, order in zip(jobs, orders) if order.recipe is not None)
+        records_by_key = complete(
+            self.ledger, self.executor, [self._begun(*pair) for pair in zip(jobs, orders)], self.on_record
+        )
+        self.teacher_keys.update(job.key for job, order in zip(jobs, orders) if order.recipe is not None)
         # A search that goes on comes by earlier batches first, and one that stops here needs what it had.
-        if new and all(record.status in FINAL for record in found.values()):
-            self.ledger.keep_states({*self.kept, *(job.key for job in jobs)})
-        records = [found[job.key] for job in jobs]
+        if new and all(record.status in FINAL for record in records_by_key.values()):
+            self.ledger.keep_states({*self.teacher_keys, *(job.key for job in jobs)})
+        records = [records_by_key[job.key] for job in jobs]
         return [Outcome(o, str(r.status), r.result, r.message) for o, r in zip(orders, records)]
 
     def _job(self, order: TrainingRequest) -> Job:

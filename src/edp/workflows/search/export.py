@@ -29,9 +29,9 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     Raises:
         StorageError: no study, none of these phases has ended, or the file cannot be written.
     """
-    held = read_study(folder)
+    content = read_study(folder)
     file = Path(folder, JOURNAL) if path is None else Path(path)
-    studies = told(held)
+    studies = told(content)
     if not studies:
         raise StorageError(
             f"'{folder}' has asked no questions yet: phase 1 (calibration) has not ended; go on with edp search, then "
@@ -41,33 +41,33 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     return file, [study.name for study in studies]
 
 
-def told(held: Mapping[str, Any]) -> list[Told]:
+def told(study: Mapping[str, Any]) -> list[Told]:
     """The studies of phases 1, 4 and 5 that have ended."""
-    space = space_of(held["spec"]["space"])
-    found = []
-    for decision in held["decisions"]:
+    space = space_of(study["spec"]["space"])
+    finished_studies = []
+    for decision in study["decisions"]:
         phase, facts = decision["phase"], decision["facts"]
         if phase == "calibration":
             for backbone, own in facts["backbones"].items():
-                found.append(_told(f"{phase} {backbone}", own["trials"], space, [], held))
+                finished_studies.append(_told(f"{phase} {backbone}", own["trials"], space, [], study))
         elif phase in ("synthesis", "exploration"):
             options = {key: Choice(tuple(values)) for key, values in facts.get("options", {}).items()}
-            found.append(_told(phase, facts["trials"], {**space, **options}, list(facts["on"]), held))
-    return found
+            finished_studies.append(_told(phase, facts["trials"], {**space, **options}, list(facts["on"]), study))
+    return finished_studies
 
 
 def _told(
-    name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], held: Mapping[str, Any]
+    name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], study: Mapping[str, Any]
 ) -> Told:
-    cost, score = held["spec"]["cost"], f"composite, {held['unit']}"
+    cost, score = study["spec"]["cost"], f"composite, {study['unit']}"
     full: dict[str, Range] = dict(space) | {module: Choice((0, 1)) for module in modules}
     objectives = (score,) if cost == "none" else (score, cost)
     rows = []
     for trial in trials:
         values = dict(trial["values"]) | {module: int(module in trial.get("modules", ())) for module in modules}
-        found = trial["score"]
-        answer = None if found is None else [found] if cost == "none" else [found, trial[cost]]
-        known = {key: value for key, value in trial.items() if key not in NO_VALUES}
+        trial_score = trial["score"]
+        answer = None if trial_score is None else [trial_score] if cost == "none" else [trial_score, trial[cost]]
+        attributes = {key: value for key, value in trial.items() if key not in NO_VALUES}
         reports = {int(step): float(value) for step, value in trial.get("rungs", ())}
-        rows.append(ToldTrial(values, answer, known, reports, bool(trial.get("pruned"))))
+        rows.append(ToldTrial(values, answer, attributes, reports, bool(trial.get("pruned"))))
     return Told(name, full, rows, objectives)

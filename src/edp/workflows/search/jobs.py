@@ -67,6 +67,6 @@ def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any
     """
     plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
     part = train_part if identity.config.get("recipe") is None else make_smaller
-    found, state = part(plain, read_state(where[START]) if START in where else None)
-    del found["seconds"]
-    return found if state is None else WithState(found, state)
+    result, state = part(plain, read_state(where[START]) if START in where else None)
+    del result["seconds"]
+    return result if state is None else WithState(result, state)

@@ -52,7 +52,7 @@ class _Worker:
         self.connection = Connection(ours.detach())
         self.output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
         pinned = {name: str(threads) for name in THREADS}
-        places = os.pathsep.join(place for place in sys.path if place)
+        places = os.pathsep.join(folder for folder in sys.path if folder)
         command = [sys.executable, "-P", "-m", "edp.workflows.search.worker", str(theirs.fileno()), str(os.getpid())]
         try:
             self.process = subprocess.Popen(
@@ -246,14 +246,14 @@ class LocalPool(ClosedAtExit):
 
     def _died(self, worker: _Worker) -> None:
         """Start a training whose process ended again, or give it up."""
-        turn, said = worker.now(), worker.said()
+        turn, last_output = worker.now(), worker.said()
         self._drop(worker)
         if turn.attempt <= self.retries:
             self._queue.appendleft(replace(turn, attempt=turn.attempt + 1))
             return
         code = worker.process.returncode
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        message = f"its process ended {turn.attempt} times, last by {how}" + (f": {said}" if said else "")
+        message = f"its process ended {turn.attempt} times, last by {how}" + (f": {last_output}" if last_output else "")
         self._ready.append(ended(turn.job, TrainingStatus.LOST, message, attempts=turn.attempt))
 
     def _drop(self, worker: _Worker) -> None:

@@ -129,21 +129,21 @@ def with_modules(
     Raises:
         ConfigError: an unknown module or option, or modules that contradict one another or the network; every reason.
     """
-    wanted = set(names)
-    reasons = conflicts(settings, wanted, channels)
+    module_names = set(names)
+    reasons = conflicts(settings, module_names, channels)
     if reasons:
         raise ConfigError("modules: " + "; ".join(reasons))
-    made = _added(settings, wanted)
+    changed_settings = _added(settings, module_names)
     if shape is not None:
-        made = shape(made)
-    for name in (name for name in MODULES if name in wanted):
+        changed_settings = shape(changed_settings)
+    for name in (name for name in MODULES if name in module_names):
         for key, option in _options(settings, name, shape).items():
             label = (options or {}).get(key, option.present)
             if label not in option.values:
                 raise ConfigError(f"modules: {key} = {label!r}; one of {list(option.values)} must hold")
             if label != option.present:
-                option.put(made, option.values[label])
-    return made
+                option.put(changed_settings, option.values[label])
+    return changed_settings
 
 
 def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[str, Choice]:
@@ -154,8 +154,8 @@ def options_of(settings: Table, name: str, shape: Shape | None = None) -> dict[s
         name: of the module, or of a toggle, which has none.
         shape: as in `with_modules`.
     """
-    found = {key: tuple(option.values) for key, option in _options(settings, name, shape).items()}
-    return {key: Choice(values) for key, values in found.items() if len(values) > 1}
+    options = {key: tuple(option.values) for key, option in _options(settings, name, shape).items()}
+    return {key: Choice(values) for key, values in options.items() if len(values) > 1}
 
 
 def present_options(settings: Table, names: Iterable[str], shape: Shape | None = None) -> dict[str, Value]:
@@ -174,40 +174,40 @@ class _Option:
 
     def put(self, settings: Table, value: Any) -> None:
         """Set it, in place."""
-        held = settings
+        table = settings
         if self.kind is not None:
-            held = next(block for block in settings["model"]["blocks"] if block["kind"] == self.kind)
+            table = next(block for block in settings["model"]["blocks"] if block["kind"] == self.kind)
         for key in self.keys[:-1]:
-            held = held[key]
-        held[self.keys[-1]] = list(value) if isinstance(value, tuple) else value
+            table = table[key]
+        table[self.keys[-1]] = list(value) if isinstance(value, tuple) else value
 
 
 def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str, _Option]:
-    module, made = part_of(name), {}
+    module, options = part_of(name), {}
     plain = plain_tree(build(Experiment, _added(settings, {name}), f"with {name}"))
     if shape is not None:
         plain = shape(plain)
-    for place, values in module.options.items():
-        keys, held = tuple(place.split(".")), plain
+    for joined_key, values in module.options.items():
+        keys, present_value = tuple(joined_key.split(".")), plain
         kind = None if module.block is None else str(module.block["kind"])
         if kind is not None:
-            held = next(block for block in plain["model"]["blocks"] if block["kind"] == kind)
+            present_value = next(block for block in plain["model"]["blocks"] if block["kind"] == kind)
         for key in keys:
-            held = held[key]
-        present = _label(held)
+            present_value = present_value[key]
+        present = _label(present_value)
         labelled = {_label(value): value for value in values}
         if present not in labelled:
-            labelled = {present: held, **labelled}
-        made[f"{name}.{keys[-1]}"] = _Option(labelled, present, keys, kind)
-    return made
+            labelled = {present: present_value, **labelled}
+        options[f"{name}.{keys[-1]}"] = _Option(labelled, present, keys, kind)
+    return options
 
 
 def _label(value: Any) -> Value:
     """What a sampler can hold: a list as text."""
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
-    held: Value = value
-    return held
+    scalar: Value = value
+    return scalar
 
 
 def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = ()) -> list[str]:
@@ -219,8 +219,8 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
     Raises:
         ConfigError: an unknown module.
     """
-    wanted = set(names)
-    chosen = [(name, part_of(name)) for name in sorted(wanted)]
+    module_names = set(names)
+    chosen = [(name, part_of(name)) for name in sorted(module_names)]
     reasons = []
     for (one, first), (other, second) in combinations(chosen, 2):
         mine, theirs = dict(_leaves(first.change)), dict(_leaves(second.change))
@@ -230,7 +230,9 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
     if reasons:
         return reasons
     try:
-        experiment = build(Experiment, _added(settings, wanted), "with " + (", ".join(sorted(wanted)) or "no modules"))
+        experiment = build(
+            Experiment, _added(settings, module_names), "with " + (", ".join(sorted(module_names)) or "no modules")
+        )
         task = experiment.task.resolve(100.0, channels, physics=experiment.model.physics)
         check_combination(task, experiment.model)
     except ConfigError as error:
@@ -251,17 +253,19 @@ def contradicting(settings: Table, names: Iterable[str], channels: Sequence[str]
 
 
 def _added(settings: Table, names: set[str]) -> Table:
-    made = copy.deepcopy(settings)
+    changed_settings = copy.deepcopy(settings)
     for name, module in (*MODULES.items(), *TOGGLES.items()):
         if name not in names:
             continue
-        made = merged(made, copy.deepcopy(dict(module.change)))
-        if module.block is not None and dict(module.block) not in made["model"]["blocks"]:
-            held = [block for block in made["model"]["blocks"] if block["kind"] != module.block["kind"]]
-            made["model"]["blocks"] = [*held, dict(module.block)]
+        changed_settings = merged(changed_settings, copy.deepcopy(dict(module.change)))
+        if module.block is not None and dict(module.block) not in changed_settings["model"]["blocks"]:
+            other_blocks = [
+                block for block in changed_settings["model"]["blocks"] if block["kind"] != module.block["kind"]
+            ]
+            changed_settings["model"]["blocks"] = [*other_blocks, dict(module.block)]
         if module.alter is not None:
-            module.alter(made)
-    return made
+            module.alter(changed_settings)
+    return changed_settings
 
 
 def _leaves(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

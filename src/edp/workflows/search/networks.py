@@ -59,7 +59,7 @@ def write_networks(
     source: DataSource,
     ground: SearchContext,
     split: ByFrozen,
-    made: Mapping[str, tuple[TrainingRequest, Mapping[str, Any]]],
+    networks: Mapping[str, tuple[TrainingRequest, Mapping[str, Any]]],
 ) -> dict[str, Path]:
     """Write the networks that were judged on the second lock-box as runs, once phase 6 has decided.
 
@@ -68,7 +68,7 @@ def write_networks(
         source: where the recordings are.
         ground: with the decisions.
         split: of the runs.
-        made: order and result by name of the network.
+        networks: order and result by name of the network.
 
     Returns:
         Folder of each run; none before phase 6 has decided. Without one of its own the chosen network is the teacher.
@@ -76,11 +76,11 @@ def write_networks(
     Raises:
         EdpError: recordings that cannot be read any more, or a folder that cannot be written.
     """
-    if NAME not in ground.decided or not made:
+    if NAME not in ground.decided or not networks:
         return {}
     recordings = source.read()
     written: dict[str, Path] = {}
-    for name, (order, result) in made.items():
+    for name, (order, result) in networks.items():
         recipe = Recipe.from_json(order.recipe or {})
         experiment = replace(recipe.experiment(experiment_of(order)), split=split)
         first = recordings[0]

@@ -80,40 +80,45 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     spec = _spec(dict(search), where)
     _check_parts(spec, settings_of(experiment), f"settings {where}: search")
     if spec.horizon not in experiment.task.horizons:
-        held = ", ".join(map(str, experiment.task.horizons))
+        horizons = ", ".join(map(str, experiment.task.horizons))
         raise ConfigError(
-            f"settings {where}: search.horizon = {spec.horizon}, and the task predicts {held} samples ahead; give one "
-            "of these, or --set task.horizons=[...]"
+            f"settings {where}: search.horizon = {spec.horizon}, and the task predicts {horizons} samples ahead; give "
+            "one of these, or --set task.horizons=[...]"
         )
     return SearchPlan(spec, experiment, preset)
 
 
 def _with_files(table: Table, folder: Path) -> Table:
     """`table` with the feature sets and the budget that it names by files."""
-    made, search = with_set_file(table, folder), table.get("search")
+    resolved, search = with_set_file(table, folder), table.get("search")
     if not isinstance(search, Mapping):
-        return made
-    held = search.get("compression")
-    if isinstance(held, Mapping) and isinstance(held.get("budget"), str):
-        search = {**search, "compression": {**held, "budget": asdict(load_budget(folder / held["budget"]))}}
-        made = {**made, "search": search}
+        return resolved
+    compression = search.get("compression")
+    if isinstance(compression, Mapping) and isinstance(compression.get("budget"), str):
+        search = {
+            **search,
+            "compression": {**compression, "budget": asdict(load_budget(folder / compression["budget"]))},
+        }
+        resolved = {**resolved, "search": search}
     if not isinstance(search.get("features"), list):
-        return made
+        return resolved
     sets = [
         build(FeatureSettings, read_set_table(folder / one), f"'{folder / one}'") if is_set_file(one) else one
         for one in search["features"]
     ]
-    return {**made, "search": {**search, "features": sets}}
+    return {**resolved, "search": {**search, "features": sets}}
 
 
 def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
     """Every backbone, feature set and value of the space makes an experiment; otherwise the first that does not."""
     for name in spec.backbones:
         if name not in DEFAULT_BACKBONE:
-            known = ", ".join(DEFAULT_BACKBONE)
-            raise ConfigError(f"{where}.backbones: there is no '{name}'{closest(name, DEFAULT_BACKBONE)} ({known})")
-    for name, held in spec.feature_sets.items():
-        if held == name and name not in (*FEATURE_SETS, "all"):
+            backbone_names = ", ".join(DEFAULT_BACKBONE)
+            raise ConfigError(
+                f"{where}.backbones: there is no '{name}'{closest(name, DEFAULT_BACKBONE)} ({backbone_names})"
+            )
+    for name, feature_set in spec.feature_sets.items():
+        if feature_set == name and name not in (*FEATURE_SETS, "all"):
             raise ConfigError(
                 f"{where}.features: there is no feature set '{name}'{closest(name, [*FEATURE_SETS, 'all'])}; a set of "
                 "your own is named by its file (.toml)"
@@ -150,40 +155,42 @@ def space_of(
         ConfigError: an unknown dimension, or a range that holds nothing.
     """
     space = dict(over or {})
-    for name, given in dict(table).items():
+    for name, entry in dict(table).items():
         if name not in DIMENSIONS:
             raise ConfigError(f"settings {where}: unknown dimension 'search.{key}.{name}'{closest(name, DIMENSIONS)}")
-        if given is False:
+        if entry is False:
             space.pop(name, None)
         else:
-            space[name] = _range(given, f"{where}: search.{key}.{name}")
+            space[name] = _range(entry, f"{where}: search.{key}.{name}")
     return space
 
 
-def _range(given: Any, where: str) -> Range:
-    if isinstance(given, Mapping):
-        return build(Real, given, where)
+def _range(entry: Any, where: str) -> Range:
+    if isinstance(entry, Mapping):
+        return build(Real, entry, where)
     try:
-        if isinstance(given, list):
-            return Choice(tuple(given))
+        if isinstance(entry, list):
+            return Choice(tuple(entry))
     except ConfigError as error:
         raise ConfigError(f"settings {where}: {error}") from error
     raise ConfigError(
-        f"settings {where} = {given!r}; a list of values, a table {{ low = .., high = .., log = true }}, or false must "
+        f"settings {where} = {entry!r}; a list of values, a table {{ low = .., high = .., log = true }}, or false must "
         "hold"
     )
 
 
 def plain_spec(spec: SearchSpec) -> Table:
     """A spec as plain values."""
-    made: Table = plain_tree(spec)
-    made["space"], made["deferred"] = plain_space(spec.space), plain_space(spec.deferred)
-    return made
+    table: Table = plain_tree(spec)
+    table["space"], table["deferred"] = plain_space(spec.space), plain_space(spec.deferred)
+    return table
 
 
 def plain_space(space: Space) -> Table:
     """A space as in a settings file."""
     return {
-        name: list(held.options) if isinstance(held, Choice) else {"low": held.low, "high": held.high, "log": held.log}
-        for name, held in space.items()
+        name: list(dimension.options)
+        if isinstance(dimension, Choice)
+        else {"low": dimension.low, "high": dimension.high, "log": dimension.log}
+        for name, dimension in space.items()
     }

@@ -217,8 +217,10 @@ class SearchSpec:
     def feature_sets(self) -> dict[str, Any]:
         """By name, what ``task.features`` of an experiment is set to: a name, or a plain table."""
         return {
-            held if isinstance(held, str) else held.name: held if isinstance(held, str) else plain_tree(held)
-            for held in self.features
+            feature_set if isinstance(feature_set, str) else feature_set.name: feature_set
+            if isinstance(feature_set, str)
+            else plain_tree(feature_set)
+            for feature_set in self.features
         }
 
     @property

@@ -143,12 +143,12 @@ def make_smaller(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[
     began = time.perf_counter()
     experiment = experiment_of(order)
     data = prepared(order, experiment)
-    held: dict[str, Weights] = {} if start is None else unpack(start)
-    network = _made(recipe, experiment, data, held)
+    weights_by_name: dict[str, Weights] = {} if start is None else unpack(start)
+    network = _made(recipe, experiment, data, weights_by_name)
     result = _judged(recipe, network, data) | {"seconds": round(time.perf_counter() - began, 3)}
     if recipe.final:
         return result | {"weights": base64.b64encode(save(_weights(network))).decode()}, None
-    return result, pack(held)
+    return result, pack(weights_by_name)
 
 
 def network_of(weights: str, task: Task, model: ModelSpec) -> Predictor:
@@ -156,19 +156,19 @@ def network_of(weights: str, task: Task, model: ModelSpec) -> Predictor:
     return _restored(load(base64.b64decode(weights)), task, model)
 
 
-def _made(recipe: Recipe, experiment: Experiment, data: Prepared, held: dict[str, Weights]) -> Predictor:
-    """The network of a recipe; it and all that it is made of are in `held` afterwards."""
-    if recipe.name not in held:
+def _made(recipe: Recipe, experiment: Experiment, data: Prepared, weights_by_name: dict[str, Weights]) -> Predictor:
+    """The network of a recipe; it and all that it is made of are in `weights_by_name` afterwards."""
+    if recipe.name not in weights_by_name:
         own = recipe.experiment(experiment)
         order, lesson = recipe.order(), None
         if order is not None:
             plain = replace(recipe, rounded=False)
-            teacher = _made(replace(plain, pruned=False, units=None), experiment, data, held)
-            begun = _made(plain, experiment, data, held) if recipe.rounded else None
+            teacher = _made(replace(plain, pruned=False, units=None), experiment, data, weights_by_name)
+            begun = _made(plain, experiment, data, weights_by_name) if recipe.rounded else None
             lesson = order.lesson([teacher], data, begun)
-        held[recipe.name] = _weights(fit(data, own.model, own.training, lesson=lesson).predictor)
+        weights_by_name[recipe.name] = _weights(fit(data, own.model, own.training, lesson=lesson).predictor)
     # Always through its weights, so that a network that was kept and one that was trained just now are the same.
-    return _restored(held[recipe.name], data.task, recipe.model(experiment))
+    return _restored(weights_by_name[recipe.name], data.task, recipe.model(experiment))
 
 
 def _judged(recipe: Recipe, network: Predictor, data: Prepared) -> dict[str, Any]:
@@ -183,11 +183,16 @@ def _judged(recipe: Recipe, network: Predictor, data: Prepared) -> dict[str, Any
         except ExportError as error:
             left_out[name] = str(error)
             continue
-        found = plain if name == "float32" else score_predictions(deployed.predict(data.test), data, skip)
-        taken = {key: list(value) if isinstance(value, tuple) else value for key, value in vars(deployed.taken).items()}
-        over = {limit: list(pair) for limit, pair in deployed.taken.over(recipe.budget).items()}  # as a ledger says it
-        formats[name] = {"scores": _overall(found), "taken": taken, "over": over}
-        shown = found if recipe.final else plain
+        scored = plain if name == "float32" else score_predictions(deployed.predict(data.test), data, skip)
+        usage = {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in vars(deployed.resource_usage).items()
+        }
+        over = {
+            limit: list(pair) for limit, pair in deployed.resource_usage.over(recipe.budget).items()
+        }  # as a ledger says it
+        formats[name] = {"scores": _overall(scored), "resource_usage": usage, "over": over}
+        shown = scored if recipe.final else plain
     sessions = {
         name: {k: {score: scores["mean"][score] for score in SCORES} for k, scores in horizons.items()}
         for name, horizons in shown["recordings"].items()
@@ -204,10 +209,10 @@ def _judged(recipe: Recipe, network: Predictor, data: Prepared) -> dict[str, Any
     }
 
 
-def _overall(found: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+def _overall(scored: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     return {
         horizon: {score: float(scores["mean"][score]) for score in ("mae", "composite")}
-        for horizon, scores in found["overall"].items()
+        for horizon, scores in scored["overall"].items()
     }
 
 

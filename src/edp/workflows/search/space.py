@@ -192,20 +192,20 @@ def apply(settings: Table, candidate: Candidate) -> Table:
     Raises:
         ConfigError: an unknown dimension.
     """
-    made = copy.deepcopy(settings)
+    changed_settings = copy.deepcopy(settings)
     for name in DIMENSIONS:  # depth after width, whatever the order of the candidate
         if name in candidate:
-            DIMENSIONS[name](made, candidate[name])
+            DIMENSIONS[name](changed_settings, candidate[name])
     unknown = [name for name in candidate if name not in DIMENSIONS]
     if unknown:
         _ = DIMENSIONS[unknown[0]]
-    return made
+    return changed_settings
 
 
 def applicable(space: Space, settings: Table) -> Space:
     """The dimensions that change something in these settings: a pure LSTM has no kernel."""
     backbone = settings["model"]["backbone"]
-    return {name: held for name, held in space.items() if name != "kernel" or "kernel" in backbone}
+    return {name: dimension for name, dimension in space.items() if name != "kernel" or "kernel" in backbone}
 
 
 def halved(settings: Table) -> Table:
@@ -215,19 +215,22 @@ def halved(settings: Table) -> Table:
     them and C / 4 where there are more. A pure TCN gets as many levels as its receptive field needs for the window
     (R >= W, thesis 3.2.3.2).
     """
-    made = copy.deepcopy(settings)
-    backbone, head = made["model"]["backbone"], made["model"]["head"]
+    halved_settings = copy.deepcopy(settings)
+    backbone, head = halved_settings["model"]["backbone"], halved_settings["model"]["head"]
     width = int(backbone.get("units", (backbone.get("channels") or [1])[0]))
     if "channels" in backbone:
         levels = len(backbone["channels"])
-        while backbone["kind"] == "tcn" and receptive_field(levels, backbone["kernel"]) < made["model"]["window"]:
+        while (
+            backbone["kind"] == "tcn"
+            and receptive_field(levels, backbone["kernel"]) < halved_settings["model"]["window"]
+        ):
             if backbone["kernel"] < 2:
                 break  # which sees one sample, however many levels there are
             levels += 1
         backbone["channels"] = [max(1, width >> level) for level in range(levels)]
     if hasattr(HEADS[head["kind"]], "hidden"):
         head["hidden"] = max(1, width // (2 if head.get("layers", 1) == 1 else 4))
-    return made
+    return halved_settings
 
 
 WIDTHS: dict[str, Callable[[Table], Table]] = {"equal": lambda settings: settings, "halved": halved}
@@ -248,11 +251,11 @@ def elastic(space: Space, baseline: Candidate, reach: Mapping[str, float] = ELAS
     """
     window: dict[str, Range] = {}
     for name, share in reach.items():
-        held = space.get(name)
-        if not isinstance(held, Real):
+        dimension = space.get(name)
+        if not isinstance(dimension, Real):
             continue
-        check({name: held}, baseline)
-        window[name] = held.around(float(baseline[name]), share, beyond)
+        check({name: dimension}, baseline)
+        window[name] = dimension.around(float(baseline[name]), share, beyond)
     return window
 
 
@@ -262,12 +265,12 @@ def check(space: Space, candidate: Candidate) -> None:
     Raises:
         ConfigError: with the value and the range.
     """
-    for name, held in space.items():
+    for name, dimension in space.items():
         if name not in candidate:
-            raise ConfigError(f"the candidate {dict(candidate)} has no value of '{name}'; {held} must hold it")
-        if not held.holds(candidate[name]):
+            raise ConfigError(f"the candidate {dict(candidate)} has no value of '{name}'; {dimension} must hold it")
+        if not dimension.holds(candidate[name]):
             raise ConfigError(
-                f"{name} = {candidate[name]!r} is not in {held}; choose a value inside, or widen the space"
+                f"{name} = {candidate[name]!r} is not in {dimension}; choose a value inside, or widen the space"
             )
 
 

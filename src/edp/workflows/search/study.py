@@ -160,18 +160,18 @@ class Study:
         values = {name: asked.params[name] for name in names(self.space)}
         on = self._allowed(tuple(name for name in self.flags if asked.params[name]))
         chosen: dict[str, Any] = {
-            name: asked.suggest_categorical(name, held.options)
+            name: asked.suggest_categorical(name, choice.options)
             for flag in on
-            for name, held in self.options.get(flag, {}).items()
+            for name, choice in self.options.get(flag, {}).items()
         }
         return Trial(asked.number, values, on, chosen)
 
     def _allowed(self, on: tuple[str, ...]) -> tuple[str, ...]:
-        kept: tuple[str, ...] = ()
+        allowed: tuple[str, ...] = ()
         for name in on:
-            if not any(name in pair and set(pair) <= {*kept, name} for pair in self.barred):
-                kept = (*kept, name)
-        return kept
+            if not any(name in pair and set(pair) <= {*allowed, name} for pair in self.barred):
+                allowed = (*allowed, name)
+        return allowed
 
     def report(self, number: int, step: int, value: float) -> None:
         """What a question that is not answered yet gives at a step of its training.
@@ -211,9 +211,11 @@ class Study:
             raise ConfigError(f"study: trial {number} was not asked, or was told before; tell each once")
         if pruned and values is not None:
             raise ConfigError(f"study: trial {number} is told as pruned, with values {list(values)}; none must hold")
-        for what, wanted, given in (("values", self.objectives, values), ("costs", self.bounds, costs)):
-            if given is not None and (len(given) != wanted or not all(map(math.isfinite, given))):
-                raise ConfigError(f"study: trial {number} is told {what} {list(given)}; {wanted} finite ones must hold")
+        for what, expected_count, numbers in (("values", self.objectives, values), ("costs", self.bounds, costs)):
+            if numbers is not None and (len(numbers) != expected_count or not all(map(math.isfinite, numbers))):
+                raise ConfigError(
+                    f"study: trial {number} is told {what} {list(numbers)}; {expected_count} finite ones must hold"
+                )
         self._waiting[number] = (values, costs, pruned)
         while self._told in self._waiting:
             self._pass_on(self._told, *self._waiting.pop(self._told))
@@ -223,8 +225,8 @@ class Study:
         from optuna.trial import TrialState
 
         trial = self._open.pop(number)
-        for place, cost in enumerate(costs):
-            trial.set_constraint(f"bound {place}", cost)
+        for index, cost in enumerate(costs):
+            trial.set_constraint(f"bound {index}", cost)
         if values is None:  # Never as infinity: a sampler would model the wall.
             beyond = pruned or any(cost > 0 for cost in costs)
             self._study.tell(trial, state=TrialState.PRUNED if beyond else TrialState.FAIL)
@@ -294,14 +296,14 @@ def _median() -> Any:
 PRUNERS: dict[str, Callable[[], Any]] = {"none": _no_pruner, "median": _median}
 
 
-def _distribution(held: Range) -> Any:
+def _distribution(dimension: Range) -> Any:
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    if isinstance(held, Real):
-        return FloatDistribution(held.low, held.high, log=held.log)
-    if held.options == (0, 1):
+    if isinstance(dimension, Real):
+        return FloatDistribution(dimension.low, dimension.high, log=dimension.log)
+    if dimension.options == (0, 1):
         return IntDistribution(0, 1)
-    return CategoricalDistribution(held.options)
+    return CategoricalDistribution(dimension.options)
 
 
 @dataclass(frozen=True)
@@ -311,14 +313,14 @@ class ToldTrial:
     Attributes:
         values: of its dimensions.
         objectives: None where it was not trained to its end.
-        known: what else is known of it.
+        attributes: what else is known of it.
         reports: values at steps before the end.
         pruned: whether it was ended at the last of them.
     """
 
     values: Candidate
     objectives: Sequence[float] | None
-    known: dict[str, Any]
+    attributes: dict[str, Any]
     reports: dict[int, float] = field(default_factory=dict)
     pruned: bool = False
 
@@ -352,11 +354,11 @@ def write_journal(path: str | Path, studies: Sequence[Told]) -> None:
     logging.getLogger("optuna").setLevel(logging.ERROR)
     with replacing(path) as temporary:
         storage = optuna.storages.JournalStorage(JournalFileBackend(str(temporary)))
-        for held in studies:
-            directions: list[Any] = ["minimize"] * len(held.objectives)
-            study = optuna.create_study(storage=storage, study_name=held.name, directions=directions)
-            study.set_user_attr("objectives", list(held.objectives))
-            study.add_trials([_frozen(held.space, row) for row in held.rows])
+        for study_copy in studies:
+            directions: list[Any] = ["minimize"] * len(study_copy.objectives)
+            study = optuna.create_study(storage=storage, study_name=study_copy.name, directions=directions)
+            study.set_user_attr("objectives", list(study_copy.objectives))
+            study.add_trials([_frozen(study_copy.space, row) for row in study_copy.rows])
 
 
 def _frozen(space: Space, row: ToldTrial) -> optuna.trial.FrozenTrial:
@@ -370,7 +372,7 @@ def _frozen(space: Space, row: ToldTrial) -> optuna.trial.FrozenTrial:
         values=None if answer is None else list(answer),
         params=dict(row.values),
         distributions={name: _distribution(space[name]) for name in row.values},
-        user_attrs=row.known,
+        user_attrs=row.attributes,
         intermediate_values=row.reports,
     )
 

@@ -17,7 +17,7 @@ from edp.workflows.search.modules import MODULES, title_of
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.trainings import TrainingRequest
 
-SCHEMA = 1
+SCHEMA = 2
 FILE = "study.json"
 EVERY_S = 2.0
 
@@ -60,14 +60,14 @@ class StudyLog:
         self._seconds = 0.0
         self._phase_began = 0.0
         self._written = 0.0
-        held = _held_before(self.file)
-        self._before = {phase["name"]: phase for phase in held.get("phases", [])}
-        self.facts["created"] = held.get("created", _now())
+        earlier = _held_before(self.file)
+        self._before = {phase["name"]: phase for phase in earlier.get("phases", [])}
+        self.facts["created"] = earlier.get("created", _now())
         self.state = "running"
 
     def on_phase(self, name: str, ground: SearchContext) -> None:
         """A phase begins."""
-        held = self._before.get(name, {})
+        earlier = self._before.get(name, {})
         self._phase_began = time.monotonic()
         self._expected[name] = PHASES[name].trainings(ground)
         self.phases[name] = {
@@ -79,7 +79,7 @@ class StudyLog:
             "pruned": 0,
             "seconds": 0.0,
             "wall_s": 0.0,
-            "began": held.get("began", _now()),
+            "began": earlier.get("began", _now()),
             "ended": None,
         }
         for later in list(PHASES)[list(PHASES).index(name) + 1 :]:
@@ -155,11 +155,11 @@ class StudyLog:
 
     def on_decision(self, decision: Decision) -> None:
         """A phase ends."""
-        phase, held = self._phase, self._before.get(decision.phase, {})
+        phase, earlier = self._phase, self._before.get(decision.phase, {})
         self._end_paused(())
         spent = time.monotonic() - self._phase_began
-        phase["wall_s"] = round(max(spent, float(held.get("wall_s", 0.0))), 1)
-        phase["ended"] = held.get("ended") or _now()
+        phase["wall_s"] = round(max(spent, float(earlier.get("wall_s", 0.0))), 1)
+        phase["ended"] = earlier.get("ended") or _now()
         self.decisions.append(decision)
         self.write(force=True)
 
@@ -223,13 +223,13 @@ def look_at(folder: str | Path) -> Table:
     Raises:
         StorageError: as `edp.report.read_study`.
     """
-    held = dict(read_study(folder))
+    study = dict(read_study(folder))
     ledger = Path(folder, "ledger")
     holder = held_by(ledger / ".lock")
     claims = list((ledger / "claims").glob("*.lock")) if holder else []
-    if held["state"] == "running" and holder is None:
-        held["state"] = "killed"
-    return held | {"holder": holder, "running": len(claims)}
+    if study["state"] == "running" and holder is None:
+        study["state"] = "killed"
+    return study | {"holder": holder, "running": len(claims)}
 
 
 def label_of(settings: Table) -> str:
@@ -253,10 +253,10 @@ def label_of(settings: Table) -> str:
 def _held_before(file: Path) -> Table:
     """What an earlier sitting wrote; what cannot be read is written anew, since the ledger holds all that counts."""
     try:
-        held = read_json(file)
+        content = read_json(file)
     except StorageError:
         return {}
-    return held if isinstance(held, dict) and held.get("schema") == SCHEMA else {}
+    return content if isinstance(content, dict) and content.get("schema") == SCHEMA else {}
 
 
 def _now() -> str:

@@ -172,12 +172,12 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
     spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
     if windowed:
         skip = max(spec.skip or 0, experiment.model.window, data.task.features.starting_ticks)
-        found = score_predictions(window_predictions(fitted.predictor, data.test), data, skip)["recordings"]
+        by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip)["recordings"]
     else:
-        found = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
+        by_recording = judge(fitted.predictor, data, spec, "").scores["models"]["network"]["recordings"]
     sessions = {
-        name: {k: {score: held["mean"][score] for score in SCORES} for k, held in horizons.items()}
-        for name, horizons in found.items()
+        name: {k: {score: horizon_scores["mean"][score] for score in SCORES} for k, horizon_scores in horizons.items()}
+        for name, horizons in by_recording.items()
     }
     counted = footprint(fitted.predictor)
     result = {
@@ -199,16 +199,16 @@ def experiment_of(order: TrainingRequest) -> Experiment:
 
     With one long epoch schedules run to their end and nothing is chosen; with several, each is validated.
     """
-    made = build(Experiment, order.settings, "of a search")
+    experiment = build(Experiment, order.settings, "of a search")
     training = replace(
-        made.training,
+        experiment.training,
         epochs=order.epochs,
         updates=order.updates // order.epochs,
         patience=order.patience,
         refit="none",
         seed=order.seed,
     )
-    return replace(made, training=training)
+    return replace(experiment, training=training)
 
 
 def mean_scores(sessions: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, float]:
@@ -225,14 +225,14 @@ def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
         DataError: a session is missing or cannot be read.
     """
     recordings = {recording.name: recording for recording in _recordings(_frozen(order.source))}
-    wanted = dict.fromkeys((*order.train, *order.validation, *order.judged))
-    missing = [name for name in wanted if name not in recordings]
+    needed = dict.fromkeys((*order.train, *order.validation, *order.judged))
+    missing = [name for name in needed if name not in recordings]
     if missing:
         raise DataError(
             f"'{order.source['path']}' has no session {', '.join(missing)}; the data changed since the search began: "
             "restore them, or begin another search"
         )
-    chosen = [recordings[name] for name in wanted]
+    chosen = [recordings[name] for name in needed]
     first = chosen[0]
     task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
     if len(order.train) == 1:
@@ -287,8 +287,8 @@ def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
 
 def settings_of(experiment: Experiment) -> Table:
     """An experiment as plain tables, without what an order decides itself, so that equal orders have equal keys."""
-    made: Table = plain_tree(experiment)
-    del made["split"], made["judge"]["baselines"]
+    settings: Table = plain_tree(experiment)
+    del settings["split"], settings["judge"]["baselines"]
     for name in ("epochs", "updates", "patience", "refit", "seed"):
-        del made["training"][name]
-    return made
+        del settings["training"][name]
+    return settings

@@ -91,12 +91,12 @@ def _end_of(
         function = resolve(identity.job)
         begun()
         started = time.monotonic()
-        given = function(identity, where)
-        result = given.result if isinstance(given, WithState) else given
+        returned = function(identity, where)
+        result = returned.result if isinstance(returned, WithState) else returned
         if not isinstance(result, Mapping):
             raise ConfigError(f"'{identity.job}' returned {type(result).__name__}; a training returns a table")
         canonical(result)
-        state = given.state if isinstance(given, WithState) else None
+        state = returned.state if isinstance(returned, WithState) else None
     except NotFiniteError as error:
         status, result, message = TrainingStatus.DIVERGED, None, str(error)
     except EdpError as error:
@@ -123,10 +123,10 @@ def resolve(name: str) -> Callable[[TrainingIdentity, Mapping[str, Any]], Any]:
     """
     module, _, function = name.partition(":")
     try:
-        found = getattr(importlib.import_module(module), function)
+        job_function = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"there is no job '{name}' ({error}); give it as package.module:function") from error
-    return found  # type: ignore[no-any-return]
+    return job_function  # type: ignore[no-any-return]
 
 
 def _out_of_memory(error: BaseException) -> bool:

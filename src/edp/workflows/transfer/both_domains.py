@@ -57,18 +57,27 @@ class BothDomains:
         spec: how much they count.
     """
 
-    def __init__(self, start: Predictor, kept: Sequence[Series], spec: BothSpec) -> None:
-        self.base, self.kept, self.spec = WarmStart(start), list(kept), spec
+    def __init__(self, start: Predictor, source_series: Sequence[Series], spec: BothSpec) -> None:
+        self.base, self.source_series, self.spec = WarmStart(start), list(source_series), spec
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """Series of both worlds, the fewer ticks several times, with their world and what the source's network says."""
-        own = [self._marked(part, TARGET, None) for part in known]
-        said = stream_predictions(self.base.start, self.kept) if self.spec.soft else [None] * len(self.kept)
-        kept = [self._marked(part, SOURCE, values) for part, values in zip(self.kept, said, strict=True)]
-        ticks = [sum(part.samples for part in parts) for parts in (own, kept)]
+        own = [self._marked(part, TARGET, None) for part in own_series]
+        source_predictions = (
+            stream_predictions(self.base.start, self.source_series)
+            if self.spec.soft
+            else [None] * len(self.source_series)
+        )
+        rehearsed = [
+            self._marked(part, SOURCE, values)
+            for part, values in zip(self.source_series, source_predictions, strict=True)
+        ]
+        ticks = [sum(part.samples for part in parts) for parts in (own, rehearsed)]
         # The arrays are shared, so to name a series again takes no memory.
-        own, kept = (parts * max(1, round(max(ticks) / n)) for parts, n in zip((own, kept), ticks, strict=True))
-        return [*own, *kept]
+        own, rehearsed = (
+            parts * max(1, round(max(ticks) / n)) for parts, n in zip((own, rehearsed), ticks, strict=True)
+        )
+        return [*own, *rehearsed]
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Take over weights and scaling; put the classifier beside the network, where there is one."""
@@ -92,8 +101,8 @@ class BothDomains:
             truth = objective.evaluate(moment.answer, moment.future, moment.features, there)
             loss = loss + spec.weight * (1 - spec.soft) * truth
         if spec.soft:
-            said = moment.teacher_targets[..., 1:].unflatten(-1, moment.future.shape[2:])
-            goal = objective.code.encode(said, moment.features)
+            source_predictions = moment.teacher_targets[..., 1:].unflatten(-1, moment.future.shape[2:])
+            goal = objective.code.encode(source_predictions, moment.features)
             soft = masked_loss(Huber(), moment.answer, goal, there, objective.weights)
             loss = loss + spec.weight * spec.soft * soft
         if spec.reversal:
@@ -110,18 +119,22 @@ class BothDomains:
     def _confusion(self, logits: Tensor, here: Tensor, there: Tensor) -> Tensor:
         """Cross-entropy of the classifier, both worlds with equal weight."""
         parts = [
-            nn.functional.binary_cross_entropy_with_logits(found, torch.full_like(found, world))
-            for found, world in ((logits[here], TARGET), (logits[there], SOURCE))
-            if found.numel()
+            nn.functional.binary_cross_entropy_with_logits(domain_logits, torch.full_like(domain_logits, world))
+            for domain_logits, world in ((logits[here], TARGET), (logits[there], SOURCE))
+            if domain_logits.numel()
         ]
         return torch.stack(parts).mean() if parts else logits.sum() * 0.0
 
-    def _marked(self, part: Series, world: float, said: np.ndarray[Any, Any] | None) -> Series:
+    def _marked(self, part: Series, world: float, source_predictions: np.ndarray[Any, Any] | None) -> Series:
         columns = [np.full((part.samples, 1), world, dtype=np.float32)]
         if self.spec.soft:
             width = len(self.base.start.task.horizons) * len(self.base.start.task.targets)
-            held = np.zeros((part.samples, width)) if said is None else said.reshape(part.samples, -1)
-            columns.append(held.astype(np.float32))
+            prediction_columns = (
+                np.zeros((part.samples, width))
+                if source_predictions is None
+                else source_predictions.reshape(part.samples, -1)
+            )
+            columns.append(prediction_columns.astype(np.float32))
         return replace(part, teacher_targets=np.concatenate(columns, axis=1))
 
 
@@ -134,8 +147,8 @@ class Classifier(nn.Module):
 
     def forward(self, hidden: Tensor) -> Tensor:
         """Logits; positive for the source."""
-        said: Tensor = self.layers(hidden)
-        return said.squeeze(-1)
+        logits: Tensor = self.layers(hidden)
+        return logits.squeeze(-1)
 
 
 def ramp(progress: float) -> float:

@@ -72,11 +72,13 @@ class TransferCase:
         """
         teaching = None
         if lesson is not None:
-            make, told = lesson, {"method": name, "source": self.source.facts, **(facts or {})}
+            make, training_facts = lesson, {"method": name, "source": self.source.facts, **(facts or {})}
             if centred and self.spec.center and not phase:
-                teaching = StrategyFactory({**told, "centred": True}, lambda data: Centred(make()), self.source.frozen)
+                teaching = StrategyFactory(
+                    {**training_facts, "centred": True}, lambda data: Centred(make()), self.source.frozen
+                )
             else:
-                teaching = StrategyFactory(told, lambda data: make(), self.source.frozen)
+                teaching = StrategyFactory(training_facts, lambda data: make(), self.source.frozen)
         experiment = replace(self.experiment, training=training)
         folder = self.folder / "phases" / phase if phase else self.folder
         data = replace(self.data, validation=[*self.data.validation, *judged])

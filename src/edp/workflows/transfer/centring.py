@@ -39,10 +39,10 @@ class Centred:
         self.base = base
         self._known: list[Series] = []
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """Those of the lesson."""
-        self._known = list(known)
-        return self.base.series(task, known)
+        self._known = list(own_series)
+        return self.base.series(task, own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """As the lesson begins."""
@@ -104,9 +104,9 @@ def _errors(net: Predictor, series: Sequence[Series]) -> tuple[NDArray[np.float6
     """Mean error and mean absolute error, SI units, ``(horizon, target)``; NaN where nothing can be judged."""
     horizons, targets = len(net.task.horizons), len(net.task.targets)
     total, size, ticks = np.zeros((horizons, targets)), np.zeros((horizons, targets)), np.zeros((horizons, 1))
-    for place, error in stream_errors(net, series):
-        total[place] += error.sum(axis=0, dtype=np.float64)
-        size[place] += np.abs(error).sum(axis=0, dtype=np.float64)
-        ticks[place] += len(error)
+    for index, error in stream_errors(net, series):
+        total[index] += error.sum(axis=0, dtype=np.float64)
+        size[index] += np.abs(error).sum(axis=0, dtype=np.float64)
+        ticks[index] += len(error)
     with np.errstate(invalid="ignore"):
         return total / ticks, size / ticks

@@ -140,13 +140,13 @@ def check_units(data: Prepared, scaler: FrontEnd) -> None:
         if same.sum() >= 2 and (here[same] * FAR < there[same]).all():
             wrong |= same
     if wrong.any():
-        said = "; ".join(
+        differences = "; ".join(
             f"{names[i]} up to {here[i]:.3g}, in the source about {there[i]:.3g} {KINDS[data.inputs[i].kind].si_unit}"
             for i in np.flatnonzero(wrong)
         )
         raise DataError(
             f"channels of the logs are more than {FAR:g} times as large or as small as those that the network learned "
-            f'from: {said}. Say the unit of these columns in the signal map (--map), such as unit = "bar"'
+            f'from: {differences}. Say the unit of these columns in the signal map (--map), such as unit = "bar"'
         )
 
 
@@ -168,17 +168,17 @@ def check_signs(data: Prepared, source: Prepared | None) -> list[str]:
         return ["The sign convention of the logs was not checked: the network reads no pilot pressure."]
     own = {pair: correlation(data, data.train, pair) for pair in pairs}
     usual = {pair: float(CONVENTION[pair]) for pair in pairs if tuple(pair) in CONVENTION}
-    known = usual if source is None else {pair: correlation(source, source.train, pair) for pair in pairs}
-    sure = {p: (r, own[p]) for p, r in known.items() if min(abs(r), abs(own[p])) >= TOGETHER}
+    source_correlations = usual if source is None else {pair: correlation(source, source.train, pair) for pair in pairs}
+    sure = {p: (r, own[p]) for p, r in source_correlations.items() if min(abs(r), abs(own[p])) >= TOGETHER}
     turned = {pair: both for pair, both in sure.items() if both[0] * both[1] < 0}
     if turned:
         origin = "by convention" if source is None else "in the source"
-        said = "; ".join(
+        differences = "; ".join(
             f"{p.target} after {p.pilot}: {'positive' if r > 0 else 'negative'} {origin}, correlation {own:+.2f} here"
             for p, (r, own) in turned.items()
         )
         raise DataError(
-            f"the logs have another sign convention than the source: {said}. Turn the column in the signal map "
+            f"the logs have another sign convention than the source: {differences}. Turn the column in the signal map "
             "(scale = -1.0), or exchange the two pilot pressures if they are mixed up; --any-sign takes the logs as "
             "they are"
         )
@@ -203,8 +203,8 @@ def correlation(data: Prepared, parts: Sequence[Series], pair: PilotPair) -> flo
     reach = round(SEARCHED_S * data.task.rate_hz)
     pilot = [part.inputs[:, column].astype(np.float64) for part in parts]
     moved = [part.targets[:, target].astype(np.float64) for part in parts]
-    found = [_pearson(pilot, moved, lag) for lag in range(0, reach + 1, max(1, reach // 10))]
-    return max(found, key=abs)
+    correlations = [_pearson(pilot, moved, lag) for lag in range(0, reach + 1, max(1, reach // 10))]
+    return max(correlations, key=abs)
 
 
 Values = Sequence[NDArray[np.float64]]

@@ -79,9 +79,9 @@ class FinetuneRequest:
     @property
     def names(self) -> list[str]:
         """All methods, each once: the one that is kept, direct transfer, the others in the order of the registry."""
-        wanted = {self.method, BEFORE, *self.rivals}
+        asked_names = {self.method, BEFORE, *self.rivals}
         first = [self.method, BEFORE]
-        return first + [name for name in METHODS if name in wanted and name not in first]
+        return first + [name for name in METHODS if name in asked_names and name not in first]
 
 
 def finetune(
@@ -110,28 +110,28 @@ def finetune(
         EdpError: logs that do not go with the source, settings that cannot be, or another run in `out`.
         Diverged: the training of the method that is kept diverged.
     """
-    told = watchers or FinetuneCallbacks()
+    callbacks = watchers or FinetuneCallbacks()
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
     names, notes = _able(begun, order)
-    data, found = _target(begun, logs, experiment, order)
-    notes += found
+    data, repair_notes = _target(begun, logs, experiment, order)
+    notes += repair_notes
     for note in notes:
-        told.on_note(note)
+        callbacks.on_note(note)
     folder = Path(out)
-    made: dict[str, Made] = {}
+    results: dict[str, Made] = {}
     for number, name in enumerate(names):
-        told.on_method(name, number, len(names))
-        place = folder if name == order.method else folder / "rivals" / name
-        case = TransferCase(begun, logs, data, experiment, order.spec, place, told.on_training)
+        callbacks.on_method(name, number, len(names))
+        method_folder = folder if name == order.method else folder / "rivals" / name
+        case = TransferCase(begun, logs, data, experiment, order.spec, method_folder, callbacks.on_training)
         try:
-            made[name] = METHODS[name]().make(case)
+            results[name] = METHODS[name]().make(case)
         except Diverged as end:
             if name == order.method:
                 raise
             notes.append(f"{METHODS[name].label} is left out: {end}")
-            told.on_note(notes[-1])
-    result, shown = _result(begun, data, experiment, order, made)
+            callbacks.on_note(notes[-1])
+    result, shown = _result(begun, data, experiment, order, results)
     result |= {"logs": str(logs.path), "notes": notes}
     write_bytes(make_folder(folder) / SHOWN, save(shown))
     write_json(folder / RESULT, result)
@@ -176,15 +176,15 @@ def _target(
 
 
 def _result(
-    source: SourceModel, data: Prepared, experiment: Experiment, order: FinetuneRequest, made: dict[str, Made]
+    source: SourceModel, data: Prepared, experiment: Experiment, order: FinetuneRequest, results: dict[str, Made]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
     """Scores of all methods in both worlds, and the predictions before and after that pictures show."""
     skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
-    predictions = {name: one.predict(data) for name, one in made.items()}
+    predictions = {name: one.predict(data) for name, one in results.items()}
     errors = {name: errors_of(values, data, skip) for name, values in predictions.items()}
     worlds = {"target": {name: measure(values, data, skip) for name, values in predictions.items()}}
     if source.data is not None:
-        worlds["source"] = {name: measure(one.predict(source.data), source.data, skip) for name, one in made.items()}
+        worlds["source"] = {name: measure(one.predict(source.data), source.data, skip) for name, one in results.items()}
     pair = {name: values for name, values in predictions.items() if name in (BEFORE, order.method)}
     rate = data.task.rate_hz
     parts = {part: getattr(data, part) for part in ("train", "validation", "test")}
@@ -204,18 +204,20 @@ def _result(
         ],
         "data": {
             "recordings": len({part.name.partition("[")[0] for part in data.train}),
-            "minutes": {part: round(sum(s.samples for s in held) / rate / 60, 3) for part, held in parts.items()},
+            "minutes": {
+                part: round(sum(s.samples for s in part_series) / rate / 60, 3) for part, part_series in parts.items()
+            },
         },
-        "methods": {name: _row(METHODS[name], one, worlds, name) for name, one in made.items()},
+        "methods": {name: _row(METHODS[name], one, worlds, name) for name, one in results.items()},
         "distributions": distributions({name: errors[name] for name in pair}, data.task.targets),
     }
     return result, excerpts(pair, data, skip)
 
 
-def _row(method: type[Method], made: Made, worlds: dict[str, Any], name: str) -> dict[str, Any]:
+def _row(method: type[Method], result: Made, worlds: dict[str, Any], name: str) -> dict[str, Any]:
     return {
         "label": method.label,
-        "learned": made.learned,
-        "weights": None if made.network is None else weights_digest(made.network),
-        "worlds": {world: held[name] for world, held in worlds.items()},
+        "learned": result.learned,
+        "weights": None if result.network is None else weights_digest(result.network),
+        "worlds": {world: domain_scores[name] for world, domain_scores in worlds.items()},
     }

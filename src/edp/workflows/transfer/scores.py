@@ -21,29 +21,29 @@ Errors = dict[str, NDArray[np.float64]]
 
 def measure(predictions: Predictions, data: Prepared, skip: int) -> dict[str, Any]:
     """Scores by horizon and target in report units, with the skew of the errors and their mean square."""
-    found: dict[str, Any] = score_predictions(predictions, data, skip)["overall"]
+    scores: dict[str, Any] = score_predictions(predictions, data, skip)["overall"]
     for horizon, errors in errors_of(predictions, data, skip).items():
-        rows = found[horizon]
-        for place, name in enumerate(data.task.targets):
-            rows[name] |= {"mse": rows[name]["rmse"] ** 2, "skew": skew(errors[:, place])}
+        rows = scores[horizon]
+        for index, name in enumerate(data.task.targets):
+            rows[name] |= {"mse": rows[name]["rmse"] ** 2, "skew": skew(errors[:, index])}
         own = [rows[name] for name in data.task.targets]
         rows["mean"] |= {key: float(np.mean([row[key] for row in own])) for key in ("mse", "skew")}
-    return found
+    return scores
 
 
 def errors_of(predictions: Predictions, data: Prepared, skip: int) -> Errors:
     """Prediction minus truth of all scored ticks by horizon, ``(tick, target)``, report units."""
     factors = np.array([KINDS[kind].report_factor for kind in data.target_kinds])
-    found = {}
-    for place, horizon in enumerate(data.task.horizons):
+    errors = {}
+    for index, horizon in enumerate(data.task.horizons):
         parts = []
         for values, series in zip(predictions, data.test, strict=True):
             ticks = series.samples - data.task.max_horizon
             truth = series.targets[horizon : horizon + max(0, ticks)].astype(np.float64)
-            error = (values[: len(truth), place].astype(np.float64) - truth) * factors
+            error = (values[: len(truth), index].astype(np.float64) - truth) * factors
             parts.append(error[skip:][np.isfinite(error[skip:]).all(axis=1)])
-        found[str(horizon)] = np.concatenate(parts)
-    return found
+        errors[str(horizon)] = np.concatenate(parts)
+    return errors
 
 
 def skew(errors: NDArray[np.float64]) -> float:
@@ -63,18 +63,24 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
     Returns:
         By horizon and target ``edges`` and the ``shares`` of each method; what lies beyond the edges is in none.
     """
-    found: dict[str, Any] = {}
+    histograms: dict[str, Any] = {}
     for horizon in next(iter(errors.values())):
-        found[horizon] = {}
-        for place, target in enumerate(targets):
-            reach = max(float(np.quantile(np.abs(held[horizon][:, place]), 0.995)) for held in errors.values()) or 1.0
+        histograms[horizon] = {}
+        for index, target in enumerate(targets):
+            reach = (
+                max(
+                    float(np.quantile(np.abs(method_errors[horizon][:, index]), 0.995))
+                    for method_errors in errors.values()
+                )
+                or 1.0
+            )
             edges = np.linspace(-reach, reach, BINS + 1)
             shares = {
-                name: (np.histogram(held[horizon][:, place], edges)[0] / len(held[horizon])).tolist()
-                for name, held in errors.items()
+                name: (np.histogram(method_errors[horizon][:, index], edges)[0] / len(method_errors[horizon])).tolist()
+                for name, method_errors in errors.items()
             }
-            found[horizon][target] = {"edges": edges.tolist(), "shares": shares}
-    return found
+            histograms[horizon][target] = {"edges": edges.tolist(), "shares": shares}
+    return histograms
 
 
 def excerpts(predictions: Mapping[str, Predictions], data: Prepared, skip: int) -> dict[str, NDArray[np.float32]]:
@@ -85,23 +91,23 @@ def excerpts(predictions: Mapping[str, Predictions], data: Prepared, skip: int) 
         ``NAME/start`` ``(1,)``, the second of the recording's part at which it begins.
     """
     size = round(SHOWN_S * data.task.rate_hz)
-    found = []
+    candidates = []
     for number, series in enumerate(data.test):
         ticks = series.samples - data.task.max_horizon
         for start in range(skip, max(skip + 1, ticks - size + 1), max(1, size // 2)):
             stop = min(start + size, ticks)
             if stop > start:
                 moved = series.targets[start:stop].astype(np.float64)
-                found.append((float(moved.std(axis=0).sum()), number, start, stop))
+                candidates.append((float(moved.std(axis=0).sum()), number, start, stop))
     best: dict[int, tuple[float, int, int, int]] = {}
-    for entry in found:
+    for entry in candidates:
         best[entry[1]] = max(entry, best.get(entry[1], entry))
-    kept: dict[str, NDArray[np.float32]] = {}
+    excerpt_arrays: dict[str, NDArray[np.float32]] = {}
     for _, number, start, stop in sorted(best.values(), reverse=True)[:SHOWN_RECORDINGS]:
         series = data.test[number]
         truth = np.stack([series.targets[start + k : stop + k] for k in data.task.horizons], axis=1)
-        kept[f"{series.name}/truth"] = np.ascontiguousarray(truth, dtype=np.float32)
-        kept[f"{series.name}/start"] = np.array([start / data.task.rate_hz], dtype=np.float32)
+        excerpt_arrays[f"{series.name}/truth"] = np.ascontiguousarray(truth, dtype=np.float32)
+        excerpt_arrays[f"{series.name}/start"] = np.array([start / data.task.rate_hz], dtype=np.float32)
         for name, values in predictions.items():
-            kept[f"{series.name}/{name}"] = np.ascontiguousarray(values[number][start:stop], dtype=np.float32)
-    return kept
+            excerpt_arrays[f"{series.name}/{name}"] = np.ascontiguousarray(values[number][start:stop], dtype=np.float32)
+    return excerpt_arrays

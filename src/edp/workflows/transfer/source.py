@@ -112,8 +112,8 @@ def target_experiment(source: SourceModel, changes: Sequence[str] = ()) -> Exper
             raise ConfigError(f"--set {key}: a fine-tuning has options of its own for it; see edp finetune --help")
     task = task_settings(source.bundle.task)
     training = replace(source.experiment.training, updates=0)
-    made = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec, training=training)
-    table = plain_tree(made)
+    experiment = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec, training=training)
+    table = plain_tree(experiment)
     for text in changes:
         table = merged(table, override(text))
     return build(Experiment, table, "of the source with --set")
@@ -121,11 +121,13 @@ def target_experiment(source: SourceModel, changes: Sequence[str] = ()) -> Exper
 
 def task_settings(task: Task) -> TaskSettings:
     """Settings that resolve to a task, its features by name where the name says them."""
-    held: str | FeatureSettings = task.features.name
+    feature_settings: str | FeatureSettings = task.features.name
     if FEATURE_SETS.get(task.features.name) != task.features:
-        held = FeatureSettings(**{entry.name: getattr(task.features, entry.name) for entry in fields(FeatureSettings)})
+        feature_settings = FeatureSettings(
+            **{entry.name: getattr(task.features, entry.name) for entry in fields(FeatureSettings)}
+        )
     return TaskSettings(
-        features=held,
+        features=feature_settings,
         targets=task.targets,
         horizons=task.horizons,
         mode=task.mode,

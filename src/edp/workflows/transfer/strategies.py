@@ -34,9 +34,9 @@ class LowRank:
         self._changes: list[tuple[Matrix, _Change]] = []
         self._frozen: list[nn.Parameter] = []
 
-    def series(self, task: Task, known: Sequence[Series]) -> list[Series]:
+    def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series as they are."""
-        return list(known)
+        return list(own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Take over weights and scaling, hold them, and put the changes in.
@@ -76,14 +76,14 @@ class LowRank:
 
     def _swap(self, changes: list[tuple[Matrix, _Change]], part: nn.Module) -> None:
         """Let a part compute with changed weights whenever it is called."""
-        held = [(matrix.holder._parameters, matrix.key, matrix.values, change) for matrix, change in changes]
+        replaced = [(matrix.holder._parameters, matrix.key, matrix.values, change) for matrix, change in changes]
 
         def enter(*_: object) -> None:
-            for parameters, key, weight, change in held:
+            for parameters, key, weight, change in replaced:
                 parameters[key] = weight + change()  # type: ignore[assignment]
 
         def leave(*_: object) -> None:
-            for parameters, key, weight, _change in held:
+            for parameters, key, weight, _change in replaced:
                 parameters[key] = weight  # type: ignore[assignment]
 
         self._handles.append(part.register_forward_pre_hook(enter))

@@ -232,9 +232,9 @@ def test_names_that_mean_something_elsewhere(sound, tmp_path):
     [
         ("[]", "no 'schema'; give the study.json"),
         ('{"a": 1}', "no 'schema'; give the study.json"),
-        ('{"schema": 2}', "has schema 2, this version of EDP reads 1"),
-        ('{"schema": 1, "state": "done", "mode": "sound"}', "state = 'done'; running, stopped, killed, finished"),
-        ('{"schema": 1, "state": "running"', "is not valid JSON"),
+        ('{"schema": 1}', "has schema 1, this version of EDP reads 2"),
+        ('{"schema": 2, "state": "done", "mode": "sound"}', "state = 'done'; running, stopped, killed, finished"),
+        ('{"schema": 2, "state": "running"', "is not valid JSON"),
         ("\ufeff", "is not valid JSON"),
     ],
 )

@@ -1,7 +1,15 @@
 """Number formats in which a smaller network can run: one file and one registration each."""
 
 from edp.workflows.compression.formats import dynamic_int8, float32, w8a16
-from edp.workflows.compression.formats.base import FORMATS, Deployed, Format, Predict, ResourceUsage, deploy, taken
+from edp.workflows.compression.formats.base import (
+    FORMATS,
+    Deployed,
+    Format,
+    Predict,
+    ResourceUsage,
+    deploy,
+    resource_usage,
+)
 
 __all__ = [
     "FORMATS",
@@ -12,6 +20,6 @@ __all__ = [
     "deploy",
     "dynamic_int8",
     "float32",
-    "taken",
+    "resource_usage",
     "w8a16",
 ]

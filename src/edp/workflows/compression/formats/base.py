@@ -36,8 +36,8 @@ class Format(Protocol):
         """Memory for the parameters of a network, whose C code takes `estimate`."""
         ...
 
-    def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
-        """How the network predicts in this format; `known` are training series, to find ranges on."""
+    def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
+        """How the network predicts in this format; `training_series` are training series, to find ranges on."""
         ...
 
 
@@ -77,7 +77,9 @@ class ResourceUsage:
         return {name: pair for name, pair in pairs.items() if pair[0] > pair[1]}
 
 
-def taken(predictor: Predictor, name: str, budget: Budget, parameter_bytes: int | None = None) -> ResourceUsage:
+def resource_usage(
+    predictor: Predictor, name: str, budget: Budget, parameter_bytes: int | None = None
+) -> ResourceUsage:
     """What a network takes in the format `name` on the core of a budget.
 
     Args:
@@ -110,32 +112,36 @@ class Deployed:
     Attributes:
         number_format: a name of `FORMATS`.
         predict: how it predicts.
-        taken: what it takes.
+        resource_usage: what it takes.
     """
 
     number_format: str
     predict: Predict
-    taken: ResourceUsage
+    resource_usage: ResourceUsage
 
     def to_json(self) -> dict[str, Any]:
         """Plain values of what it takes."""
-        return {"format": self.number_format, "label": FORMATS[self.number_format].label} | vars(self.taken)
+        return {"format": self.number_format, "label": FORMATS[self.number_format].label} | vars(self.resource_usage)
 
 
 def deploy(
-    predictor: Predictor, name: str, known: Sequence[Series], budget: Budget, parameter_bytes: int | None = None
+    predictor: Predictor,
+    name: str,
+    training_series: Sequence[Series],
+    budget: Budget,
+    parameter_bytes: int | None = None,
 ) -> Deployed:
     """A network in the format `name`.
 
     Args:
         predictor: the network, in float32.
         name: a name of `FORMATS`.
-        known: training series, on which ranges of activations are found.
+        training_series: training series, on which ranges of activations are found.
         budget: says for which core cycles are estimated.
         parameter_bytes: where they are known better than the format knows them.
 
     Raises:
         ConfigError: an unknown format, or a network that it cannot hold.
     """
-    predict = FORMATS[name]().predictions(predictor, known)
-    return Deployed(name, predict, taken(predictor, name, budget, parameter_bytes))
+    predict = FORMATS[name]().predictions(predictor, training_series)
+    return Deployed(name, predict, resource_usage(predictor, name, budget, parameter_bytes))

@@ -29,6 +29,6 @@ class DynamicInt8:
         """One byte for each weight of a linear layer, four for the others, as in Table 4.9; no code is exported."""
         return dynamic_int8(predictor).weight_bytes
 
-    def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
+    def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
         """A copy that computes with the rounded numbers."""
         return partial(stream_predictions, dynamic_int8(predictor).predictor)

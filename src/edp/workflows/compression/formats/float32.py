@@ -25,6 +25,6 @@ class Float32:
         """All constants of the exported C code."""
         return estimate.parameter_bytes
 
-    def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
+    def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
         """The network as it is."""
         return partial(stream_predictions, predictor)

@@ -29,6 +29,6 @@ class W8A16:
         """All constants of the exported C code."""
         return estimate.parameter_bytes
 
-    def predictions(self, predictor: Predictor, known: Sequence[Series]) -> Predict:
-        """Ranges and weights are chosen on `known`."""
-        return partial(stream_predictions, integer_predictor(predictor, known))
+    def predictions(self, predictor: Predictor, training_series: Sequence[Series]) -> Predict:
+        """Ranges and weights are chosen on `training_series`."""
+        return partial(stream_predictions, integer_predictor(predictor, training_series))

@@ -64,9 +64,9 @@ def streamed(bundle: Bundle, inputs: Rows, folder: Path) -> tuple[Rows, float]:
     (folder / "driver.c").write_text(filled)
     runtime = sorted(path.name for path in folder.glob("edp_*.c"))
     called([compiler, *FLAGS, "driver.c", f"{NAME}.c", *runtime, "-lm", "-o", "driver"], folder)
-    said = called([folder / "driver"], folder, np.ascontiguousarray(inputs, dtype=np.float32).tobytes())
-    (seconds,) = struct.unpack("<d", said[-8:])
-    return np.frombuffer(said[:-8], dtype=np.float32).reshape(len(inputs), -1), seconds / len(inputs)
+    output = called([folder / "driver"], folder, np.ascontiguousarray(inputs, dtype=np.float32).tobytes())
+    (seconds,) = struct.unpack("<d", output[-8:])
+    return np.frombuffer(output[:-8], dtype=np.float32).reshape(len(inputs), -1), seconds / len(inputs)
 
 
 @FORMS.register("c")
@@ -77,8 +77,8 @@ class CCode:
 
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""
-        found, seconds = streamed(case.bundle, case.inputs, folder)
-        return [(case.bundle.predictor.number_format, Ran(found, seconds))]
+        predictions, seconds = streamed(case.bundle, case.inputs, folder)
+        return [(case.bundle.predictor.number_format, Ran(predictions, seconds))]
 
 
 @FORMS.register("c_w8a16")
@@ -93,8 +93,8 @@ class WholeNumbers:
         if isinstance(predictor, IntegerPredictor):
             return []  # the form `c` is that already
         whole = IntegerPredictor(predictor, calibrate(predictor.graph(), [case.inputs]))
-        found, seconds = streamed(replace(case.bundle, predictor=whole), case.inputs, folder)
-        wanted = stream(whole, case.inputs)
-        deviations = np.abs(wanted - case.wanted).max() / float(predictor.code.width.max())
+        predictions, seconds = streamed(replace(case.bundle, predictor=whole), case.inputs, folder)
+        expected = stream(whole, case.inputs)
+        deviations = np.abs(expected - case.expected).max() / float(predictor.code.width.max())
         note = f"against the Python reference of the same; that is {deviations:.2g} deviations from float32 at most"
-        return [("w8a16", Ran(found, seconds, wanted, np.zeros_like(case.allowed), note))]
+        return [("w8a16", Ran(predictions, seconds, expected, np.zeros_like(case.allowed), note))]

@@ -36,19 +36,19 @@ class Slave:
         self.outputs = [v.valueReference for v in listed if v.causality == "output" and v.type == real]
         self.step_s = float(about.defaultExperiment.stepSize)
         self.version = version
-        made: Any = (fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave)(
+        slave: Any = (fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave)(
             guid=about.guid if version == 2 else about.instantiationToken,
             unzipDirectory=str(folder),
             modelIdentifier=about.coSimulation.modelIdentifier,
             instanceName=NAME,
         )
-        made.instantiate()
-        self.fmu = made
-        self.put, self.take = (made.setReal, made.getReal) if version == 2 else (made.setFloat64, made.getFloat64)
+        slave.instantiate()
+        self.fmu = slave
+        self.put, self.take = (slave.setReal, slave.getReal) if version == 2 else (slave.setFloat64, slave.getFloat64)
 
     def stream(self, inputs: Rows) -> Rows:
         """Predictions after each row ``(tick, number)``, from a reset."""
-        fmu, put, take, step_s, found = self.fmu, self.put, self.take, self.step_s, []
+        fmu, put, take, step_s, predictions = self.fmu, self.put, self.take, self.step_s, []
         fmu.reset()
         if self.version == 2:
             fmu.setupExperiment(startTime=0.0)
@@ -57,8 +57,8 @@ class Slave:
         for tick, row in enumerate(inputs.tolist()):
             put(self.inputs, row)
             fmu.doStep(tick * step_s, step_s)
-            found.append(take(self.outputs))
-        return np.array(found, dtype=np.float32)
+            predictions.append(take(self.outputs))
+        return np.array(predictions, dtype=np.float32)
 
     def close(self) -> None:
         """Free the instance and its library."""
@@ -80,9 +80,9 @@ class Fmu:
         for version, file in zip((2, 3), FmuTarget(binaries="linux64").write(case.bundle, NAME, folder), strict=True):
             try:
                 slave = Slave(file, folder / str(version), version)
-                found, seconds = timed(lambda slave=slave: slave.stream(case.inputs))  # type: ignore[misc]
+                predictions, seconds = timed(lambda slave=slave: slave.stream(case.inputs))  # type: ignore[misc]
                 slave.close()
             except Exception as error:  # FMPy raises plain exceptions
                 raise Broken(f"FMPy on {file.name}: {error}") from error
-            runs.append((f"FMI {version}.0", Ran(found, seconds / len(found))))
+            runs.append((f"FMI {version}.0", Ran(predictions, seconds / len(predictions))))
         return runs

@@ -72,8 +72,8 @@ def _octave(case: ParityCase, folder: Path, run: str, timed: str) -> tuple[Rows,
     text = PROGRAM.substitute(folder=matlab_string(folder), run=run, timed=timed, rounds=ROUNDS)
     (folder / "parity_program.m").write_text(text)
     called([program, "--norc", "--quiet", "parity_program.m"], folder)
-    made = scipy.io.loadmat(folder / "found.mat")
-    return np.asarray(made["found"], dtype=np.float32), float(made["seconds"].item())
+    octave_file = scipy.io.loadmat(folder / "found.mat")
+    return np.asarray(octave_file["found"], dtype=np.float32), float(octave_file["seconds"].item())
 
 
 @FORMS.register("matlab")
@@ -85,8 +85,8 @@ class MatlabCode:
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""
         float_graph(case.bundle.predictor, "plain MATLAB code")
-        found, seconds = _octave(case, folder, NATIVE, NATIVE_TIMED)
-        return [("", Ran(found, seconds / len(found)))]
+        predictions, seconds = _octave(case, folder, NATIVE, NATIVE_TIMED)
+        return [("", Ran(predictions, seconds / len(predictions)))]
 
 
 @FORMS.register("s_function")
@@ -98,9 +98,9 @@ class SFunction:
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""
         need("mkoctfile", "octave-dev")
-        found, seconds = _octave(case, folder, BLOCK, BLOCK_TIMED)
+        predictions, seconds = _octave(case, folder, BLOCK, BLOCK_TIMED)
         note = "stand-ins take the place of Simulink's headers"
-        return [("", Ran(found, seconds / REPEATS / len(found), note=note))]
+        return [("", Ran(predictions, seconds / REPEATS / len(predictions), note=note))]
 
 
 @FORMS.register("c_caller")
@@ -117,12 +117,12 @@ class CCaller:
         sizes = [graph.width_of(value) for value in graph.results.values()]
         places = np.cumsum([0, *sizes])
         sizes_of = {"ticks": len(case.inputs), "inputs": graph.inputs, "numbers": sum(sizes), "rounds": ROUNDS}
-        results = ", ".join(f"&out[tick][{place}]" for place in places[:-1])
+        results = ", ".join(f"&out[tick][{offset}]" for offset in places[:-1])
         text = DRIVER.substitute(sizes_of, name=NAME, NAME=NAME.upper(), results=results)
         (folder / "driver.c").write_text(text)
         sources = ["driver.c", f"{NAME}_call.c", *sorted((folder / "core").glob("*.c"))]
         called([compiler, *FLAGS, "-I", "core", *sources, "-lm", "-o", "driver"], folder)
-        said = called([folder / "driver"], folder, np.ascontiguousarray(case.inputs, dtype=np.float32).tobytes())
-        (seconds,) = struct.unpack("<d", said[-8:])
-        found = np.frombuffer(said[:-8], dtype=np.float32).reshape(len(case.inputs), -1)
-        return [("", Ran(found, seconds / len(found), note="the state goes in and comes out as a vector"))]
+        output = called([folder / "driver"], folder, np.ascontiguousarray(case.inputs, dtype=np.float32).tobytes())
+        (seconds,) = struct.unpack("<d", output[-8:])
+        predictions = np.frombuffer(output[:-8], dtype=np.float32).reshape(len(case.inputs), -1)
+        return [("", Ran(predictions, seconds / len(predictions), note="the state goes in and comes out as a vector"))]

@@ -54,8 +54,8 @@ def _runs(case: ParityCase, folder: Path, kind: str, inputs: np.ndarray, rest: d
     runs = []
     for python in (sys.executable, *case.interpreters):
         command = [python, "run.py", f"{NAME}.json", kind, "inputs.npy", "found.npy", ROUNDS]
-        said = json.loads(called(command, folder))
-        runs.append((said["version"], Ran(np.load(folder / "found.npy"), said["seconds"], **rest)))
+        output = json.loads(called(command, folder))
+        runs.append((output["version"], Ran(np.load(folder / "found.npy"), output["seconds"], **rest)))
     return runs
 
 
@@ -78,6 +78,6 @@ class OnnxWindow:
 
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""
-        windows, wanted = case.last_windows(WINDOWS)
+        windows, expected = case.last_windows(WINDOWS)
         note = f"the last {len(windows)} windows, against PyTorch from reset"
-        return _runs(case, folder, "window", np.stack(windows), {"wanted": wanted, "note": note})
+        return _runs(case, folder, "window", np.stack(windows), {"expected": expected, "note": note})

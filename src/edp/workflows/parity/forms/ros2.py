@@ -44,6 +44,8 @@ class Ros2Core:
         Ros2Target().write(case.bundle, NAME, folder)
         (folder / "run.py").write_text(PROGRAM)
         called([sys.executable, "-c", f"from {NAME}_ros.core import build; build({python_literal(compiler)})"], folder)
-        said = json.loads(called([sys.executable, "run.py", ROUNDS], folder, json.dumps(case.inputs.tolist()).encode()))
-        found = [np.concatenate([np.ravel(part) for part in tick]) for tick in said[0]]
-        return [("", Ran(np.array(found, np.float32), said[1]))]
+        output = json.loads(
+            called([sys.executable, "run.py", ROUNDS], folder, json.dumps(case.inputs.tolist()).encode())
+        )
+        predictions = [np.concatenate([np.ravel(part) for part in tick]) for tick in output[0]]
+        return [("", Ran(np.array(predictions, np.float32), output[1]))]

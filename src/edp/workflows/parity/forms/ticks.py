@@ -27,8 +27,8 @@ class TorchTicks:
             running.reset()
             return np.array([_numbers(running.step(row)) for row in case.inputs], dtype=np.float32)
 
-        found, seconds = timed(ticks)
-        return [("", Ran(found, seconds / len(found)))]
+        predictions, seconds = timed(ticks)
+        return [("", Ran(predictions, seconds / len(predictions)))]
 
 
 def _numbers(tick: StreamTick) -> Rows:

@@ -92,7 +92,7 @@ class _Asked:
     """A question of a batch while it is trained.
 
     Attributes:
-        place: of its quest.
+        quest_number: of its quest.
         trial, settings, costs: see `AnsweredQuestion`.
         orders: whole trainings, one a run; none where it is not trained.
         outcomes: of the last part of each.
@@ -100,7 +100,7 @@ class _Asked:
         pruned: whether it ended at the last of these.
     """
 
-    place: int
+    quest_number: int
     trial: Trial
     settings: Table
     costs: dict[str, float]
@@ -127,9 +127,9 @@ def answer_all(
     answers: list[list[AnsweredQuestion]] = [[] for _ in quests]
     while any(len(have) < quest.trials for have, quest in zip(answers, quests, strict=True)):
         batch = [
-            _asked(ground, place, trial, quest.settings(trial))
-            for place, quest in enumerate(quests)
-            for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[place])))
+            _asked(ground, quest_number, trial, quest.settings(trial))
+            for quest_number, quest in enumerate(quests)
+            for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[quest_number])))
         ]
         alive = batch
         for number, stop in enumerate([*stops, None]):
@@ -140,32 +140,32 @@ def answer_all(
                 one.outcomes = tuple(next(outcomes) for _ in orders)
             if stop is None:
                 break
-            alive = [one for one in alive if _goes_on(ground, quests[one.place].study, one, stop)]
+            alive = [one for one in alive if _goes_on(ground, quests[one.quest_number].study, one, stop)]
             if not alive:
                 break
         for one in batch:
             score = None if one.pruned else mean_of(ground, one.outcomes)
             answer = AnsweredQuestion(one.trial, one.settings, one.costs, score, one.outcomes, one.rungs, one.pruned)
-            answers[one.place].append(answer)
-            tell(ground, quests[one.place].study, answer)
+            answers[one.quest_number].append(answer)
+            tell(ground, quests[one.quest_number].study, answer)
     return answers
 
 
-def _asked(ground: SearchContext, place: int, trial: Trial, settings: Table) -> _Asked:
+def _asked(ground: SearchContext, quest_number: int, trial: Trial, settings: Table) -> _Asked:
     spec = ground.spec
     costs = _costs(settings, ground)
     fits = bool(costs) and all(costs[name] <= most for name, most in spec.limits.items())
-    return _Asked(place, trial, settings, costs, ground.orders(settings, range(spec.trial_runs)) if fits else [])
+    return _Asked(quest_number, trial, settings, costs, ground.orders(settings, range(spec.trial_runs)) if fits else [])
 
 
 def _goes_on(ground: SearchContext, study: Study, one: _Asked, stop: int) -> bool:
     """Whether a question is trained beyond a rung: it ended well there, and is not hopeless."""
-    found = mean_of(ground, one.outcomes)
-    if found is None:
+    score = mean_of(ground, one.outcomes)
+    if score is None:
         return False
-    one.rungs[stop] = found
+    one.rungs[stop] = score
     if ground.spec.pruner != "none":
-        study.report(one.trial.number, stop, found)
+        study.report(one.trial.number, stop, score)
         one.pruned = study.hopeless(one.trial.number)
     return not one.pruned
 
@@ -179,20 +179,20 @@ def _costs(settings: Table, ground: SearchContext) -> dict[str, float]:
 
 def possible(ground: SearchContext, space: Space, arm: Table) -> tuple[Space, list[str]]:
     """The part of a space in which every value makes a network of this arm, and in words what was left out."""
-    kept: dict[str, Range] = {}
+    feasible: dict[str, Range] = {}
     notes = []
-    for name, held in space.items():
-        if not isinstance(held, Choice):
-            kept[name] = held
+    for name, dimension in space.items():
+        if not isinstance(dimension, Choice):
+            feasible[name] = dimension
             continue
-        fit = tuple(value for value in held.options if _costs(ground.shaped(apply(arm, {name: value})), ground))
-        out = [str(value) for value in held.options if value not in fit]
+        fit = tuple(value for value in dimension.options if _costs(ground.shaped(apply(arm, {name: value})), ground))
+        out = [str(value) for value in dimension.options if value not in fit]
         if len(fit) > 1:
-            kept[name] = Choice(fit)
+            feasible[name] = Choice(fit)
         if out:
             left = f"{', '.join(map(str, fit))} stay" if len(fit) > 1 else "it keeps its own"
             notes.append(f"{name} {', '.join(out)} cannot be with a window of {arm['model']['window']}; {left}")
-    return kept, notes
+    return feasible, notes
 
 
 def tell(ground: SearchContext, study: Study, answer: AnsweredQuestion) -> None:

@@ -73,14 +73,14 @@ class Calibration:
             if picked is None:
                 sentences.append(f"{backbone}: no training of {len(own)} ended well; it is left out.")
                 continue
-            facts["backbones"][backbone] = _plain(ground, picked) | {"trials": [_plain(ground, held) for held in own]}
+            facts["backbones"][backbone] = _plain(ground, picked) | {"trials": [_plain(ground, item) for item in own]}
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
             text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} {ground.unit} with {size} parameters"
             if lowest is not None and lowest is not picked:
                 size = f"{lowest.costs['parameters']:,.0f}"
                 text += f"; the lowest, {lowest.score:.3g}, has {size} and does not repay the difference"
-            sentences += [f"{text}.", *(f"{backbone}: {said}" for said in said_of_pruned(ground, own))]
+            sentences += [f"{text}.", *(f"{backbone}: {sentence}" for sentence in said_of_pruned(ground, own))]
         if not chosen:
             raise DataError(
                 "phase 1: no training of any backbone ended well; see the messages of the trainings, and lower the "
@@ -92,9 +92,9 @@ class Calibration:
             scores = facts["final"]["scores"]
             listed = ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
             against = "".join(
-                f"; {held['best']} against {name} {100 * held['change']:+.2f} % ({100 * held['low']:+.2f} to "
-                f"{100 * held['high']:+.2f} %)"
-                for name, held in facts["final"]["against"].items()
+                f"; {item['best']} against {name} {100 * item['change']:+.2f} % ({100 * item['low']:+.2f} to "
+                f"{100 * item['high']:+.2f} %)"
+                for name, item in facts["final"]["against"].items()
             )
             sentences.append(f"Each on all {ground.spec.folds} folds: {listed} {ground.unit}{against}.")
         winner = min(scores, key=lambda name: scores[name])
@@ -120,9 +120,9 @@ def _final(ground: SearchContext, backbones: list[str], outcomes: Sequence[Outco
     """Mean score of each backbone over the folds, and the lowest against each of the others."""
     mask = ground.folds(ground.spec.folds)
     parts = np.split(np.arange(len(outcomes)), len(backbones))
-    raw = np.stack([ground.table([outcomes[place] for place in part]) for part in parts])
+    raw = np.stack([ground.table([outcomes[index] for index in part]) for part in parts])
     tables = dict(zip(backbones, fill_worst(raw, mask), strict=True))
-    scores = {name: float(held[mask].mean()) for name, held in tables.items()}
+    scores = {name: float(table[mask].mean()) for name, table in tables.items()}
     return {"runs": ground.spec.folds, "scores": scores, "against": lowest_against_others(tables, mask)}
 
 
@@ -132,8 +132,8 @@ def _efficient(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
     for answer in answers:
         if answer.score is None:
             continue
-        held = by_size.get(answer.costs["parameters"])
-        if held is None or held.score is None or answer.score < held.score:
+        best_of_size = by_size.get(answer.costs["parameters"])
+        if best_of_size is None or best_of_size.score is None or answer.score < best_of_size.score:
             by_size[answer.costs["parameters"]] = answer
     if not by_size:
         return None
@@ -143,8 +143,8 @@ def _efficient(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
 
 def _front(ground: SearchContext, answers: list[AnsweredQuestion]) -> list[dict[str, Any]]:
     done = [answer for answer in answers if answer.score is not None]
-    kept = pareto([(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done])
-    return [_plain(ground, done[place]) for place in kept]
+    front_indices = pareto([(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done])
+    return [_plain(ground, done[index]) for index in front_indices]
 
 
 def _plain(ground: SearchContext, answer: AnsweredQuestion) -> dict[str, Any]:

@@ -34,10 +34,10 @@ class _Made:
     @property
     def error(self) -> float:
         """MAE in float32, the mean over horizons; infinite where it was not trained to its end."""
-        held = self.outcome.result
-        if held is None:
+        result = self.outcome.result
+        if result is None:
             return float("inf")
-        return sum(float(scores["mae"]) for scores in held["plain"].values()) / len(held["plain"])
+        return sum(float(scores["mae"]) for scores in result["plain"].values()) / len(result["plain"])
 
 
 class CompressionPhase:
@@ -74,15 +74,15 @@ class CompressionPhase:
             plan = plan_of(ground, settings)
         except ConfigError as error:
             return _nothing(ground, f"No network was made: {error}.")
-        made = [teacher]
+        networks = [teacher]
         recipes = [recipe_of(ground, order.units, order.pruned) for ways in plan.orders.values() for order in ways]
         outcomes = yield [order_of(ground, settings, recipe) for recipe in recipes]
-        made += map(_Made, recipes, outcomes)
+        networks += map(_Made, recipes, outcomes)
         if plan.rounds:
-            better = [replace(_better(made, units).recipe, rounded=True) for units in plan.orders]
+            better = [replace(_better(networks, units).recipe, rounded=True) for units in plan.orders]
             outcomes = yield [order_of(ground, settings, recipe) for recipe in better]
-            made += map(_Made, better, outcomes)
-        rows = rows_of(ground, teacher, made)
+            networks += map(_Made, better, outcomes)
+        rows = rows_of(ground, teacher, networks)
         chosen = chosen_of(rows)
         if chosen is None:
             return self.decide(ground, plan, rows, None, ())
@@ -99,7 +99,9 @@ class CompressionPhase:
         outcomes: Sequence[Outcome],
     ) -> Decision:
         """The network with the least error among those that fit, and what the second lock-box says of it."""
-        points = [(row["error"], row["taken"]["cycles"][2], row["taken"]["parameter_bytes"]) for row in rows]
+        points = [
+            (row["error"], row["resource_usage"]["cycles"][2], row["resource_usage"]["parameter_bytes"]) for row in rows
+        ]
         budget = ground.spec.compression.budget
         facts: dict[str, Any] = {
             "on": True,
@@ -116,17 +118,24 @@ class CompressionPhase:
         if chosen is None:
             return Decision(NAME, facts, (*sentences, f"None of them fits the budget '{budget.name}'."))
         row = rows[chosen]
+        usage = row["resource_usage"]
         sentences.append(
-            f"Chosen for '{budget.name}': {row['name']} with {row['taken']['parameter_bytes']:,} bytes of parameters "
-            f"and {row['taken']['cycles'][2]:,} cycles a tick; its error there is {100 * (row['error'] - 1):+.1f} % "
+            f"Chosen for '{budget.name}': {row['name']} with {usage['parameter_bytes']:,} bytes of parameters "
+            f"and {usage['cycles'][2]:,} cycles a tick; its error there is {100 * (row['error'] - 1):+.1f} % "
             "against the teacher's."
         )
         formats = ("float32", row["format"])
-        held = [o.result["formats"].get(f) if o.result is not None else None for o, f in zip(outcomes, formats)]
-        if None in held or not held:
+        format_results = [
+            o.result["formats"].get(f) if o.result is not None else None for o, f in zip(outcomes, formats)
+        ]
+        if None in format_results or not format_results:
             sentences.append("A network could not be judged on the second lock-box.")
             return Decision(NAME, facts, tuple(sentences))
-        scores = {who: one["scores"] for who, one in zip(("teacher", "chosen"), held, strict=True) if one is not None}
+        scores = {
+            who: one["scores"]
+            for who, one in zip(("teacher", "chosen"), format_results, strict=True)
+            if one is not None
+        }
         error = relative(scores["chosen"], scores["teacher"])
         facts["box"] = {"scores": scores, "error": error}
         sentences.append(
@@ -177,21 +186,21 @@ def plan_of(ground: SearchContext, settings: Table) -> CompressionPlan:
     return make_plan(network, spec.budget, units, spec.formats, shares=spec.shares)
 
 
-def _better(made: Sequence[_Made], units: int) -> _Made:
+def _better(networks: Sequence[_Made], units: int) -> _Made:
     """Of the networks of a width the one with the least error in float32."""
-    return min((one for one in made if one.recipe.units == units), key=lambda one: one.error)
+    return min((one for one in networks if one.recipe.units == units), key=lambda one: one.error)
 
 
-def rows_of(ground: SearchContext, teacher: _Made, made: Sequence[_Made]) -> list[Row]:
+def rows_of(ground: SearchContext, teacher: _Made, networks: Sequence[_Made]) -> list[Row]:
     """Every network in every format that it can be in, in the order in which they were made."""
     rows: list[Row] = []
     base = teacher.outcome.result or {}
-    for one in made:
-        held = one.outcome.result
-        if held is None:
+    for one in networks:
+        result = one.outcome.result
+        if result is None:
             continue
         order = one.recipe.order()
-        for name, found in held["formats"].items():
+        for name, format_result in result["formats"].items():
             rows.append(
                 {
                     "name": f"{one.recipe.name} {FORMATS[name].label}",
@@ -200,11 +209,11 @@ def rows_of(ground: SearchContext, teacher: _Made, made: Sequence[_Made]) -> lis
                     "pruned": one.recipe.pruned,
                     "rounded": one.recipe.rounded,
                     "format": name,
-                    "taken": found["taken"],
-                    "over": found["over"],
-                    "scores": found["scores"],
-                    "before": held["plain"],
-                    "error": relative(found["scores"], base["plain"]),
+                    "resource_usage": format_result["resource_usage"],
+                    "over": format_result["over"],
+                    "scores": format_result["scores"],
+                    "before": result["plain"],
+                    "error": relative(format_result["scores"], base["plain"]),
                 }
             )
     return rows
@@ -212,10 +221,14 @@ def rows_of(ground: SearchContext, teacher: _Made, made: Sequence[_Made]) -> lis
 
 def chosen_of(rows: Sequence[Row]) -> int | None:
     """Place of the row that fits with the least error, of equals the cheapest; None where none fits."""
-    fitting = [place for place, row in enumerate(rows) if not row["over"]]
+    fitting = [index for index, row in enumerate(rows) if not row["over"]]
     return min(
         fitting,
-        key=lambda i: (rows[i]["error"], rows[i]["taken"]["cycles"][2], rows[i]["taken"]["parameter_bytes"]),
+        key=lambda i: (
+            rows[i]["error"],
+            rows[i]["resource_usage"]["cycles"][2],
+            rows[i]["resource_usage"]["parameter_bytes"],
+        ),
         default=None,
     )
 

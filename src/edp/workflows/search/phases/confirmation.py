@@ -56,8 +56,8 @@ def _sound(ground: SearchContext, passed: list[str], arms: list[Table]) -> Cours
     start = 0
     for stop in (*(look.runs for look in looks), runs):
         outcomes = yield [order for arm in alive for order in ground.orders(arms[arm], range(start, stop))]
-        for place, arm in enumerate(alive):
-            own = outcomes[place * (stop - start) : (place + 1) * (stop - start)]
+        for index, arm in enumerate(alive):
+            own = outcomes[index * (stop - start) : (index + 1) * (stop - start)]
             scores[arm, start:stop] = ground.table(own)
         start = stop
         filled = fill_worst(scores[alive, :stop], mask[:stop])
@@ -66,14 +66,18 @@ def _sound(ground: SearchContext, passed: list[str], arms: list[Table]) -> Cours
             alive = [0, *(arm for arm, out in zip(alive[1:], hopeless, strict=True) if not out)]
         if len(alive) == 1:
             break
-    found = confirm(
+    evidence = confirm(
         scores[:, :start],
         passed,
         ground.decided["screening"].facts["registered"],
         mask[:start],
         Rule(alpha=ground.spec.alpha, least_gain=ground.spec.least_gain, looks=looks),
     )
-    return _decision([_plain(held) for held in found], [held.module for held in found if held.confirmed], _texts(found))
+    return _decision(
+        [_plain(module_evidence) for module_evidence in evidence],
+        [module_evidence.module for module_evidence in evidence if module_evidence.confirmed],
+        _texts(evidence),
+    )
 
 
 def _hopeless(filled: Array, mask: Mask, stop: int, looks: Sequence[Look]) -> list[bool]:
@@ -90,10 +94,10 @@ def _thesis(ground: SearchContext, passed: list[str], arms: list[Table]) -> Cour
         order for arm in arms for seed in range(seeds) for order in ground.orders(arm, range(runs), seed=seed)
     ]
     scores = _by_metric(ground, outcomes, len(arms), seeds, runs)
-    found = thesis_confirm(scores, passed, METRICS, ground.spec.alpha)
-    confirmed = [name for name in passed if any(held.confirmed for held in found if held.module == name)]
-    texts = [_thesis_text(name, [held for held in found if held.module == name]) for name in passed]
-    return _decision([asdict(held) for held in found], confirmed, texts)
+    evidence = thesis_confirm(scores, passed, METRICS, ground.spec.alpha)
+    confirmed = [name for name in passed if any(entry.confirmed for entry in evidence if entry.module == name)]
+    texts = [_thesis_text(name, [entry for entry in evidence if entry.module == name]) for name in passed]
+    return _decision([asdict(entry) for entry in evidence], confirmed, texts)
 
 
 def _by_metric(ground: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
@@ -110,17 +114,17 @@ def _decision(evidence: list[dict[str, Any]], confirmed: list[str], texts: list[
     return Decision("confirmation", {"confirmed": confirmed, "evidence": evidence}, (head, *texts))
 
 
-def _plain(held: ModuleEvidence) -> dict[str, Any]:
-    return asdict(held)
+def _plain(evidence: ModuleEvidence) -> dict[str, Any]:
+    return asdict(evidence)
 
 
-def _texts(found: Sequence[ModuleEvidence]) -> list[str]:
-    return [f"{MODULES[held.module].title}: {held.reason}." for held in found]
+def _texts(evidence: Sequence[ModuleEvidence]) -> list[str]:
+    return [f"{MODULES[entry.module].title}: {entry.reason}." for entry in evidence]
 
 
-def _thesis_text(name: str, found: Sequence[ThesisEvidence]) -> str:
-    best = min(found, key=lambda held: held.adjusted)
-    verdict = "confirmed" if any(held.confirmed for held in found) else "not confirmed"
+def _thesis_text(name: str, evidence: Sequence[ThesisEvidence]) -> str:
+    best = min(evidence, key=lambda entry: entry.adjusted)
+    verdict = "confirmed" if any(entry.confirmed for entry in evidence) else "not confirmed"
     return (
         f"{MODULES[name].title}: {verdict}; on {best.metric} adjusted p {best.adjusted:.2g}, d_z {best.d_z:.2f}, "
         f"wins {100 * best.stability:.0f} %."

@@ -36,7 +36,7 @@ class Exploration:
         switches = [*free, *spec.toggles]
         answers = yield from ask_together(ground, "exploration", switches, spec.free_trials, starts, options)
         facts = winner_of(ground, "exploration", switches, answers)
-        facts["options"] = {key: list(held.options) for own in options.values() for key, held in own.items()}
+        facts["options"] = {key: list(choice.options) for own in options.values() for key, choice in own.items()}
         runs = fresh_runs(ground)
         arms = (earlier["settings"], facts["settings"])
         outcomes = yield [order for settings in arms for order in ground.orders(settings, runs)]
@@ -52,11 +52,11 @@ class Exploration:
         filled = fill_worst(scores, mask[:, seen])
         test = clustered_t(filled[1] - filled[0], mask[:, seen])
         fresh = [float(own[mask[:, seen]].mean()) for own in filled]
-        found = changed(test, fresh[0])
-        better = found["change"] < 0 and found["p"] < ground.spec.alpha
+        comparison = changed(test, fresh[0])
+        better = comparison["change"] < 0 and comparison["p"] < ground.spec.alpha
         names = ", ".join(map(title_of, facts["modules"])) or "no module"
         facts |= {
-            **found,
+            **comparison,
             "fresh": {"synthesis": fresh[0], "exploration": fresh[1]},
             "runs": size,
             "teacher": "exploration" if better else "synthesis",
@@ -65,8 +65,8 @@ class Exploration:
         verdict = "it is the teacher" if better else "the winner of phase 4 stays the teacher"
         sentences = (
             f"Best of {len(facts['trials'])} questions about all modules: {names}.",
-            f"Against the winner of phase 4 on {size} fresh runs: {100 * found['change']:+.2f} % (one-sided p "
-            f"{found['p']:.2g}); {verdict}.",
+            f"Against the winner of phase 4 on {size} fresh runs: {100 * comparison['change']:+.2f} % (one-sided p "
+            f"{comparison['p']:.2g}); {verdict}.",
             *facts["said_of_pruned"],
         )
         return Decision("exploration", facts, sentences)

@@ -26,20 +26,20 @@ DEFAULT_BACKBONE: dict[str, Table] = {
 
 def arm_settings(base: Table, backbone: str, features: Any) -> Table:
     """The base with another backbone of like size, and another feature set (a name, or a plain table)."""
-    held = base["model"]["backbone"]
-    if held["kind"] == backbone:
-        made = dict(held)
+    base_backbone = base["model"]["backbone"]
+    if base_backbone["kind"] == backbone:
+        arm_backbone = dict(base_backbone)
     else:
-        made = dict(DEFAULT_BACKBONE[backbone])
-        width = int(held.get("units", (held.get("channels") or [64])[-1]))
-        if "units" in made:
-            made["units"] = width
-        if "channels" in made:
-            made["channels"] = [width] * len(made["channels"])
+        arm_backbone = dict(DEFAULT_BACKBONE[backbone])
+        width = int(base_backbone.get("units", (base_backbone.get("channels") or [64])[-1]))
+        if "units" in arm_backbone:
+            arm_backbone["units"] = width
+        if "channels" in arm_backbone:
+            arm_backbone["channels"] = [width] * len(arm_backbone["channels"])
     return {
         **base,
         "task": {**base["task"], "features": features},
-        "model": {**base["model"], "backbone": made, "blocks": []},
+        "model": {**base["model"], "backbone": arm_backbone, "blocks": []},
     }
 
 
@@ -92,7 +92,7 @@ class Isolation:
         }
         chosen = min(means, key=lambda name: means[name])
         facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(ground, tables, chosen)}
-        own = {name: held.mean(axis=0) for (name, f), held in zip(arms, tables, strict=True) if f == chosen}
+        own = {name: arm_table.mean(axis=0) for (name, f), arm_table in zip(arms, tables, strict=True) if f == chosen}
         facts["backbones"] = lowest_against_others(own, _judged(ground)[0])
         facts["variance"] = _proxy(ground, tables, arms)
         sentences = [
@@ -100,15 +100,16 @@ class Isolation:
             + ", ".join(f"{name} {value:.3g}" for name, value in means.items())
             + f" {ground.unit} over all backbones."
         ]
-        for backbone, found in facts["comparisons"].items():
+        for backbone, comparison in facts["comparisons"].items():
             sentences.append(
-                f"{backbone}: {chosen} against {found['rival']} {100 * found['change']:+.2f} % "
-                f"(one-sided p {found['p']:.2g}, two-way clustered t over {spec.variance_runs} runs)."
+                f"{backbone}: {chosen} against {comparison['rival']} {100 * comparison['change']:+.2f} % "
+                f"(one-sided p {comparison['p']:.2g}, two-way clustered t over {spec.variance_runs} runs)."
             )
-        for backbone, found in facts["backbones"].items():
+        for backbone, comparison in facts["backbones"].items():
             sentences.append(
-                f"With {chosen}, {found['best']} against {backbone} {100 * found['change']:+.2f} % "
-                f"({100 * found['low']:+.2f} to {100 * found['high']:+.2f} %); phase 1 tunes each before one is chosen."
+                f"With {chosen}, {comparison['best']} against {backbone} {100 * comparison['change']:+.2f} % "
+                f"({100 * comparison['low']:+.2f} to {100 * comparison['high']:+.2f} %); phase 1 tunes each before "
+                "one is chosen."
             )
         return Decision("isolation", facts, tuple(sentences))
 
@@ -116,17 +117,17 @@ class Isolation:
         """The chosen feature set against the next best one, for each backbone."""
         spec = ground.spec
         rivals = [name for name in spec.feature_sets if name != chosen]
-        found = {}
-        for place, backbone in enumerate(spec.backbones):
-            own = {f: tables[place * len(spec.features) + i] for i, f in enumerate(spec.feature_sets)}
+        comparisons = {}
+        for index, backbone in enumerate(spec.backbones):
+            own = {f: tables[index * len(spec.features) + i] for i, f in enumerate(spec.feature_sets)}
             if not rivals:
                 continue
             rival = min(rivals, key=lambda name: float(np.nanmean(own[name])))
             first, second = (own[name].mean(axis=0) for name in (chosen, rival))
             mask, _ = _judged(ground)
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
-            found[backbone] = {"rival": rival, **changed(test, float(np.nanmean(second)))}
-        return found
+            comparisons[backbone] = {"rival": rival, **changed(test, float(np.nanmean(second)))}
+        return comparisons
 
 
 def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]:
@@ -136,11 +137,11 @@ def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) 
         tables: scores ``(run, session)`` by the name of the arm.
         mask: cells that are judged.
     """
-    means = {name: float(held[mask].mean()) for name, held in tables.items()}
+    means = {name: float(arm_table[mask].mean()) for name, arm_table in tables.items()}
     best = min(means, key=lambda name: means[name])
     return {
-        name: {"best": best, **changed(clustered_t(np.where(mask, tables[best] - held, 0.0), mask), means[name])}
-        for name, held in tables.items()
+        name: {"best": best, **changed(clustered_t(np.where(mask, tables[best] - arm_table, 0.0), mask), means[name])}
+        for name, arm_table in tables.items()
         if name != best
     }
 
@@ -176,18 +177,18 @@ def _proxy(ground: SearchContext, tables: list[Array], arms: list[tuple[str, str
     differences = [tables[i][0] - tables[j][0] for i, j in alike] or [tables[0][0] - own for own in tables[0][1:]]
     if not differences:
         raise DataError("one backbone, one feature set and one seed show no variance; set variance_seeds = 2 or more")
-    found = [paired_variance(np.where(mask, difference, 0.0), mask) for difference in differences]
-    largest = max(found, key=lambda held: held.session + held.run + held.cell)
+    variances = [paired_variance(np.where(mask, difference, 0.0), mask) for difference in differences]
+    largest = max(variances, key=lambda variance: variance.session + variance.run + variance.cell)
     return {"session": largest.session, "run": largest.run, "cell": largest.cell}
 
 
-def _plain(found: SplitVariance) -> dict[str, Any]:
+def _plain(variance: SplitVariance) -> dict[str, Any]:
     return {
-        "mean": found.mean,
-        "split": found.split,
-        "seed": found.seed,
-        "split_interval": found.split_interval,
-        "seed_interval": found.seed_interval,
+        "mean": variance.mean,
+        "split": variance.split,
+        "seed": variance.seed,
+        "split_interval": variance.split_interval,
+        "seed_interval": variance.seed_interval,
     }
 
 

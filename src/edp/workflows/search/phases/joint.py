@@ -70,16 +70,16 @@ def winner_of(
     Raises:
         DataError: no training ended well.
     """
-    found = best(answers)
-    if found is None:
+    winner = best(answers)
+    if winner is None:
         raise DataError(f"{name}: none of {len(answers)} trainings ended well; see their messages in the ledger")
     done = [answer for answer in answers if answer.score is not None]
     facts: dict[str, Any] = {
-        "settings": found.settings,
-        "values": {**found.trial.values, **found.trial.options},
-        "modules": list(found.trial.flags),
-        "score": found.score,
-        "costs": found.costs,
+        "settings": winner.settings,
+        "values": {**winner.trial.values, **winner.trial.options},
+        "modules": list(winner.trial.flags),
+        "score": winner.score,
+        "costs": winner.costs,
         "on": {module: sum(module in answer.trial.flags for answer in done) / len(done) for module in modules},
         "trials": [
             {
@@ -97,14 +97,18 @@ def winner_of(
     facts["said_of_pruned"] = said_of_pruned(ground, answers)
     if ground.spec.cost != "none":
         points = [(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done]
-        facts["front"] = [done[place].trial.number for place in pareto(points)]
+        facts["front"] = [done[index].trial.number for index in pareto(points)]
     return facts
 
 
 def _inside(window: Space, values: Candidate) -> dict[str, Any]:
     """Values of the window's dimensions, brought into it."""
-    made: dict[str, Any] = {}
-    for name, held in window.items():
+    clipped: dict[str, Any] = {}
+    for name, dimension in window.items():
         if name in values:
-            made[name] = min(max(float(values[name]), held.low), held.high) if isinstance(held, Real) else values[name]
-    return made
+            clipped[name] = (
+                min(max(float(values[name]), dimension.low), dimension.high)
+                if isinstance(dimension, Real)
+                else values[name]
+            )
+    return clipped

@@ -57,14 +57,16 @@ def _thesis(ground: SearchContext) -> Decision:
     spec = ground.spec
     features = ground.decided["isolation"].facts["features"]
     backbone = ground.decided["calibration"].facts["backbone"]
-    arms = {name: held["mae"] for name, held in ground.decided["isolation"].facts["arms"].items()}
+    arms = {name: arm["mae"] for name, arm in ground.decided["isolation"].facts["arms"].items()}
     sigma = max((arms[f"{one} {features}"]["seed"] or 0.0) for one in spec.backbones)
     mean = arms[f"{backbone} {features}"]["mean"]
     if sigma <= 0.0:
         plan = {"splits": 2, "simulated": None, "analytical": 0.0}
     else:
-        found = thesis_plan(mean, sigma, spec.run_seeds, share=spec.least_effect, alpha=spec.alpha, power=spec.power)
-        plan = asdict(found)
+        power_plan = thesis_plan(
+            mean, sigma, spec.run_seeds, share=spec.least_effect, alpha=spec.alpha, power=spec.power
+        )
+        plan = asdict(power_plan)
     runs = min(int(plan["splits"] or 2), spec.most_runs)
     text = (
         f"J = {plan['splits']} splits of {spec.run_seeds} seeds after eq. 3.42 (seeds differ by {sigma:.3g} "

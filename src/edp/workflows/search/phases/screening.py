@@ -37,7 +37,7 @@ class ModuleScreening:
 def baseline_of(ground: SearchContext) -> tuple[Table, Candidate, Space]:
     """Settings of the baseline, its values, and the window around them in which candidates are tuned."""
     facts = ground.decided["calibration"].facts
-    space = {name: held for name, held in ground.spec.space.items() if name in ground.spec.elastic}
+    space = {name: dimension for name, dimension in ground.spec.space.items() if name in ground.spec.elastic}
     beyond = ground.spec.mode == "thesis"
     return facts["settings"], facts["baseline"], elastic(space, facts["baseline"], ground.spec.elastic, beyond)
 
@@ -64,18 +64,20 @@ def _sound(ground: SearchContext) -> Course:
 def _drawn(ground: SearchContext, window: Space, count: int) -> list[dict[str, float]]:
     """Values inside the window by chance, so that effects are averages over it."""
     rng = np.random.default_rng(ground.seed("screening"))
-    made = []
+    candidates = []
     for _ in range(count):
         values = {}
         for name in names(window):
-            held = window[name]
-            if isinstance(held, Choice):
+            dimension = window[name]
+            if isinstance(dimension, Choice):
                 continue
-            low, high = (np.log10([held.low, held.high])) if held.log else (held.low, held.high)
+            low, high = (
+                (np.log10([dimension.low, dimension.high])) if dimension.log else (dimension.low, dimension.high)
+            )
             value = float(rng.uniform(low, high))
-            values[name] = 10.0**value if held.log else value
-        made.append(values)
-    return made
+            values[name] = 10.0**value if dimension.log else value
+        candidates.append(values)
+    return candidates
 
 
 def _passed_by_design(
@@ -116,7 +118,7 @@ def _thesis(ground: SearchContext) -> Course:
     quests = [_quest(ground, base, name, window) for name in free]
     answers = yield from answer_all(ground, quests)
     table = {name: _gain(own, reference) for name, own in zip(free, answers, strict=True)}
-    passed = [name for name, held in table.items() if held["gain"] is not None and held["gain"] > 0]
+    passed = [name for name, row in table.items() if row["gain"] is not None and row["gain"] > 0]
     sentences = (
         f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {reference:.3g} "
         f"{ground.unit} and go on; by chance alone most do, since the best of {spec.module_trials} is compared with a "

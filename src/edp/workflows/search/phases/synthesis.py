@@ -92,12 +92,12 @@ def judged(
 ) -> dict[str, dict[str, float | None]]:
     """Means over seeds of each score on the test sessions, by arm; None where a training did not end well."""
     seeds = ground.spec.run_seeds
-    found: dict[str, dict[str, float | None]] = {}
-    for place, arm in enumerate(arms):
-        own = outcomes[place * seeds : (place + 1) * seeds]
+    arm_scores: dict[str, dict[str, float | None]] = {}
+    for index, arm in enumerate(arms):
+        own = outcomes[index * seeds : (index + 1) * seeds]
         means = {name: float(np.mean([o.mean(ground.spec.horizon, name) for o in own])) for name in SCORES}
-        found[arm] = {name: value if np.isfinite(value) else None for name, value in means.items()}
-    return found
+        arm_scores[arm] = {name: value if np.isfinite(value) else None for name, value in means.items()}
+    return arm_scores
 
 
 def gained(ground: SearchContext, outcomes: Sequence[Outcome]) -> dict[str, float] | None:

@@ -31,7 +31,7 @@ class FewSteps:
         spec, source = case.spec, case.source
         meta: Mapping[str, Any] = (source.bundle.provenance.get("lesson") or {}).get("meta") or {}
         rate = spec.inner_rate or float(meta.get("inner_rate", RATE))
-        held = decompose(source.predictor).encoding if meta.get("head_only") else ()
+        frozen = decompose(source.predictor).encoding if meta.get("head_only") else ()
         training = replace(
             case.tuning(Sgd(learning_rate=rate), spec.inner_steps),
             terms=case.experiment.training.terms,
@@ -39,6 +39,6 @@ class FewSteps:
             average=NoAverage(),
             updates=1,
         )
-        network = case.train("few_steps", training, lambda: WarmStart(source.predictor, held), centred=False)
-        names = [name for name, _ in network.named_parameters() if name not in held]
+        network = case.train("few_steps", training, lambda: WarmStart(source.predictor, frozen), centred=False)
+        names = [name for name, _ in network.named_parameters() if name not in frozen]
         return of_network(network, size_of(network, names))

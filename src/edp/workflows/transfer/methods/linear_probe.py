@@ -21,6 +21,6 @@ class LinearProbe:
     def make(self, case: TransferCase) -> Made:
         """Train the last layer."""
         parts = decompose(case.source.predictor)
-        held = {*parts.encoding, *parts.head} - {*parts.last}
-        network = case.train("linear_probe", case.tuning(), lambda: WarmStart(case.source.predictor, held))
+        frozen = {*parts.encoding, *parts.head} - {*parts.last}
+        network = case.train("linear_probe", case.tuning(), lambda: WarmStart(case.source.predictor, frozen))
         return of_network(network, size_of(network, parts.last))

@@ -63,7 +63,7 @@ def train_both(case: TransferCase, name: str, spec: BothSpec) -> Made:
     source = case.source
     if source.data is None:
         raise ConfigError(f"method '{name}' needs the recordings of the source: {source.absent}")
-    kept = source.data.train
+    source_series = source.data.train
     least = 4 * (
         max(source.predictor.spec.window, case.experiment.training.chunks.burn_in) + case.data.task.max_horizon
     )
@@ -71,7 +71,7 @@ def train_both(case: TransferCase, name: str, spec: BothSpec) -> Made:
     network = case.train(
         name,
         case.tuning(),
-        lambda: BothDomains(source.predictor, kept, spec),
+        lambda: BothDomains(source.predictor, source_series, spec),
         asdict(spec),
         judged=judged,
         centred=False,

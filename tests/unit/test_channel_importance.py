@@ -1,4 +1,4 @@
-"""What channels are worth to a trained predictor: exact on laws that are known."""
+"""Importance of channels to a trained predictor: exact on laws that are known."""
 
 from dataclasses import replace
 
@@ -10,14 +10,14 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, DataError
-from edp.evaluation.channel_importance import WorthSpec, _donors, channel_worths
+from edp.evaluation.channel_importance import ChannelImportanceSpec, _donors, measure_channel_importance
 from edp.evaluation.conditional import OthersModel, collinear
 from edp.networks.blocks import LinearBypass
 from edp.signals import Channel, Kind
 from edp.training import fit
 
 NAMES = ("speed", "lever", "twice", "noise", "second")
-SPEC = WorthSpec(repeats=2, groups=(("lever", "twice"),), skip=20)
+SPEC = ChannelImportanceSpec(repeats=2, groups=(("lever", "twice"),), skip=20)
 
 
 def drive(seed, samples=900):
@@ -49,16 +49,18 @@ def predictor(data, tiny_model, tiny_training):
 
 
 @pytest.fixture(scope="module")
-def worths(predictor, data):
+def importances(predictor, data):
     seen = []
-    found = channel_worths(predictor, data, SPEC, lambda name, done, total: seen.append((name, done, total)))
+    found = measure_channel_importance(
+        predictor, data, SPEC, lambda name, done, total: seen.append((name, done, total))
+    )
     assert seen == [(", ".join(row.members), n, 6) for n, row in enumerate(found.rows[::2])]
     return found
 
 
-def test_worths_follow_the_law(worths):
-    rows = {row.members: row for row in worths.rows if row.target == "mean"}
-    base = worths.error["3"]["mean"]
+def test_importances_follow_the_law(importances):
+    rows = {row.members: row for row in importances.rows if row.target == "mean"}
+    base = importances.error["3"]["mean"]
     lever, twice, both = rows[("lever",)], rows[("twice",)], rows[("lever", "twice")]
     # A law gives the one from the other: alone they have nothing of their own, together nearly all.
     assert lever.explained > 0.999
@@ -69,19 +71,21 @@ def test_worths_follow_the_law(worths):
     assert both.exchanged.mean > rows[("second",)].exchanged.mean > 0
     assert rows[("second",)].renewed.low > 0
     assert abs(rows[("noise",)].exchanged.mean) < 0.05 * both.exchanged.mean
-    assert [row.members for row in worths.ranked(3)[:2]] == [("speed",), ("lever", "twice")]
-    assert worths.units == {"mean": "mm/s", "speed": "mm/s"}
-    for row in worths.rows:
+    assert [row.members for row in importances.ranked(3)[:2]] == [("speed",), ("lever", "twice")]
+    assert importances.units == {"mean": "mm/s", "speed": "mm/s"}
+    for row in importances.rows:
         assert row.exchanged.low <= row.exchanged.mean <= row.exchanged.high
 
 
-def test_the_same_seed_gives_the_same_worths(worths, predictor, data):
-    assert channel_worths(predictor, data, SPEC) == worths
-    assert channel_worths(predictor, data, replace(SPEC, seed=1)) != worths
+def test_the_same_seed_gives_the_same_importances(importances, predictor, data):
+    assert measure_channel_importance(predictor, data, SPEC) == importances
+    assert measure_channel_importance(predictor, data, replace(SPEC, seed=1)) != importances
 
 
 def test_one_recording_is_exchanged_with_itself_far_off(predictor, data):
-    found = channel_worths(predictor, replace(data, test=data.test[:1]), WorthSpec(repeats=1, skip=20))
+    found = measure_channel_importance(
+        predictor, replace(data, test=data.test[:1]), ChannelImportanceSpec(repeats=1, skip=20)
+    )
     rows = {row.members: row for row in found.rows if row.target == "mean"}
     assert rows[("second",)].renewed.mean > 0
     rng = np.random.default_rng(0)
@@ -114,13 +118,13 @@ def test_still_channels_and_lone_channels():
 
 def test_mistakes_are_told(predictor, data):
     with pytest.raises(ConfigError, match=r"names 'levr', which is no input.*lever"):
-        channel_worths(predictor, data, WorthSpec(groups=(("levr", "noise"),)))
+        measure_channel_importance(predictor, data, ChannelImportanceSpec(groups=(("levr", "noise"),)))
     with pytest.raises(DataError, match="longest has 900 samples, the first 2000 are start-up"):
-        channel_worths(predictor, data, WorthSpec(skip=2000))
+        measure_channel_importance(predictor, data, ChannelImportanceSpec(skip=2000))
     with pytest.raises(ConfigError, match="repeats = 0"):
-        WorthSpec(repeats=0)
+        ChannelImportanceSpec(repeats=0)
     with pytest.raises(ConfigError, match=r"lags = \[0, -1\]; whole numbers, 0 <= lags"):
-        WorthSpec(lags=(0, -1))
+        ChannelImportanceSpec(lags=(0, -1))
 
 
 def test_collinear_channels_form_groups():
