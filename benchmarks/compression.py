@@ -6,7 +6,7 @@ whole numbers (W8A16), and the rival in the same run: the variants of the thesis
 seed 0, judged on the validation part). The chosen network is put into whole numbers, exported, compiled for a
 Cortex-M4F and run on an emulated one: bytes of constants, program, state and stack are those of that where compiler and
 emulator are there, else the estimates. Students have as many updates as their teacher, and a third of that with rounded
-numbers. All choices rest on the validation part. The test part is a second lock-box: nothing was chosen or judged on it
+numbers. All choices rest on the validation part. The test part is a second test set: nothing was chosen or judged on it
 before, and it is opened once, for the teacher and the chosen network. Seeds are those of weights and of the split; the
 recordings stay.
 
@@ -30,7 +30,7 @@ from edp.config.experiment import Experiment, load_experiment
 from edp.evaluation.controller import Budget
 from edp.training import load_bundle
 from edp.workflows.compression import FORMATS, CompressionResult, CompressionSearchSpec, Judged, search
-from edp.workflows.compression.planning import WAYS
+from edp.workflows.compression.planning import RECIPES
 from edp.workflows.compression.quantise import quantise
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set, train
 
@@ -56,7 +56,7 @@ def one(source: DataSource, horizon: int, seed: int, folder: Path, arguments: ar
         budget=BUDGET,
         units=tuple(arguments.units),
         formats=(FORMAT,),
-        ways=tuple(arguments.ways),
+        recipes=tuple(arguments.recipes),
         thesis=seed == 0 and not arguments.quick,
     )
     return search(run / "teacher", spec, run / "small")
@@ -93,8 +93,8 @@ def facts_of(found: CompressionResult, horizon: int, made: dict[str, int]) -> di
                 "parameters": row.resource_usage.parameters, "bytes": row.resource_usage.parameter_bytes,
                 "cycles": list(row.resource_usage.cycles), "memory": memory(row)}  # fmt: skip
 
-    box = {"error": found.box["error"], "scores": found.box["scores"]} if found.best else {}
-    return {"teacher": plain(found.teacher), "rows": [plain(row) for row in found.rows], "box": box,
+    box = {"error": found.held_out_test["error"], "scores": found.held_out_test["scores"]} if found.best else {}
+    return {"teacher": plain(found.teacher), "rows": [plain(row) for row in found.rows], "held_out_test": box,
             "chosen": found.best.name if found.best else None, "compiled": made,
             "notes": list(found.notes)}  # fmt: skip
 
@@ -133,7 +133,7 @@ def verdicts_of(
     key = str(horizon)
 
     def boxed(name: str) -> float:
-        return statistics.median(one.box["scores"][name][key]["mae"] for one in found)
+        return statistics.median(one.held_out_test["scores"][name][key]["mae"] for one in found)
 
     taken = [(row.resource_usage.parameter_bytes, memory(row)) for row in best]
     if all(objects):
@@ -144,7 +144,7 @@ def verdicts_of(
         verdict(f"k={horizon}: constants", bytes_, 100_000, "<= 1.0", "bytes", quick),
         verdict(f"k={horizon}: cycles, high estimate, M4F", cycles, BUDGET.cycles, "<= 1.0", "cycles", quick),
         verdict(f"k={horizon}: state and stack", used, MEMORY, "<= 1.0", "bytes", quick),
-        verdict(f"k={horizon}: lock-box MAE against the teacher", boxed("chosen"), boxed("teacher"), "<= 1.05",
+        verdict(f"k={horizon}: sealed test set MAE against the teacher", boxed("chosen"), boxed("teacher"), "<= 1.05",
                 "mm/s", quick),
     ]  # fmt: skip
     tight = [[row for row in one.rows if row.fits and row.resource_usage.cycles[2] <= TIGHT] for one in found]
@@ -165,7 +165,9 @@ def main() -> None:
     made = parser(__doc__ or "")
     made.add_argument("--work", type=Path, default=None, help="folder that keeps data and runs")
     made.add_argument("--units", type=int, nargs="*", default=[], help="widths of the smaller networks; default 68")
-    made.add_argument("--ways", nargs="+", default=list(WAYS), choices=WAYS, help="how they are made; default all")
+    made.add_argument(
+        "--recipes", nargs="+", default=list(RECIPES), choices=RECIPES, help="how they are made; default all"
+    )
     made.add_argument("--updates", type=int, default=4000, help="of the teacher and of each student")
     made.add_argument("--minutes", type=float, default=300.0, help="minutes of simulated recordings")
     made.add_argument("--horizons", type=int, nargs="+", default=[10, 1])
@@ -190,9 +192,9 @@ def main() -> None:
                 print(f"\nk = {horizon}, seed {seed}: validation part; * is chosen", flush=True)
                 table(["network", "MAE mm/s", "over teacher %", "parameters", "bytes", "format", "cycles", "budget"],
                       rows_of(found, horizon))  # fmt: skip
-                box = found.box["scores"] if found.best else {}
+                box = found.held_out_test["scores"] if found.best else {}
                 print("compiled:", objects[horizon][-1])
-                print("lock-box:", {name: round(score[str(horizon)]["mae"], 4) for name, score in box.items()})
+                print("sealed test set:", {name: round(score[str(horizon)]["mae"], 4) for name, score in box.items()})
     verdicts = [v for k, found in searches.items() for v in verdicts_of(found, objects[k], k, quick)]
     kept = {
         f"k={k}": [facts_of(one, k, made_of) for one, made_of in zip(found, objects[k], strict=True)]

@@ -63,7 +63,7 @@ class Size:
         source_min: simulated minutes of the source.
         source: changes of its training.
         spec: how networks are trained on.
-        replayed: updates of an epoch of methods that replay the source, whose recordings are longer.
+        rehearsed: updates of an epoch of methods that rehearse the source, whose recordings are longer.
         grid: minutes of logs by method; 0 is direct transfer.
         rest: methods that are tried with all logs only.
         seeds: trainings of each.
@@ -76,7 +76,7 @@ class Size:
     source_min: float
     source: tuple[str, ...]
     spec: FinetuneSpec
-    replayed: int
+    rehearsed: int
     grid: dict[str, tuple[int, ...]]
     rest: tuple[str, ...]
     seeds: int
@@ -95,7 +95,7 @@ FULL = Size(
     source_min=240.0,
     source=("training.epochs=12", "training.updates=600"),
     spec=FinetuneSpec(),
-    replayed=400,
+    rehearsed=400,
     grid={
         OURS: (1, 2, 5, 10, 20, 45),
         "scratch": (1, 2, 5, 10, 20, 45),
@@ -104,7 +104,7 @@ FULL = Size(
         "low_rank": (1, 5, 45),
         "linear_probe": (1, 5, 45),
     },
-    rest=("replay", "replay_distilled", "adversarial"),
+    rest=("rehearsal", "rehearsal_distilled", "adversarial"),
     seeds=2,
     small=("training.epochs=6", "training.updates=200"),
     soil_min=10.0,
@@ -115,8 +115,8 @@ QUICK = replace(
     source_min=12.0,
     source=("training.epochs=1", "training.updates=4"),
     spec=FinetuneSpec(rounds=1),
-    replayed=2,
-    grid={OURS: (1, 2), "scratch": (2,), "ridge_arx": (1, 2), "replay": (2,)},
+    rehearsed=2,
+    grid={OURS: (1, 2), "scratch": (2,), "ridge_arx": (1, 2), "rehearsal": (2,)},
     rest=(),
     seeds=1,
     small=("training.epochs=1", "training.updates=2"),
@@ -152,7 +152,7 @@ class World:
 
     def made(self, method: str, minutes: int, seed: int) -> Made:
         """What a method comes to; a training that is done is read."""
-        shorter = (f"training.updates={self.size.replayed}",) if METHODS[method].replays else ()
+        shorter = (f"training.updates={self.size.rehearsed}",) if METHODS[method].needs_source else ()
         experiment = target_experiment(self.source, (f"training.seed={seed}", *shorter))
         folder = self.work / "runs" / f"{method}_{minutes}_{seed}"
         data = shortened(self.data, minutes, seed) if minutes else self.data

@@ -29,7 +29,7 @@ from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec, finet
 from real_recordings import EXAMPLES, PRESET, QUICK, shared_folder
 
 OURS, NONE = "full", "direct"
-RIVALS = (NONE, "scratch", "ridge_arx", "replay")
+RIVALS = (NONE, "scratch", "ridge_arx", "rehearsal")
 RATES = (3e-3, 1e-2, 3e-2)  # the validation part chooses
 SPEC = FinetuneSpec(batch=8, rounds=20)  # seconds of logs do not hold more lanes
 CHANGES = ('split={kind="time"}', "training.refit=none")
@@ -74,7 +74,7 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     for folder, order in tried.items():
         finetune(work / "run", logs, order, folder)
     best = min(tried, key=validation)
-    return finetune(work / "run", logs, replace(tried[best], rivals=RIVALS), best)  # what is trained is read
+    return finetune(work / "run", logs, replace(tried[best], baselines=RIVALS), best)  # what is trained is read
 
 
 def validation(folder: Path) -> float:
@@ -88,7 +88,7 @@ def rows_of(regimes: Regimes, found: dict[str, Any]) -> Iterator[dict[str, Any]]
     for horizon in found["task"]["horizons"]:
         for target in found["targets"]:
             errors = {
-                name: row["worlds"]["target"][str(horizon)][target["name"]]["rmse"]
+                name: row["domains"]["target"][str(horizon)][target["name"]]["rmse"]
                 for name, row in found["methods"].items()
             }
             yield {"set": regimes.title, "target": target["name"], "horizon": horizon, "rmse": errors}

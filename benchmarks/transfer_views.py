@@ -111,8 +111,8 @@ def verdicts_of(
         yield verdict("network of many machines over direct transfer", zero, direct["mae"], "<= 0.6", "mm/s", quick)
         all_logs = foundation[OURS][minutes_of_all]["mae"]
         yield verdict("the same fine-tuned over direct transfer", all_logs, direct["mae"], "<= 0.36", "mm/s", quick)
-    if "replay" in curves:
-        both = curves["replay"][minutes_of_all]["worlds"]
+    if "rehearsal" in curves:
+        both = curves["rehearsal"][minutes_of_all]["worlds"]
         yield verdict(
             "both worlds: in the target", both["target"]["mean"]["mae"], best["mae"], "<= 1.05", "mm/s", quick
         )

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class EdpError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it without a traceback.
+    """Base of every error that the user can repair; the command line prints it without a traceback.
 
     Attributes:
         exit_code: with which the command line then ends.

@@ -32,7 +32,7 @@ def bench():
 
 def test_rows_and_verdicts_are_those_of_the_transfer(bench):
     def worlds(*rmse):
-        return {"worlds": {"target": {str(k): {"y": {"rmse": e}} for k, e in zip((1, 5), rmse, strict=True)}}}
+        return {"domains": {"target": {str(k): {"y": {"rmse": e}} for k, e in zip((1, 5), rmse, strict=True)}}}
 
     methods = {"full": worlds(1.0, 4.0), "direct": worlds(2.0, 4.0), "scratch": worlds(0.5, 2.0)}
     found = {"task": {"horizons": [1, 5]}, "targets": [{"name": "y"}], "methods": methods}

@@ -70,7 +70,7 @@ def c() -> SimpleNamespace:
 
 @pytest.fixture(scope="session")
 def bundle_of(predictor_of, integers_of) -> Callable[..., Bundle]:
-    """The bundle of a small network of the registries, in single precision or in whole numbers."""
+    """The bundle of a small network of the registries, in single precision or integer (W8A16)."""
 
     def make(structure: str, whole: bool = False) -> Bundle:
         predictor = integers_of(structure) if whole else predictor_of(structure, dtype=torch.float32)

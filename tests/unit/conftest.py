@@ -95,7 +95,7 @@ def lever_sessions(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
 
 @pytest.fixture(scope="session")
 def six_sessions(tmp_path_factory: pytest.TempPathFactory) -> DataSource:
-    """Six logs of the same kind: for a search with both lock-boxes."""
+    """Six logs of the same kind: for a search with both sealed test sets."""
     return write_sessions(tmp_path_factory.mktemp("six"), 6)
 
 

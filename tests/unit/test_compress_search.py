@@ -79,9 +79,9 @@ def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight)
     assert {row.way for row in found.rows} >= {"teacher", "distilled", "pruned and distilled"}
     assert any(row.way.endswith("trained on rounded") for row in found.rows)
     held = read_json(folder / "compression.json")
-    assert len(held["box"]["openings"]) == 1
-    assert set(held["box"]["scores"]) == {"teacher", "chosen"}
-    assert held["box"]["seen_before"] is False
+    assert len(held["held_out_test"]["openings"]) == 1
+    assert set(held["held_out_test"]["scores"]) == {"teacher", "chosen"}
+    assert held["held_out_test"]["seen_before"] is False
     assert load_bundle(best.run).predictor.spec.backbone.units < 16
 
 
@@ -91,7 +91,7 @@ def test_the_same_call_trains_and_opens_nothing_again(run, tight, done, monkeypa
     again = search(run, CompressionSearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
     assert [row.name for row in again.rows] == [row.name for row in found.rows]
     assert [row.error for row in again.rows] == [row.error for row in found.rows]
-    assert len(again.box["openings"]) == 1
+    assert len(again.held_out_test["openings"]) == 1
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_another_choice_needs_a_word_and_is_recorded(run, tight, done, tmp_path)
         search(run, other, folder)
     looked = search(run, replace(other, again=True), folder)
     assert looked.best != done[1].best
-    assert len(looked.box["openings"]) == 2
+    assert len(looked.held_out_test["openings"]) == 2
 
 
 def test_a_budget_that_nobody_can_meet_is_refused_with_the_nearest(run, tmp_path):
@@ -148,7 +148,7 @@ def test_what_has_no_form_in_whole_numbers_is_left_out_with_the_reason(tiny, tin
     plan = make_plan(teacher, Budget())
     assert "w8a16" not in plan.formats
     assert not plan.rounds
-    assert {order.name[0] for ways in plan.orders.values() for order in ways} == {"u"}
+    assert {order.name[0] for orders in plan.orders.values() for order in orders} == {"u"}
     assert any(note.startswith("pruning: no rule") for note in plan.notes)
     assert any("LayerNormLstm" in note for note in plan.notes)
 
@@ -162,13 +162,13 @@ def test_widths_reach_from_the_widest_that_fits_to_a_quarter_of_it(run):
     assert tuple(narrow.orders) == (12, 4, 2)
 
 
-def test_ways_can_be_left_out(run):
+def test_recipes_can_be_left_out(run):
     teacher = load_bundle(run).predictor
-    plan = make_plan(teacher, Budget(), units=(4,), ways=("pruned",))
-    assert [order.name for ways in plan.orders.values() for order in ways] == ["p4"]
-    for ways, message in ((("cut",), "ways = cut; some of distilled, pruned"), ((), "ways = none; some of")):
+    plan = make_plan(teacher, Budget(), units=(4,), recipes=("pruned",))
+    assert [order.name for orders in plan.orders.values() for order in orders] == ["p4"]
+    for recipes, message in ((("cut",), "recipes = cut; some of distilled, pruned"), ((), "recipes = none; some of")):
         with pytest.raises(ConfigError, match=message):
-            make_plan(teacher, Budget(), ways=ways)
+            make_plan(teacher, Budget(), recipes=recipes)
 
 
 def test_the_widest_network_fits_with_all_of_its_constants(run):
@@ -207,7 +207,7 @@ def test_the_command_prints_the_table_and_the_choice(run, tmp_path):
     assert "fits “budget”" in shown.output
     facts = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
     assert facts["rows"][facts["chosen"]]["fits"]
-    assert np.isfinite(facts["box"]["error"])
+    assert np.isfinite(facts["held_out_test"]["error"])
 
 
 @pytest.mark.parametrize(

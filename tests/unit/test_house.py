@@ -6,6 +6,11 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
+CLEAN = (
+    *("cli/", "config/", "evaluation/", "report/", "settings/", "storage/", "training/", "workflows/"),
+    *("errors.py", "registry.py", "signals.py"),
+)
+"""Rooms without a variable of a banned name (`BANNED` of the benchmark)."""
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +42,11 @@ def test_files_and_functions_are_short(house):
 
 def test_no_public_class_name_stands_twice(house):
     assert house.duplicates == {}
+
+
+def test_variables_of_clean_rooms_have_names_that_say_what_they_are(house):
+    rooms = tuple(f"edp/{room}" for room in CLEAN)
+    assert [entry for entry in house.banned if entry.startswith(rooms)] == []
 
 
 def test_the_counts_see_what_they_are_to_refuse(benchmark, tmp_path):

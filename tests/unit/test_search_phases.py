@@ -439,7 +439,7 @@ def test_phase_6_compares_on_development_sessions_and_opens_the_second_lock_box_
     assert facts["chosen"] is not None
     row = facts["rows"][facts["chosen"]]
     assert row["error"] == min(one["error"] for one in facts["rows"] if not one["over"])
-    assert facts["box"]["error"] > 0
+    assert facts["held_out_test"]["error"] > 0
     assert len(made) <= PHASES["compression"].trainings(found)
 
 

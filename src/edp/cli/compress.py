@@ -28,7 +28,9 @@ def compress(
         list[str], typer.Option("--format", help="float32, dynamic_int8 or w8a16; may be repeated. Default: all.")
     ] = [],  # noqa: B006
     thesis: Annotated[bool, typer.Option(help="Also make the variants of the thesis's Table 4.9.")] = False,
-    again: Annotated[bool, typer.Option(help="Open the lock-box again for another choice; it is recorded.")] = False,
+    again: Annotated[
+        bool, typer.Option(help="Open the sealed test set again for another choice; it is recorded.")
+    ] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting of the trainings, for example training.epochs=10.")
     ] = [],  # noqa: B006

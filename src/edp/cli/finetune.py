@@ -21,7 +21,7 @@ def finetune(
     logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, a folder of logs, or a data-set file.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished one goes on.")],
     method: Annotated[str, typer.Option(help="The method whose network is kept.")] = "full",
-    rivals: Annotated[
+    baselines: Annotated[
         str, typer.Option(help="Comma-separated methods to compare with, 'all' or 'none'.")
     ] = "ridge_arx",
     head_epochs: Annotated[int, typer.Option(help="Epochs of phase 1, the head alone.")] = 15,
@@ -36,7 +36,9 @@ def finetune(
     weight_decay: Annotated[float, typer.Option(help="Lambda of the weights' decay.")] = 1e-4,
     patience: Annotated[int, typer.Option(help="Epochs without gain before a phase ends; 0: never.")] = 8,
     rank: Annotated[int, typer.Option(help="Of the low-rank adapters.")] = 8,
-    source_weight: Annotated[float, typer.Option(help="Weight of the source's loss, where it is replayed.")] = 1.0,
+    source_weight: Annotated[
+        float, typer.Option(help="Weight of the source's loss, of methods that rehearse it.")
+    ] = 1.0,
     soft: Annotated[float, typer.Option(help="Share of that loss that the source's network teaches.")] = 0.5,
     reversal: Annotated[float, typer.Option(help="Weight of the reversed gradient of the adversary.")] = 0.1,
     inner_rate: Annotated[
@@ -52,13 +54,13 @@ def finetune(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Train a network of one machine on with logs of another, and judge it beside rivals on the same ticks.
+    """Train a network of one machine on with logs of another, and judge it beside baselines on the same ticks.
 
     Each log is divided by time: its beginning trains, a part validates, its end tests. The source's scaling is
     carried. What comes out is a run: judge, report and export it. Stop it at any moment (Ctrl-C): the same command
     goes on.
 
-    Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --rivals all`
+    Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --baselines all`
     """
     from edp.report import read_transfer, write_transfer_page
     from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec
@@ -66,7 +68,9 @@ def finetune(
 
     named = [field.name for field in fields(FinetuneSpec) if field.name in context.params]
     spec = FinetuneSpec(**{name: context.params[name] for name in named}, check_signs=not any_sign)
-    order = FinetuneRequest(spec=spec, method=method, rivals=_named(rivals, tuple(METHODS)), changes=tuple(changes))
+    order = FinetuneRequest(
+        spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=tuple(changes)
+    )
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "finetune", "method")
@@ -83,10 +87,14 @@ def finetune(
     emit(as_json, result | {"run": str(folder), "report": str(page)}, show)
 
 
-def _named(rivals: str, every: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of methods from the text of ``--rivals``."""
+def _named(baselines: str, every: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of methods from the text of ``--baselines``."""
     special = {"all": every, "none": ()}
-    return special[rivals] if rivals in special else tuple(name.strip() for name in rivals.split(",") if name.strip())
+    return (
+        special[baselines]
+        if baselines in special
+        else tuple(name.strip() for name in baselines.split(",") if name.strip())
+    )
 
 
 def _tables(facts: Transfer) -> None:

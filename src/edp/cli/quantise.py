@@ -1,4 +1,4 @@
-"""``edp quantise``: a trained network in whole numbers."""
+"""``edp quantise``: a trained network in integers (W8A16)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def quantise(
     ] = 20_000,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a run with 8-bit weights and 16-bit values: evaluate, report and export then use whole numbers.
+    """Write a run with 8-bit weights and 16-bit values: evaluate, report and export then use integer arithmetic.
 
     Example: `edp quantise runs/first --out runs/first_w8a16`
     """

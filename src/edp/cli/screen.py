@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SHOWN = 40
 SHOWN_FLAGS = 20
 TOLD_SHARE = 0.005
-"""Of the work, what must be done before the time left is told."""
+"""Of the work, what must be done before the time left is reported."""
 
 
 def screen(

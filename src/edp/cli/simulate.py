@@ -166,5 +166,5 @@ def _limit_spec(moments: int, branches: int, horizons: str) -> LimitSpec:
     try:
         ahead = tuple(int(part) for part in horizons.split(",") if part.strip())
     except ValueError as error:
-        raise ConfigError(f"--horizons {horizons}: give whole numbers of samples, such as 1,10") from error
+        raise ConfigError(f"--horizons {horizons}: give integers (samples), such as 1,10") from error
     return LimitSpec(horizons=ahead, moments=moments, branches=branches)

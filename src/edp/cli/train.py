@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
-    list[str], typer.Option("--repair", help="Mend logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort.")
+    list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort.")
 ]
 
 

@@ -13,8 +13,8 @@ from edp.errors import ConfigError, DataError, StorageError
 from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, shown
 
-SECOND_BOX = "second test sessions"
-"""What ledgers call the second lock-box of a search."""
+SECOND_TEST_SET = "second test sessions"
+"""What ledgers call the second sealed test set of a search."""
 SHARED_SHARE, SHARED_ROWS = 0.2, 50
 """A recording is a piece of another one where so large a share of its different rows, and so many, stand in both.
 Rows of a machine at rest repeat, but are few among the different ones; sensors that move never repeat all channels."""
@@ -42,11 +42,11 @@ class ByFrozen:
     not know train, unless they are a piece of a frozen one.
 
     Attributes:
-        test: frozen sessions that test: the first lock-box of the search.
-        second: frozen sessions of the second lock-box, for what is compressed; left out of all parts otherwise.
+        test: frozen sessions that test: the first sealed test set of the search.
+        second: frozen sessions of the second sealed test set, for what is compressed; left out of all parts otherwise.
         validation: development sessions that validate.
         train: development sessions that train.
-        study: folder of the search, whose ledger records each look at the second lock-box.
+        study: folder of the search, whose ledger records each look at the second sealed test set.
         missing: what happens where a frozen session is not among the recordings: ``refuse``, or ``draw`` for other
             data: a share of what is left tests, and validates where no session of `validation` is there.
         validation_share: share that is drawn to validate.
@@ -86,13 +86,13 @@ class ByFrozen:
         return {session.digest: session.name for session in (*self.test, *self.second)}
 
     def opened(self) -> ByFrozen:
-        """The same split with the second lock-box in the place of the test sessions.
+        """The same split with the second sealed test set in the place of the test sessions.
 
         Raises:
-            ConfigError: the search set no second lock-box apart.
+            ConfigError: the search set no second sealed test set apart.
         """
         if not self.second:
-            raise ConfigError("split: the search set no second lock-box apart, so it cannot be opened")
+            raise ConfigError("split: the search set no second sealed test set apart, so it cannot be opened")
         return replace(self, test=self.second, second=self.test)
 
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:

@@ -20,7 +20,7 @@ BOARD_TYPICAL, BOARD_SLOW = 1.26, 1.43
 
 
 MOST_GRANTED = 2**53
-"""Cycles or bytes: beyond it not every whole number is a float, in which estimates are computed."""
+"""Cycles or bytes: beyond it not every integer is a float, in which estimates are computed."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Multiply-accumulates as they run: networks traced operation by operation and held against their own count."""
+"""Multiply-accumulates as they run: networks executed operation by operation and held against their own count."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Trace(TorchDispatchMode):
     Double precision keeps recurrent layers off fused kernels, which cannot be looked into.
 
     Args:
-        network: whose parts are told apart; hooks are removed at the end.
+        network: whose parts are distinguished; hooks are removed at the end.
 
     Attributes:
         operations: how often each ran, by part.
@@ -209,7 +209,7 @@ def check_counted(predictor: Predictor) -> None:
             if seen.within(name) != counted:
                 wrong.append((name, type(part).__name__, counted, seen.within(name)))
     if wrong:
-        # The innermost part is the one to mend: those around it sum it up.
+        # The innermost part is the one to correct: those around it sum it up.
         name, kind, counted, ran = max(wrong, key=lambda entry: (entry[0].count("."), len(entry[0])))
         raise ConfigError(
             f"the part '{name}' of the network ({kind}) counts {counted:,} multiply-accumulates a tick, but "

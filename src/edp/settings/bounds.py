@@ -43,7 +43,7 @@ class Bound:
     Attributes:
         low: least value.
         high: largest value, finite.
-        whole: only whole numbers.
+        whole: only integers.
         above: `low` itself is out.
         below: `high` itself is out.
     """
@@ -58,7 +58,7 @@ class Bound:
         """Whether a value is a number within; NaN, infinity, text and truth values are not."""
         if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
             return False
-        number: Any = value  # whole numbers beyond what a float holds compare as they are
+        number: Any = value  # integers beyond what a float holds compare as they are
         over = number > self.low if self.above else number >= self.low
         under = number < self.high if self.below else number <= self.high
         return bool(over and under)
@@ -66,12 +66,12 @@ class Bound:
     def rule(self, name: str) -> str:
         """The rule as a message says it."""
         first, second = "<" if self.above else "<=", "<" if self.below else "<="
-        kind = "whole numbers, " if self.whole else ""
+        kind = "integers, " if self.whole else ""
         return f"{kind}{self.low:,.12g} {first} {name} {second} {self.high:,.12g}"
 
 
 def whole(low: int, high: int) -> Bound:
-    """Whole numbers from `low` to `high`, both included."""
+    """Integers from `low` to `high`, both included."""
     return Bound(low, high, whole=True)
 
 
@@ -98,7 +98,7 @@ def between(low: float, high: float) -> Bound:
 SEED = whole(0, MOST_SEED)
 SHARE = span(0.0, 1.0)
 RATE = above(0.0, 1e38)
-"""Of learning: what float32 holds. A rate that is too large for a network is told as a training that diverged."""
+"""Of learning: what float32 holds. A rate that is too large for a network is reported as a training that diverged."""
 DECAY = span(0.0, 100.0)
 """Of weights, per unit of the learning rate."""
 WEIGHT = above(0.0, MOST_WEIGHT)

@@ -26,7 +26,7 @@ SETTINGS_BYTES = 4 * 2**20
 DEPTH = 60
 """Of tables and lists in each other; EDP's own files need 10."""
 DIGITS = 40
-"""Of a whole number; the 128 bits of a random generator's state take 39."""
+"""Of an integer; the 128 bits of a random generator's state take 39."""
 _KEY = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*+{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{DEPTH}}}", re.MULTILINE)
 """A dotted key deeper than `DEPTH`, on which the standard library's reader spends the third power of its parts."""
@@ -223,7 +223,7 @@ def _finite(text: str) -> float:
 
 
 def _check_tree(value: Any) -> None:
-    """Refuse what is nested too deep for those who walk through it, and whole numbers that nothing can hold."""
+    """Refuse what is nested too deep for those who walk through it, and integers that nothing can hold."""
     level, bound = [value], 10**DIGITS
     for _ in range(DEPTH + 1):
         below: list[Any] = []

@@ -35,9 +35,9 @@ from edp.storage import make_folder, object_with, read_bytes, read_json, write_b
 
 SCHEMA = 5
 INTEGER_SCHEMA = 6
-"""Of a bundle in whole numbers, which older versions would read as one in float32."""
+"""Of an integer bundle, which older versions would read as one in float32."""
 ADAPTED_SCHEMA = 7
-"""Of a bundle with an adaptation, which older versions would leave out; its network may be in whole numbers."""
+"""Of a bundle with an adaptation, which older versions would leave out; its network may be an integer one."""
 UNHASHED = {2: SCHEMA, 3: INTEGER_SCHEMA, 4: ADAPTED_SCHEMA}
 """Schemas from before the header had a hash, and what they became."""
 WEIGHTS_BYTES = 2**30
@@ -87,7 +87,7 @@ def make_bundle(
 
 
 def weights_digest(predictor: Predictor) -> str:
-    """Content address of the weights of a predictor, and of what they became in whole numbers."""
+    """Content address of the weights of a predictor, and of their integer form."""
     state = hashlib.blake2b(_weights_bytes(predictor), digest_size=16)
     if isinstance(predictor, IntegerPredictor):
         state.update(repr(sorted(predictor.formats.fracs.items())).encode() + _integers_bytes(predictor))
@@ -277,7 +277,7 @@ def _formats(plain: Any) -> dict[str, int]:
     wrong = [name for name, frac in formats.items() if isinstance(frac, bool) or not isinstance(frac, int)]
     wrong += [name for name, frac in formats.items() if name not in wrong and abs(frac) > MOST_BITS]
     if wrong:
-        raise ValueError(f"the format of '{wrong[0][:40]}' is no whole number of at most {MOST_BITS} bits")
+        raise ValueError(f"the format of '{wrong[0][:40]}' is no integer of at most {MOST_BITS} bits")
     return formats
 
 

@@ -31,7 +31,7 @@ REFIT = "refit.safetensors"
 
 @dataclass
 class Progress:
-    """Where a training stands after a whole number of epochs."""
+    """Where a training stands after an integer number of epochs."""
 
     epoch: int = 0
     updates: int = 0

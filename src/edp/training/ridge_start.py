@@ -1,4 +1,4 @@
-"""Put the ridge regression on the training data into a linear by-pass before training."""
+"""Put the ridge regression on the training data into a linear skip connection before training."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from edp.networks.predictor import Predictor
 
 
 def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequence[Series]) -> bool:
-    """Set the by-pass to the ridge regression and silence the heads, so that training starts as that baseline.
+    """Set the skip connection to the ridge regression and silence the heads, so that training starts as that baseline.
 
     The regression reads the logged channels, and those derived ones that say what no logged channel says: targets, and
-    those whose source is not itself a feature. Does nothing where the predictor has no by-pass or it starts from zero.
+    those whose source is not itself a feature. Does nothing without a skip connection or where it starts from zero.
 
     Args:
         predictor: with its fitted scaler.
@@ -68,7 +68,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
     unit = predictor.code.width.double().cpu().numpy()
     weight = (maps * width[:, None, None] / unit).reshape(bypass.spec.taps, len(offset), -1)
     with torch.no_grad():
-        # The by-pass filters forward in time: its last tap is lag 0.
+        # The skip connection filters forward in time: its last tap is lag 0.
         bypass.weight.copy_(torch.from_numpy(weight[::-1].transpose(2, 1, 0).copy()))
         bypass.bias.copy_(torch.from_numpy((level / unit).ravel()))
         for parameter in (predictor.heads.weights[-1], predictor.heads.biases[-1]):

@@ -127,7 +127,7 @@ def train(
             before that, where an epoch was finished.
     """
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
-    if experiment.model.physics is not None:  # an unknown machine is told before recordings are read
+    if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read
         settings["machine"] = experiment.model.physics.digest()
     taught = {} if teaching is None else {"lesson": dict(teaching.facts)}
     frozen = {} if teaching is None else teaching.frozen
@@ -249,7 +249,7 @@ def evaluate(
 
 
 def _check_run_writable(folder: Path) -> None:
-    """See before minutes of work that a run folder can be written; one that is not there is told by its reader."""
+    """See before minutes of work that a run folder can be written; a missing one is reported by its reader."""
     if folder.is_dir():
         check_writable(folder)
 
@@ -352,7 +352,7 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
         return _untrained(experiment.model, task), source.stem, None
     bundle = load_bundle(source)
     predictor = bundle.predictor
-    # Whole numbers have the counts of the network that they were made of.
+    # Integer networks have the counts of the network that they were quantised from.
     counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
     return counted, describe(predictor.spec), bundle.adaptation
 

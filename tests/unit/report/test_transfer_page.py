@@ -33,7 +33,7 @@ def scores(rows):
 def content():
     edges, shares = np.linspace(-10, 10, 6).tolist(), [0.1, 0.2, 0.4, 0.2, 0.1]
     return {
-        "schema": 1,
+        "schema": 2,
         "method": "two_phase",
         "before": "direct",
         "network": "hybrid",
@@ -44,7 +44,7 @@ def content():
             name: {
                 "label": {"direct": "Standard", "two_phase": "Fine-Tuned"}[name],
                 "learned": 0 if name == "direct" else 84_292,
-                "worlds": {"target": scores(rows), "source": scores(PRINTED["direct"])},
+                "domains": {"target": scores(rows), "source": scores(PRINTED["direct"])},
             }
             for name, rows in PRINTED.items()
         },
@@ -119,10 +119,10 @@ def test_names_from_files_end_no_element(folder):
 def test_what_is_not_there_is_not_shown(folder):
     held = content()
     for row in held["methods"].values():
-        del row["worlds"]["source"]
+        del row["domains"]["source"]
         for name in (*CYLINDERS, "mean"):
-            row["worlds"]["target"]["10"][name]["r2"] = None
-    held["methods"]["two_phase"]["worlds"] = held["methods"]["direct"]["worlds"]
+            row["domains"]["target"]["10"][name]["r2"] = None
+    held["methods"]["two_phase"]["domains"] = held["methods"]["direct"]["domains"]
     facts = read_transfer(folder(held))
     assert transfer_facts.headline(facts).startswith("No epoch was better on the validation part")
     assert "source" not in " ".join(transfer_facts.verdict(facts))
@@ -132,9 +132,13 @@ def test_what_is_not_there_is_not_shown(folder):
 
 def test_a_better_rival_is_named(folder):
     held = content()
-    held["methods"]["full"] = {"label": "One rate", "learned": 84_292, "worlds": held["methods"]["two_phase"]["worlds"]}
+    held["methods"]["full"] = {
+        "label": "One rate",
+        "learned": 84_292,
+        "domains": held["methods"]["two_phase"]["domains"],
+    }
     held["methods"]["two_phase"] |= {
-        "worlds": {"target": scores(PRINTED["direct"]), "source": scores(PRINTED["direct"])}
+        "domains": {"target": scores(PRINTED["direct"]), "source": scores(PRINTED["direct"])}
     }
     assert "One rate has less: 2.93 mm/s." in transfer_facts.verdict(read_transfer(folder(held)))
 

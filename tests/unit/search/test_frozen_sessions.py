@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edp.config.experiment import load_experiment, plain_tree
-from edp.data.frozen import SECOND_BOX, ByFrozen, Session
+from edp.data.frozen import SECOND_TEST_SET, ByFrozen, Session
 from edp.errors import ConfigError, DataError
 from edp.evaluation.controller import Budget
 from edp.logs import read_recording, write_recording
@@ -165,7 +165,7 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
         assert not any(frozen & set(record.identity.split["train"]) for record in ledger)
         opened = {key for one in ledger.openings() for key in one.judged}
         assert {r.key for r in ledger if frozen & set(r.identity.split["judged"])} == opened
-        assert [one.box for one in ledger.openings()] == ["test sessions", SECOND_BOX]
+        assert [one.test_set for one in ledger.openings()] == ["test sessions", SECOND_TEST_SET]
     need = resource_usage(load_bundle(run).predictor, "float32", Budget())
     budget = Budget(name="tight", parameter_bytes=need.parameter_bytes - 1)
     spec = CompressionSearchSpec(budget=budget, units=(2,), formats=("float32",), again=True)
@@ -180,18 +180,18 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
         assert {s.name for s in data.test} == set(study.ground.test)
         assert {s.name for s in data.train} == set(study.ground.training)
         assert {s.name for s in data.validation} == set(study.ground.validation)
-    assert found.box["name"] == SECOND_BOX
+    assert found.held_out_test["name"] == SECOND_TEST_SET
     held = read_json(tmp_path / "small/compression.json")
-    assert held["box"]["seen_before"]
+    assert held["held_out_test"]["seen_before"]
     with Ledger(study.folder / "ledger") as ledger:
-        assert len(ledger.openings(SECOND_BOX)) == 2
+        assert len(ledger.openings(SECOND_TEST_SET)) == 2
     with pytest.raises(ConfigError, match="was opened on"):
         search(run, replace(spec, again=False, units=(1,)), tmp_path / "other")
 
 
 def test_the_networks_of_phase_6_are_runs_like_any_other(study, tmp_path):
     facts = study.ground.decided["compression"].facts
-    assert facts["box"] is not None
+    assert facts["held_out_test"] is not None
     row = facts["rows"][facts["chosen"]]
     chosen = study.networks.get("chosen", study.networks["teacher"])
     assert load_bundle(chosen).predictor.spec.backbone.units == row["units"] or row["units"] is None
@@ -289,7 +289,7 @@ def test_a_split_that_contradicts_itself_is_refused():
         ByFrozen(missing="maybe")
     with pytest.raises(ConfigError, match="names no test sessions"):
         ByFrozen().split([], 1)
-    with pytest.raises(ConfigError, match="no second lock-box"):
+    with pytest.raises(ConfigError, match="no second sealed test set"):
         ByFrozen(test=(session,)).opened()
     assert plain_tree(ByFrozen(test=(session,)), "split")["test"] == [{"name": "a", "digest": "1"}]
 

@@ -329,14 +329,14 @@ def test_a_ledger_belongs_to_one_data_set_and_search_space(tmp_path):
 
 def test_every_opening_of_a_lock_box_is_recorded(tmp_path):
     with Ledger(tmp_path) as ledger:
-        first = ledger.open_box("test", ["a", "b"], "final comparison")
-        assert ledger.open_box("test", ["a", "b"], "final comparison") == first
+        first = ledger.open_test_set("test", ["a", "b"], "final comparison")
+        assert ledger.open_test_set("test", ["a", "b"], "final comparison") == first
         with pytest.raises(
-            ConfigError, match=r"lock-box 'test' was opened on .* \(final comparison\) for other models"
+            ConfigError, match=r"sealed test set 'test' was opened on .* \(final comparison\) for other models"
         ):
-            ledger.open_box("test", ["c"], "a better idea")
-        ledger.open_box("compression", ["c"], "students")
-        second = ledger.open_box("test", ["c"], "a better idea", again=True)
+            ledger.open_test_set("test", ["c"], "a better idea")
+        ledger.open_test_set("compression", ["c"], "students")
+        second = ledger.open_test_set("test", ["c"], "a better idea", again=True)
     with Ledger(tmp_path) as ledger:
         assert ledger.openings("test") == [first, second]
-        assert [one.box for one in ledger.openings()] == ["test", "compression", "test"]
+        assert [one.test_set for one in ledger.openings()] == ["test", "compression", "test"]

@@ -115,7 +115,10 @@ def test_the_test_sessions_judge_only_behind_the_recorded_opening(finished):
     assert second == set(last.judged)
     assert len(second) in (1, 2)
     assert len(sealed) in (1, 2)  # winner and baseline may be the same network
-    assert [one["box"] for one in read_study(finished.folder)["openings"]] == ["test sessions", "second test sessions"]
+    assert [one["test_set"] for one in read_study(finished.folder)["openings"]] == [
+        "test sessions",
+        "second test sessions",
+    ]
 
 
 def test_a_search_that_was_stopped_again_and_again_trains_nothing_twice_and_finds_the_same(

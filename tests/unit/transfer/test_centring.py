@@ -38,14 +38,14 @@ def learned(source, **changes):
 
 
 @pytest.fixture(scope="module")
-def world(run, target):
+def domain(run, target):
     source = read_source(run)
     return source.predictor, [source.bundle.task.series(recording) for recording in target.read()]
 
 
 @pytest.mark.parametrize("kind", ["plain", "stanh", "quantiles"])
-def test_the_mean_error_goes_and_little_else_changes(world, kind):
-    source, series = world
+def test_the_mean_error_goes_and_little_else_changes(domain, kind):
+    source, series = domain
     parts = {"stanh": {"activation": ACTIVATIONS["stanh"]()}, "quantiles": {"output": OUTPUTS["quantiles"]()}}
     net = learned(source, **parts.get(kind, {}))
     last = net.heads.biases[-1]
@@ -70,8 +70,8 @@ def test_the_mean_error_goes_and_little_else_changes(world, kind):
             np.testing.assert_allclose(wide[:, :, 1] - wide[:, :, 0], was[:, :, 1] - was[:, :, 0], atol=1e-5)
 
 
-def test_nothing_is_done_without_a_whole_window_or_at_too_high_a_price(world):
-    source, series = world
+def test_nothing_is_done_without_a_whole_window_or_at_too_high_a_price(domain):
+    source, series = domain
     net = learned(source)
     before = copy.deepcopy(net.state_dict())
     centre(net, [replace(part, inputs=part.inputs[:8], targets=part.targets[:8]) for part in series])
@@ -98,7 +98,7 @@ def test_a_fine_tuned_network_is_centred_unless_it_is_not_asked_for_or_logs_are_
         monkeypatch.setattr(centring, "SHORTEST_S", shortest)
         folder = tmp_path / name
         order = FinetuneRequest(
-            spec=replace(small, center=center), method="full", rivals=(), changes=("training.updates=25",)
+            spec=replace(small, center=center), method="full", baselines=(), changes=("training.updates=25",)
         )
         finetune(run, target, order, folder)
         net = load_bundle(folder / "bundle").predictor

@@ -38,7 +38,7 @@ BUFFERS = ("front.offset", "front.width", "code.offset", "code.width")
 @pytest.fixture(scope="module")
 def tuned(run, target, small, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned") / "run"
-    order = FinetuneRequest(spec=small, method="two_phase", rivals=tuple(METHODS), changes=UPDATES)
+    order = FinetuneRequest(spec=small, method="two_phase", baselines=tuple(METHODS), changes=UPDATES)
     return folder, finetune(run, target, order, folder)
 
 
@@ -46,18 +46,18 @@ class Pulled(Exception):
     pass
 
 
-def test_every_method_is_judged_on_the_same_ticks_in_both_worlds(tuned):
+def test_every_method_is_judged_on_the_same_ticks_in_both_domains(tuned):
     _, found = tuned
     assert set(found["methods"]) == set(METHODS)
-    for world in ("target", "source"):
-        counts = {row["worlds"][world][k]["rise"]["count"] for row in found["methods"].values() for k in ("2", "5")}
-        assert len(counts) == 1, world
-    mae = {name: row["worlds"]["target"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
+    for domain in ("target", "source"):
+        counts = {row["domains"][domain][k]["rise"]["count"] for row in found["methods"].values() for k in ("2", "5")}
+        assert len(counts) == 1, domain
+    mae = {name: row["domains"]["target"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
     assert all(np.isfinite(value) for value in mae.values())
     assert mae["two_phase"] < mae["direct"]
     assert mae["full"] < mae["direct"]
-    kept = {name: row["worlds"]["source"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
-    for name in ("replay", "replay_distilled", "adversarial"):
+    kept = {name: row["domains"]["source"]["5"]["mean"]["mae"] for name, row in found["methods"].items()}
+    for name in ("rehearsal", "rehearsal_distilled", "adversarial"):
         assert mae[name] < mae["direct"]
         assert kept[name] < kept["full"]
 
@@ -65,11 +65,11 @@ def test_every_method_is_judged_on_the_same_ticks_in_both_worlds(tuned):
 def test_the_scaling_of_the_source_is_carried_and_only_from_scratch_fitted_anew(tuned, run):
     folder, _ = tuned
     before = load_bundle(run).predictor.state_dict()
-    for name in ("", "rivals/full", "rivals/linear_probe", "rivals/low_rank", "phases/head"):
+    for name in ("", "baselines/full", "baselines/linear_probe", "baselines/low_rank", "phases/head"):
         after = load_bundle(folder / name).predictor.state_dict()
         assert after.keys() == before.keys()
         assert all(torch.equal(before[key], after[key]) for key in BUFFERS), name
-    scratch = load_bundle(folder / "rivals" / "scratch").predictor.state_dict()
+    scratch = load_bundle(folder / "baselines" / "scratch").predictor.state_dict()
     assert not torch.equal(before["code.width"], scratch["code.width"])
 
 
@@ -77,8 +77,8 @@ def test_the_scaling_of_the_source_is_carried_and_only_from_scratch_fitted_anew(
     ("name", "learns"),
     [
         ("phases/head", lambda parts: {*parts.head}),
-        ("rivals/linear_probe", lambda parts: {*parts.last}),
-        ("rivals/full", lambda parts: {*parts.head, *parts.encoding}),
+        ("baselines/linear_probe", lambda parts: {*parts.last}),
+        ("baselines/full", lambda parts: {*parts.head, *parts.encoding}),
         ("", lambda parts: {*parts.head, *parts.encoding}),
     ],
 )
@@ -89,7 +89,7 @@ def test_what_is_held_does_not_move(tuned, run, name, learns):
     moved = {key for key, tensor in after.items() if not torch.equal(tensor, before[key])}
     assert moved <= learns(decompose(source))
     assert all(parameter.requires_grad for parameter in after.values())
-    assert moved or name not in ("", "rivals/full")  # a part alone may find nothing better than the start
+    assert moved or name not in ("", "baselines/full")  # a part alone may find nothing better than the start
 
 
 def test_the_backbone_moves_less_than_the_head(tuned, run):
@@ -108,7 +108,7 @@ def test_low_rank_changes_have_their_rank_and_leave_an_ordinary_network(tuned, r
     folder, found = tuned
     before = dict(load_bundle(run).predictor.named_parameters())
     changed = 0
-    for name, after in load_bundle(folder / "rivals" / "low_rank").predictor.named_parameters():
+    for name, after in load_bundle(folder / "baselines" / "low_rank").predictor.named_parameters():
         change = (after - before[name]).detach().double()
         if change.ndim == 2:
             assert int(torch.linalg.matrix_rank(change, rtol=1e-4)) <= small.rank, name
@@ -152,7 +152,9 @@ def test_a_stopped_adversarial_training_goes_on_to_the_same_bits(tuned, run, tar
     with pytest.raises(Pulled):
         finetune(run, target, order, tmp_path / "run", FinetuneCallbacks(on_training=pull))
     finetune(run, target, order, tmp_path / "run")
-    ends = [load_bundle(folder).predictor.state_dict() for folder in (whole / "rivals/adversarial", tmp_path / "run")]
+    ends = [
+        load_bundle(folder).predictor.state_dict() for folder in (whole / "baselines/adversarial", tmp_path / "run")
+    ]
     assert ends[0].keys() == ends[1].keys()
     assert all(torch.equal(ends[0][key], ends[1][key]) for key in ends[0])
 
@@ -161,7 +163,7 @@ def test_the_run_can_be_judged_like_any_other(tuned):
     folder, found = tuned
     scores = read_json(evaluate(folder) / "scores.json")
     mine = scores["models"]["network"]["overall"]["5"]["rise"]["mae"]
-    assert mine == pytest.approx(found["methods"]["two_phase"]["worlds"]["target"]["5"]["rise"]["mae"], rel=1e-6)
+    assert mine == pytest.approx(found["methods"]["two_phase"]["domains"]["target"]["5"]["rise"]["mae"], rel=1e-6)
     assert read_json(folder / "provenance.json")["lesson"]["method"] == "two_phase"
 
 
@@ -171,12 +173,12 @@ def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small
         (tmp_path / "alone" / file.name).write_bytes(file.read_bytes())
     notes = []
     changes = ("training.updates=2", "training.chunks.length=32")
-    order = FinetuneRequest(spec=small, method="two_phase", rivals=("adversarial",), changes=changes)
+    order = FinetuneRequest(spec=small, method="two_phase", baselines=("adversarial",), changes=changes)
     found = finetune(tmp_path / "alone", target, order, tmp_path / "run", FinetuneCallbacks(on_note=notes.append))
-    assert list(found["methods"]["two_phase"]["worlds"]) == ["target"]
+    assert list(found["methods"]["two_phase"]["domains"]) == ["target"]
     assert any("bundle without the run" in note for note in notes)
     assert any("sign of rise, turn was not checked" in note for note in notes)
-    assert any(note.startswith("Replay, adversarial is left out: it needs the recordings") for note in notes)
+    assert any(note.startswith("Rehearsal, adversarial is left out: it needs the recordings") for note in notes)
     with pytest.raises(ConfigError, match=r"'adversarial' needs the recordings of the source.*bundle without the run"):
         finetune(tmp_path / "alone", target, FinetuneRequest(spec=small, method="adversarial"), tmp_path / "other")
     assert not (tmp_path / "other").exists()
@@ -234,7 +236,9 @@ def test_methods_that_leave_no_run_or_do_not_exist_are_refused(small):
     with pytest.raises(ConfigError, match=r"'ridge_arx' trains nothing.*two_phase"):
         FinetuneRequest(spec=small, method="ridge_arx")
     with pytest.raises(ConfigError, match="unknown method 'two_phases'; did you mean 'two_phase'"):
-        FinetuneRequest(spec=small, rivals=("two_phases",))
+        FinetuneRequest(spec=small, baselines=("two_phases",))
+    with pytest.raises(ConfigError, match="'replay_distilled' is now called 'rehearsal_distilled'"):
+        FinetuneRequest(spec=small, baselines=("replay_distilled",))
 
 
 def test_the_defaults_of_the_two_phases_are_those_of_the_thesis():
@@ -303,14 +307,14 @@ def test_skew_and_squares_are_those_of_scipy(tiny):
 
 
 def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
-    options = ["--rounds", "2", "--batch", "4", "--rivals", "direct, ridge_arx", "--set", "training.updates=3"]
+    options = ["--rounds", "2", "--batch", "4", "--baselines", "direct, ridge_arx", "--set", "training.updates=3"]
     call = ["finetune", str(run), str(target.path), "--out", str(tmp_path / "run"), *options]
     told = CliRunner().invoke(app, call)
     assert told.exit_code == 0, told.output
     assert "next: edp evaluate" in told.output
     facts = read_json(tmp_path / "run" / "transfer.json")
     assert set(facts["methods"]) == {"full", "direct", "ridge_arx"}
-    assert math.isfinite(facts["methods"]["direct"]["worlds"]["target"]["2"]["mean"]["mse"])
+    assert math.isfinite(facts["methods"]["direct"]["domains"]["target"]["2"]["mean"]["mse"])
     page = (tmp_path / "run" / "transfer.html").read_text(encoding="utf-8")
     assert "Before and after" in page
     assert {path.name for path in (tmp_path / "run" / "tables").iterdir()} >= {"pair_k2.csv", "methods_k5.md"}

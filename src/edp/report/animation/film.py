@@ -21,7 +21,7 @@ FILMS = {
     ".mp4": ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart", "-f", "mp4"),
     ".gif": ("-vf", "fps=12.5,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse", "-f", "gif"),
 }
-"""What ffmpeg is told, by ending."""
+"""Options of ffmpeg, by file ending."""
 COLOURS = ((11, 87, 208), (184, 115, 26), (27, 110, 83))
 NAMES = ("BOOM", "ARM", "BUCKET")
 INK, SOFT, RULE, RED = (28, 37, 46), (102, 113, 125), (225, 230, 234), (179, 38, 30)

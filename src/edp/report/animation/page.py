@@ -169,7 +169,7 @@ def _angles(shown: _Columns, machine: Machine) -> Array:
             raise DataError(
                 f"channel '{name}' of '{shown.recording.name}' runs from {values.min():.3f} to {values.max():.3f} m, "
                 f"the {JOINTS[i]} cylinder of {machine.name} from 0 to {full:.3f} m; choose another --machine, or "
-                "mend unit and zero in the signal map"
+                "correct unit and zero in the signal map"
             )
         grid = np.linspace(0.0, full, 201)
         if i < 2:

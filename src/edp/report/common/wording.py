@@ -54,7 +54,7 @@ def short_label(name: str) -> str:
 
 
 def short_labels(names: Iterable[str]) -> tuple[str, ...]:
-    """Short names of one picture, told apart by a number where only the middle did: axes go by their labels."""
+    """Short names of one picture, distinguished by a number where only the middle differed: axes go by their labels."""
     seen: dict[str, int] = {}
     labels = []
     for label in map(short_label, names):

@@ -39,14 +39,14 @@ class CompressionFacts:
         """Places of a row for each network: that of its smallest format; the teacher in float32 comes first."""
         smallest: dict[tuple[str, bool], int] = {}
         for index, row in enumerate(self.rows):
-            whole = row["way"] == "teacher" and row["number_format"] == "float32"
+            whole = row["recipe"] == "teacher" and row["number_format"] == "float32"
             best = smallest.get((row["run"], whole))
             if (
                 best is None
                 or row["resource_usage"]["parameter_bytes"] < self.rows[best]["resource_usage"]["parameter_bytes"]
             ):
                 smallest[row["run"], whole] = index
-        return sorted(smallest.values(), key=lambda index: (self.rows[index]["way"] != "teacher", index))
+        return sorted(smallest.values(), key=lambda index: (self.rows[index]["recipe"] != "teacher", index))
 
     @property
     def horizons(self) -> list[str]:
@@ -97,7 +97,7 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
         rows.append(
             (
                 row["name"],
-                row["way"],
+                row["recipe"],
                 mae,
                 100 * (mae / teacher - 1),
                 usage["parameters"],
@@ -127,9 +127,9 @@ def table_sheet(facts: CompressionFacts, horizon: str) -> Sheet:
     return Sheet(f"k{horizon}", caption, columns, tuple(rows), frozenset(facts.content["front"]))
 
 
-def box_sheet(facts: CompressionFacts) -> Sheet | None:
-    """Teacher and chosen on the lock-box."""
-    scores = facts.content["box"].get("scores")
+def held_out_sheet(facts: CompressionFacts) -> Sheet | None:
+    """Teacher and chosen on the sealed test set."""
+    scores = facts.content["held_out_test"].get("scores")
     if not scores:
         return None
     rows: list[tuple[Value, ...]] = []
@@ -147,7 +147,7 @@ def box_sheet(facts: CompressionFacts) -> Sheet | None:
         Column("Composite, teacher", unit, figures([row[4] for row in rows])),
         Column("Composite, chosen", unit, figures([row[5] for row in rows])),
     )
-    return Sheet("lockbox", "On recordings that took part in no choice", columns, tuple(rows))
+    return Sheet("held_out_test", "On recordings that took part in no choice", columns, tuple(rows))
 
 
 def headline(facts: CompressionFacts) -> str:
@@ -161,7 +161,7 @@ def headline(facts: CompressionFacts) -> str:
 
 def verdict(facts: CompressionFacts) -> list[str]:
     """Sentences under the headline."""
-    best, box = facts.chosen, facts.content["box"]
+    best, held_out = facts.chosen, facts.content["held_out_test"]
     if best is None:
         near = min(facts.rows, key=lambda row: max(value / limit for value, limit in row["over"].values()))
         over = listed(f"{LIMITS[k]} {v:,} of {limit:,}" for k, (v, limit) in near["over"].items())
@@ -171,30 +171,34 @@ def verdict(facts: CompressionFacts) -> list[str]:
         f"It takes {usage['cycles'][2]:,} of {budget['cycles']:,} cycles a tick (high estimate) and "
         f"{usage['parameter_bytes']:,} of {budget['parameter_bytes']:,} bytes for parameters."
     ]
-    if "error" in box:
-        lines.append(f"On the lock-box its MAE is {percent(box['error'] - 1, signed=True)} against the teacher's.")
+    if "error" in held_out:
+        lines.append(
+            f"On the sealed test set its MAE is {percent(held_out['error'] - 1, signed=True)} against the teacher's."
+        )
     return lines
 
 
 def caveats(facts: CompressionFacts) -> list[str]:
     """What the figures can and cannot show."""
-    box, parts = facts.content["box"], facts.content["recordings"]
+    held_out, parts = facts.content["held_out_test"], facts.content["recordings"]
     lines = [
         "Cycles, program and memory beside constants are estimates; MACs are counted, and so are the bytes of all "
         "constants, as the exported C code holds them (INT8, which has no such code: as in Table 4.9). The high "
         "estimate decides.",
         f"Networks are compared and chosen on {parts['validation']} validation recordings, which chose their best "
         "epochs too: the least of many errors is a little too good there.",
-        f"The lock-box, {parts['test']} recordings, was opened for the chosen network and the teacher alone.",
+        f"The sealed test set, {parts['test']} recordings, was opened for the chosen network and the teacher alone.",
         "One training each: differences of a percent between neighbours may be chance.",
     ]
-    if box.get("seen_before"):
+    if held_out.get("seen_before"):
         lines.append(
-            "The run of the teacher was judged on the lock-box before, so the teacher was perhaps chosen by it. "
+            "The run of the teacher was judged on the sealed test set before, so the teacher was perhaps chosen by it. "
             "Recordings that nobody looked at, given with --data, would show more."
         )
-    if len(box.get("openings", ())) > 1:
-        lines.append(f"The lock-box was opened {len(box['openings'])} times; each look after the first shows less.")
+    if len(held_out.get("openings", ())) > 1:
+        lines.append(
+            f"The sealed test set was opened {len(held_out['openings'])} times; openings after the first show less."
+        )
     return [*lines, *facts.content["notes"]]
 
 

@@ -36,9 +36,12 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
 
 
 def sheets(facts: CompressionFacts) -> list[Sheet]:
-    """A table a horizon, longest first, and that of the lock-box."""
-    box = words.box_sheet(facts)
-    return [*(words.table_sheet(facts, horizon) for horizon in reversed(facts.horizons)), *([box] if box else [])]
+    """A table a horizon, longest first, and that of the sealed test set."""
+    held_out = words.held_out_sheet(facts)
+    return [
+        *(words.table_sheet(facts, horizon) for horizon in reversed(facts.horizons)),
+        *([held_out] if held_out else []),
+    ]
 
 
 def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
@@ -50,9 +53,9 @@ def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
         "verdict": words.verdict(facts),
         "tiles": words.tiles(facts),
         "caveats": words.caveats(facts),
-        "tables": [sheet.table() for sheet in tables if sheet.name != "lockbox"],
-        "box": next((sheet.table() for sheet in tables if sheet.name == "lockbox"), None),
-        "opened": facts.content["box"].get("opened", ""),
+        "tables": [sheet.table() for sheet in tables if sheet.name != "held_out_test"],
+        "held_out": next((sheet.table() for sheet in tables if sheet.name == "held_out_test"), None),
+        "opened": facts.content["held_out_test"].get("opened", ""),
         "budget": facts.content["budget"],
         **shown(plots),
     }

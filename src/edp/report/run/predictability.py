@@ -52,5 +52,5 @@ def limit_line(facts: Facts, samples: int | None) -> str:
     return (
         f"The limit of predictability here is {least} {facts.unit} (95 %: {low} to {high}): even a predictor that "
         f"knows the true state is off by that, for it knows neither the operator's next choices nor the noise to come; "
-        f"told the commands, it would be off by {error_with_commands}."
+        f"with the commands known, its error would be {error_with_commands}."
     )

@@ -9,7 +9,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
-from edp.data.frozen import SECOND_BOX
+from edp.data.frozen import SECOND_TEST_SET
 from edp.errors import StorageError
 from edp.storage import read_json
 
@@ -101,13 +101,13 @@ class StudyFacts:
         unit: of the scores.
         data: path, number of sessions, hours and hash of the recordings.
         spec: settings of the search.
-        development, test, second: names of sessions; `second` are those of the second lock-box.
+        development, test, second: names of sessions; `second` are those of the second test set.
         modules: title of each module by name.
         phases: in their order, those that have not begun among them.
         facts: what each decided phase found, by name.
         sentences: what it decided and why.
         history: every training that has ended, in the order in which they were asked for.
-        openings: looks at the test sessions.
+        openings: judged_counts at the test sessions.
     """
 
     state: str
@@ -218,12 +218,14 @@ def _phase(phase_row: Mapping[str, Any]) -> PhaseFacts:
 
 
 def _history(rows: Sequence[Mapping[str, Any]], openings: Sequence[Mapping[str, Any]]) -> tuple[Training, ...]:
-    """What has ended. The last trainings that phases 4 and 6 asked for are those that a lock-box was opened for."""
+    """What has ended. The last trainings of phases 4 and 6 are those that a sealed test set was opened for."""
     test: set[int] = set()
     for phase, second in (("synthesis", False), ("compression", True)):
         places = [index for index, row in enumerate(rows) if row["phase"] == phase]
-        looks = [len(row["judged"]) for row in openings if (str(row["box"]) == SECOND_BOX) == second]
-        sealed = (looks[-1] if second else sum(looks)) if looks else 0  # looks of edp compress trained nothing here
+        judged_counts = [len(row["judged"]) for row in openings if (str(row["test_set"]) == SECOND_TEST_SET) == second]
+        sealed = (
+            (judged_counts[-1] if second else sum(judged_counts)) if judged_counts else 0
+        )  # judged_counts of edp compress trained nothing here
         test |= set(places[len(places) - sealed :] if sealed and places else ())
     return tuple(_training(row, index in test) for index, row in enumerate(rows) if row["status"] != "waiting")
 

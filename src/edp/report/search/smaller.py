@@ -16,7 +16,7 @@ def smaller_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     rows = tuple(
         (
             str(row["name"]),
-            str(row["way"]),
+            str(row["recipe"]),
             real(row["resource_usage"]["parameters"]),
             real(row["resource_usage"]["parameter_bytes"]),
             real(row["resource_usage"]["cycles"][2]),
@@ -52,7 +52,7 @@ def _mean(scores: Mapping[str, Mapping[str, Any]], name: str) -> float:
 
 @of_phase("compression", "")
 def chosen_words(study: StudyFacts, facts: Mapping[str, Any]) -> str:
-    """What was chosen for the controller, and what the second lock-box says of it."""
+    """What was chosen for the controller, and what the second sealed test set says of it."""
     if not facts["on"]:
         return ""
     if facts["chosen"] is None:
@@ -60,7 +60,7 @@ def chosen_words(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     row = facts["rows"][int(facts["chosen"])]
     size = number(real(row["resource_usage"]["parameter_bytes"]) / 1000, 1)
     text = f"For the controller {row['name']} is chosen, with {size} kB of parameters"
-    if facts["box"] is None:
-        return f"{text}; it could not be judged on the second lock-box."
-    change = percent(real(facts["box"]["error"]) - 1, signed=True)
-    return f"{text}; on the second lock-box its error is {change} against the teacher's."
+    if facts["held_out_test"] is None:
+        return f"{text}; it could not be judged on the second sealed test set."
+    change = percent(real(facts["held_out_test"]["error"]) - 1, signed=True)
+    return f"{text}; on the second sealed test set its error is {change} against the teacher's."

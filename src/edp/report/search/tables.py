@@ -207,17 +207,17 @@ def _against(value: float, reference: float | None, show: Any) -> str:
 
 
 def openings_sheet(study: StudyFacts) -> Sheet | None:
-    """Every look at the test sessions."""
+    """Every opening of the sealed test sets."""
     rows = tuple(
         (
             moment(opening.get("time")),
             str(opening.get("why", "")),
             len(opening.get("judged", ())),
-            str(opening.get("box", "")),
+            str(opening.get("test_set", "")),
         )
         for opening in study.openings
     )
-    columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Box"))
+    columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Test set"))
     return Sheet("openings", "Looks at the sessions set apart", columns, rows)
 
 

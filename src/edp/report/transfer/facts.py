@@ -17,7 +17,7 @@ from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import listed, number, percent
 from edp.storage import read_json
 
-RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 1
+RESULT, SHOWN, SCHEMA = "transfer.json", "transfer_predictions.safetensors", 2
 TARGET, SOURCE, MEAN = "target", "source", "mean"
 SIGNIFICANT = 0.05
 """Share of the MAE from which a bias is named."""
@@ -66,13 +66,13 @@ class Transfer:
         return self.content["before"], self.content["method"]
 
     @property
-    def worlds(self) -> list[str]:
+    def domains(self) -> list[str]:
         """Where methods were judged: on the target, and on the source where its recordings are at hand."""
-        return list(self.methods[self.content["method"]]["worlds"])
+        return list(self.methods[self.content["method"]]["domains"])
 
-    def score(self, method: str, horizon: str, target: str = MEAN, world: str = TARGET) -> Mapping[str, Any]:
+    def score(self, method: str, horizon: str, target: str = MEAN, domain: str = TARGET) -> Mapping[str, Any]:
         """Scores of a method."""
-        scores: Mapping[str, Any] = self.methods[method]["worlds"][world][horizon][target]
+        scores: Mapping[str, Any] = self.methods[method]["domains"][domain][horizon][target]
         return scores
 
     def gain(self, horizon: str) -> float:
@@ -138,9 +138,9 @@ def pair_sheet(facts: Transfer, horizon: str) -> Sheet:
 
 
 def method_sheet(facts: Transfer, horizon: str) -> Sheet:
-    """All methods on the same ticks, least error first, in both worlds where both were judged."""
+    """All methods on the same ticks, least error first, in both domains where both were judged."""
     direct = float(facts.score(facts.content["before"], horizon)["mae"])
-    both = SOURCE in facts.worlds
+    both = SOURCE in facts.domains
     rows: list[tuple[Value, ...]] = []
     names = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
     for name in names:
@@ -157,7 +157,7 @@ def method_sheet(facts: Transfer, horizon: str) -> Sheet:
                 scores["p99"],
                 max((row["bias"] for row in each), key=abs),
                 facts.methods[name]["learned"],
-                *([facts.score(name, horizon, world=SOURCE)["mae"]] if both else []),
+                *([facts.score(name, horizon, domain=SOURCE)["mae"]] if both else []),
             )
         )
     unit = facts.unit
@@ -189,7 +189,7 @@ def headline(facts: Transfer) -> str:
 
 
 def verdict(facts: Transfer) -> list[str]:
-    """Sentences under the headline: R2 and bias of each target, the best rival, the source's world."""
+    """Sentences under the headline: R2 and bias of each target, the best baseline, the domain of the source."""
     horizon, method = facts.horizons[-1], facts.content["method"]
     each = {facts.name(target): facts.score(method, horizon, target["name"]) for target in facts.targets}
     r2_texts = listed(f"{number(row['r2'], 4)} ({name})" for name, row in each.items())
@@ -197,13 +197,13 @@ def verdict(facts: Transfer) -> list[str]:
     leaning = [name for name, row in each.items() if abs(row["bias"]) > SIGNIFICANT * row["mae"]]
     if leaning:
         lines.append(f"The errors of {listed(leaning)} have a bias above {percent(SIGNIFICANT)} of their MAE.")
-    rivals = [name for name in facts.methods if name != method]
-    best = min(rivals, key=lambda name: facts.score(name, horizon)["mae"])
+    baselines = [name for name in facts.methods if name != method]
+    best = min(baselines, key=lambda name: facts.score(name, horizon)["mae"])
     if facts.score(best, horizon)["mae"] < facts.score(method, horizon)["mae"]:
         better = facts.methods[best]["label"]
         lines.append(f"{better} has less: {number(facts.score(best, horizon)['mae'])} {facts.unit}.")
-    if SOURCE in facts.worlds:
-        was, now = (facts.score(name, horizon, world=SOURCE)["mae"] for name in facts.pair)
+    if SOURCE in facts.domains:
+        was, now = (facts.score(name, horizon, domain=SOURCE)["mae"] for name in facts.pair)
         change = percent(now / was - 1, signed=True)
         lines.append(f"On the source's own test part the error is {number(now)} {facts.unit}, {change}.")
     return lines

@@ -47,7 +47,7 @@ def render(facts: Transfer, tables: list[Sheet]) -> str:
         "caveats": words.caveats(facts),
         "pairs": [sheet.table() for sheet in tables if sheet.name.startswith("pair")],
         "methods": [sheet.table() for sheet in tables if sheet.name.startswith("methods")],
-        "both": words.SOURCE in facts.worlds,
+        "both": words.SOURCE in facts.domains,
         **shown(plots),
     }
     return template("transfer.html.jinja").render(**context)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AHEAD, RECORDING = "horizon", "recording"
-WORLDS = {TARGET: "on the target's logs", SOURCE: "on the source's recordings"}
+DOMAINS = {TARGET: "on the target's logs", SOURCE: "on the source's recordings"}
 
 
 def transfer_plots(facts: Transfer) -> dict[str, Plot]:
@@ -100,23 +100,23 @@ def error_plot(facts: Transfer) -> Plot:
 
 
 def method_plot(facts: Transfer) -> Plot:
-    """MAE of every method by target, in each world that it was judged in."""
+    """MAE of every method by target, in each domain that it was judged in."""
     figure = make_subplots(
-        rows=len(facts.worlds), cols=1, shared_xaxes=True, vertical_spacing=0.12,
-        subplot_titles=[WORLDS[world].capitalize() for world in facts.worlds],
+        rows=len(facts.domains), cols=1, shared_xaxes=True, vertical_spacing=0.12,
+        subplot_titles=[DOMAINS[domain].capitalize() for domain in facts.domains],
     )  # fmt: skip
     for horizon in facts.horizons:
         order = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
         labels = [html.escape(facts.methods[name]["label"]) for name in order]
-        for row, world in enumerate(facts.worlds, start=1):
+        for row, domain in enumerate(facts.domains, start=1):
             for index, target in enumerate(facts.targets):
                 figure.add_bar(
-                    x=labels, y=[facts.score(name, horizon, target["name"], world)["mae"] for name in order],
+                    x=labels, y=[facts.score(name, horizon, target["name"], domain)["mae"] for name in order],
                     row=row, col=1, name=html.escape(short_label(facts.name(target))), legendgroup=target["name"],
                     showlegend=row == 1, marker={"color": MUTED[index % len(MUTED)]}, meta={AHEAD: horizon},
                     visible=horizon == facts.horizons[0], hovertemplate="%{y:.4~g}",
                 )  # fmt: skip
-    styled(figure, 120 + 240 * len(facts.worlds), bargap=0.3)
+    styled(figure, 120 + 240 * len(facts.domains), bargap=0.3)
     figure.update_yaxes(title_text=with_unit("Mean absolute error", facts.unit))
     figure.update_layout(margin_t=66)
     return Plot("methods", figure, _controls(facts))

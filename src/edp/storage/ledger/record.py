@@ -159,7 +159,7 @@ class Record:
         """Key of the identity."""
         return self.identity.key
 
-    def told(self) -> list[Any]:
+    def reported(self) -> list[Any]:
         """What an equal training says again, to the bit."""
         return [self.key, str(self.status), self.result, self.message]
 

@@ -16,7 +16,7 @@ from edp.storage.ledger.claims import free_dead_claims, whole
 from edp.storage.ledger.record import FINAL, RECORD_BYTES, SCHEMA, Record, TrainingStatus, body_of, canonical, digest_of
 from edp.storage.ledger.states import SUFFIX, left_state, read_state
 from edp.storage.locks import check_held, hold
-from edp.storage.reading import read_bytes, read_object
+from edp.storage.reading import object_with, read_bytes, read_object
 from edp.storage.writing import make_folder, remove_unfinished, storage_error, write_bytes, write_json
 
 
@@ -72,20 +72,26 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
 
 @dataclass(frozen=True)
 class Opening:
-    """One look into a lock-box: who was judged, why, and when."""
+    """One opening of a sealed test set: who was judged, why, and when."""
 
-    box: str
+    test_set: str
     judged: tuple[str, ...]
     why: str
     time: str
 
 
 def _opening(file: Path) -> Opening:
-    content = read_object(file, (part.name for part in fields(Opening)))
+    content = read_object(file)
+    if "box" in content:
+        raise StorageError(
+            f"'{file}' is of an older version of EDP, whose ledgers this one does not read: search again in another "
+            "folder, or go on with the version that wrote it"
+        )
+    object_with(content, (part.name for part in fields(Opening)), f"'{file}'")
     judged = content["judged"]
     if not isinstance(judged, list) or not all(isinstance(key, str) for key in judged):
         raise StorageError(f"'{file}' is damaged: judged must be a list of keys; restore it")
-    return Opening(str(content["box"]), tuple(judged), str(content["why"]), str(content["time"]))
+    return Opening(str(content["test_set"]), tuple(judged), str(content["why"]), str(content["time"]))
 
 
 class Ledger:
@@ -171,7 +177,7 @@ class Ledger:
         """
         check_held(self.path / ".lock", self._lock)
         existing = self.finished(record.key)
-        if existing is not None and existing.told() != record.told():
+        if existing is not None and existing.reported() != record.reported():
             raise StorageError(
                 f"training {record.key} is in '{self.path}' as {existing.status} and came again, {record.status}, with "
                 "another result; equal trainings must give equal results: is something not in its key?"
@@ -200,7 +206,7 @@ class Ledger:
 
     def digest(self) -> str:
         """Hash over all results; what is measured, such as seconds, is left out."""
-        return digest_of([record.told() for record in self])
+        return digest_of([record.reported() for record in self])
 
     def set_aside(self, statuses: Collection[TrainingStatus]) -> int:
         """Put records away so that their trainings are tried again, for example after a cap was raised; how many."""
@@ -231,35 +237,36 @@ class Ledger:
             )
         return True
 
-    def open_box(self, box: str, judged: Sequence[str], why: str, again: bool = False) -> Opening:
-        """Record that held-out recordings are looked at; the same look again, after a stop, counts once.
+    def open_test_set(self, name: str, judged: Sequence[str], why: str, again: bool = False) -> Opening:
+        """Record that held-out recordings are judged on; the same opening again, after a stop, counts once.
 
         Args:
-            box: name of the lock-box.
+            name: of the sealed test set.
             judged: keys of what is judged on it.
             why: a sentence for the report.
-            again: allow a further look at other things; it is recorded, too, and weakens what the box can show.
+            again: allow a further opening for other models; it is recorded and weakens what the set can show.
 
         Raises:
-            ConfigError: the box was opened before for something else.
+            ConfigError: the test set was opened before for something else.
         """
-        before = self.openings(box)
+        before = self.openings(name)
         for opening in before:
             if opening.judged == tuple(judged):
                 return opening
         if before and not again:
             raise ConfigError(
-                f"lock-box '{box}' was opened on {before[0].time} ({before[0].why}) for other models; scores on it "
-                "would no longer be of unseen recordings. Judge on other recordings, or say that it is opened again"
+                f"sealed test set '{name}' was opened on {before[0].time} ({before[0].why}) for other models; "
+                "scores on it would no longer be of unseen recordings. Judge on other recordings, or say that it is "
+                "opened again"
             )
-        opening = Opening(box, tuple(judged), why, time.strftime("%Y-%m-%dT%H:%M:%S%z"))
+        opening = Opening(name, tuple(judged), why, time.strftime("%Y-%m-%dT%H:%M:%S%z"))
         write_json(self.path / "openings" / f"{len(self.openings()) + 1:04d}.json", asdict(opening))
         return opening
 
-    def openings(self, box: str | None = None) -> list[Opening]:
-        """Looks into one lock-box or all, oldest first."""
+    def openings(self, name: str | None = None) -> list[Opening]:
+        """Openings of one sealed test set or of all, oldest first."""
         openings = [_opening(file) for file in sorted((self.path / "openings").glob("*.json"))]
-        return [one for one in openings if box in (None, one.box)]
+        return [one for one in openings if name in (None, one.test_set)]
 
     def _enter_arrivals(self) -> None:
         """Enter what workers had finished when the last coordinator was killed."""

@@ -33,7 +33,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     """Write a run whose network has an adaptation: it is exported with it and replayed with it.
 
     Args:
-        run: run folder, in single precision or in whole numbers.
+        run: run folder, in single precision or integer (W8A16).
         out: folder of the new run; one that `adapt` wrote is replaced.
         spec: options.
 

@@ -22,7 +22,7 @@ class Judged:
 
     Attributes:
         name: of the network and its format.
-        way: how it was made, in words.
+        recipe: how it was made, in words.
         number_format: a name of `FORMATS`.
         resource_usage: what it takes of the controller.
         over: limits that it exceeds: what it takes, and what is granted.
@@ -33,7 +33,7 @@ class Judged:
     """
 
     name: str
-    way: str
+    recipe: str
     number_format: str
     resource_usage: ResourceUsage
     over: Mapping[str, tuple[int, int]]
@@ -62,7 +62,7 @@ class CompressionResult:
         rows: all networks in all formats, in the order in which they were made.
         front: places of the rows that no other one betters in error, cycles and bytes of parameters.
         chosen: place of the row that fits with the least error; None where none fits.
-        box: scores of teacher and chosen on recordings that took part in no choice, by horizon.
+        held_out_test: scores of teacher and chosen on recordings that took part in no choice, by horizon.
         notes: what was left out, and why.
     """
 
@@ -70,7 +70,7 @@ class CompressionResult:
     rows: list[Judged]
     front: list[int]
     chosen: int | None
-    box: Mapping[str, Any] = field(default_factory=dict)
+    held_out_test: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
 
     @property
@@ -106,12 +106,12 @@ def choose(rows: Sequence[Judged]) -> tuple[list[int], int | None]:
     return pareto(points), best
 
 
-def way_of(order: CompressionRequest) -> str:
+def recipe_text(order: CompressionRequest) -> str:
     """How an order makes its network, in words."""
     levels = "pruned and distilled" if order.pruned else "distilled"
     if order.rounding is None:
         return levels
-    begun = "teacher" if order.of is None else way_of(order.of)
+    begun = "teacher" if order.of is None else recipe_text(order.of)
     return f"{begun}, trained on rounded"
 
 
@@ -119,8 +119,8 @@ def deployed_row(
     name: str, order: CompressionRequest | None, deployed: Deployed, scores: tuple[Any, Any], budget: Budget, run: str
 ) -> Judged:
     """A row without its error, which needs the teacher; `scores` are in its format and in float32."""
-    way = "teacher" if order is None else way_of(order)
+    recipe = "teacher" if order is None else recipe_text(order)
     over = deployed.resource_usage.over(budget)
     return Judged(
-        name, way, deployed.number_format, deployed.resource_usage, over, scores[0], scores[1], float("nan"), run
+        name, recipe, deployed.number_format, deployed.resource_usage, over, scores[0], scores[1], float("nan"), run
     )

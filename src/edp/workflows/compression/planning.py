@@ -20,7 +20,7 @@ from edp.workflows.compression.pruning import check_pruning
 from edp.workflows.compression.variants import rounded_order
 
 STEP = 4  # widths are multiples of it: what kernels compute at a time
-WAYS = ("distilled", "pruned")  # and the better one is trained on with rounded numbers
+RECIPES = ("distilled", "pruned")  # and the better one is trained on with rounded numbers
 SHARES = (1.0, 0.5, 0.25)  # of the widest that fits: the front below it
 
 
@@ -29,7 +29,7 @@ class CompressionPlan:
     """What is to be made.
 
     Attributes:
-        orders: the ways to each width, widest first.
+        orders: the recipes for each width, widest first.
         formats: in which a network can be.
         notes: what was left out, and why.
     """
@@ -46,10 +46,10 @@ class CompressionPlan:
     @property
     def trainings(self) -> int:
         """How many there are."""
-        return sum(len(ways) + self.rounds for ways in self.orders.values())
+        return sum(len(orders) + self.rounds for orders in self.orders.values())
 
     def tuned(self, best: CompressionRequest) -> list[CompressionRequest]:
-        """What is made of the better way of a width."""
+        """What is made of the better recipe of a width."""
         return [rounded_order(best)] if self.rounds else []
 
 
@@ -58,7 +58,7 @@ def make_plan(
     budget: Budget,
     units: Sequence[int] = (),
     formats: Sequence[str] = (),
-    ways: Sequence[str] = WAYS,
+    recipes: Sequence[str] = RECIPES,
     shares: Sequence[float] = SHARES,
 ) -> CompressionPlan:
     """Plan a search: the widest network that fits in each format, and its halves and quarters.
@@ -68,16 +68,16 @@ def make_plan(
         budget: what the controller grants.
         units: widths to make; none given, they are planned.
         formats: names of number formats; none given, all.
-        ways: some of `WAYS`.
+        recipes: some of `RECIPES`.
         shares: of the widest that fits; each plans a width.
 
     Raises:
-        ConfigError: an unknown format or way, a width that is none, or a budget that no network of this kind meets.
+        ConfigError: an unknown format or recipe, a width that is none, or a budget that no network of this kind meets.
     """
     full = width_of(teacher.spec)
-    unknown = [way for way in ways if way not in WAYS]
-    if unknown or not ways:
-        raise ConfigError(f"ways = {', '.join(unknown) or 'none'}; some of {', '.join(WAYS)} must hold")
+    unknown = [recipe for recipe in recipes if recipe not in RECIPES]
+    if unknown or not recipes:
+        raise ConfigError(f"recipes = {', '.join(unknown) or 'none'}; some of {', '.join(RECIPES)} must hold")
     wrong = [width for width in units if not 1 <= width <= full]
     if wrong:
         raise ConfigError(
@@ -85,38 +85,38 @@ def make_plan(
         )
     possible = [width for width in sorted({1, 2, full, *range(STEP, full, STEP)}) if width <= full]
     possible = [width for width in possible if not _why_not(teacher, _narrow(teacher.spec, width))]
-    able, notes = _able(teacher, possible[0], formats or list(FORMATS))
-    fitting = {name: _widest(teacher, name, budget, possible) for name in able}
+    supported, notes = _supported(teacher, possible[0], formats or list(FORMATS))
+    fitting = {name: _widest(teacher, name, budget, possible) for name in supported}
     if not any(fitting.values()):
-        raise ConfigError(_refusal(teacher, budget, able, possible[0]))
+        raise ConfigError(_refusal(teacher, budget, supported, possible[0]))
     for name, width in fitting.items():
         if not width:
             notes.append(f"no width fits the budget in {FORMATS[name].label}")
     tops = set(fitting.values()) - {0}
     goals = {max(tops) * share for share in shares}
     widths = set(units) or tops | {max([width for width in possible if width <= goal] or tops) for goal in goals}
-    orders = {width: _orders(teacher, width, ways, notes) for width in sorted(widths - {full}, reverse=True)}
-    return CompressionPlan(orders, tuple(able), tuple(dict.fromkeys(notes)))
+    orders = {width: _orders(teacher, width, recipes, notes) for width in sorted(widths - {full}, reverse=True)}
+    return CompressionPlan(orders, tuple(supported), tuple(dict.fromkeys(notes)))
 
 
-def _orders(teacher: Predictor, width: int, ways: Sequence[str], notes: list[str]) -> tuple[CompressionRequest, ...]:
-    """The ways to a network of this width; why there are no others is noted."""
+def _orders(teacher: Predictor, width: int, recipes: Sequence[str], notes: list[str]) -> tuple[CompressionRequest, ...]:
+    """The recipes for a network of this width; why there are no others is noted."""
     both = {
         "distilled": CompressionRequest(name=f"u{width}", units=width),
         "pruned": CompressionRequest(name=f"p{width}", units=width, pruned=True),
     }
-    orders = [order for way, order in both.items() if way in ways]
+    orders = [order for recipe, order in both.items() if recipe in recipes]
     try:
         check_pruning(teacher.spec, _narrow(teacher.spec, width))
     except ConfigError as error:
         notes.append(str(error))
         orders = [both["distilled"]]
     why = {order: _why_not(teacher, order.model(teacher.spec)) for order in orders}
-    notes += [f"{way.name} is left out: {reason}" for way, reason in why.items() if reason]
-    able = tuple(way for way, reason in why.items() if not reason)
-    if not able:
+    notes += [f"{recipe.name} is left out: {reason}" for recipe, reason in why.items() if reason]
+    supported = tuple(recipe for recipe, reason in why.items() if not reason)
+    if not supported:
         raise ConfigError("; ".join(reason for reason in why.values() if reason))
-    return able
+    return supported
 
 
 def _why_not(teacher: Predictor, model: ModelSpec) -> str:
@@ -128,22 +128,22 @@ def _why_not(teacher: Predictor, model: ModelSpec) -> str:
     return ""
 
 
-def _able(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
+def _supported(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
     """The formats that have a form for every part of the network, and why the others have none."""
     net = _untrained(_narrow(teacher.spec, least), teacher.task)
     drawn = np.random.default_rng(0).normal(size=(2 * net.spec.window, len(net.task.inputs))).astype(np.float32)
     series = [Series("drawn", drawn, np.zeros((len(drawn), len(net.task.targets)), dtype=np.float32))]
-    able, notes = [], []
+    supported, notes = [], []
     for name in formats:
         try:
             FORMATS[name]().predictions(net, series)
         except ExportError as error:
             notes.append(f"number format '{name}' is left out: {error}")
         else:
-            able.append(name)
-    if not able:
+            supported.append(name)
+    if not supported:
         raise ConfigError("; ".join(notes))
-    return able, notes
+    return supported, notes
 
 
 def _narrow(model: ModelSpec, units: int) -> ModelSpec:

@@ -1,4 +1,4 @@
-"""A run in whole numbers, as a run of its own."""
+"""An integer (W8A16) run, as a run of its own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from edp.workflows.train_evaluate import trained_run
 
 
 def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str, float]:
-    """Write a run in W8A16: it is judged, reported and exported in whole numbers.
+    """Write a run in W8A16: it is judged, reported and exported in integer arithmetic.
 
     Formats and weights are chosen on the inputs of the training part; the errors are of the validation part.
 
@@ -29,7 +29,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
         ``float`` and ``integer``: MAE over horizons and targets in SI units; ``bytes``: of the constants of its C code.
 
     Raises:
-        EdpError: not a run folder, a network without a form in whole numbers or in them already, or a folder that
+        EdpError: not a run folder, a network without an integer form or already in integer form, or a folder that
             holds another run.
     """
     folder = Path(run)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import Experiment, experiment_toml, plain_tree
-from edp.data.frozen import SECOND_BOX, ByFrozen
+from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.data.prepared import Prepared
 from edp.errors import ExportError
 from edp.evaluation.controller import Budget
@@ -35,11 +35,11 @@ from edp.workflows.compression.judged import (
     on_validation,
     relative,
 )
-from edp.workflows.compression.planning import WAYS, CompressionPlan, make_plan
+from edp.workflows.compression.planning import RECIPES, CompressionPlan, make_plan
 from edp.workflows.compression.variants import VARIANTS, CompressedCandidate
 from edp.workflows.train_evaluate import StrategyFactory, prepare_data, train
 
-BOX = "test"
+TEST_PART = "test"
 THESIS_VARIANTS = {"A_u32": 32, "A_u64": 64, "B_LPTQ": 64, "C_QAT": 0, "C_u64_QAT": 64}
 """Width of the students of Table 4.9; 0 where the teacher keeps its own."""
 RESULT = "compression.json"
@@ -53,16 +53,16 @@ class CompressionSearchSpec:
         budget: what the controller grants.
         units: widths; none given, they are planned from the budget.
         formats: number formats; none given, all.
-        ways: how each width is made, some of `edp.workflows.compression.planning.WAYS`.
+        recipes: how each width is made, some of `edp.workflows.compression.planning.RECIPES`.
         thesis: also make the variants of Table 4.9 that are narrower than the teacher.
-        again: open the lock-box again for another choice, which weakens what it can show; it is recorded.
+        again: open the sealed test set again for another choice, which weakens what it can show; it is recorded.
         changes: settings of the trainings that differ from the run's, as ``key.path=value``.
     """
 
     budget: Budget
     units: tuple[int, ...] = ()
     formats: tuple[str, ...] = ()
-    ways: tuple[str, ...] = WAYS
+    recipes: tuple[str, ...] = RECIPES
     thesis: bool = False
     again: bool = False
     changes: tuple[str, ...] = ()
@@ -150,7 +150,7 @@ def search(
     """Make smaller networks of a run, judge them in their formats, and choose the best that fits a budget.
 
     Choices rest on the validation part. The test part is opened once, for the chosen network and the teacher; that is
-    recorded in the folder. For a run of a model search it is the second lock-box of the search, and the look is
+    recorded in the folder. For a run of a model search it is the second test set of the search, and the opening is
     recorded in its ledger, too. The same call goes on after a stop, and trains nothing twice.
 
     Args:
@@ -161,47 +161,47 @@ def search(
         watchers: called on the way.
 
     Raises:
-        EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a lock-box that was
+        EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a test set that was
             opened for another choice.
     """
     teacher, experiment, own = read_run(run, spec.changes)
-    plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.ways)
+    plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.recipes)
     callbacks = watchers or CompressionCallbacks()
     for note in plan.notes:
         callbacks.on_note(note)
     frozen = frozen_sessions(run, experiment)
     data = prepare_data(source or own, experiment, frozen)
-    box = _box_of(source or own, experiment, data)
+    held_out = _held_out_test_of(source or own, experiment, data)
     settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
     with RunFolder(out) as folder:
         folder.claim(key, experiment_toml(experiment))
         bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), callbacks)
         bench.frozen = frozen
-        court = _Evaluator(bench, spec.budget, Path(run), box.data)
-        rows, notes = _rows(bench, court, plan, spec)
+        evaluator = _Evaluator(bench, spec.budget, Path(run), held_out.data)
+        rows, notes = _rows(bench, evaluator, plan, spec)
         front, chosen = choose(rows)
-        result = CompressionResult(court.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
+        result = CompressionResult(evaluator.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
         if result.best is not None:
-            result = replace(result, box=_open_box(result, court, folder, box, spec.again))
-        seen = box.seen(result.box.get("openings", ())) or _seen(Path(run), source, own, box)
-        write_json(folder.file(RESULT), _plain(result, spec, data, seen, len(box.data.test)))
+            result = replace(result, held_out_test=_judge_held_out(result, evaluator, folder, held_out, spec.again))
+        seen = held_out.seen(result.held_out_test.get("openings", ())) or _seen(Path(run), source, own, held_out)
+        write_json(folder.file(RESULT), _plain(result, spec, data, seen, len(held_out.data.test)))
     return result
 
 
 @dataclass(frozen=True, eq=False)
-class _Box:
+class _HeldOutTest:
     """The recordings that are looked at once.
 
     Attributes:
         data: they are its test part.
-        name: of the lock-box.
-        study: folder of the model search that set it apart and records each look; None where none did, or it is gone.
+        name: of the sealed test set.
+        study: folder of the model search that set it apart and records openings; None where none did, or it is gone.
         opened_before: whether a model search judged on it already.
     """
 
     data: Prepared
-    name: str = BOX
+    name: str = TEST_PART
     study: Path | None = None
     opened_before: bool = False
 
@@ -210,22 +210,22 @@ class _Box:
         return self.opened_before or len(openings) > 1
 
 
-def _box_of(source: DataSource, experiment: Experiment, data: Prepared) -> _Box:
-    """The second lock-box of the model search that a run comes from, else the test part."""
+def _held_out_test_of(source: DataSource, experiment: Experiment, data: Prepared) -> _HeldOutTest:
+    """The second test set of the model search that a run comes from, else the test part."""
     split = experiment.split
     if not isinstance(split, ByFrozen):
-        return _Box(data)
+        return _HeldOutTest(data)
     there = {recording.digest for recording in source.read()}
     if not any(session.digest in there for session in split.second):
-        return _Box(data, opened_before=any(session.digest in there for session in split.test))
+        return _HeldOutTest(data, opened_before=any(session.digest in there for session in split.test))
     study = Path(split.study)
     recorded = split.study and (study / "study.json").is_file() and (study / "ledger" / "about.json").is_file()
     opened = prepare_data(source, replace(experiment, split=split.opened()))
-    return _Box(opened, SECOND_BOX, study if recorded else None)
+    return _HeldOutTest(opened, SECOND_TEST_SET, study if recorded else None)
 
 
 def _rows(
-    bench: DiskBench, court: _Evaluator, plan: CompressionPlan, spec: CompressionSearchSpec
+    bench: DiskBench, evaluator: _Evaluator, plan: CompressionPlan, spec: CompressionSearchSpec
 ) -> tuple[list[Judged], list[str]]:
     """Every network in every format that it can be in, and what could not be."""
     names = _variants(bench) if spec.thesis else []
@@ -235,7 +235,7 @@ def _rows(
     def judge(order: CompressionRequest | None, network: Predictor, formats: Sequence[str]) -> None:
         for name in formats:
             try:
-                rows.append(court.judged(order, network, name))
+                rows.append(evaluator.judged(order, network, name))
             except ExportError as error:
                 notes.append(f"{'teacher' if order is None else order.name} in {FORMATS[name].label}: {error}")
 
@@ -244,12 +244,12 @@ def _rows(
         networks = {order: bench.network(order) for order in orders}
         for order, network in networks.items():
             judge(order, network, plan.formats)
-        plain = {order: court.float_error(network) for order, network in networks.items()}
+        plain = {order: evaluator.float_error(network) for order, network in networks.items()}
         for order in plan.tuned(min(plain, key=plain.__getitem__)):
             judge(order, bench.network(order), [name for name in plan.formats if FORMATS[name].rounded])
     for name in names:
         make = VARIANTS[name]
-        rows.append(court.variant(make(bench)))
+        rows.append(evaluator.variant(make(bench)))
     return rows, notes
 
 
@@ -260,10 +260,10 @@ def _variants(bench: Bench) -> list[str]:
 
 
 class _Evaluator:
-    """Judges networks on the validation part, and at the end two on the lock-box: the test part of `box`."""
+    """Judges networks on the validation part, and at the end two on the test set: the test part of `held_out`."""
 
-    def __init__(self, bench: DiskBench, budget: Budget, run: Path, box: Prepared) -> None:
-        self.bench, self.budget, self.box = bench, budget, box
+    def __init__(self, bench: DiskBench, budget: Budget, run: Path, held_out: Prepared) -> None:
+        self.bench, self.budget, self.held_out = bench, budget, held_out
         self.data, self.skip = on_validation(bench.data), bench.teacher.spec.window
         self.deployed: dict[str, tuple[Deployed, Predictor]] = {}
         self._float: dict[int, dict[str, dict[str, float]]] = {}
@@ -288,9 +288,9 @@ class _Evaluator:
         """Error in float32, over the teacher's."""
         return relative(self._plain(network), self.teacher.scores)
 
-    def on_box(self, row: Judged) -> dict[str, dict[str, float]]:
-        """Scores on the lock-box."""
-        return measure(self.deployed[row.name][0], self.box, self.skip)
+    def on_held_out_test(self, row: Judged) -> dict[str, dict[str, float]]:
+        """Scores on the sealed test set."""
+        return measure(self.deployed[row.name][0], self.held_out, self.skip)
 
     def key(self, row: Judged) -> str:
         """What is judged: weights and format."""
@@ -318,27 +318,27 @@ class _Evaluator:
         return deployed_row(name, order, deployed, (scores, before), self.budget, str(run))
 
 
-def _open_box(
-    result: CompressionResult, court: _Evaluator, folder: RunFolder, box: _Box, again: bool
+def _judge_held_out(
+    result: CompressionResult, evaluator: _Evaluator, folder: RunFolder, held_out: _HeldOutTest, again: bool
 ) -> dict[str, Any]:
-    """Judge teacher and chosen on the lock-box, once; the look is recorded before it is taken."""
+    """Judge teacher and chosen on the sealed test set, once; the opening is recorded before it is made."""
     pair = {"teacher": result.teacher, "chosen": result.best}
-    keys = [court.key(row) for row in pair.values() if row is not None]
+    keys = [evaluator.key(row) for row in pair.values() if row is not None]
     why = "the network chosen by edp compress, and its teacher"
-    ledgers = [folder.file("ledger")] if box.study is None else [box.study / "ledger", folder.file("ledger")]
+    ledgers = [folder.file("ledger")] if held_out.study is None else [held_out.study / "ledger", folder.file("ledger")]
     openings: list[dict[str, Any]] = []
-    for ledger_folder in ledgers:  # that of the search first: it knows of looks from other folders
+    for ledger_folder in ledgers:  # that of the search first: it knows of openings from other folders
         with Ledger(ledger_folder) as ledger:
-            opening = ledger.open_box(box.name, keys, why, again)
-            openings = openings or [asdict(one) for one in ledger.openings(box.name)]
-    scores = {name: court.on_box(row) for name, row in pair.items() if row is not None}
+            opening = ledger.open_test_set(held_out.name, keys, why, again)
+            openings = openings or [asdict(one) for one in ledger.openings(held_out.name)]
+    scores = {name: evaluator.on_held_out_test(row) for name, row in pair.items() if row is not None}
     error = relative(scores["chosen"], scores["teacher"])
-    return {"name": box.name, "opened": opening.time, "openings": openings, "scores": scores, "error": error}
+    return {"name": held_out.name, "opened": opening.time, "openings": openings, "scores": scores, "error": error}
 
 
-def _seen(run: Path, source: DataSource | None, own: DataSource, box: _Box) -> bool:
-    """Whether the lock-box is the test part and was judged before, by ``edp evaluate``."""
-    same = box.name == BOX and (source is None or source.to_plain() == own.to_plain())
+def _seen(run: Path, source: DataSource | None, own: DataSource, held_out: _HeldOutTest) -> bool:
+    """Whether the sealed test set is the test part and was judged before, by ``edp evaluate``."""
+    same = held_out.name == TEST_PART and (source is None or source.to_plain() == own.to_plain())
     return same and (run / "scores.json").is_file()
 
 
@@ -356,6 +356,6 @@ def _plain(
         "rows": [row.to_json() for row in result.rows],
         "front": result.front,
         "chosen": result.chosen,
-        "box": dict(result.box) | {"seen_before": seen},
+        "held_out_test": dict(result.held_out_test) | {"seen_before": seen},
         "notes": list(result.notes),
     }

@@ -106,7 +106,7 @@ def select_features(
         listeners: who hears of the progress.
 
     Raises:
-        EdpError: the recordings cannot be read as they are, or nothing can be told from them.
+        EdpError: the recordings cannot be read as they are, or no conclusion can be drawn from them.
     """
     order, listeners = order or SelectionOrder(), listeners or Listeners()
     folder = check_writable(out)

@@ -106,7 +106,7 @@ def _start(path: str | Path) -> tuple[Predictor, dict[str, str]]:
     """A network to begin with, and names by digest of sessions that stay frozen for what comes of it.
 
     Raises:
-        BundleError: not a bundle, or one of a network in whole numbers.
+        BundleError: not a bundle, or one of an integer network (W8A16).
     """
     bundle = load_bundle(path)
     predictor = bundle.predictor

@@ -88,7 +88,7 @@ class SearchContext:
         test: names of the sessions set apart.
         channels: of the recordings.
         unit: of the scores, for sentences.
-        second: names of the sessions of the second lock-box; none without phase 6.
+        second: names of the sessions of the second test set; none without phase 6.
         decided: what earlier phases decided, by name.
     """
 
@@ -180,7 +180,7 @@ class SearchContext:
 def set_apart(
     sessions: Sequence[str], families: Mapping[str, str], spec: SearchSpec
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Development sessions, test sessions, and those of the second lock-box: of each family its share, drawn once.
+    """Development sessions, test sessions, and those of the second test set: of each family its share, drawn once.
 
     Args:
         sessions: names in order.
@@ -188,7 +188,7 @@ def set_apart(
         spec: share and seed.
 
     Raises:
-        ConfigError: a session that is to be set apart is not there, or is named for both lock-boxes.
+        ConfigError: a session that is to be set apart is not there, or is named for both test sets.
         DataError: too few sessions for the folds.
     """
     for part, named in (("test", spec.test), ("second", spec.second)):

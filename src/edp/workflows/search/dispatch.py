@@ -25,8 +25,8 @@ class Dispatcher:
         threads: of each training; the pool pins as many.
         seconds: cap on the time of a training.
         memory_mb: cap on its memory.
-        on_record: told of each record and whether it was trained now.
-        on_orders: told of each batch before it is done: keys and orders.
+        on_record: called with each record, and whether it was trained now.
+        on_orders: called with each batch before it is done: keys and orders.
         teacher_keys: keys of the networks of phase 6, whose states later ones are made of.
     """
 

@@ -64,7 +64,7 @@ class Executor(Protocol):
         ...
 
     def cancel(self, key: str) -> None:
-        """Stop a job or take it from the queue; nothing is told of it any more."""
+        """Stop a job or take it from the queue; nothing is reported of it any more."""
         ...
 
     def running(self) -> list[str]:

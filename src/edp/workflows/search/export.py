@@ -10,7 +10,7 @@ from edp.errors import StorageError
 from edp.report import read_study
 from edp.workflows.search.plan import space_of
 from edp.workflows.search.space import Choice, Range, Space
-from edp.workflows.search.study import Told, ToldTrial, write_journal
+from edp.workflows.search.study import FinishedStudy, FinishedTrial, write_journal
 
 JOURNAL = "optuna.journal"
 NO_VALUES = ("number", "values", "modules", "score", "statuses", "rungs", "pruned")
@@ -31,7 +31,7 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     """
     content = read_study(folder)
     file = Path(folder, JOURNAL) if path is None else Path(path)
-    studies = told(content)
+    studies = ended_studies(content)
     if not studies:
         raise StorageError(
             f"'{folder}' has asked no questions yet: phase 1 (calibration) has not ended; go on with edp search, then "
@@ -41,24 +41,24 @@ def export_study(folder: str | Path, path: str | Path | None = None) -> tuple[Pa
     return file, [study.name for study in studies]
 
 
-def told(study: Mapping[str, Any]) -> list[Told]:
+def ended_studies(study: Mapping[str, Any]) -> list[FinishedStudy]:
     """The studies of phases 1, 4 and 5 that have ended."""
     space = space_of(study["spec"]["space"])
-    finished_studies = []
+    studies = []
     for decision in study["decisions"]:
         phase, facts = decision["phase"], decision["facts"]
         if phase == "calibration":
             for backbone, own in facts["backbones"].items():
-                finished_studies.append(_told(f"{phase} {backbone}", own["trials"], space, [], study))
+                studies.append(_ended_study(f"{phase} {backbone}", own["trials"], space, [], study))
         elif phase in ("synthesis", "exploration"):
             options = {key: Choice(tuple(values)) for key, values in facts.get("options", {}).items()}
-            finished_studies.append(_told(phase, facts["trials"], {**space, **options}, list(facts["on"]), study))
-    return finished_studies
+            studies.append(_ended_study(phase, facts["trials"], {**space, **options}, list(facts["on"]), study))
+    return studies
 
 
-def _told(
+def _ended_study(
     name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], study: Mapping[str, Any]
-) -> Told:
+) -> FinishedStudy:
     cost, score = study["spec"]["cost"], f"composite, {study['unit']}"
     full: dict[str, Range] = dict(space) | {module: Choice((0, 1)) for module in modules}
     objectives = (score,) if cost == "none" else (score, cost)
@@ -69,5 +69,5 @@ def _told(
         answer = None if trial_score is None else [trial_score] if cost == "none" else [trial_score, trial[cost]]
         attributes = {key: value for key, value in trial.items() if key not in NO_VALUES}
         reports = {int(step): float(value) for step, value in trial.get("rungs", ())}
-        rows.append(ToldTrial(values, answer, attributes, reports, bool(trial.get("pruned"))))
-    return Told(name, full, rows, objectives)
+        rows.append(FinishedTrial(values, answer, attributes, reports, bool(trial.get("pruned"))))
+    return FinishedStudy(name, full, rows, objectives)

@@ -61,7 +61,7 @@ def write_networks(
     split: ByFrozen,
     networks: Mapping[str, tuple[TrainingRequest, Mapping[str, Any]]],
 ) -> dict[str, Path]:
-    """Write the networks that were judged on the second lock-box as runs, once phase 6 has decided.
+    """Write the networks that were judged on the second sealed test set as runs, once phase 6 has decided.
 
     Args:
         folder: of the study.

@@ -31,9 +31,9 @@ def run_phases(
         ground: what the phases stand on.
         do: has orders done.
         until: the last phase to run; None for all.
-        on_decision: told of each decision.
+        on_decision: called with each decision.
         phases: names of those to run; None for all that are registered.
-        on_phase: told of each phase before it begins, and what it stands on.
+        on_phase: called with each phase before it begins, and with what it rests on.
 
     Raises:
         ConfigError: an unknown phase.

@@ -15,7 +15,7 @@ from typing import Any
 import tomli_w
 
 from edp.config.experiment import Experiment, Table, build, plain_tree
-from edp.data.frozen import SECOND_BOX, ByFrozen
+from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.errors import ConfigError, DataError, LostError
 from edp.logs.source import DataSource
 from edp.recording import Recording
@@ -34,7 +34,7 @@ from edp.workflows.search.run_phases import run_phases
 from edp.workflows.search.study_log import StudyLog
 from edp.workflows.search.trainings import TrainingRequest, settings_of
 
-BOX = "test sessions"
+TEST_SET = "test sessions"
 TEACHER = "teacher.toml"
 MOST_SECONDS, MOST_MB = 31_557_600.0, 1e9  # a year, a petabyte: caps beyond cap nothing
 
@@ -89,7 +89,7 @@ class Resources:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchCallbacks:
-    """Who is told of a search under way.
+    """Callbacks of a running search.
 
     Attributes:
         on_note: a sentence, such as that damaged records were set apart.
@@ -143,7 +143,7 @@ def run_search(
         folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml`` and ``networks``.
         crew: who does the trainings.
         until: name of the last phase to run.
-        watchers: are told of what happens.
+        watchers: callbacks.
 
     Raises:
         BusyError: another process searches in this folder.
@@ -185,7 +185,7 @@ def run_search(
             diary.openings = ledger.openings()
             diary.end(state)
         split = frozen_split(target, ground, data.digests)
-        networks = write_networks(target, source, ground, split, work.made)
+        networks = write_networks(target, source, ground, split, work.judged_networks)
         teacher = _write_teacher(target, ground, split)
         return SearchResult(target, ground, state, ledger.digest(), diary.trained, teacher, networks)
 
@@ -221,17 +221,17 @@ class _Data:
 
 
 class _Work:
-    """Passes on what happens, and opens a lock-box when a batch is to be judged on its sessions.
+    """Passes on what happens, and opens a sealed test set when a batch is to be judged on its sessions.
 
     Attributes:
         orders: of the batch under way, by key.
-        made: networks that were judged on the second lock-box, by name: order and result.
+        judged: networks that were judged on the second test set, by name: order and result.
     """
 
     def __init__(self, ledger: Ledger, diary: StudyLog, ground: SearchContext, watchers: SearchCallbacks) -> None:
         self.ledger, self.diary, self.ground, self.watchers = ledger, diary, ground, watchers
         self.orders: dict[str, TrainingRequest] = {}
-        self.made: dict[str, tuple[TrainingRequest, Mapping[str, Any]]] = {}
+        self.judged_networks: dict[str, tuple[TrainingRequest, Mapping[str, Any]]] = {}
 
     def on_phase(self, name: str, ground: SearchContext) -> None:
         self.diary.on_phase(name, ground)
@@ -239,30 +239,31 @@ class _Work:
 
     def on_orders(self, keys: Sequence[str], orders: Sequence[TrainingRequest]) -> None:
         self.orders = dict(zip(keys, orders, strict=True))
-        for box, sessions, why in (
-            (BOX, self.ground.test, "phase 4: its winner and the baseline, trained at length"),
-            (SECOND_BOX, self.ground.second, "phase 6: the chosen network and its teacher"),
+        for test_set, sessions, why in (
+            (TEST_SET, self.ground.test, "phase 4: its winner and the baseline, trained at length"),
+            (SECOND_TEST_SET, self.ground.second, "phase 6: the chosen network and its teacher"),
         ):
             sealed = sorted({key for key, order in self.orders.items() if set(order.judged) & set(sessions)})
             if sealed:
-                self._open(box, sealed, why)
+                self._open(test_set, sealed, why)
         self.diary.on_orders(keys, orders)
         self.watchers.on_progress(self.diary)
 
-    def _open(self, box: str, keys: Sequence[str], why: str) -> None:
-        """Record a look before it is taken. ``edp compress`` may have opened the second lock-box before phase 6."""
-        earlier = [one for one in self.ledger.openings(box) if one.judged != tuple(keys)]
-        self.ledger.open_box(box, keys, why, again=box == SECOND_BOX)
+    def _open(self, test_set: str, keys: Sequence[str], why: str) -> None:
+        """Record an opening before it is made. ``edp compress`` may have opened the second test set before phase 6."""
+        earlier = [one for one in self.ledger.openings(test_set) if one.judged != tuple(keys)]
+        self.ledger.open_test_set(test_set, keys, why, again=test_set == SECOND_TEST_SET)
         if earlier:
             self.watchers.on_note(
-                f"lock-box '{box}' was opened on {earlier[0].time} ({earlier[0].why}), so this look shows less"
+                f"sealed test set '{test_set}' was opened on {earlier[0].time} ({earlier[0].why}), so this one "
+                "shows less"
             )
         self.diary.openings = self.ledger.openings()
 
     def on_record(self, record: Record, trained: bool) -> None:
         order = self.orders[record.key]
         if record.result is not None and set(order.judged) & set(self.ground.second):
-            self.made[network_name(order)] = order, record.result
+            self.judged_networks[network_name(order)] = order, record.result
         self.diary.on_record(record, order, trained)
         self.watchers.on_progress(self.diary)
 

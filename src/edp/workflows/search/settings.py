@@ -40,7 +40,7 @@ class CompressionSpec:
     """Phase 6: the best network that a controller can run.
 
     Attributes:
-        on: whether it is made; without it no second lock-box is set apart.
+        on: whether it is made; without it no second test set is set apart.
         budget: what the controller grants: a table, or the path of a budget file.
         units: widths to make; none given, they are planned from the budget.
         shares: of the widest that fits; each plans a width.
@@ -85,7 +85,7 @@ class SearchSpec:
         horizon: at which scores are taken, one of the task's.
         test_share: share of the sessions that are set apart as test before anything else.
         test: names of the sessions to set apart, instead of a share that is drawn.
-        second_share: share of the sessions that are set apart beside them, as second lock-box, for phase 6 alone.
+        second_share: share of the sessions that are set apart beside them, as second test set, for phase 6 alone.
         second: names of these, instead of a share that is drawn.
         folds: into which the other sessions are dealt.
         backbones: registered backbones that are compared.

@@ -49,7 +49,7 @@ class Recipe:
         units: width; None for the teacher itself.
         pruned: begin with what pruning leaves of the teacher.
         rounded: trained on with rounded numbers.
-        final: the format in which it is judged on the second lock-box; empty for the comparison.
+        final: the format in which it is judged on the second sealed test set; empty for the comparison.
     """
 
     updates: int

@@ -137,7 +137,7 @@ def _loss(settings: Table, value: str) -> None:
 SCHEDULES: dict[str, Table] = {
     # Factor, patience and threshold of appendix B.1.1.
     "plateau": {"kind": "plateau", "shrink": 0.5, "patience": 5, "threshold": 1e-4},
-    # Annealed to zero, as PyTorch's schedule does unless told otherwise; B.1.1 has no warm-up.
+    # Annealed to zero, as PyTorch's schedule does by default; B.1.1 has no warm-up.
     "cosine": {"kind": "cosine", "warmup": 0.0, "floor": 0.0},
 }
 """The two schedules of thesis 3.2.4.2."""

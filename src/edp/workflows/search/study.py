@@ -1,6 +1,6 @@
-"""Ask and tell: the only door to Optuna. Nothing is stored; what was told is told again when a search goes on.
+"""Ask and tell: the only door to Optuna. Nothing is stored; reported values are reported again when a search goes on.
 
-A study is a pure function of its root seed and of what it was told, in the order of the trials: each question is asked
+A study is a pure function of its root seed and of the reports, in the order of the trials: each question is asked
 with a sampler seeded by root and number. So a search that was killed asks the same again and finds the answers in the
 ledger, and any number of workers gives the same sequence.
 """
@@ -76,10 +76,10 @@ class Study:
         sampler: how questions are chosen.
         flags: switches that may be on or off.
         barred: sets of switches that cannot be on together: of each the later one in `flags` is switched off.
-        objectives: how many values are told.
+        objectives: how many values are reported.
         pruner: ``none``, or ``median``, which says of a reported trial whether it is worse than the median of those
-            that were told before, at the same step; only with one objective.
-        bounds: how many costs are told that must not exceed zero; a trial that exceeds may be told by its costs alone,
+            that were reported before, at the same step; only with one objective.
+        bounds: number of costs that must not exceed zero; a trial that exceeds may be reported by its costs alone,
             so that what cannot be used need not be trained. With bounds TPE stands in for the Gaussian process.
         options: further dimensions of a switch, asked where it is on.
     """
@@ -146,7 +146,7 @@ class Study:
         self._study.enqueue_trial(dict(values) | switched | dict(options or {}))
 
     def ask(self, count: int) -> list[Trial]:
-        """The next questions, `count` of them; those asked before count as unanswered until they are told."""
+        """The next questions, `count` of them; those asked before count as unanswered until they are reported."""
         return [self._ask() for _ in range(count)]
 
     def _ask(self) -> Trial:
@@ -180,7 +180,7 @@ class Study:
             ConfigError: a question that was not asked, a value that is not finite, or several objectives.
         """
         if number not in self._open or number in self._waiting:
-            raise ConfigError(f"study: trial {number} was not asked, or was told before; report before you tell")
+            raise ConfigError(f"study: trial {number} was not asked, or is finished; report before you tell")
         if self.objectives > 1 or not math.isfinite(value):
             raise ConfigError(
                 f"study: trial {number} reports {value} at step {step} of a study with {self.objectives} objectives; a "
@@ -189,13 +189,13 @@ class Study:
         self._open[number].report(value, step)
 
     def hopeless(self, number: int) -> bool:
-        """Whether the pruner would end a question after its last report, by what was told of earlier ones."""
+        """Whether the pruner would end a question after its last report, by the reports of earlier ones."""
         return self.pruner != "none" and bool(self._open[number].should_prune())  # NumPy's would not be plain
 
     def tell(
         self, number: int, values: Sequence[float] | None, costs: Sequence[float] = (), pruned: bool = False
     ) -> None:
-        """What a question gave; told in any order, it counts in the order of numbers.
+        """What a question gave; reported in any order, it counts in the order of numbers.
 
         Args:
             number: of the trial.
@@ -208,13 +208,15 @@ class Study:
                 one that was pruned.
         """
         if number not in self._open and number not in self._waiting:
-            raise ConfigError(f"study: trial {number} was not asked, or was told before; tell each once")
+            raise ConfigError(f"study: trial {number} was not asked, or is finished; tell each once")
         if pruned and values is not None:
-            raise ConfigError(f"study: trial {number} is told as pruned, with values {list(values)}; none must hold")
+            raise ConfigError(
+                f"study: trial {number} is reported as pruned, with values {list(values)}; none must hold"
+            )
         for what, expected_count, numbers in (("values", self.objectives, values), ("costs", self.bounds, costs)):
             if numbers is not None and (len(numbers) != expected_count or not all(map(math.isfinite, numbers))):
                 raise ConfigError(
-                    f"study: trial {number} is told {what} {list(numbers)}; {expected_count} finite ones must hold"
+                    f"study: trial {number} is reported {what} {list(numbers)}; {expected_count} finite ones must hold"
                 )
         self._waiting[number] = (values, costs, pruned)
         while self._told in self._waiting:
@@ -307,7 +309,7 @@ def _distribution(dimension: Range) -> Any:
 
 
 @dataclass(frozen=True)
-class ToldTrial:
+class FinishedTrial:
     """A question of a study that is over.
 
     Attributes:
@@ -326,7 +328,7 @@ class ToldTrial:
 
 
 @dataclass(frozen=True)
-class Told:
+class FinishedStudy:
     """A study that is over: what was asked and what came of it, for a viewer.
 
     Attributes:
@@ -338,11 +340,11 @@ class Told:
 
     name: str
     space: Space
-    rows: Sequence[ToldTrial]
+    rows: Sequence[FinishedTrial]
     objectives: tuple[str, ...]
 
 
-def write_journal(path: str | Path, studies: Sequence[Told]) -> None:
+def write_journal(path: str | Path, studies: Sequence[FinishedStudy]) -> None:
     """A copy of studies as a journal that Optuna and its dashboard read; replaced whole, never appended to.
 
     Raises:
@@ -361,7 +363,7 @@ def write_journal(path: str | Path, studies: Sequence[Told]) -> None:
             study.add_trials([_frozen(study_copy.space, row) for row in study_copy.rows])
 
 
-def _frozen(space: Space, row: ToldTrial) -> optuna.trial.FrozenTrial:
+def _frozen(space: Space, row: FinishedTrial) -> optuna.trial.FrozenTrial:
     from optuna.trial import TrialState, create_trial
 
     answer, state = row.objectives, TrialState.FAIL if row.objectives is None else TrialState.COMPLETE
@@ -381,10 +383,10 @@ __all__ = [
     "PRUNERS",
     "SAMPLERS",
     "Candidate",
+    "FinishedStudy",
+    "FinishedTrial",
     "SamplerSpec",
     "Study",
-    "Told",
-    "ToldTrial",
     "Trial",
     "Value",
     "write_journal",

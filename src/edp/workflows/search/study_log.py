@@ -1,4 +1,4 @@
-"""What a study has done so far, as plain values in ``study.json``: for progress, for its report, for a look aside."""
+"""Progress of a study as plain values in ``study.json``, for its report and for `edp search status`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class StudyLog:
     Attributes:
         trained: trainings of this sitting.
         decisions: of the phases that have ended.
-        openings: looks into the lock-box.
+        openings: openings of the sealed test sets.
         state: ``running``, ``stopped`` or ``finished``.
         workers: trainings that run side by side.
     """

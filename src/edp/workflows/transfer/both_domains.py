@@ -1,4 +1,4 @@
-"""Trainings that keep the source: replay, distillation from its network, adversarial training (thesis 5.5.1)."""
+"""Trainings that keep the source: rehearsal, distillation from its network, adversarial training (thesis 5.5.1)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class BothSpec:
     Attributes:
         weight: of the source's loss; that of the target's is one.
         soft: share of it that compares with what the source's network says, not with the truth.
-        reversal: weight of the reversed gradient of a classifier of the two worlds; 0 for none.
+        reversal: weight of the reversed gradient of a classifier of the two domains; 0 for none.
 
     Raises:
         ConfigError: a value out of range.
@@ -45,11 +45,11 @@ class BothSpec:
     reversal: float = 0.0
 
     def __post_init__(self) -> None:
-        check_bounds("both worlds", self, weight=WEIGHT, soft=SHARE, reversal=span(0.0, MOST_WEIGHT))
+        check_bounds("both domains", self, weight=WEIGHT, soft=SHARE, reversal=span(0.0, MOST_WEIGHT))
 
 
 class BothDomains:
-    """A lesson that goes on from the source's network with recordings of both worlds, in equal shares of ticks.
+    """A lesson that goes on from the source's network with recordings of both domains, in equal shares of ticks.
 
     Args:
         start: the source's network.
@@ -61,7 +61,7 @@ class BothDomains:
         self.base, self.source_series, self.spec = WarmStart(start), list(source_series), spec
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """Series of both worlds, the fewer ticks several times, with their world and what the source's network says."""
+        """Series of both domains, the shorter repeated, with their domain and the source network's predictions."""
         own = [self._marked(part, TARGET, None) for part in own_series]
         source_predictions = (
             stream_predictions(self.base.start, self.source_series)
@@ -94,8 +94,8 @@ class BothDomains:
 
     def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
         """The loss of the target, that of the source, and that of the classifier with its gradient reversed."""
-        spec, world = self.spec, moment.teacher_targets[..., 0]
-        here, there = moment.valid & (world < 0.5), moment.valid & (world > 0.5)
+        spec, domain = self.spec, moment.teacher_targets[..., 0]
+        here, there = moment.valid & (domain < 0.5), moment.valid & (domain > 0.5)
         loss = objective.evaluate(moment.answer, moment.future, moment.features, here)
         if spec.soft < 1:
             truth = objective.evaluate(moment.answer, moment.future, moment.features, there)
@@ -117,16 +117,16 @@ class BothDomains:
         self.base.end(net)
 
     def _confusion(self, logits: Tensor, here: Tensor, there: Tensor) -> Tensor:
-        """Cross-entropy of the classifier, both worlds with equal weight."""
+        """Cross-entropy of the classifier, both domains with equal weight."""
         parts = [
-            nn.functional.binary_cross_entropy_with_logits(domain_logits, torch.full_like(domain_logits, world))
-            for domain_logits, world in ((logits[here], TARGET), (logits[there], SOURCE))
+            nn.functional.binary_cross_entropy_with_logits(domain_logits, torch.full_like(domain_logits, domain))
+            for domain_logits, domain in ((logits[here], TARGET), (logits[there], SOURCE))
             if domain_logits.numel()
         ]
         return torch.stack(parts).mean() if parts else logits.sum() * 0.0
 
-    def _marked(self, part: Series, world: float, source_predictions: np.ndarray[Any, Any] | None) -> Series:
-        columns = [np.full((part.samples, 1), world, dtype=np.float32)]
+    def _marked(self, part: Series, domain: float, source_predictions: np.ndarray[Any, Any] | None) -> Series:
+        columns = [np.full((part.samples, 1), domain, dtype=np.float32)]
         if self.spec.soft:
             width = len(self.base.start.task.horizons) * len(self.base.start.task.targets)
             prediction_columns = (
@@ -139,7 +139,7 @@ class BothDomains:
 
 
 class Classifier(nn.Module):
-    """Which world a tick is from, by the backbone's representation: ``(..., width)`` to logits ``(...)``."""
+    """Which domain a tick is from, by the backbone's representation: ``(..., width)`` to logits ``(...)``."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

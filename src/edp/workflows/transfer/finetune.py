@@ -1,4 +1,4 @@
-"""From a network of one machine and logs of another to a network of the other, beside rivals on the same ticks."""
+"""From a network of one machine and logs of another to a network of the other, beside baselines on the same ticks."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ from edp.workflows.transfer.spec import FinetuneSpec
 
 RESULT, SHOWN = "transfer.json", "transfer_predictions.safetensors"
 BEFORE = "direct"
+RENAMED = {"replay": "rehearsal", "replay_distilled": "rehearsal_distilled"}
+"""Methods by their former names; ``edp replay`` judges a log with an adapted network and mixes no data."""
 
 
 @dataclass(frozen=True)
@@ -55,31 +57,33 @@ class FinetuneRequest:
     Attributes:
         spec: phases, rates and regularisers.
         method: name of the method whose network is kept as the run.
-        rivals: names of further methods; direct transfer is always among them.
+        baselines: names of further methods; direct transfer is always among them.
         changes: settings of the trainings that differ from those of the source, as ``key.path=value``.
 
     Raises:
-        ConfigError: an unknown method, or one that leaves no network as `method`.
+        ConfigError: an unknown method, a former name of one, or one that leaves no network as `method`.
     """
 
     spec: FinetuneSpec
     method: str = "full"
-    rivals: tuple[str, ...] = ()
+    baselines: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in (self.method, *self.rivals):
+        for name in (self.method, *self.baselines):
+            if name in RENAMED:
+                raise ConfigError(f"method '{name}' is now called '{RENAMED[name]}'; give that name")
             _ = METHODS[name]
         if not METHODS[self.method].trains:
-            able = ", ".join(name for name, method in METHODS.items() if method.trains)
+            trainable = ", ".join(name for name, method in METHODS.items() if method.trains)
             raise ConfigError(
-                f"method '{self.method}' trains nothing, so it leaves no run; one of {able} must be given"
+                f"method '{self.method}' trains nothing, so it leaves no run; one of {trainable} must be given"
             )
 
     @property
     def names(self) -> list[str]:
         """All methods, each once: the one that is kept, direct transfer, the others in the order of the registry."""
-        asked_names = {self.method, BEFORE, *self.rivals}
+        asked_names = {self.method, BEFORE, *self.baselines}
         first = [self.method, BEFORE]
         return first + [name for name in METHODS if name in asked_names and name not in first]
 
@@ -91,10 +95,10 @@ def finetune(
     out: str | Path,
     watchers: FinetuneCallbacks | None = None,
 ) -> dict[str, Any]:
-    """Train a network of one machine on for another, judge it beside rivals, and write a run folder.
+    """Train a network of one machine on for another, judge it beside baselines, and write a run folder.
 
     The source's scaling is carried and never fitted again. Each log is divided by time into training, validation and
-    test part with a gap of W + k. The same call goes on after a stop. Rivals lie in ``rivals/`` of the folder.
+    test part with a gap of W + k. The same call goes on after a stop. Baselines lie in ``baselines/`` of the folder.
 
     Args:
         source: run folder or bundle.
@@ -122,7 +126,7 @@ def finetune(
     results: dict[str, Made] = {}
     for number, name in enumerate(names):
         callbacks.on_method(name, number, len(names))
-        method_folder = folder if name == order.method else folder / "rivals" / name
+        method_folder = folder if name == order.method else folder / "baselines" / name
         case = TransferCase(begun, logs, data, experiment, order.spec, method_folder, callbacks.on_training)
         try:
             results[name] = METHODS[name]().make(case)
@@ -144,7 +148,7 @@ def _able(source: SourceModel, order: FinetuneRequest) -> tuple[list[str], list[
     Raises:
         ConfigError: the method that is to be kept is one of the others.
     """
-    lacking = [name for name in order.names if METHODS[name].replays and source.data is None]
+    lacking = [name for name in order.names if METHODS[name].needs_source and source.data is None]
     if order.method in lacking:
         raise ConfigError(
             f"method '{order.method}' needs the recordings of the source, which are not there: {source.absent}"
@@ -171,26 +175,28 @@ def _target(
     if order.spec.check_signs:
         notes += check_signs(data, source.data)
     if source.data is None:
-        notes.append(f"What becomes of the source's world was not judged: {source.absent}.")
+        notes.append(f"What becomes of the domain of the source was not judged: {source.absent}.")
     return data, notes
 
 
 def _result(
     source: SourceModel, data: Prepared, experiment: Experiment, order: FinetuneRequest, results: dict[str, Made]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-    """Scores of all methods in both worlds, and the predictions before and after that pictures show."""
+    """Scores of all methods in both domains, and the predictions before and after that pictures show."""
     skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
     predictions = {name: one.predict(data) for name, one in results.items()}
     errors = {name: errors_of(values, data, skip) for name, values in predictions.items()}
-    worlds = {"target": {name: measure(values, data, skip) for name, values in predictions.items()}}
+    domains = {"target": {name: measure(values, data, skip) for name, values in predictions.items()}}
     if source.data is not None:
-        worlds["source"] = {name: measure(one.predict(source.data), source.data, skip) for name, one in results.items()}
+        domains["source"] = {
+            name: measure(one.predict(source.data), source.data, skip) for name, one in results.items()
+        }
     pair = {name: values for name, values in predictions.items() if name in (BEFORE, order.method)}
     rate = data.task.rate_hz
     parts = {part: getattr(data, part) for part in ("train", "validation", "test")}
     facts = [KINDS[kind] for kind in data.target_kinds]
     result = {
-        "schema": 1,
+        "schema": 2,
         "edp": __version__,
         "method": order.method,
         "before": BEFORE,
@@ -208,16 +214,16 @@ def _result(
                 part: round(sum(s.samples for s in part_series) / rate / 60, 3) for part, part_series in parts.items()
             },
         },
-        "methods": {name: _row(METHODS[name], one, worlds, name) for name, one in results.items()},
+        "methods": {name: _row(METHODS[name], one, domains, name) for name, one in results.items()},
         "distributions": distributions({name: errors[name] for name in pair}, data.task.targets),
     }
     return result, excerpts(pair, data, skip)
 
 
-def _row(method: type[Method], result: Made, worlds: dict[str, Any], name: str) -> dict[str, Any]:
+def _row(method: type[Method], result: Made, domains: dict[str, Any], name: str) -> dict[str, Any]:
     return {
         "label": method.label,
         "learned": result.learned,
         "weights": None if result.network is None else weights_digest(result.network),
-        "worlds": {world: domain_scores[name] for world, domain_scores in worlds.items()},
+        "domains": {domain: domain_scores[name] for domain, domain_scores in domains.items()},
     }

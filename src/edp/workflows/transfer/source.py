@@ -70,7 +70,7 @@ def read_source(path: str | Path) -> SourceModel:
     """The source of a run folder, of the run that a bundle lies in, or of a bundle alone.
 
     Raises:
-        BundleError: not a bundle, or one of a network in whole numbers.
+        BundleError: not a bundle, or one of an integer network (W8A16).
     """
     folder = Path(path)
     if (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file():

@@ -38,9 +38,9 @@ class FinetuneSpec:
         weight_decay: lambda of AdamW and SOAP.
         patience: epochs without a better validation score before a phase ends; 0 never ends early.
         rank: of the low-rank adapters.
-        source_weight: of the source's loss beside the target's, of methods that replay it.
+        source_weight: of the source's loss beside the target's, of methods that rehearse it.
         soft: share of that loss that compares with what the source's network says, of the method that distils.
-        reversal: weight of the reversed gradient of the classifier of worlds, of the adversarial method.
+        reversal: weight of the reversed gradient of the classifier of domains, of the adversarial method.
         inner_rate: learning rate of the method of few steps; 0 for that of the source's meta-learning, or 0.5.
         inner_steps: most steps of that method.
         center: take the mean error over the logs that train out of the network that comes out.

@@ -150,8 +150,8 @@ def study_of(spec):
         ],
         "history": world.history,
         "openings": [
-            {"box": "test", "judged": ["a1", "b2", "c3", "d4"], "why": "phase 4", "time": TIMES["ended"]},
-            {"box": "second test sessions", "judged": ["e5", "f6"], "why": "phase 6", "time": TIMES["ended"]},
+            {"test_set": "test", "judged": ["a1", "b2", "c3", "d4"], "why": "phase 4", "time": TIMES["ended"]},
+            {"test_set": "second test sessions", "judged": ["e5", "f6"], "why": "phase 6", "time": TIMES["ended"]},
         ],
     }
     return json.loads(json.dumps(study, allow_nan=False))

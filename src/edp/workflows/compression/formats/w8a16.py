@@ -16,9 +16,9 @@ from edp.workflows.compression.formats.base import FORMATS, Predict
 
 @FORMATS.register("w8a16")
 class W8A16:
-    """Static quantisation of the whole network, judged in whole numbers (`edp.ir.w8a16`).
+    """Static quantisation of the whole network, judged in integer arithmetic (`edp.ir.w8a16`).
 
-    A network that has no form in whole numbers is refused by name.
+    A network that has no integer form is refused by name.
     """
 
     label: ClassVar[str] = "W8A16"

@@ -1,4 +1,4 @@
-"""The exported C on this computer: in single precision, and in whole numbers against their Python reference."""
+"""The exported C on this computer: in single precision, and in integers (W8A16) against their Python reference."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ class CCode:
 
 @FORMS.register("c_w8a16")
 class WholeNumbers:
-    """``edp export --to c`` in whole numbers; a float network is quantised on the golden recording for this."""
+    """``edp export --to c`` in integers (W8A16); a float network is quantised on the golden recording for this."""
 
-    title: ClassVar[str] = "C in whole numbers"
+    title: ClassVar[str] = "C in integers (W8A16)"
 
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""

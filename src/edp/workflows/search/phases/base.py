@@ -115,13 +115,13 @@ def answer_all(
 ) -> Generator[list[TrainingRequest], list[Outcome], list[list[AnsweredQuestion]]]:
     """Ask all quests side by side, a batch each at a time, until each has all its answers.
 
-    A question whose costs exceed the limits, or whose network cannot be, is told so and not trained.
+    A question whose costs exceed the limits, or whose network cannot be, is reported so and not trained.
 
     Args:
         ground: of the search.
         quests: that are asked.
         stops: steps at which trainings of a batch are judged and may end early. All of a batch are judged by what was
-            told of earlier batches, in the order of their numbers, so that who trained them has no say.
+            reported of earlier batches, in the order of their numbers, so that who trained them has no say.
     """
     spec = ground.spec
     answers: list[list[AnsweredQuestion]] = [[] for _ in quests]

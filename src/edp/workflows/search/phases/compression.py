@@ -1,4 +1,4 @@
-"""Phase 6: the teacher at length, smaller networks of it, and one look at the second lock-box (thesis 3.3.7)."""
+"""Phase 6: the teacher at length, smaller networks of it, and one evaluation on the second test set (thesis 3.3.7)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edp.networks.predictor import build_model
 from edp.stats.pareto import pareto
 from edp.training.bundle import blank_scaler
 from edp.workflows.compression import FORMATS
-from edp.workflows.compression.judged import relative, way_of
+from edp.workflows.compression.judged import recipe_text, relative
 from edp.workflows.compression.planning import CompressionPlan, make_plan
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.phases.base import PHASES, Course
@@ -41,12 +41,12 @@ class _Made:
 
 
 class CompressionPhase:
-    """Phase 6. Networks are compared on development sessions that do not train; the second lock-box chooses nothing."""
+    """Phase 6. Networks are compared on development sessions that do not train; the second test set chooses nothing."""
 
     title = NAME
 
     def trainings(self, ground: SearchContext) -> int:
-        """Teacher, at most three networks a width, and teacher and choice once more on the second lock-box."""
+        """Teacher, at most three networks a width, and teacher and choice once more on the second test set."""
         spec = ground.spec.compression
         if not spec.on:
             return 0
@@ -59,7 +59,7 @@ class CompressionPhase:
         return 3 * widths + 3
 
     def run(self, ground: SearchContext) -> Course:
-        """Teacher; students of each width; the better of each with rounded numbers; the choice on the lock-box."""
+        """Teacher; students of each width; the better of each with rounded numbers; the choice on the test set."""
         if not ground.spec.compression.on:
             yield from ()
             return Decision(NAME, {"on": False}, ("Left out: search.compression.on is false.",))
@@ -75,7 +75,7 @@ class CompressionPhase:
         except ConfigError as error:
             return _nothing(ground, f"No network was made: {error}.")
         networks = [teacher]
-        recipes = [recipe_of(ground, order.units, order.pruned) for ways in plan.orders.values() for order in ways]
+        recipes = [recipe_of(ground, order.units, order.pruned) for orders in plan.orders.values() for order in orders]
         outcomes = yield [order_of(ground, settings, recipe) for recipe in recipes]
         networks += map(_Made, recipes, outcomes)
         if plan.rounds:
@@ -98,7 +98,7 @@ class CompressionPhase:
         chosen: int | None,
         outcomes: Sequence[Outcome],
     ) -> Decision:
-        """The network with the least error among those that fit, and what the second lock-box says of it."""
+        """The network with the least error among those that fit, and what the second test set says of it."""
         points = [
             (row["error"], row["resource_usage"]["cycles"][2], row["resource_usage"]["parameter_bytes"]) for row in rows
         ]
@@ -112,7 +112,7 @@ class CompressionPhase:
             "front": pareto(points),
             "chosen": chosen,
             "notes": list(plan.notes),
-            "box": None,
+            "held_out_test": None,
         }
         sentences = [f"{len(rows)} networks and formats were compared on {', '.join(ground.validation)}."]
         if chosen is None:
@@ -129,7 +129,7 @@ class CompressionPhase:
             o.result["formats"].get(f) if o.result is not None else None for o, f in zip(outcomes, formats)
         ]
         if None in format_results or not format_results:
-            sentences.append("A network could not be judged on the second lock-box.")
+            sentences.append("A network could not be judged on the second test set.")
             return Decision(NAME, facts, tuple(sentences))
         scores = {
             who: one["scores"]
@@ -137,9 +137,9 @@ class CompressionPhase:
             if one is not None
         }
         error = relative(scores["chosen"], scores["teacher"])
-        facts["box"] = {"scores": scores, "error": error}
+        facts["held_out_test"] = {"scores": scores, "error": error}
         sentences.append(
-            f"On the second lock-box ({', '.join(ground.second)}), opened for these two alone: "
+            f"On the second test set ({', '.join(ground.second)}), opened for these two alone: "
             f"{100 * (error - 1):+.1f} % against the teacher's error."
         )
         return Decision(NAME, facts, tuple(sentences))
@@ -204,7 +204,7 @@ def rows_of(ground: SearchContext, teacher: _Made, networks: Sequence[_Made]) ->
             rows.append(
                 {
                     "name": f"{one.recipe.name} {FORMATS[name].label}",
-                    "way": "teacher" if order is None else way_of(order),
+                    "recipe": "teacher" if order is None else recipe_text(order),
                     "units": one.recipe.units,
                     "pruned": one.recipe.pruned,
                     "rounded": one.recipe.rounded,
@@ -238,9 +238,9 @@ def _final(ground: SearchContext, row: Row) -> Recipe:
 
 
 def _nothing(ground: SearchContext, why: str) -> Decision:
-    facts = {"on": True, "rows": [], "front": [], "chosen": None, "notes": [why], "box": None}
+    facts = {"on": True, "rows": [], "front": [], "chosen": None, "notes": [why], "held_out_test": None}
     facts |= {"second": list(ground.second), "budget": recipe_of(ground).to_json()["budget"]}
-    return Decision(NAME, facts, (why, "The second lock-box stays closed."))
+    return Decision(NAME, facts, (why, "The second test set stays closed."))
 
 
 PHASES.register(NAME)(CompressionPhase())

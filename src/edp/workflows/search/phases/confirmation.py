@@ -29,7 +29,7 @@ class Confirmation:
     title = "confirmation"
 
     def trainings(self, ground: SearchContext) -> int:
-        """Were nothing dropped at a look; before the screening, with half of the modules."""
+        """Were nothing dropped at an interim analysis; before the screening, with half of the modules."""
         spec, decided = ground.spec, ground.decided
         arms = len(decided["screening"].facts["passed"]) if "screening" in decided else len(MODULES) // 2
         runs = int(decided["planning"].facts["runs"]) if "planning" in decided else spec.most_runs
@@ -47,7 +47,7 @@ class Confirmation:
 
 
 def _sound(ground: SearchContext, passed: list[str], arms: list[Table]) -> Course:
-    """Look by look; what a look drops is not trained any more."""
+    """One interim analysis after the other; a dropped module is not trained any more."""
     runs = int(ground.decided["planning"].facts["runs"])
     looks = tuple(look for look in LOOKS if look.runs < runs)
     mask = ground.folds(runs)
@@ -81,7 +81,7 @@ def _sound(ground: SearchContext, passed: list[str], arms: list[Table]) -> Cours
 
 
 def _hopeless(filled: Array, mask: Mask, stop: int, looks: Sequence[Look]) -> list[bool]:
-    """Which modules the look after `stop` runs drops."""
+    """Which modules the interim analysis after `stop` runs drops."""
     level = next(look.drop_above for look in looks if look.runs == stop)
     seen = mask.any(axis=0)
     p = clustered_t((filled[1:] - filled[0])[..., seen], mask[:, seen]).p

@@ -1,4 +1,4 @@
-"""Phase 4: the confirmed modules together, and the one look at the test sessions (thesis 3.3.5)."""
+"""Phase 4: the confirmed modules together, and the one evaluation on the test sessions (thesis 3.3.5)."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from edp.workflows.transfer.methods.few_steps import FewSteps
 from edp.workflows.transfer.methods.full import Full
 from edp.workflows.transfer.methods.linear_probe import LinearProbe
 from edp.workflows.transfer.methods.low_rank import Adapters
-from edp.workflows.transfer.methods.rehearsal import Adversarial, Rehearsal, ReplayDistilled
+from edp.workflows.transfer.methods.rehearsal import Adversarial, DistilledRehearsal, Rehearsal
 from edp.workflows.transfer.methods.ridge_arx import Ridge
 from edp.workflows.transfer.methods.scratch import Scratch
 from edp.workflows.transfer.methods.two_phase import TwoPhase
@@ -16,13 +16,13 @@ __all__ = [
     "Adapters",
     "Adversarial",
     "Direct",
+    "DistilledRehearsal",
     "FewSteps",
     "Full",
     "LinearProbe",
     "Made",
     "Method",
     "Rehearsal",
-    "ReplayDistilled",
     "Ridge",
     "Scratch",
     "TwoPhase",

@@ -51,7 +51,7 @@ class Method(Protocol):
     """How tables and pictures call it."""
     trains: ClassVar[bool]
     """Whether it leaves a run, which can be judged, reported and exported."""
-    replays: ClassVar[bool]
+    needs_source: ClassVar[bool]
     """Whether it needs the recordings of the source."""
 
     def make(self, case: TransferCase) -> Made:

@@ -14,7 +14,7 @@ class Direct:
 
     label: ClassVar[str] = "Direct transfer"
     trains: ClassVar[bool] = False
-    replays: ClassVar[bool] = False
+    needs_source: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Nothing is learned."""

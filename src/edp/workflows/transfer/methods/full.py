@@ -15,7 +15,7 @@ class Full:
 
     label: ClassVar[str] = "Fine-tuned, one rate"
     trains: ClassVar[bool] = True
-    replays: ClassVar[bool] = False
+    needs_source: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train everything."""

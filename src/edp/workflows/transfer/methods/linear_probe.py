@@ -16,7 +16,7 @@ class LinearProbe:
 
     label: ClassVar[str] = "Linear probe"
     trains: ClassVar[bool] = True
-    replays: ClassVar[bool] = False
+    needs_source: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train the last layer."""

@@ -16,7 +16,7 @@ class Adapters:
 
     label: ClassVar[str] = "Low-rank adapters"
     trains: ClassVar[bool] = True
-    replays: ClassVar[bool] = False
+    needs_source: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train the changes."""

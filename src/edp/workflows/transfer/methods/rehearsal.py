@@ -1,4 +1,4 @@
-"""Methods that keep the source's world: one set of weights for both."""
+"""Methods that keep the domain of the source: one set of weights for both."""
 
 from __future__ import annotations
 
@@ -13,49 +13,49 @@ from edp.workflows.transfer.case import TransferCase
 from edp.workflows.transfer.methods.base import METHODS, Made, of_network, size_of
 
 
-@METHODS.register("replay")
+@METHODS.register("rehearsal")
 class Rehearsal:
     """Everything learns from the target's logs and the source's recordings together."""
 
-    label: ClassVar[str] = "Replay"
+    label: ClassVar[str] = "Rehearsal"
     trains: ClassVar[bool] = True
-    replays: ClassVar[bool] = True
+    needs_source: ClassVar[bool] = True
 
     def make(self, case: TransferCase) -> Made:
-        """Train on both worlds."""
-        return train_both(case, "replay", BothSpec(weight=case.spec.source_weight))
+        """Train on both domains."""
+        return train_both(case, "rehearsal", BothSpec(weight=case.spec.source_weight))
 
 
-@METHODS.register("replay_distilled")
-class ReplayDistilled:
-    """Replay in which the source's own network teaches a share of its world."""
+@METHODS.register("rehearsal_distilled")
+class DistilledRehearsal:
+    """Rehearsal in which the source's own network teaches a share of its domain."""
 
-    label: ClassVar[str] = "Replay, distilled"
+    label: ClassVar[str] = "Rehearsal, distilled"
     trains: ClassVar[bool] = True
-    replays: ClassVar[bool] = True
+    needs_source: ClassVar[bool] = True
 
     def make(self, case: TransferCase) -> Made:
-        """Train on both worlds."""
+        """Train on both domains."""
         spec = BothSpec(weight=case.spec.source_weight, soft=case.spec.soft)
-        return train_both(case, "replay_distilled", spec)
+        return train_both(case, "rehearsal_distilled", spec)
 
 
 @METHODS.register("adversarial")
 class Adversarial:
-    """Replay with a classifier of worlds on the backbone's features, whose gradient is reversed (5.5.1)."""
+    """Rehearsal with a classifier of domains on the backbone's features, whose gradient is reversed (5.5.1)."""
 
-    label: ClassVar[str] = "Replay, adversarial"
+    label: ClassVar[str] = "Rehearsal, adversarial"
     trains: ClassVar[bool] = True
-    replays: ClassVar[bool] = True
+    needs_source: ClassVar[bool] = True
 
     def make(self, case: TransferCase) -> Made:
-        """Train on both worlds."""
+        """Train on both domains."""
         spec = BothSpec(weight=case.spec.source_weight, reversal=case.spec.reversal)
         return train_both(case, "adversarial", spec)
 
 
 def train_both(case: TransferCase, name: str, spec: BothSpec) -> Made:
-    """Train on both worlds; the best epoch is chosen on as many validation ticks of the one as of the other.
+    """Train on both domains; the best epoch is chosen on as many validation ticks of the one as of the other.
 
     Raises:
         ConfigError: the recordings of the source are not at hand.

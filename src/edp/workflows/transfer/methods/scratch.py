@@ -18,7 +18,7 @@ class Scratch:
 
     label: ClassVar[str] = "From scratch"
     trains: ClassVar[bool] = True
-    replays: ClassVar[bool] = False
+    needs_source: ClassVar[bool] = False
 
     def make(self, case: TransferCase) -> Made:
         """Train as ``edp train`` would, with the early stopping of the fine-tuning."""

@@ -1,4 +1,4 @@
-"""Trainings on two worlds: equal shares, what is taught, reversed gradients, and that they go on after a stop."""
+"""Trainings on two domains: equal shares, what is taught, reversed gradients, and that they go on after a stop."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def kept(tiny):
     return [dataclasses.replace(part, name=f"kept {part.name}") for part in (*tiny.train, *tiny.validation)] * 3
 
 
-def test_both_worlds_have_equal_shares_and_the_network_of_the_source_teaches_its_own(tiny, start):
+def test_both_domains_have_equal_shares_and_the_network_of_the_source_teaches_its_own(tiny, start):
     lesson = BothDomains(start, kept(tiny), BothSpec(soft=0.5))
     found = lesson.series(tiny.task, tiny.train)
     ticks = {name: sum(p.samples for p in found if p.name.startswith("kept") == name) for name in (True, False)}
