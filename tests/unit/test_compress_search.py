@@ -76,8 +76,8 @@ def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight)
         others = [(r.error, r.resource_usage.cycles[2], r.resource_usage.parameter_bytes) for r in found.rows]
         beaten = any(all(a <= b for a, b in zip(other, point)) and other != point for other in others)
         assert (place in found.front) != beaten
-    assert {row.way for row in found.rows} >= {"teacher", "distilled", "pruned and distilled"}
-    assert any(row.way.endswith("trained on rounded") for row in found.rows)
+    assert {row.recipe for row in found.rows} >= {"teacher", "distilled", "pruned and distilled"}
+    assert any(row.recipe.endswith("trained on rounded") for row in found.rows)
     held = read_json(folder / "compression.json")
     assert len(held["held_out_test"]["openings"]) == 1
     assert set(held["held_out_test"]["scores"]) == {"teacher", "chosen"}

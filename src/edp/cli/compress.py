@@ -78,7 +78,7 @@ def compress(
             out.print(f"next: {then}, or edp footprint {best.run}")
         out.print(f"report: {page}")
 
-    emit(as_json, dict(facts.held) | {"report": str(page)}, show)
+    emit(as_json, dict(facts.content) | {"report": str(page)}, show)
 
 
 def _tables(facts: Any) -> None:

@@ -154,7 +154,7 @@ def test_views_leave_out_what_says_nothing():
     assert pearson.key == "pearson"
     assert [bar.label for bar in pearson.bars] == ["noise", "u<b>", "late"]
     assert [math.copysign(1, bar.mark) for bar in pearson.bars] == [-1, 1, -1]
-    assert [bar.kept for bar in pearson.bars] == [False, True, False]
+    assert [bar.proposed for bar in pearson.bars] == [False, True, False]
 
 
 def test_pictures_are_written_in_two_formats(tmp_path):
