@@ -1,4 +1,4 @@
-"""``edp adapt`` and ``edp replay``: a correction that is learned on board, and what it would have been worth."""
+"""``edp adapt`` and ``edp replay``: a correction that is learned on board, and its effect on recorded logs."""
 
 from __future__ import annotations
 
@@ -15,16 +15,22 @@ def adapt(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train, finetune, distil, compress or quantise.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the new run.")],
     rank: Annotated[int, typer.Option(help="Directions of the inputs that corrections may use.")] = 18,
-    forgetting: Annotated[float, typer.Option(help="Seconds of motion after which 1/e is left of a lesson.")] = 60.0,
-    noise: Annotated[float, typer.Option(help="Variance of errors that nothing explains; less: faster.")] = 100.0,
+    forgetting: Annotated[float, typer.Option(help="Time constant of forgetting, in seconds of motion.")] = 60.0,
+    noise: Annotated[
+        float, typer.Option(help="Variance of the unexplained error; smaller values learn faster.")
+    ] = 100.0,
     prior: Annotated[float, typer.Option(help="Spread of coefficients, in units of the network's errors.")] = 0.3,
     limit: Annotated[float, typer.Option(help="Largest correction, in units of the network's errors.")] = 3.0,
-    rest: Annotated[float, typer.Option(help="Share of the targets' spread within which nothing moves.")] = 0.05,
+    rest: Annotated[
+        float, typer.Option(help="Dead zone: share of the targets' spread below which the machine counts as at rest.")
+    ] = 0.05,
     judged: Annotated[float, typer.Option(help="Seconds of motion over which the correction is judged.")] = 10.0,
-    margin: Annotated[float, typer.Option(help="Share by which it must be worse to be taken back.")] = 0.05,
+    margin: Annotated[
+        float, typer.Option(help="Relative increase of the error at which the correction is switched off.")
+    ] = 0.05,
     as_json: JsonFlag = False,
 ) -> None:
-    """Give a run a small, bounded correction that learns on board: export and replay then have it.
+    """Add a small, bounded correction to a run that is learned on board; export and replay include it.
 
     Its limits and directions are fitted to the run's own recordings; the network stays as it is.
 
@@ -62,9 +68,9 @@ def replay(
     run: Annotated[Path, typer.Argument(help="Run folder of edp adapt, or its bundle.")],
     logs: Annotated[Path, typer.Argument(help="Logs: a log, a folder of logs, or a data-set file.")],
     carry: Annotated[
-        bool, typer.Option(help="Keep what was learned from one log to the next, as on one machine.")
+        bool, typer.Option(help="Carry the learned coefficients from one log to the next, as on one machine.")
     ] = False,
-    frozen: Annotated[bool, typer.Option("--frozen", help="Learn nothing.")] = False,
+    frozen: Annotated[bool, typer.Option("--frozen", help="Apply the correction without learning.")] = False,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,

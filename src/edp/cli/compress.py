@@ -16,20 +16,22 @@ if TYPE_CHECKING:
 
 def compress(
     bundle: Annotated[Path, typer.Argument(help="Run folder of the teacher, or its bundle.")],
-    folder: Annotated[Path, typer.Option("--out", help="Folder of the search; goes on where it stopped.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder of the search; an unfinished search continues.")],
     data: Annotated[
         Path | None, typer.Option(help="A log, a folder of logs, or a data-set file; default: those of the run.")
     ] = None,
     budget: Annotated[
         Path | None, typer.Option("--budget", help="Limits of the controller (TOML); by default those of the thesis.")
     ] = None,
-    units: Annotated[list[int], typer.Option(help="A width to make; may be repeated. Default: planned.")] = [],  # noqa: B006
+    units: Annotated[
+        list[int], typer.Option(help="Width of a network to train; may be repeated. Default: planned from the budget.")
+    ] = [],  # noqa: B006
     formats: Annotated[
         list[str], typer.Option("--format", help="float32, dynamic_int8 or w8a16; may be repeated. Default: all.")
     ] = [],  # noqa: B006
-    thesis: Annotated[bool, typer.Option(help="Also make the variants of the thesis's Table 4.9.")] = False,
+    thesis: Annotated[bool, typer.Option(help="Also train the variants of the thesis's Table 4.9.")] = False,
     again: Annotated[
-        bool, typer.Option(help="Open the sealed test set again for another choice; it is recorded.")
+        bool, typer.Option(help="Open the sealed test set again for another choice; the opening is recorded.")
     ] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting of the trainings, for example training.epochs=10.")
@@ -38,10 +40,10 @@ def compress(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Search width, pruning, number formats and training with rounded numbers for the best network within a budget.
+    """Search width, pruning, number formats and quantisation-aware training for the best network within a budget.
 
     Choices rest on the validation part; the test part is opened once, for the chosen network and the teacher. Stop
-    it at any moment (Ctrl-C): the same command goes on.
+    it at any moment (Ctrl-C): the same command continues.
 
     Example: `edp compress runs/first --budget examples/budgets/small_controller.toml --out runs/small`
     """

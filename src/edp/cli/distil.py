@@ -14,17 +14,22 @@ from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
 def distil(
     run: Annotated[Path, typer.Argument(help="Run folder of the teacher.")],
     units: Annotated[int, typer.Option(help="Width of the student: recurrent units, or channels of the first level.")],
-    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run in it goes on.")],
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     data: Annotated[
         Path | None, typer.Option(help="A log, a folder of logs, or a data-set file; default: those of the run.")
     ] = None,
     levels: Annotated[int | None, typer.Option(help="Convolution levels; default: one less than the teacher.")] = None,
-    pruned: Annotated[bool, typer.Option(help="Begin with the teacher's most important channels and units.")] = False,
-    truth: Annotated[float, typer.Option(help="Weight of the truth beside the teachers; 0: teachers alone.")] = 0.5,
+    pruned: Annotated[
+        bool, typer.Option(help="Initialise with the teacher's most important channels and units.")
+    ] = False,
+    truth: Annotated[
+        float, typer.Option(help="Weight of the measured targets beside the teachers' predictions; 0: teachers only.")
+    ] = 0.5,
     hint: Annotated[float, typer.Option(help="Weight of the hidden-feature hint.")] = 0.0,
     teachers: Annotated[list[Path], typer.Option("--teacher", help="A further teacher; may be repeated.")] = [],  # noqa: B006
     further: Annotated[
-        Path | None, typer.Option(help="Recordings without truth; the student learns what the teachers say of them.")
+        Path | None,
+        typer.Option(help="Recordings without measured targets; the student learns the teachers' predictions on them."),
     ] = None,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting of the training, for example training.epochs=10.")
@@ -33,9 +38,9 @@ def distil(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Train a smaller network of the same parts on the truth and on what a trained network says, and write a run.
+    """Train a smaller network of the same parts on measured targets and on predictions of a trained network.
 
-    Stop it at any moment (Ctrl-C): the same command goes on. The run is judged with `edp evaluate`.
+    Stop it at any moment (Ctrl-C): the same command continues. The run is judged with `edp evaluate`.
 
     Example: `edp distil runs/first --units 32 --out runs/small`
     """

@@ -25,11 +25,11 @@ def evaluate(
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     channel_importance: Annotated[
-        bool, typer.Option(help="Also take each channel away from the model, and say how much the error grows.")
+        bool, typer.Option(help="Also measure channel importance: the growth of the error when a channel is removed.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Score a trained model on held-out recordings beside honest baselines.
+    """Score a trained model on held-out recordings beside baselines.
 
     Example: `edp evaluate runs/first` or `edp evaluate runs/first --data logs/monday --map mine.toml`
     """

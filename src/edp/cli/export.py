@@ -14,8 +14,8 @@ from edp.errors import ConfigError
 def export(
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train.")],
     to: Annotated[str, typer.Option(help="Form: c (C99 for controllers), casadi, fmu, onnx, ros2 or simulink.")],
-    folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an export that is there is replaced.")],
-    name: Annotated[str, typer.Option(help="What the network is called there.")] = "predictor",
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an existing export is replaced.")],
+    name: Annotated[str, typer.Option(help="Name of the network in the exported files.")] = "predictor",
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
     ] = None,

@@ -19,34 +19,40 @@ def finetune(
     context: typer.Context,
     bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
     logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, a folder of logs, or a data-set file.")],
-    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished one goes on.")],
-    method: Annotated[str, typer.Option(help="The method whose network is kept.")] = "full",
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
+    method: Annotated[str, typer.Option(help="Method whose network becomes the run.")] = "full",
     baselines: Annotated[
         str, typer.Option(help="Comma-separated methods to compare with, 'all' or 'none'.")
     ] = "ridge_arx",
-    head_epochs: Annotated[int, typer.Option(help="Epochs of phase 1, the head alone.")] = 15,
-    epochs: Annotated[int, typer.Option(help="Epochs of phase 2, everything.")] = 25,
+    head_epochs: Annotated[int, typer.Option(help="Epochs of phase 1, in which only the head is trained.")] = 15,
+    epochs: Annotated[int, typer.Option(help="Epochs of phase 2, in which all weights are trained.")] = 25,
     head_rate: Annotated[float, typer.Option(help="Learning rate of the head in both phases.")] = 3e-4,
     backbone_rate: Annotated[float, typer.Option(help="Learning rate of the backbone in phase 2.")] = 1e-5,
-    depth_decay: Annotated[float, typer.Option(help="Rate of a part of the backbone over that of the next.")] = 1.0,
+    depth_decay: Annotated[
+        float, typer.Option(help="Ratio of the learning rates of consecutive parts of the backbone.")
+    ] = 1.0,
     rounds: Annotated[int, typer.Option(help="Epochs of methods without phases.")] = 10,
     rate: Annotated[float, typer.Option(help="Learning rate of methods without phases.")] = 3e-3,
-    batch: Annotated[int, typer.Option(help="Lanes of a chunk, or windows, of an update.")] = 32,
-    smoothness: Annotated[float, typer.Option(help="Weight of the smoothness of predictions; 0: none.")] = 0.05,
-    weight_decay: Annotated[float, typer.Option(help="Lambda of the weights' decay.")] = 1e-4,
-    patience: Annotated[int, typer.Option(help="Epochs without gain before a phase ends; 0: never.")] = 8,
-    rank: Annotated[int, typer.Option(help="Of the low-rank adapters.")] = 8,
+    batch: Annotated[int, typer.Option(help="Batch size: parallel chunks, or windows, of an update.")] = 32,
+    smoothness: Annotated[float, typer.Option(help="Weight of the smoothness penalty on predictions; 0: none.")] = 0.05,
+    weight_decay: Annotated[float, typer.Option(help="Weight decay.")] = 1e-4,
+    patience: Annotated[int, typer.Option(help="Epochs without improvement before a phase ends; 0: no limit.")] = 8,
+    rank: Annotated[int, typer.Option(help="Rank of the low-rank adapters.")] = 8,
     source_weight: Annotated[
-        float, typer.Option(help="Weight of the source's loss, of methods that rehearse it.")
+        float, typer.Option(help="Weight of the loss on source recordings (rehearsal methods).")
     ] = 1.0,
-    soft: Annotated[float, typer.Option(help="Share of that loss that the source's network teaches.")] = 0.5,
-    reversal: Annotated[float, typer.Option(help="Weight of the reversed gradient of the adversary.")] = 0.1,
+    soft: Annotated[
+        float, typer.Option(help="Share of that loss computed against predictions of the source network.")
+    ] = 0.5,
+    reversal: Annotated[float, typer.Option(help="Weight of the reversed gradient (method adversarial).")] = 0.1,
     inner_rate: Annotated[
-        float, typer.Option(help="Rate of few steps; 0: the source's own, where it was meta-learned.")
+        float, typer.Option(help="Learning rate of method few_steps; 0: that of the source's meta-learning.")
     ] = 0.0,
-    inner_steps: Annotated[int, typer.Option(help="Most steps of the method of few steps.")] = 30,
-    center: Annotated[bool, typer.Option(help="Take the mean error over the training logs out of the network.")] = True,
-    any_sign: Annotated[bool, typer.Option("--any-sign", help="Take logs of another sign convention.")] = False,
+    inner_steps: Annotated[int, typer.Option(help="Maximum number of steps of method few_steps.")] = 30,
+    center: Annotated[
+        bool, typer.Option(help="Remove the mean error over the training logs from the output bias.")
+    ] = True,
+    any_sign: Annotated[bool, typer.Option("--any-sign", help="Accept logs of another sign convention.")] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting of the trainings, for example training.updates=100.")
     ] = [],  # noqa: B006
@@ -54,11 +60,11 @@ def finetune(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Train a network of one machine on with logs of another, and judge it beside baselines on the same ticks.
+    """Fine-tune a network of one machine with logs of another, and judge it beside baselines on the same ticks.
 
     Each log is divided by time: its beginning trains, a part validates, its end tests. The source's scaling is
-    carried. What comes out is a run: judge, report and export it. Stop it at any moment (Ctrl-C): the same command
-    goes on.
+    kept. The result is a run, which can be judged, reported and exported. After a stop (Ctrl-C) the same command
+    continues.
 
     Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --baselines all`
     """

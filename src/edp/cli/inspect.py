@@ -23,12 +23,16 @@ def inspect(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     signal_map: MapOption = None,
     channels: Annotated[bool, typer.Option(help="Show a row for each channel.")] = True,
-    covered: Annotated[bool, typer.Option("--coverage/--no-coverage", help="Show what the data cover.")] = True,
+    covered: Annotated[
+        bool, typer.Option("--coverage/--no-coverage", help="Show the coverage of the operating range.")
+    ] = True,
     page: Annotated[Path | None, typer.Option(help="Also write quality and coverage as an offline HTML page.")] = None,
     split: Annotated[
-        str, typer.Option(help="Also say how far tests lie from training: recordings, blocks, time.")
+        str, typer.Option(help="Also report the distance of tests from training data: recordings, blocks, time.")
     ] = "",
-    inputs: Annotated[str, typer.Option(help="Channels that command, where names and kinds do not tell: a,b.")] = "",
+    inputs: Annotated[
+        str, typer.Option(help="Command channels, where names and kinds do not identify them: a,b.")
+    ] = "",
     as_json: JsonFlag = False,
 ) -> None:
     """Report the quality of recordings: time, gaps, noise, steps, clipping, units, repeats; nothing is changed.

@@ -19,19 +19,21 @@ if TYPE_CHECKING:
 def parity(
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train or edp quantise.")],
     data: Annotated[
-        Path | None, typer.Option(help="A log whose first ticks are the golden recording; default: random inputs.")
+        Path | None, typer.Option(help="Log whose first ticks are the reference recording; default: random inputs.")
     ] = None,
-    ticks: Annotated[int, typer.Option(min=1, help="Length of the golden recording.")] = 400,
-    forms: Annotated[list[str], typer.Option("--form", help="A form to run; may be repeated. Default: all.")] = [],  # noqa: B006
+    ticks: Annotated[int, typer.Option(min=1, help="Length of the reference recording, in ticks.")] = 400,
+    forms: Annotated[
+        list[str], typer.Option("--form", help="Exported form to run; may be repeated. Default: all.")
+    ] = [],  # noqa: B006
     interpreters: Annotated[
         list[str],
         typer.Option("--onnxruntime", help="Python program with another ONNX Runtime to run too; may be repeated."),
     ] = [],  # noqa: B006
-    strict: Annotated[bool, typer.Option(help="Forms that cannot be run here fail too.")] = False,
+    strict: Annotated[bool, typer.Option(help="Count forms that cannot be run here as failures.")] = False,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     yes: Annotated[
-        bool, typer.Option("--yes", help="Do not ask before code of a bundle outside of a run folder is run.")
+        bool, typer.Option("--yes", help="Run code of a bundle outside of a run folder without confirmation.")
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:

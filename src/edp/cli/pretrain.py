@@ -13,16 +13,18 @@ from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
 
 def pretrain(
     data: Annotated[Path, typer.Argument(help="Recordings of many machines: a folder of logs, or a data-set file.")],
-    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run in it goes on.")],
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     method: Annotated[str, typer.Option(help="joint, fomaml, maml or reptile.")] = "joint",
     start: Annotated[
-        Path | None, typer.Option(help="Run folder or bundle to begin with; by default at random.")
+        Path | None, typer.Option(help="Run folder or bundle of the initial weights; default: random.")
     ] = None,
-    inner_rate: Annotated[float, typer.Option(help="Of the meta-learners: rate of a step of adaptation.")] = 0.5,
-    inner_steps: Annotated[int, typer.Option(help="Steps of adaptation to a machine.")] = 3,
-    shots: Annotated[int, typer.Option(help="Pieces of a machine to adapt on, and as many to judge by.")] = 4,
-    head_only: Annotated[bool, typer.Option("--head-only", help="Adapt the head alone (ANIL).")] = False,
-    config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset.")] = None,
+    inner_rate: Annotated[float, typer.Option(help="Learning rate of an adaptation step (meta-learners).")] = 0.5,
+    inner_steps: Annotated[int, typer.Option(help="Number of adaptation steps for each machine.")] = 3,
+    shots: Annotated[
+        int, typer.Option(help="Number of stretches of a machine to adapt on, and as many to judge on.")
+    ] = 4,
+    head_only: Annotated[bool, typer.Option("--head-only", help="Adapt only the head (ANIL).")] = False,
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
     preset: Annotated[str, typer.Option(help="quick, small, standard or thesis.")] = "standard",
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting, for example split.test_masses=[12,17].")
@@ -31,10 +33,10 @@ def pretrain(
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
-    """Train one network over many machines, and judge it on machines that it never saw.
+    """Train one network over many machines, and judge it on unseen machines.
 
     Whole machines validate and test. What comes out is a run: fine-tune, judge, report and export it. Stop it at any
-    moment (Ctrl-C): the same command goes on.
+    moment (Ctrl-C): the same command continues.
 
     Example: `edp simulate data/many --scenario examples/scenarios/many_machines.toml`, then
     `edp pretrain data/many --out runs/foundation --set split.test_masses=[12,17]`

@@ -14,7 +14,7 @@ def quantise(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train, distil or compress.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the new run.")],
     ticks: Annotated[
-        int, typer.Option(min=1000, max=100_000_000, help="Ticks on which formats and weights are chosen.")
+        int, typer.Option(min=1000, max=100_000_000, help="Number of calibration ticks for formats and weights.")
     ] = 20_000,
     as_json: JsonFlag = False,
 ) -> None:

@@ -32,9 +32,11 @@ def screen(
     horizon: Annotated[int, typer.Option(help="How many samples ahead the model will predict.")] = 10,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
-    exclude: Annotated[str, typer.Option(help="Channels that are no candidates: a,b.")] = "",
-    trusted: Annotated[str, typer.Option(help="Channels known to be measured, above all commands: a,b.")] = "",
-    truth: Annotated[bool, typer.Option(help="Let channels that only a simulation knows be candidates.")] = False,
+    exclude: Annotated[str, typer.Option(help="Channels to leave out of the candidates: a,b.")] = "",
+    trusted: Annotated[
+        str, typer.Option(help="Channels known to be measured (no leak of the future), above all commands: a,b.")
+    ] = "",
+    truth: Annotated[bool, typer.Option(help="Accept channels that exist only in a simulation as candidates.")] = False,
     changes: Annotated[
         list[str], typer.Option("--set", help="An option of the screening, for example max_lag=200 or forest.trees=60.")
     ] = [],  # noqa: B006
@@ -42,10 +44,14 @@ def screen(
     trials: Annotated[
         bool, typer.Option(help="Also train a network on each set, and compare their held-out errors.")
     ] = False,
-    config: Annotated[Path | None, typer.Option(help="Of --trials: settings (TOML) laid over the preset.")] = None,
-    preset: Annotated[str, typer.Option(help="Of --trials: quick, small, standard or thesis.")] = "quick",
-    own: Annotated[list[Path], typer.Option("--features", help="Of --trials: a feature-set file to try as well.")] = [],  # noqa: B006
-    random: Annotated[int, typer.Option(help="Of --trials: sets drawn at random, of the proposed size.")] = 3,
+    config: Annotated[
+        Path | None, typer.Option(help="With --trials: settings (TOML) that override the preset.")
+    ] = None,
+    preset: Annotated[str, typer.Option(help="With --trials: quick, small, standard or thesis.")] = "quick",
+    own: Annotated[
+        list[Path], typer.Option("--features", help="With --trials: further feature-set file; may be repeated.")
+    ] = [],  # noqa: B006
+    random: Annotated[int, typer.Option(help="With --trials: number of random sets of the proposed size.")] = 3,
     as_json: JsonFlag = False,
 ) -> None:
     """Screen recordings for the channels a model needs: a ranked, reasoned proposal with its evidence.

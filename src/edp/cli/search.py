@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from edp.workflows.search.runner import SearchResult
     from edp.workflows.search.study_log import StudyLog
 
-StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study: what edp search --study was given.")]
+StudyArgument = Annotated[Path, typer.Argument(help="Folder of a study, as in edp search --study.")]
 DEFAULT = "run"
 
 
@@ -51,33 +51,37 @@ app = typer.Typer(
 @app.command(DEFAULT)
 def run(
     data: Annotated[Path, typer.Argument(help="A folder of logs, or a data-set file (.toml); each log is a session.")],
-    study: Annotated[Path, typer.Option("--study", help="Folder of the study; goes on where it stopped.")],
-    preset: Annotated[str, typer.Option(help="quick, standard or thesis: how much is trained.")] = "quick",
-    mode: Annotated[str | None, typer.Option(help="sound, or thesis: its tests and rules.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset, with [search].")] = None,
+    study: Annotated[Path, typer.Option("--study", help="Folder of the study; an unfinished study continues.")],
+    preset: Annotated[str, typer.Option(help="Extent of the search: quick, standard or thesis.")] = "quick",
+    mode: Annotated[str | None, typer.Option(help="Tests and decision rules: sound, or thesis.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Settings (TOML) that override the preset, with [search].")
+    ] = None,
     changes: Annotated[
         list[str], typer.Option("--set", help="One setting, for example search.trials=30 or model.window=40.")
     ] = [],  # noqa: B006
-    phase: Annotated[str | None, typer.Option(help="The last phase to run now; all, where not given.")] = None,
+    phase: Annotated[str | None, typer.Option(help="Last phase to run; default: all.")] = None,
     budget: Annotated[
         Path | None, typer.Option(help="Limits of the controller (TOML) for phase 6; by default those of the thesis.")
     ] = None,
-    workers: Annotated[int, typer.Option(help="Trainings side by side; 0: as many as cores.")] = 0,
-    cluster: Annotated[str, typer.Option(help="Address of a Ray cluster that trains instead, or auto.")] = "",
+    workers: Annotated[int, typer.Option(help="Parallel trainings; 0: one for each core.")] = 0,
+    cluster: Annotated[str, typer.Option(help="Address of a Ray cluster for the trainings, or auto.")] = "",
     open_cluster: Annotated[
         bool,
-        typer.Option("--open-cluster", help="Take a cluster without a token, on which whoever reaches it runs code."),
+        typer.Option(
+            "--open-cluster", help="Accept a cluster without a token, on which anyone who can reach it can run code."
+        ),
     ] = False,
-    threads: Annotated[int, typer.Option(help="Of each training; another number is another training.")] = 1,
-    seconds: Annotated[float | None, typer.Option(help="Cap on the time of a training.")] = None,
-    memory: Annotated[float | None, typer.Option(help="Cap on the memory of a training, MB.")] = None,
+    threads: Annotated[int, typer.Option(help="CPU threads per training (results depend on it).")] = 1,
+    seconds: Annotated[float | None, typer.Option(help="Time limit of a training, in seconds.")] = None,
+    memory: Annotated[float | None, typer.Option(help="Memory limit of a training, in MB.")] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
     """Search for the network: from which features and backbone to which modules, each step tested.
 
-    Stop it at any moment (Ctrl-C, or pull the plug): the same command goes on, and trains nothing twice.
+    Stop it at any moment (Ctrl-C, or a power failure): the same command continues, and repeats no training.
 
     Example: `edp search logs/ --study studies/first --preset quick`
 

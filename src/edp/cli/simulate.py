@@ -17,20 +17,26 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    folder: Annotated[Path, typer.Argument(help="Folder for the logs; an unfinished data set goes on.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the logs; an unfinished data set continues.")],
     scenario: Annotated[
-        Path | None, typer.Option(help="Scenario file (.toml) with all that follows; options given here go first.")
+        Path | None,
+        typer.Option(help="Scenario file (.toml) with these settings; options of the command line take precedence."),
     ] = None,
     machine: Annotated[str | None, typer.Option(help="M22 (default), C14, or the path of a machine file.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Length of all recordings together; default: 60.")] = None,
-    recordings: Annotated[int | None, typer.Option(help="How many recordings; default: 30.")] = None,
-    seed: Annotated[int | None, typer.Option(help="The same seed gives the same bits; default: 0.")] = None,
-    family: Annotated[
-        int | None, typer.Option(help="So many random machines, M22 scaled and scattered, in place of one.")
+    minutes: Annotated[
+        float | None, typer.Option(help="Total length of all recordings, in minutes; default: 60.")
     ] = None,
-    masses: Annotated[str | None, typer.Option(help="Of --family: range of masses in t; default: 10-50.")] = None,
+    recordings: Annotated[int | None, typer.Option(help="Number of recordings; default: 30.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Random seed; equal seeds give bit-identical data; default: 0.")
+    ] = None,
+    family: Annotated[
+        int | None,
+        typer.Option(help="Number of random machines, scaled and scattered from M22, in place of one machine."),
+    ] = None,
+    masses: Annotated[str | None, typer.Option(help="With --family: range of masses in t; default: 10-50.")] = None,
     scatter: Annotated[
-        float | None, typer.Option(help="Of --family: how widely machines differ beside their size; default: 1.")
+        float | None, typer.Option(help="With --family: scatter of machine parameters beside size; default: 1.")
     ] = None,
     material: Annotated[
         list[str] | None,
@@ -43,12 +49,16 @@ def simulate(
         str | None, typer.Option("--format", help="Ending of the logs: parquet (default), csv or mat.")
     ] = None,
     layout: Annotated[str | None, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, ...")] = None,
-    truth: Annotated[str | None, typer.Option(help="What only a simulation knows: with, apart or without.")] = None,
-    workers: Annotated[int, typer.Option(help="Processes; 0 for one a core.")] = 0,
-    limit: Annotated[bool, typer.Option("--limit", help="Also find the limit of predictability: limit.json.")] = False,
-    moments: Annotated[int, typer.Option(help="Of --limit: moments that are branched.")] = 240,
-    branches: Annotated[int, typer.Option(help="Of --limit: futures from each moment.")] = 32,
-    horizons: Annotated[str, typer.Option(help="Of --limit: samples ahead.")] = "1,2,5,10,20,50",
+    truth: Annotated[
+        str | None, typer.Option(help="Channels that exist only in a simulation: with, apart or without.")
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Number of processes; 0: one for each core.")] = 0,
+    limit: Annotated[
+        bool, typer.Option("--limit", help="Also compute the limit of predictability: limit.json.")
+    ] = False,
+    moments: Annotated[int, typer.Option(help="With --limit: number of branching moments.")] = 240,
+    branches: Annotated[int, typer.Option(help="With --limit: number of futures from each moment.")] = 32,
+    horizons: Annotated[str, typer.Option(help="With --limit: horizons in samples.")] = "1,2,5,10,20,50",
     as_json: JsonFlag = False,
 ) -> None:
     """Simulate recordings of an excavator: M22 in free air, or what a scenario file describes.

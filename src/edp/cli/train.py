@@ -24,8 +24,8 @@ RepairOption = Annotated[
 
 def train(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
-    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run in it goes on.")],
-    config: Annotated[Path | None, typer.Option(help="Settings (TOML) laid over the preset.")] = None,
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
     preset: Annotated[str, typer.Option(help="quick, small, standard or thesis.")] = "standard",
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example training.epochs=10.")] = [],  # noqa: B006
     signal_map: MapOption = None,
