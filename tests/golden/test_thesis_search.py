@@ -25,14 +25,14 @@ DOC = Path(__file__).parents[2] / "docs/thesis_preset.md"
 SESSIONS = tuple(f"s{number:02d}" for number in range(31))
 
 
-def ground(**changes):
+def context(**changes):
     spec = dataclasses.replace(PLAN.spec, **changes)
     return SearchContext(spec, settings_of(PLAN.experiment), {"path": "nowhere"}, SESSIONS[:25], SESSIONS[25:])
 
 
 def network(values, modules=(), options=None):
     """Settings of a network of the space: a point of phase 1, then modules with options of phase 5."""
-    held = ground()
+    held = context()
     check = {**held.spec.space, **held.spec.deferred}
     assert all(check[name].holds(value) for name, value in values.items())
     return held.network(held.shaped(apply(held.base, values)), modules, options)
@@ -80,7 +80,7 @@ def test_widths_halve_and_the_baseline_is_that_of_table_4_8():
 
 
 def test_every_point_of_the_space_makes_a_network_of_every_backbone():
-    held = ground()
+    held = context()
     for backbone in PLAN.spec.backbones:
         arm = copy.deepcopy(held.base)
         if backbone != "hybrid":
@@ -102,7 +102,7 @@ def test_all_fourteen_modules_can_be_screened_and_none_is_in_the_baseline():
     assert len(MODULES) == 14
     plain = costs_of(base)["parameters"]
     for name in MODULES:
-        changed = ground().network(base, [name])
+        changed = context().network(base, [name])
         assert changed != base
         assert (costs_of(changed)["parameters"] == plain) == (name in ("zoneout", "physics_residual"))
 
@@ -110,8 +110,8 @@ def test_all_fourteen_modules_can_be_screened_and_none_is_in_the_baseline():
 def test_a_gated_head_has_the_width_of_the_plain_one():
     """Section 3.2.2.3: the projection is 2 d' wide for the d' of the baseline."""
     base = network({"units": 256, "layers": 1, "kernel": 5})
-    assert ground().network(base, ["glu_head"])["model"]["head"]["hidden"] == 128
-    made = ground().network(base, ["glu_head"], {"glu_head.hidden": 32})
+    assert context().network(base, ["glu_head"])["model"]["head"]["hidden"] == 128
+    made = context().network(base, ["glu_head"], {"glu_head.hidden": 32})
     assert made["model"]["head"]["hidden"] == 32
 
 
@@ -125,7 +125,7 @@ def test_toggles_are_those_of_table_4_6_that_are_no_module():
     table = {"SWA", "Correlation Loss", "Focal Loss"}
     assert {TOGGLES[name].title for name in PLAN.spec.toggles} == table
     assert not table & {module.title for module in MODULES.values()}
-    held = ground()
+    held = context()
     made = held.network(held.base, PLAN.spec.toggles)["training"]
     assert made["average"] == {"kind": "swa"}
     assert made["loss"] == {"kind": "focal", "gamma": 2.0, "delta": 1.5}
@@ -154,7 +154,7 @@ def test_the_space_is_the_printed_one():
 
 
 def test_deferred_dimensions_set_what_they_say():
-    base = ground().base
+    base = context().base
     cosine = apply(base, {"schedule": "cosine", "patience": 3})["training"]["schedule"]
     assert cosine == {"kind": "cosine", "warmup": 0.0, "floor": 0.0}
     plateau = apply(base, {"schedule": "plateau", "patience": 3})["training"]["schedule"]
@@ -202,7 +202,7 @@ def test_budgets_are_the_printed_ones():
 
 
 def test_the_page_says_what_the_planner_counts():
-    held = ground()
+    held = context()
     asked = [phase.trainings(held) for phase in PHASES.values()]
     assert (
         f"{sum(asked):,}" in re.search(r"^\| `thesis` \|.*$", (DOC.parent / "search.md").read_text(), re.MULTILINE)[0]
@@ -231,7 +231,7 @@ class World:
 def walked():
     world = World()
     small = {"module_trials": 2, "free_trials": 4, "joint_trials": 3, "variance_runs": 10, "most_runs": 5, "trials": 6}
-    found = run_phases(ground(**small, warm_rounds=1, rungs=(0.5,)), world, until="exploration")
+    found = run_phases(context(**small, warm_rounds=1, rungs=(0.5,)), world, until="exploration")
     return found, world.orders
 
 

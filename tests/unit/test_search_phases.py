@@ -33,7 +33,7 @@ SPEC = SearchSpec(
 )
 
 
-def ground(spec=SPEC):
+def context(spec=SPEC):
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
     return SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:])
 
@@ -96,7 +96,7 @@ def by_rate(settings):
 
 @pytest.fixture(scope="module")
 def found():
-    return run_phases(ground(), World(by_rate), until="calibration")
+    return run_phases(context(), World(by_rate), until="calibration")
 
 
 def test_phase_0_takes_the_better_feature_set_and_says_how_sure_it_is(found):
@@ -115,7 +115,7 @@ def test_phase_0_holds_the_best_backbone_against_the_others():
     def hybrid_gains(settings):
         return by_rate(settings) * (0.9 if settings["model"]["backbone"]["kind"] == "hybrid" else 1.0)
 
-    facts = run_phases(ground(), World(hybrid_gains), until="isolation").decided["isolation"].facts
+    facts = run_phases(context(), World(hybrid_gains), until="isolation").decided["isolation"].facts
     (held,) = facts["backbones"].values()
     assert held["best"] == "hybrid"
     assert list(facts["backbones"]) == ["lstm"]
@@ -124,7 +124,7 @@ def test_phase_0_holds_the_best_backbone_against_the_others():
 
 def test_phase_0_pairs_all_arms_on_the_same_folds_and_seeds():
     world = World(by_rate)
-    run_phases(ground(), world, until="isolation")
+    run_phases(context(), world, until="isolation")
     orders = [json.loads(key) for key in world.done]
     assert len(orders) == 4 * 6 * 2
     pairs = {(tuple(order["judged"]), order["seed"]) for order in orders}
@@ -150,7 +150,7 @@ class OneFoldMisleads(World):
 
     def _train(self, order):
         found = super()._train(order)
-        easy = order.judged == ground().orders({}, [0])[0].judged
+        easy = order.judged == context().orders({}, [0])[0].judged
         if easy and order.settings["model"]["backbone"]["kind"] == "lstm":
             for scores in found.result["sessions"].values():
                 scores["10"] = {name: value - 2.0 for name, value in scores["10"].items()}
@@ -163,7 +163,7 @@ def test_backbones_are_chosen_on_all_folds_but_in_the_thesis_by_one(mode):
         return by_rate(settings) - 0.7 * (settings["model"]["backbone"]["kind"] == "hybrid")
 
     spec = dataclasses.replace(SPEC, mode=mode)
-    facts = run_phases(ground(spec), OneFoldMisleads(hybrid_gains), until="calibration").decided["calibration"].facts
+    facts = run_phases(context(spec), OneFoldMisleads(hybrid_gains), until="calibration").decided["calibration"].facts
     kept = {name: held["score"] for name, held in facts["backbones"].items()}
     if mode == "sound":
         assert kept["lstm"] < kept["hybrid"]
@@ -178,9 +178,9 @@ def test_backbones_are_chosen_on_all_folds_but_in_the_thesis_by_one(mode):
 
 def test_decisions_are_plain_and_come_again_without_a_training(found):
     world = World(by_rate)
-    first = run_phases(ground(), world, until="calibration")
+    first = run_phases(context(), world, until="calibration")
     trained = world.trained
-    again = run_phases(ground(), world, until="calibration")
+    again = run_phases(context(), world, until="calibration")
     assert world.trained == trained
     for name in ("isolation", "calibration"):
         plain = json.loads(json.dumps(again.decided[name].to_json()))
@@ -193,7 +193,7 @@ def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
     def brittle(settings):
         return None if settings["training"]["optimizer"]["learning_rate"] > 1e-2 else by_rate(settings)
 
-    facts = run_phases(ground(), World(brittle), until="calibration").decided["calibration"].facts
+    facts = run_phases(context(), World(brittle), until="calibration").decided["calibration"].facts
     assert facts["baseline"]["learning_rate"] <= 1e-2
     statuses = [status for trial in facts["backbones"]["lstm"]["trials"] for status in trial["statuses"]]
     assert "diverged" in statuses
@@ -203,20 +203,20 @@ def test_trainings_that_diverge_count_as_the_worst_and_are_never_chosen():
             None if settings["task"]["features"] == "FG1" and settings["model"]["backbone"]["kind"] == "lstm" else 5.0
         )
 
-    assert run_phases(ground(), World(fg1_breaks), until="isolation").decided["isolation"].facts["features"] == "FG2"
-    usual = ground().base["training"]["optimizer"]["learning_rate"]
+    assert run_phases(context(), World(fg1_breaks), until="isolation").decided["isolation"].facts["features"] == "FG2"
+    usual = context().base["training"]["optimizer"]["learning_rate"]
 
     def only_as_it_was(settings):
         return 9.0 if settings["training"]["optimizer"]["learning_rate"] == usual else None
 
     with pytest.raises(DataError, match="no training of any backbone ended well"):
-        run_phases(ground(), World(only_as_it_was), until="calibration")
+        run_phases(context(), World(only_as_it_was), until="calibration")
 
 
 def test_what_costs_too_much_is_not_trained_and_a_cost_gives_a_front():
     spec = dataclasses.replace(SPEC, limits={"parameters": 4000.0}, cost="parameters", backbones=("lstm",))
     world = World(by_rate)
-    facts = run_phases(ground(spec), world, until="calibration").decided["calibration"].facts
+    facts = run_phases(context(spec), world, until="calibration").decided["calibration"].facts
     trials = facts["backbones"]["lstm"]["trials"]
     assert any(trial["parameters"] > 4000 for trial in trials)
     assert all((trial["score"] is None) == (trial["parameters"] > 4000) for trial in trials)
@@ -228,7 +228,7 @@ def test_what_costs_too_much_is_not_trained_and_a_cost_gives_a_front():
 def test_the_thesis_mode_uses_its_own_estimates():
     spec = dataclasses.replace(SPEC, mode="thesis")
     sound, thesis = (
-        run_phases(ground(s), World(by_rate), until="isolation").decided["isolation"].facts for s in (SPEC, spec)
+        run_phases(context(s), World(by_rate), until="isolation").decided["isolation"].facts for s in (SPEC, spec)
     )
     assert sound["arms"]["lstm FG1"]["split_interval"] is not None
     assert thesis["arms"]["lstm FG1"]["split_interval"] is None
@@ -268,7 +268,7 @@ def test_settings_out_of_range_are_refused(options, message):
 
 def test_an_unknown_phase_is_named():
     with pytest.raises(ConfigError, match="unknown phase 'calibratoin'"):
-        run_phases(ground(), World(by_rate), until="calibratoin")
+        run_phases(context(), World(by_rate), until="calibratoin")
     assert list(PHASES)[:2] == ["isolation", "calibration"]
     assert plain_tree(load_experiment(None, "quick"))["task"]["features"] == "FG2"
 
@@ -288,7 +288,7 @@ CONFIRMED = dataclasses.replace(
 @pytest.fixture(scope="module")
 def sound():
     world = World(with_effects)
-    return run_phases(ground(CONFIRMED), world), world
+    return run_phases(context(CONFIRMED), world), world
 
 
 def test_the_design_passes_what_helps_and_stops_what_harms(sound):
@@ -333,7 +333,7 @@ def test_what_a_look_drops_is_not_trained_any_more(sound):
 
 def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
     spec = dataclasses.replace(CONFIRMED, mode="thesis", module_trials=3, run_seeds=2, most_runs=4)
-    found = run_phases(ground(spec), World(with_effects), until="confirmation")
+    found = run_phases(context(spec), World(with_effects), until="confirmation")
     screening, confirmation = (found.decided[name].facts for name in ("screening", "confirmation"))
     assert "squeeze_excitation" in screening["passed"]
     assert found.decided["planning"].facts["runs"] <= 4
@@ -343,7 +343,7 @@ def test_the_thesis_mode_walks_the_same_phases_by_its_own_rules():
 
 def test_without_a_survivor_nothing_is_trained():
     world = World(lambda settings: 5.0 + bool(settings["model"]["blocks"]), noise=0.0)
-    first = run_phases(ground(CONFIRMED), world, until="planning")
+    first = run_phases(context(CONFIRMED), world, until="planning")
     first = dataclasses.replace(
         first,
         decided={
@@ -390,7 +390,7 @@ def test_the_exploration_starts_from_the_synthesis_and_is_judged_on_fresh_folds(
         in (facts if facts["teacher"] == "exploration" else found.decided["synthesis"].facts)["modules"]
     )
     seeds = {order["seed"] for order in map(json.loads, world.done)}
-    fresh = {ground(CONFIRMED).seed("run", run, 0) for run in range(6, 12)}
+    fresh = {context(CONFIRMED).seed("run", run, 0) for run in range(6, 12)}
     assert fresh <= seeds
 
 
@@ -410,7 +410,7 @@ def test_synergies_that_no_module_has_alone_are_found_by_the_exploration():
 
     spec = dataclasses.replace(CONFIRMED, free_trials=40)
     world = World(together)
-    found = run_phases(ground(spec), world)
+    found = run_phases(context(spec), world)
     facts = found.decided["exploration"].facts
     assert {"squeeze_excitation", "temporal_difference"} <= set(facts["modules"])
     alone = found.decided["confirmation"].facts["confirmed"]
@@ -428,12 +428,12 @@ def test_phase_6_compares_on_development_sessions_and_opens_the_second_lock_box_
     sealed = [order for order in made if set(order["judged"]) & set(SESSIONS[11:])]
     assert [order["recipe"]["final"] for order in made[-2:]] == ["float32", sealed[-1]["recipe"]["final"]]
     assert sealed == made[-2:]
-    ground = found
+    context = found
     for order in made:
-        assert order["train"] == list(ground.training)
+        assert order["train"] == list(context.training)
         assert order["updates"] == CONFIRMED.final_updates
         assert order["settings"] == found.decided["exploration"].facts["teacher_settings"]
-    assert all(order["judged"] == list(ground.validation) for order in made[:-2])
+    assert all(order["judged"] == list(context.validation) for order in made[:-2])
     assert not any(set(order["judged"]) & set(SESSIONS[11:]) for order in orders if order not in sealed)
     facts = found.decided["compression"].facts
     assert facts["chosen"] is not None

@@ -33,7 +33,7 @@ SPEC = SearchSpec(
 ISOLATION = Decision("isolation", {"features": "FG2"}, ())
 
 
-def ground(**changes):
+def context(**changes):
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
     spec = dataclasses.replace(SPEC, **changes)
     return SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:], decided={"isolation": ISOLATION})
@@ -63,7 +63,7 @@ class World:
 
 
 def calibrated(do, **changes):
-    decision = run_phases(ground(**changes), do, phases=["calibration"]).decided["calibration"]
+    decision = run_phases(context(**changes), do, phases=["calibration"]).decided["calibration"]
     return decision, decision.facts["backbones"]["lstm"]["trials"]
 
 

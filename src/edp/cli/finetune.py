@@ -80,8 +80,8 @@ def finetune(
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "finetune", "method")
-        watchers = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
-        result = make(bundle, source, order, folder, watchers)
+        callbacks = FinetuneCallbacks(display.on_note, display.on_training, display.on_next)
+        result = make(bundle, source, order, folder, callbacks)
     page = write_transfer_page(folder)
     facts = read_transfer(folder)
 

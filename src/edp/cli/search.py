@@ -93,7 +93,7 @@ def run(
     changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
-    crew = Resources(
+    resources = Resources(
         workers=workers,
         threads=threads,
         seconds=seconds,
@@ -104,13 +104,13 @@ def run(
     source = source_of(data, signal_map, repair)
     with progress(as_json) as shown:
         display = SearchDisplay(shown, Steps(as_json), as_json)
-        watchers = SearchCallbacks(
+        callbacks = SearchCallbacks(
             on_note=display.on_note,
             on_phase=display.on_phase,
             on_progress=display.on_progress,
             on_decision=display.on_decision,
         )
-        result = run_search(source, plan, study, crew, phase, watchers)
+        result = run_search(source, plan, study, resources, phase, callbacks)
         page = _write_report(study, None, pictures=result.state == "finished")
     emit(as_json, _facts(result) | {"report": str(page)}, lambda: _show(result, data, page))
 
@@ -179,17 +179,17 @@ class SearchDisplay:
         if not self.quiet:
             out.print(text)
 
-    def on_phase(self, name: str, diary: StudyLog) -> None:
+    def on_phase(self, name: str, study_log: StudyLog) -> None:
         """A phase begins."""
         from edp.workflows.search.phases import PHASES
 
         self.title = f"phase {list(PHASES).index(name) + 1} of {len(PHASES)}, {PHASES[name].title}"
-        self.on_progress(diary)
+        self.on_progress(study_log)
 
-    def on_progress(self, diary: StudyLog) -> None:
+    def on_progress(self, study_log: StudyLog) -> None:
         """Show how far it is."""
-        counts, left = diary.counts(), diary.seconds_left()
-        running = min(diary.workers, counts["asked"] - counts["done"])
+        counts, left = study_log.counts(), study_log.seconds_left()
+        running = min(study_log.workers, counts["asked"] - counts["done"])
         note = f"{self.title}: {counts['done']} trainings, {running} running, {counts['total'] - counts['done']} left"
         self.shown.update(self.bar, completed=counts["done"] / max(1, counts["total"]), note=note)
         self.steps.say(f"search: {note}" + ("" if left is None else f", at most {duration(left)}"))
@@ -214,10 +214,10 @@ def _facts(result: SearchResult) -> dict[str, Any]:
     return {
         "study": str(result.folder),
         "state": result.state,
-        "phases": list(result.ground.decided),
+        "phases": list(result.context.decided),
         "trained_now": result.trained,
         "digest": result.digest,
-        "decisions": [decision.to_json() for decision in result.ground.decided.values()],
+        "decisions": [decision.to_json() for decision in result.context.decided.values()],
         "teacher": None if result.teacher is None else str(result.teacher),
         "networks": {name: str(folder) for name, folder in result.networks.items()},
     }
@@ -239,7 +239,7 @@ def _show(result: SearchResult, data: Path, page: Path) -> None:
 
 def _deploying(result: SearchResult) -> str:
     """The command that goes on with the network that phase 6 chose."""
-    facts = result.ground.decided["compression"].facts
+    facts = result.context.decided["compression"].facts
     run = result.networks.get("chosen", result.networks.get("teacher"))
     if facts["rows"][facts["chosen"]]["format"] == "w8a16":
         return f"edp quantise {run} --out {result.folder / 'w8a16'}"

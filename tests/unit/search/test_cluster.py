@@ -111,21 +111,21 @@ def test_a_study_on_three_nodes_of_which_one_is_killed_finds_what_one_machine_fi
     plan = load_plan(None, "quick", CHANGES)
     done = []
 
-    def kill_one(diary):
-        if diary.trained == 4 and not done:
-            done.append(diary.workers)
+    def kill_one(study_log):
+        if study_log.trained == 4 and not done:
+            done.append(study_log.workers)
             cluster.kill(2)
 
-    crew = Resources(cluster=cluster.address)
+    resources = Resources(cluster=cluster.address)
     there = run_search(
-        six_sessions, plan, tmp_path / "there", crew, "calibration", SearchCallbacks(on_progress=kill_one)
+        six_sessions, plan, tmp_path / "there", resources, "calibration", SearchCallbacks(on_progress=kill_one)
     )
     assert done == [3]
     here = run_search(six_sessions, plan, tmp_path / "here", Resources(workers=1), "calibration")
     assert there.digest == here.digest
     assert there.trained == here.trained == 11
-    assert there.ground.decided == here.ground.decided
-    again = run_search(six_sessions, plan, tmp_path / "there", crew, "calibration")
+    assert there.context.decided == here.context.decided
+    again = run_search(six_sessions, plan, tmp_path / "there", resources, "calibration")
     assert again.trained == 0
 
 

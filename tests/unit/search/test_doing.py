@@ -29,19 +29,19 @@ class Stop(Exception):
 
 
 @pytest.fixture(scope="module")
-def ground(lever_sessions):
+def context(lever_sessions):
     base = settings_of(load_experiment(None, "quick", CHANGES))
     names = tuple(f"s{number}" for number in range(5))
     return SearchContext(SPEC, base, lever_sessions.to_plain(), names[:4], names[4:], ("lever", "speed"))
 
 
-def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(ground, tmp_path):
+def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(context, tmp_path):
     trained = []
 
     def search(on_record):
         with Ledger(tmp_path / "ledger") as ledger, LocalPool(1) as pool:
             do = Dispatcher(ledger, pool, "data", on_record=on_record)
-            return run_phases(ground, do, until="isolation").decided["isolation"]
+            return run_phases(context, do, until="isolation").decided["isolation"]
 
     def stop_after_three(record, now):
         trained.append(record.key)

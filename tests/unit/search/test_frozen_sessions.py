@@ -142,7 +142,7 @@ def content(targets):
 
 def sealed(study, source):
     """Contents of the frozen sessions."""
-    names = {*study.ground.test, *study.ground.second}
+    names = {*study.context.test, *study.context.second}
     task = load_experiment(study.teacher, "quick").task
     recordings = [recording for recording in source.read() if recording.name in names]
     resolved = task.resolve(100.0, recordings[0].channel_names)
@@ -160,7 +160,7 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
     study, run, six_sessions, seen, tmp_path
 ):
     with Ledger(study.folder / "ledger") as ledger:
-        frozen = {*study.ground.test, *study.ground.second}
+        frozen = {*study.context.test, *study.context.second}
         assert len(frozen) == 2
         assert not any(frozen & set(record.identity.split["train"]) for record in ledger)
         opened = {key for one in ledger.openings() for key in one.judged}
@@ -177,9 +177,9 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
     assert not set(seen) & sealed(study, six_sessions)
     for folder in (run, *study.networks.values(), tmp_path / "student", tmp_path / "w8a16"):
         data = trained_run(folder)[3]
-        assert {s.name for s in data.test} == set(study.ground.test)
-        assert {s.name for s in data.train} == set(study.ground.training)
-        assert {s.name for s in data.validation} == set(study.ground.validation)
+        assert {s.name for s in data.test} == set(study.context.test)
+        assert {s.name for s in data.train} == set(study.context.training)
+        assert {s.name for s in data.validation} == set(study.context.validation)
     assert found.held_out_test["name"] == SECOND_TEST_SET
     held = read_json(tmp_path / "small/compression.json")
     assert held["held_out_test"]["seen_before"]
@@ -190,24 +190,24 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
 
 
 def test_the_networks_of_phase_6_are_runs_like_any_other(study, tmp_path):
-    facts = study.ground.decided["compression"].facts
+    facts = study.context.decided["compression"].facts
     assert facts["held_out_test"] is not None
     row = facts["rows"][facts["chosen"]]
     chosen = study.networks.get("chosen", study.networks["teacher"])
     assert load_bundle(chosen).predictor.spec.backbone.units == row["units"] or row["units"] is None
     scores = read_json(evaluate(chosen, baselines=()) / "scores.json")["models"]["network"]
-    assert set(scores["recordings"]) == set(study.ground.test)
+    assert set(scores["recordings"]) == set(study.context.test)
     assert look_at(study.folder)["phases"][-1]["name"] == "compression"
 
 
 def test_a_frozen_session_under_another_name_is_still_frozen(study, run, six_sessions, tmp_path):
-    (test,), (second,) = study.ground.test, study.ground.second
+    (test,), (second,) = study.context.test, study.context.second
     source = copied(six_sessions, tmp_path / "logs", **{test: "a_new_day", second: "b_new_day"})
     copy = replace(read_recording(tmp_path / "logs/a_new_day.parquet"), name="c_copy")
     write_recording(copy, tmp_path / "logs/c_copy.parquet")
     data = prepare_data(source, load_experiment(study.teacher, "quick"))
     assert [series.name for series in data.test] == ["a_new_day"]
-    assert {s.name for s in [*data.train, *data.validation]} == set(study.ground.development)
+    assert {s.name for s in [*data.train, *data.validation]} == set(study.context.development)
     opened = prepare_data(source, replaced(study, lambda split: split.opened()))
     assert [series.name for series in opened.test] == ["b_new_day"]
     with pytest.raises(DataError, match=f"'a_new_day' .* is the frozen session '{test}'"):
@@ -223,7 +223,7 @@ def replaced(study, change):
 
 
 def test_a_frozen_session_that_is_missing_changed_or_cut_is_told(study, six_sessions, tmp_path):
-    (test,), (second,) = study.ground.test, study.ground.second
+    (test,), (second,) = study.context.test, study.context.second
     experiment = load_experiment(study.teacher, "quick")
     source = copied(six_sessions, tmp_path)
     (tmp_path / f"{second}.parquet").unlink()
@@ -260,13 +260,13 @@ def test_phase_6_killed_after_each_training_comes_to_the_same(
     folder = shutil.copytree(explored, tmp_path / "study")
     sittings = 0
 
-    def kill(diary):
-        if diary.trained >= (2 if harm == "none" else 1):
+    def kill(study_log):
+        if study_log.trained >= (2 if harm == "none" else 1):
             raise Killed
 
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, folder, Here(workers=1), watchers=SearchCallbacks(on_progress=kill))
+            found = run_search(six_sessions, plan, folder, Here(workers=1), callbacks=SearchCallbacks(on_progress=kill))
         except Killed:
             sittings += 1
             if harm != "none":
@@ -275,7 +275,7 @@ def test_phase_6_killed_after_each_training_comes_to_the_same(
         break
     assert sittings >= 2
     assert found.digest == study.digest
-    assert found.ground.decided["compression"] == study.ground.decided["compression"]
+    assert found.context.decided["compression"] == study.context.decided["compression"]
     for name, network in found.networks.items():
         ours, theirs = (weights_digest(load_bundle(one).predictor) for one in (network, study.networks[name]))
         assert ours == theirs
@@ -295,17 +295,17 @@ def test_a_split_that_contradicts_itself_is_refused():
 
 
 def test_a_network_of_several_epochs_is_the_same_from_a_state_and_from_nothing(study, plan):
-    ground = replace(study.ground, spec=replace(plan.spec, mode="thesis", epochs=3, updates=6, final_updates=6))
-    settings = teacher_settings(ground)
-    recipe = replace(recipe_of(ground, 2), rounded=True, final="w8a16")
-    order = order_of(ground, settings, recipe, ground.second)
-    assert (order.epochs, order.validation) == (3, ground.validation)
-    assert not set(order.train) & {*ground.validation, *ground.test, *ground.second}
+    context = replace(study.context, spec=replace(plan.spec, mode="thesis", epochs=3, updates=6, final_updates=6))
+    settings = teacher_settings(context)
+    recipe = replace(recipe_of(context, 2), rounded=True, final="w8a16")
+    order = order_of(context, settings, recipe, context.second)
+    assert (order.epochs, order.validation) == (3, context.validation)
+    assert not set(order.train) & {*context.validation, *context.test, *context.second}
     whole, state = make_smaller(order.to_json())
     assert state is None
     earlier = before(order)
     assert [Recipe.from_json(one.recipe).name for one in earlier] == ["u2_qat", "u2", "teacher"]
-    assert not any(set(one.judged) & set(ground.second) for one in earlier)
+    assert not any(set(one.judged) & set(context.second) for one in earlier)
     for one in earlier:
         found = make_smaller(order.to_json(), make_smaller(one.to_json())[1])[0]
         assert {**found, "seconds": 0} == {**whole, "seconds": 0}

@@ -292,7 +292,7 @@ def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same
     for _ in range(20):
         heard = []
 
-        def stop(diary, heard=heard, limit=15 + 5 * stops):
+        def stop(study_log, heard=heard, limit=15 + 5 * stops):
             heard.append(1)
             if len(heard) > limit:
                 raise Stop
@@ -304,7 +304,7 @@ def test_a_study_that_is_stopped_between_rungs_again_and_again_comes_to_the_same
             stops += 1
             assert look_at(tmp_path)["state"] == "stopped"
     assert stops > 4
-    assert (again.digest, again.ground.decided) == (study.digest, study.ground.decided)
+    assert (again.digest, again.context.decided) == (study.digest, study.context.decided)
     assert untimed(tmp_path) == untimed(study.folder)
 
 

@@ -84,7 +84,7 @@ def finished(six_sessions, plan, tmp_path_factory):
 
 def test_all_phases_run_and_leave_a_teacher_that_can_be_trained(finished, plan):
     assert finished.state == "finished"
-    assert list(finished.ground.decided) == [
+    assert list(finished.context.decided) == [
         "isolation",
         "calibration",
         "screening",
@@ -108,8 +108,8 @@ def test_all_phases_run_and_leave_a_teacher_that_can_be_trained(finished, plan):
 
 def test_the_test_sessions_judge_only_behind_the_recorded_opening(finished):
     with Ledger(finished.folder / "ledger") as ledger:
-        sealed = {r.key for r in ledger if set(r.identity.split["judged"]) & set(finished.ground.test)}
-        second = {r.key for r in ledger if set(r.identity.split["judged"]) & set(finished.ground.second)}
+        sealed = {r.key for r in ledger if set(r.identity.split["judged"]) & set(finished.context.test)}
+        second = {r.key for r in ledger if set(r.identity.split["judged"]) & set(finished.context.second)}
         opening, last = ledger.openings()
     assert sealed == set(opening.judged)
     assert second == set(last.judged)
@@ -126,14 +126,14 @@ def test_a_search_that_was_stopped_again_and_again_trains_nothing_twice_and_find
 ):
     done = []
 
-    def stop_every_30(diary):
-        if diary.trained >= 30:
+    def stop_every_30(study_log):
+        if study_log.trained >= 30:
             raise Stop
 
     trained = 0
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, tmp_path, CREW, watchers=SearchCallbacks(on_progress=stop_every_30))
+            found = run_search(six_sessions, plan, tmp_path, CREW, callbacks=SearchCallbacks(on_progress=stop_every_30))
         except Stop:
             study = look_at(tmp_path)
             assert study["state"] == "stopped"
@@ -158,7 +158,7 @@ def test_a_search_that_was_stopped_again_and_again_trains_nothing_twice_and_find
 
 def test_phases_up_to_one_and_then_the_rest(six_sessions, plan, tmp_path):
     first = run_search(six_sessions, plan, tmp_path, CREW, until="isolation")
-    assert (first.state, list(first.ground.decided), first.teacher) == ("stopped", ["isolation"], None)
+    assert (first.state, list(first.context.decided), first.teacher) == ("stopped", ["isolation"], None)
     second = run_search(six_sessions, plan, tmp_path, CREW, until="calibration")
     assert second.trained == plan.spec.trials
 

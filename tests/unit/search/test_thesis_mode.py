@@ -164,12 +164,12 @@ def test_all_phases_run_by_the_rules_of_the_thesis_and_leave_a_teacher(finished,
     assert study["mode"] == "thesis"
     assert study["counts"]["done"] == study["counts"]["asked"] == finished.trained
     assert {row["status"] for row in study["history"]} == {"done"}
-    assert set(finished.ground.decided["synthesis"].facts["on"]) >= set(plan.spec.toggles)
+    assert set(finished.context.decided["synthesis"].facts["on"]) >= set(plan.spec.toggles)
     with Ledger(finished.folder / "ledger") as ledger:
         held = list(ledger)
     assert {record.identity.epochs for record in held} == {3}
-    tests = {*finished.ground.test, *finished.ground.second}
-    assert finished.ground.decided["compression"].facts["chosen"] is not None
+    tests = {*finished.context.test, *finished.context.second}
+    assert finished.context.decided["compression"].facts["chosen"] is not None
     for record in held:
         split = record.identity.split
         assert not tests & {*split["train"], *split["validation"]}
@@ -187,14 +187,14 @@ def test_its_report_is_written_and_speaks_of_epochs(finished, tmp_path):
 
 @pytest.mark.slow
 def test_stopped_again_and_again_it_comes_to_the_same(six_sessions, plan, finished, tmp_path):
-    def stop_every_25(diary):
-        if diary.trained >= 25:
+    def stop_every_25(study_log):
+        if study_log.trained >= 25:
             raise Stop
 
     trained = 0
     for _ in range(20):
         try:
-            found = run_search(six_sessions, plan, tmp_path, CREW, watchers=SearchCallbacks(on_progress=stop_every_25))
+            found = run_search(six_sessions, plan, tmp_path, CREW, callbacks=SearchCallbacks(on_progress=stop_every_25))
         except Stop:
             trained += 25
             continue

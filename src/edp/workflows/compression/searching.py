@@ -94,7 +94,7 @@ class DiskBench(Bench):
         experiment: settings of the teacher's run.
         source: where the recordings are.
         folder: for the runs.
-        watchers: called on the way.
+        callbacks: called on the way.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class DiskBench(Bench):
         experiment: Experiment,
         source: DataSource,
         folder: Path,
-        watchers: CompressionCallbacks,
+        callbacks: CompressionCallbacks,
     ) -> None:
         super().__init__(teacher, data, experiment.training)
         self.frozen: Mapping[str, str] = {}
-        self.experiment, self.source, self.folder, self.watchers = experiment, source, folder, watchers
+        self.experiment, self.source, self.folder, self.callbacks = experiment, source, folder, callbacks
         self.done, self.count = 0, 0
 
     def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
@@ -128,7 +128,7 @@ class DiskBench(Bench):
 
         model, training = order.model(self.teacher.spec), order.training(self.training)
         student_experiment = replace(self.experiment, model=model, training=training)
-        tell = self.watchers.on_training
+        tell = self.callbacks.on_training
         teaching = StrategyFactory(facts, lesson, self.frozen)
         return train(
             self.source,
@@ -145,7 +145,7 @@ def search(
     spec: CompressionSearchSpec,
     out: str | Path,
     source: DataSource | None = None,
-    watchers: CompressionCallbacks | None = None,
+    callbacks: CompressionCallbacks | None = None,
 ) -> CompressionResult:
     """Make smaller networks of a run, judge them in their formats, and choose the best that fits a budget.
 
@@ -158,7 +158,7 @@ def search(
         spec: what is searched.
         out: folder of the search, with a run for each network.
         source: recordings to learn, choose and judge on; by default those of the run.
-        watchers: called on the way.
+        callbacks: called on the way.
 
     Raises:
         EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a test set that was
@@ -166,7 +166,7 @@ def search(
     """
     teacher, experiment, own = read_run(run, spec.changes)
     plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.recipes)
-    callbacks = watchers or CompressionCallbacks()
+    callbacks = callbacks or CompressionCallbacks()
     for note in plan.notes:
         callbacks.on_note(note)
     frozen = frozen_sessions(run, experiment)

@@ -27,12 +27,12 @@ from edp.workflows.search.trainings import TrainingRequest, experiment_of
 FOLDER, CHOSEN = "networks", "chosen"
 
 
-def frozen_split(folder: Path, ground: SearchContext, digests: Mapping[str, str]) -> ByFrozen:
+def frozen_split(folder: Path, context: SearchContext, digests: Mapping[str, str]) -> ByFrozen:
     """The sessions of a search by their content, for every command after it.
 
     Args:
         folder: of the study.
-        ground: with the sessions set apart.
+        context: with the sessions set apart.
         digests: of all sessions by name.
     """
 
@@ -40,10 +40,10 @@ def frozen_split(folder: Path, ground: SearchContext, digests: Mapping[str, str]
         return tuple(Session(name=name, digest=digests[name]) for name in names)
 
     return ByFrozen(
-        test=known(ground.test),
-        second=known(ground.second),
-        validation=known(ground.validation),
-        train=known(ground.training),
+        test=known(context.test),
+        second=known(context.second),
+        validation=known(context.validation),
+        train=known(context.training),
         study=str(folder.resolve()),
     )
 
@@ -57,7 +57,7 @@ def network_name(order: TrainingRequest) -> str:
 def write_networks(
     folder: Path,
     source: DataSource,
-    ground: SearchContext,
+    context: SearchContext,
     split: ByFrozen,
     networks: Mapping[str, tuple[TrainingRequest, Mapping[str, Any]]],
 ) -> dict[str, Path]:
@@ -66,7 +66,7 @@ def write_networks(
     Args:
         folder: of the study.
         source: where the recordings are.
-        ground: with the decisions.
+        context: with the decisions.
         split: of the runs.
         networks: order and result by name of the network.
 
@@ -76,7 +76,7 @@ def write_networks(
     Raises:
         EdpError: recordings that cannot be read any more, or a folder that cannot be written.
     """
-    if NAME not in ground.decided or not networks:
+    if NAME not in context.decided or not networks:
         return {}
     recordings = source.read()
     written: dict[str, Path] = {}

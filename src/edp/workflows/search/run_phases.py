@@ -15,7 +15,7 @@ Do = Callable[[list[TrainingRequest]], list[Outcome]]
 
 
 def run_phases(
-    ground: SearchContext,
+    context: SearchContext,
     do: Do,
     until: str | None = None,
     on_decision: Callable[[Decision], None] | None = None,
@@ -28,7 +28,7 @@ def run_phases(
     to the same decisions again, with the same orders.
 
     Args:
-        ground: what the phases stand on.
+        context: what the phases stand on.
         do: has orders done.
         until: the last phase to run; None for all.
         on_decision: called with each decision.
@@ -46,16 +46,16 @@ def run_phases(
         names = names[: names.index(until) + 1]
     for name in names:
         if on_phase is not None:
-            on_phase(name, ground)
-        decision = _run(name, ground, do)
-        ground = replace(ground, decided={**ground.decided, name: decision})
+            on_phase(name, context)
+        decision = _run(name, context, do)
+        context = replace(context, decided={**context.decided, name: decision})
         if on_decision is not None:
             on_decision(decision)
-    return ground
+    return context
 
 
-def _run(name: str, ground: SearchContext, do: Do) -> Decision:
-    course = PHASES[name].run(ground)
+def _run(name: str, context: SearchContext, do: Do) -> Decision:
+    course = PHASES[name].run(context)
     try:
         orders = next(course)
         while True:

@@ -99,8 +99,8 @@ class SearchCallbacks:
     """
 
     on_note: Callable[[str], None] = lambda text: None
-    on_phase: Callable[[str, StudyLog], None] = lambda name, diary: None
-    on_progress: Callable[[StudyLog], None] = lambda diary: None
+    on_phase: Callable[[str, StudyLog], None] = lambda name, study_log: None
+    on_progress: Callable[[StudyLog], None] = lambda study_log: None
     on_decision: Callable[[Decision], None] = lambda decision: None
 
 
@@ -110,7 +110,7 @@ class SearchResult:
 
     Attributes:
         folder: of the study.
-        ground: with the decisions.
+        context: with the decisions.
         state: ``finished``, or ``stopped`` where not all phases were to run.
         digest: hash over the results of all trainings.
         trained: trainings of this sitting.
@@ -119,7 +119,7 @@ class SearchResult:
     """
 
     folder: Path
-    ground: SearchContext
+    context: SearchContext
     state: str
     digest: str
     trained: int
@@ -131,9 +131,9 @@ def run_search(
     source: DataSource,
     plan: SearchPlan,
     folder: str | Path,
-    crew: Resources | None = None,
+    resources: Resources | None = None,
     until: str | None = None,
-    watchers: SearchCallbacks | None = None,
+    callbacks: SearchCallbacks | None = None,
 ) -> SearchResult:
     """Search, or go on with a search where it stopped.
 
@@ -141,9 +141,9 @@ def run_search(
         source: where the recordings are; each is a session.
         plan: what is searched.
         folder: of the study: ``ledger``, ``study.json`` and, at the end, ``teacher.toml`` and ``networks``.
-        crew: who does the trainings.
+        resources: who does the trainings.
         until: name of the last phase to run.
-        watchers: callbacks.
+        callbacks: called as the search proceeds.
 
     Raises:
         BusyError: another process searches in this folder.
@@ -152,7 +152,7 @@ def run_search(
         LostError: the processes of a training were killed again and again.
         StorageError: the disk is full or the folder cannot be written; what was done stays.
     """
-    crew, watchers = crew or Resources(), watchers or SearchCallbacks()
+    resources, callbacks = resources or Resources(), callbacks or SearchCallbacks()
     if until is not None:
         _ = PHASES[until]
     data = _Data.read(source, plan)  # before anything is made on disk
@@ -161,33 +161,40 @@ def run_search(
     with ExitStack() as open_things:
         ledger = open_things.enter_context(Ledger(target / "ledger"))
         if ledger.damaged:
-            watchers.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
+            callbacks.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
         ledger.bind({"data": data.digest, **plan.to_plain()})
         settings = settings_of(plan.experiment)
-        ground = SearchContext(
+        context = SearchContext(
             plan.spec, settings, source.to_plain(), development, test, data.channels, data.unit, second=second
         )
-        diary = StudyLog(target, _facts(plan, data, source, ground), ground)
-        executor = open_things.enter_context(crew.gather())
-        diary.workers = executor.workers
-        work = _Work(ledger, diary, ground, watchers)
+        study_log = StudyLog(target, _facts(plan, data, source, context), context)
+        executor = open_things.enter_context(resources.gather())
+        study_log.workers = executor.workers
+        work = _Work(ledger, study_log, context, callbacks)
         doing = Dispatcher(
-            ledger, executor, data.digest, crew.threads, crew.seconds, crew.memory_mb, work.on_record, work.on_orders
+            ledger,
+            executor,
+            data.digest,
+            resources.threads,
+            resources.seconds,
+            resources.memory_mb,
+            work.on_record,
+            work.on_orders,
         )
         state = "stopped"
         try:
-            ground = run_phases(
-                ground, lambda orders: _whole(doing(orders)), until, work.on_decision, on_phase=work.on_phase
+            context = run_phases(
+                context, lambda orders: _whole(doing(orders)), until, work.on_decision, on_phase=work.on_phase
             )
             ledger.keep_states(())
-            state = "finished" if len(ground.decided) == len(PHASES) else "stopped"
+            state = "finished" if len(context.decided) == len(PHASES) else "stopped"
         finally:
-            diary.openings = ledger.openings()
-            diary.end(state)
-        split = frozen_split(target, ground, data.digests)
-        networks = write_networks(target, source, ground, split, work.judged_networks)
-        teacher = _write_teacher(target, ground, split)
-        return SearchResult(target, ground, state, ledger.digest(), diary.trained, teacher, networks)
+            study_log.openings = ledger.openings()
+            study_log.end(state)
+        split = frozen_split(target, context, data.digests)
+        networks = write_networks(target, source, context, split, work.judged_networks)
+        teacher = _write_teacher(target, context, split)
+        return SearchResult(target, context, state, ledger.digest(), study_log.trained, teacher, networks)
 
 
 @dataclass(frozen=True)
@@ -228,48 +235,48 @@ class _Work:
         judged: networks that were judged on the second test set, by name: order and result.
     """
 
-    def __init__(self, ledger: Ledger, diary: StudyLog, ground: SearchContext, watchers: SearchCallbacks) -> None:
-        self.ledger, self.diary, self.ground, self.watchers = ledger, diary, ground, watchers
+    def __init__(self, ledger: Ledger, study_log: StudyLog, context: SearchContext, callbacks: SearchCallbacks) -> None:
+        self.ledger, self.study_log, self.context, self.callbacks = ledger, study_log, context, callbacks
         self.orders: dict[str, TrainingRequest] = {}
         self.judged_networks: dict[str, tuple[TrainingRequest, Mapping[str, Any]]] = {}
 
-    def on_phase(self, name: str, ground: SearchContext) -> None:
-        self.diary.on_phase(name, ground)
-        self.watchers.on_phase(name, self.diary)
+    def on_phase(self, name: str, context: SearchContext) -> None:
+        self.study_log.on_phase(name, context)
+        self.callbacks.on_phase(name, self.study_log)
 
     def on_orders(self, keys: Sequence[str], orders: Sequence[TrainingRequest]) -> None:
         self.orders = dict(zip(keys, orders, strict=True))
         for test_set, sessions, why in (
-            (TEST_SET, self.ground.test, "phase 4: its winner and the baseline, trained at length"),
-            (SECOND_TEST_SET, self.ground.second, "phase 6: the chosen network and its teacher"),
+            (TEST_SET, self.context.test, "phase 4: its winner and the baseline, trained at length"),
+            (SECOND_TEST_SET, self.context.second, "phase 6: the chosen network and its teacher"),
         ):
             sealed = sorted({key for key, order in self.orders.items() if set(order.judged) & set(sessions)})
             if sealed:
                 self._open(test_set, sealed, why)
-        self.diary.on_orders(keys, orders)
-        self.watchers.on_progress(self.diary)
+        self.study_log.on_orders(keys, orders)
+        self.callbacks.on_progress(self.study_log)
 
     def _open(self, test_set: str, keys: Sequence[str], why: str) -> None:
         """Record an opening before it is made. ``edp compress`` may have opened the second test set before phase 6."""
         earlier = [one for one in self.ledger.openings(test_set) if one.judged != tuple(keys)]
         self.ledger.open_test_set(test_set, keys, why, again=test_set == SECOND_TEST_SET)
         if earlier:
-            self.watchers.on_note(
+            self.callbacks.on_note(
                 f"sealed test set '{test_set}' was opened on {earlier[0].time} ({earlier[0].why}), so this one "
                 "shows less"
             )
-        self.diary.openings = self.ledger.openings()
+        self.study_log.openings = self.ledger.openings()
 
     def on_record(self, record: Record, trained: bool) -> None:
         order = self.orders[record.key]
-        if record.result is not None and set(order.judged) & set(self.ground.second):
+        if record.result is not None and set(order.judged) & set(self.context.second):
             self.judged_networks[network_name(order)] = order, record.result
-        self.diary.on_record(record, order, trained)
-        self.watchers.on_progress(self.diary)
+        self.study_log.on_record(record, order, trained)
+        self.callbacks.on_progress(self.study_log)
 
     def on_decision(self, decision: Decision) -> None:
-        self.diary.on_decision(decision)
-        self.watchers.on_decision(decision)
+        self.study_log.on_decision(decision)
+        self.callbacks.on_decision(decision)
 
 
 def _whole(outcomes: list[Outcome]) -> list[Outcome]:
@@ -327,7 +334,7 @@ def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> str:
     return units.pop() if len(units) == 1 else "mixed units"
 
 
-def _facts(plan: SearchPlan, data: _Data, source: DataSource, ground: SearchContext) -> Table:
+def _facts(plan: SearchPlan, data: _Data, source: DataSource, context: SearchContext) -> Table:
     return {
         "mode": plan.spec.mode,
         "unit": data.unit,
@@ -340,20 +347,20 @@ def _facts(plan: SearchPlan, data: _Data, source: DataSource, ground: SearchCont
         },
         "spec": plain_spec(plan.spec),
         "sessions": {
-            "development": list(ground.development),
-            "test": list(ground.test),
-            "second": list(ground.second),
+            "development": list(context.development),
+            "test": list(context.test),
+            "second": list(context.second),
         },
     }
 
 
-def _write_teacher(folder: Path, ground: SearchContext, split: ByFrozen) -> Path | None:
+def _write_teacher(folder: Path, context: SearchContext, split: ByFrozen) -> Path | None:
     """The winner's settings with the sessions that stay frozen, as `edp train --config` takes them."""
     settings: Any = None
-    if "exploration" in ground.decided:
-        settings = ground.decided["exploration"].facts["teacher_settings"]
-    elif "synthesis" in ground.decided:
-        settings = ground.decided["synthesis"].facts["settings"]
+    if "exploration" in context.decided:
+        settings = context.decided["exploration"].facts["teacher_settings"]
+    elif "synthesis" in context.decided:
+        settings = context.decided["synthesis"].facts["settings"]
     if settings is None:
         return None
     file = folder / TEACHER

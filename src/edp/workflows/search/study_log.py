@@ -32,7 +32,7 @@ class StudyLog:
     Args:
         folder: of the study.
         facts: what does not change: mode, preset, data, spec, sessions.
-        ground: of the search, before any decision.
+        context: of the search, before any decision.
 
     Attributes:
         trained: trainings of this sitting.
@@ -42,10 +42,10 @@ class StudyLog:
         workers: trainings that run side by side.
     """
 
-    def __init__(self, folder: Path, facts: Mapping[str, Any], ground: SearchContext) -> None:
+    def __init__(self, folder: Path, facts: Mapping[str, Any], context: SearchContext) -> None:
         self.file = folder / FILE
         self.facts = dict(facts)
-        self.horizon = ground.spec.horizon
+        self.horizon = context.spec.horizon
         self.decisions: list[Decision] = []
         self.phases: dict[str, dict[str, Any]] = {}
         self.rows: dict[str, dict[str, Any]] = {}
@@ -56,7 +56,7 @@ class StudyLog:
         self._paused: dict[str, None] = {}
         self._now: set[str] = set()
         self._heard: set[str] = set()
-        self._expected = {name: phase.trainings(ground) for name, phase in PHASES.items()}
+        self._expected = {name: phase.trainings(context) for name, phase in PHASES.items()}
         self._seconds = 0.0
         self._phase_began = 0.0
         self._written = 0.0
@@ -65,11 +65,11 @@ class StudyLog:
         self.facts["created"] = earlier.get("created", _now())
         self.state = "running"
 
-    def on_phase(self, name: str, ground: SearchContext) -> None:
+    def on_phase(self, name: str, context: SearchContext) -> None:
         """A phase begins."""
         earlier = self._before.get(name, {})
         self._phase_began = time.monotonic()
-        self._expected[name] = PHASES[name].trainings(ground)
+        self._expected[name] = PHASES[name].trainings(context)
         self.phases[name] = {
             "name": name,
             "title": PHASES[name].title,
@@ -83,7 +83,7 @@ class StudyLog:
             "ended": None,
         }
         for later in list(PHASES)[list(PHASES).index(name) + 1 :]:
-            self._expected[later] = PHASES[later].trainings(ground)
+            self._expected[later] = PHASES[later].trainings(context)
         self.write(force=True)
 
     def on_orders(self, keys: Sequence[str], orders: Sequence[TrainingRequest]) -> None:

@@ -93,7 +93,7 @@ def finetune(
     logs: DataSource,
     order: FinetuneRequest,
     out: str | Path,
-    watchers: FinetuneCallbacks | None = None,
+    callbacks: FinetuneCallbacks | None = None,
 ) -> dict[str, Any]:
     """Train a network of one machine on for another, judge it beside baselines, and write a run folder.
 
@@ -105,7 +105,7 @@ def finetune(
         logs: recordings of the target.
         order: methods and settings.
         out: run folder.
-        watchers: called on the way.
+        callbacks: called on the way.
 
     Returns:
         The content of ``transfer.json``.
@@ -114,7 +114,7 @@ def finetune(
         EdpError: logs that do not go with the source, settings that cannot be, or another run in `out`.
         Diverged: the training of the method that is kept diverged.
     """
-    callbacks = watchers or FinetuneCallbacks()
+    callbacks = callbacks or FinetuneCallbacks()
     begun = read_source(source)
     experiment = target_experiment(begun, order.changes)
     names, notes = _able(begun, order)

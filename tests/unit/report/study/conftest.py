@@ -117,13 +117,13 @@ def smaller_outcome(order, score):
 def study_of(spec):
     """What the search writes, from all phases on the made-up world."""
     base = settings_of(load_experiment(None, "quick", ["model.blocks=[]", "model.backbone.units=4"]))
-    ground, world = (
+    context, world = (
         SearchContext(spec, base, {"path": "nowhere"}, SESSIONS[:9], SESSIONS[9:11], second=SESSIONS[11:]),
         World(),
     )
     for name in PHASES:
         world.phase = name
-        ground = run_phases(ground, world, phases=[name])
+        context = run_phases(context, world, phases=[name])
     study = {
         "schema": 2,
         "state": "finished",
@@ -134,7 +134,7 @@ def study_of(spec):
         "spec": dataclasses.asdict(spec),
         "sessions": {"development": list(SESSIONS[:9]), "test": list(SESSIONS[9:11]), "second": list(SESSIONS[11:])},
         "modules": {name: module.title for name, module in MODULES.items()},
-        "decisions": [held.to_json() for held in ground.decided.values()],
+        "decisions": [held.to_json() for held in context.decided.values()],
         "phases": [
             {
                 "name": name,

@@ -22,7 +22,7 @@ Course = Generator[list[TrainingRequest], list[Outcome], Decision]
 
 
 class PhaseSpec(Protocol):
-    """A phase: a pure function of the ground and of what came of its orders; it does nothing else.
+    """A phase: a pure function of the context and of the results of its orders; it does nothing else.
 
     Attributes:
         title: for progress and reports.
@@ -30,11 +30,11 @@ class PhaseSpec(Protocol):
 
     title: str
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """The trainings that it needs, batch by batch, and what follows from them."""
         ...
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """How many it will order at most, as far as is known now; for the time left, and for nothing else."""
         ...
 
@@ -111,23 +111,23 @@ class _Asked:
 
 
 def answer_all(
-    ground: SearchContext, quests: list[Quest], stops: Sequence[int] = ()
+    context: SearchContext, quests: list[Quest], stops: Sequence[int] = ()
 ) -> Generator[list[TrainingRequest], list[Outcome], list[list[AnsweredQuestion]]]:
     """Ask all quests side by side, a batch each at a time, until each has all its answers.
 
     A question whose costs exceed the limits, or whose network cannot be, is reported so and not trained.
 
     Args:
-        ground: of the search.
+        context: of the search.
         quests: that are asked.
         stops: steps at which trainings of a batch are judged and may end early. All of a batch are judged by what was
             reported of earlier batches, in the order of their numbers, so that who trained them has no say.
     """
-    spec = ground.spec
+    spec = context.spec
     answers: list[list[AnsweredQuestion]] = [[] for _ in quests]
     while any(len(have) < quest.trials for have, quest in zip(answers, quests, strict=True)):
         batch = [
-            _asked(ground, quest_number, trial, quest.settings(trial))
+            _asked(context, quest_number, trial, quest.settings(trial))
             for quest_number, quest in enumerate(quests)
             for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[quest_number])))
         ]
@@ -140,44 +140,46 @@ def answer_all(
                 one.outcomes = tuple(next(outcomes) for _ in orders)
             if stop is None:
                 break
-            alive = [one for one in alive if _goes_on(ground, quests[one.quest_number].study, one, stop)]
+            alive = [one for one in alive if _goes_on(context, quests[one.quest_number].study, one, stop)]
             if not alive:
                 break
         for one in batch:
-            score = None if one.pruned else mean_of(ground, one.outcomes)
+            score = None if one.pruned else mean_of(context, one.outcomes)
             answer = AnsweredQuestion(one.trial, one.settings, one.costs, score, one.outcomes, one.rungs, one.pruned)
             answers[one.quest_number].append(answer)
-            tell(ground, quests[one.quest_number].study, answer)
+            tell(context, quests[one.quest_number].study, answer)
     return answers
 
 
-def _asked(ground: SearchContext, quest_number: int, trial: Trial, settings: Table) -> _Asked:
-    spec = ground.spec
-    costs = _costs(settings, ground)
+def _asked(context: SearchContext, quest_number: int, trial: Trial, settings: Table) -> _Asked:
+    spec = context.spec
+    costs = _costs(settings, context)
     fits = bool(costs) and all(costs[name] <= most for name, most in spec.limits.items())
-    return _Asked(quest_number, trial, settings, costs, ground.orders(settings, range(spec.trial_runs)) if fits else [])
+    return _Asked(
+        quest_number, trial, settings, costs, context.orders(settings, range(spec.trial_runs)) if fits else []
+    )
 
 
-def _goes_on(ground: SearchContext, study: Study, one: _Asked, stop: int) -> bool:
+def _goes_on(context: SearchContext, study: Study, one: _Asked, stop: int) -> bool:
     """Whether a question is trained beyond a rung: it ended well there, and is not hopeless."""
-    score = mean_of(ground, one.outcomes)
+    score = mean_of(context, one.outcomes)
     if score is None:
         return False
     one.rungs[stop] = score
-    if ground.spec.pruner != "none":
+    if context.spec.pruner != "none":
         study.report(one.trial.number, stop, score)
         one.pruned = study.hopeless(one.trial.number)
     return not one.pruned
 
 
-def _costs(settings: Table, ground: SearchContext) -> dict[str, float]:
+def _costs(settings: Table, context: SearchContext) -> dict[str, float]:
     try:
-        return costs_of(settings, ground.channels)
+        return costs_of(settings, context.channels)
     except ConfigError:  # values that are each in their range, and make no network together
         return {}
 
 
-def possible(ground: SearchContext, space: Space, arm: Table) -> tuple[Space, list[str]]:
+def possible(context: SearchContext, space: Space, arm: Table) -> tuple[Space, list[str]]:
     """The part of a space in which every value makes a network of this arm, and in words what was left out."""
     feasible: dict[str, Range] = {}
     notes = []
@@ -185,7 +187,7 @@ def possible(ground: SearchContext, space: Space, arm: Table) -> tuple[Space, li
         if not isinstance(dimension, Choice):
             feasible[name] = dimension
             continue
-        fit = tuple(value for value in dimension.options if _costs(ground.shaped(apply(arm, {name: value})), ground))
+        fit = tuple(value for value in dimension.options if _costs(context.shaped(apply(arm, {name: value})), context))
         out = [str(value) for value in dimension.options if value not in fit]
         if len(fit) > 1:
             feasible[name] = Choice(fit)
@@ -195,9 +197,9 @@ def possible(ground: SearchContext, space: Space, arm: Table) -> tuple[Space, li
     return feasible, notes
 
 
-def tell(ground: SearchContext, study: Study, answer: AnsweredQuestion) -> None:
+def tell(context: SearchContext, study: Study, answer: AnsweredQuestion) -> None:
     """Pass an answer on to its study."""
-    spec = ground.spec
+    spec = context.spec
     bounds = [answer.costs[name] / most - 1.0 if answer.costs else 1.0 for name, most in sorted(spec.limits.items())]
     values = None
     if answer.score is not None:
@@ -206,25 +208,25 @@ def tell(ground: SearchContext, study: Study, answer: AnsweredQuestion) -> None:
 
 
 def new_study(
-    ground: SearchContext,
+    context: SearchContext,
     name: str,
     space: Space,
     flags: Sequence[str] = (),
     barred: frozenset[frozenset[str]] = frozenset(),
 ) -> Study:
     """A study under the costs and limits of this search, with a root of its own."""
-    spec = ground.spec
+    spec = context.spec
     objectives = 1 if spec.cost == "none" else 2
-    root = ground.seed("study", name)
+    root = context.seed("study", name)
     return Study(space, root, spec.sampler, tuple(flags), barred, objectives, len(spec.limits), spec.pruner)
 
 
-def said_of_pruned(ground: SearchContext, answers: Sequence[AnsweredQuestion]) -> list[str]:
+def said_of_pruned(context: SearchContext, answers: Sequence[AnsweredQuestion]) -> list[str]:
     """A sentence on the questions that were ended at a rung; none where none was."""
     pruned = [answer for answer in answers if answer.pruned]
     if not pruned:
         return []
-    saved = sum(1.0 - max(answer.rungs) / ground.spec.length for answer in pruned)
+    saved = sum(1.0 - max(answer.rungs) / context.spec.length for answer in pruned)
     share = saved / max(1, sum(bool(answer.outcomes) for answer in answers))
     return [
         f"{len(pruned)} of {len(answers)} questions were ended at a rung as worse than the median there, which spared "
@@ -238,9 +240,9 @@ def best(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
     return min(done, key=lambda answer: (answer.score, answer.trial.number), default=None)
 
 
-def mean_of(ground: SearchContext, outcomes: Sequence[Outcome], name: str = "composite") -> float | None:
+def mean_of(context: SearchContext, outcomes: Sequence[Outcome], name: str = "composite") -> float | None:
     """A score, mean over outcomes; None where there is none, or one did not end well."""
-    values = [outcome.mean(ground.spec.horizon, name) for outcome in outcomes]
+    values = [outcome.mean(context.spec.horizon, name) for outcome in outcomes]
     return float(np.mean(values)) if values and np.isfinite(values).all() else None
 
 

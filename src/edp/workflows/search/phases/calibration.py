@@ -34,32 +34,32 @@ class Calibration:
 
     title = "calibration"
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """Every question of every backbone, were none too costly, and the final between them."""
-        spec = ground.spec
+        spec = context.spec
         final = spec.folds if spec.mode == "sound" and len(spec.backbones) > 1 else 0
         return len(spec.backbones) * (spec.trials * spec.trial_runs + final)
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """All backbones side by side: every size in turn, then what the sampler asks; the best of each on all folds."""
-        features = ground.spec.feature_sets[ground.decided["isolation"].facts["features"]]
-        arms = {backbone: arm_settings(ground.base, backbone, features) for backbone in ground.spec.backbones}
-        spaces = {name: possible(ground, applicable(ground.spec.space, arm), arm) for name, arm in arms.items()}
-        quests = [_quest(ground, name, arm, spaces[name][0]) for name, arm in arms.items()]
-        answers = yield from answer_all(ground, quests, ground.spec.stops)
+        features = context.spec.feature_sets[context.decided["isolation"].facts["features"]]
+        arms = {backbone: arm_settings(context.base, backbone, features) for backbone in context.spec.backbones}
+        spaces = {name: possible(context, applicable(context.spec.space, arm), arm) for name, arm in arms.items()}
+        quests = [_quest(context, name, arm, spaces[name][0]) for name, arm in arms.items()]
+        answers = yield from answer_all(context, quests, context.spec.stops)
         notes = [f"{name}: {note}." for name, (_, some) in spaces.items() for note in some]
         asked = dict(zip(arms, answers, strict=True))
         chosen = {name: picked for name, own in asked.items() if (picked := _efficient(own)) is not None}
         final: list[Outcome] = []
         # One fold may be easy for one of them; the thesis decides by it.
-        if ground.spec.mode == "sound" and len(chosen) > 1:
-            runs = range(ground.spec.folds)
-            final = yield [order for picked in chosen.values() for order in ground.orders(picked.settings, runs)]
-        return self.decide(ground, asked, chosen, final, notes)
+        if context.spec.mode == "sound" and len(chosen) > 1:
+            runs = range(context.spec.folds)
+            final = yield [order for picked in chosen.values() for order in context.orders(picked.settings, runs)]
+        return self.decide(context, asked, chosen, final, notes)
 
     def decide(
         self,
-        ground: SearchContext,
+        context: SearchContext,
         answers: dict[str, list[AnsweredQuestion]],
         chosen: dict[str, AnsweredQuestion],
         final: Sequence[Outcome],
@@ -73,14 +73,14 @@ class Calibration:
             if picked is None:
                 sentences.append(f"{backbone}: no training of {len(own)} ended well; it is left out.")
                 continue
-            facts["backbones"][backbone] = _plain(ground, picked) | {"trials": [_plain(ground, item) for item in own]}
+            facts["backbones"][backbone] = _plain(context, picked) | {"trials": [_plain(context, item) for item in own]}
             lowest = best(own)
             size = f"{picked.costs['parameters']:,.0f}"
-            text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} {ground.unit} with {size} parameters"
+            text = f"{backbone}: {_values(picked)} gives {picked.score:.3g} {context.unit} with {size} parameters"
             if lowest is not None and lowest is not picked:
                 size = f"{lowest.costs['parameters']:,.0f}"
                 text += f"; the lowest, {lowest.score:.3g}, has {size} and does not repay the difference"
-            sentences += [f"{text}.", *(f"{backbone}: {sentence}" for sentence in said_of_pruned(ground, own))]
+            sentences += [f"{text}.", *(f"{backbone}: {sentence}" for sentence in said_of_pruned(context, own))]
         if not chosen:
             raise DataError(
                 "phase 1: no training of any backbone ended well; see the messages of the trainings, and lower the "
@@ -88,7 +88,7 @@ class Calibration:
             )
         scores = {name: picked.score or 0.0 for name, picked in chosen.items()}
         if final:
-            facts["final"] = _final(ground, list(chosen), final)
+            facts["final"] = _final(context, list(chosen), final)
             scores = facts["final"]["scores"]
             listed = ", ".join(f"{name} {score:.3g}" for name, score in scores.items())
             against = "".join(
@@ -96,34 +96,34 @@ class Calibration:
                 f"{100 * item['high']:+.2f} %)"
                 for name, item in facts["final"]["against"].items()
             )
-            sentences.append(f"Each on all {ground.spec.folds} folds: {listed} {ground.unit}{against}.")
+            sentences.append(f"Each on all {context.spec.folds} folds: {listed} {context.unit}{against}.")
         winner = min(scores, key=lambda name: scores[name])
         facts |= {"backbone": winner, "baseline": dict(chosen[winner].trial.values)}
         facts["settings"] = chosen[winner].settings
         sentences.append(f"The baseline of all later phases is {winner}.")
-        if ground.spec.cost != "none":
-            facts["front"] = {name: _front(ground, own) for name, own in answers.items()}
+        if context.spec.cost != "none":
+            facts["front"] = {name: _front(context, own) for name, own in answers.items()}
         return Decision("calibration", facts, tuple(sentences))
 
 
-def _quest(ground: SearchContext, backbone: str, arm: Table, space: Space) -> Quest:
-    spec = ground.spec
-    study = new_study(ground, f"calibration {backbone}", space)
+def _quest(context: SearchContext, backbone: str, arm: Table, space: Space) -> Quest:
+    spec = context.spec
+    study = new_study(context, f"calibration {backbone}", space)
     sizes = space.get("units")
     for _ in range(spec.warm_rounds):
         for size in sizes.options if isinstance(sizes, Choice) else ():
             study.suggest({"units": size})
-    return Quest(study, lambda trial: ground.shaped(apply(arm, trial.values)), spec.trials)
+    return Quest(study, lambda trial: context.shaped(apply(arm, trial.values)), spec.trials)
 
 
-def _final(ground: SearchContext, backbones: list[str], outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Mean score of each backbone over the folds, and the lowest against each of the others."""
-    mask = ground.folds(ground.spec.folds)
+    mask = context.folds(context.spec.folds)
     parts = np.split(np.arange(len(outcomes)), len(backbones))
-    raw = np.stack([ground.table([outcomes[index] for index in part]) for part in parts])
+    raw = np.stack([context.table([outcomes[index] for index in part]) for part in parts])
     tables = dict(zip(backbones, fill_worst(raw, mask), strict=True))
     scores = {name: float(table[mask].mean()) for name, table in tables.items()}
-    return {"runs": ground.spec.folds, "scores": scores, "against": lowest_against_others(tables, mask)}
+    return {"runs": context.spec.folds, "scores": scores, "against": lowest_against_others(tables, mask)}
 
 
 def _efficient(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
@@ -141,18 +141,18 @@ def _efficient(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
     return by_size[most_efficient(candidates).parameters]
 
 
-def _front(ground: SearchContext, answers: list[AnsweredQuestion]) -> list[dict[str, Any]]:
+def _front(context: SearchContext, answers: list[AnsweredQuestion]) -> list[dict[str, Any]]:
     done = [answer for answer in answers if answer.score is not None]
-    front_indices = pareto([(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done])
-    return [_plain(ground, done[index]) for index in front_indices]
+    front_indices = pareto([(answer.score or 0.0, answer.costs[context.spec.cost]) for answer in done])
+    return [_plain(context, done[index]) for index in front_indices]
 
 
-def _plain(ground: SearchContext, answer: AnsweredQuestion) -> dict[str, Any]:
+def _plain(context: SearchContext, answer: AnsweredQuestion) -> dict[str, Any]:
     return {
         "number": answer.trial.number,
         "values": dict(answer.trial.values),
         "score": answer.score,
-        "mae": None if answer.pruned else mean_of(ground, answer.outcomes, "mae"),
+        "mae": None if answer.pruned else mean_of(context, answer.outcomes, "mae"),
         **answer.costs,
         "statuses": [outcome.status for outcome in answer.outcomes],
         **answer.course(),

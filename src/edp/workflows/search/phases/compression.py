@@ -45,54 +45,54 @@ class CompressionPhase:
 
     title = NAME
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """Teacher, at most three networks a width, and teacher and choice once more on the second test set."""
-        spec = ground.spec.compression
+        spec = context.spec.compression
         if not spec.on:
             return 0
-        if "exploration" in ground.decided:
+        if "exploration" in context.decided:
             try:
-                return plan_of(ground, teacher_settings(ground)).trainings + 3
+                return plan_of(context, teacher_settings(context)).trainings + 3
             except ConfigError:
                 return 1
         widths = len(spec.units) or len(spec.shares) + len(spec.formats or FORMATS) - 1
         return 3 * widths + 3
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """Teacher; students of each width; the better of each with rounded numbers; the choice on the test set."""
-        if not ground.spec.compression.on:
+        if not context.spec.compression.on:
             yield from ()
             return Decision(NAME, {"on": False}, ("Left out: search.compression.on is false.",))
-        settings = teacher_settings(ground)
-        (first,) = yield [order_of(ground, settings, recipe_of(ground))]
-        teacher = _Made(recipe_of(ground), first)
+        settings = teacher_settings(context)
+        (first,) = yield [order_of(context, settings, recipe_of(context))]
+        teacher = _Made(recipe_of(context), first)
         if first.result is None:
             return _nothing(
-                ground, f"The teacher's training at length did not end well ({first.message or first.status})."
+                context, f"The teacher's training at length did not end well ({first.message or first.status})."
             )
         try:
-            plan = plan_of(ground, settings)
+            plan = plan_of(context, settings)
         except ConfigError as error:
-            return _nothing(ground, f"No network was made: {error}.")
+            return _nothing(context, f"No network was made: {error}.")
         networks = [teacher]
-        recipes = [recipe_of(ground, order.units, order.pruned) for orders in plan.orders.values() for order in orders]
-        outcomes = yield [order_of(ground, settings, recipe) for recipe in recipes]
+        recipes = [recipe_of(context, order.units, order.pruned) for orders in plan.orders.values() for order in orders]
+        outcomes = yield [order_of(context, settings, recipe) for recipe in recipes]
         networks += map(_Made, recipes, outcomes)
         if plan.rounds:
             better = [replace(_better(networks, units).recipe, rounded=True) for units in plan.orders]
-            outcomes = yield [order_of(ground, settings, recipe) for recipe in better]
+            outcomes = yield [order_of(context, settings, recipe) for recipe in better]
             networks += map(_Made, better, outcomes)
-        rows = rows_of(ground, teacher, networks)
+        rows = rows_of(context, teacher, networks)
         chosen = chosen_of(rows)
         if chosen is None:
-            return self.decide(ground, plan, rows, None, ())
-        final = [replace(recipe_of(ground), final="float32"), _final(ground, rows[chosen])]
-        outcomes = yield [order_of(ground, settings, recipe, ground.second) for recipe in final]
-        return self.decide(ground, plan, rows, chosen, outcomes)
+            return self.decide(context, plan, rows, None, ())
+        final = [replace(recipe_of(context), final="float32"), _final(context, rows[chosen])]
+        outcomes = yield [order_of(context, settings, recipe, context.second) for recipe in final]
+        return self.decide(context, plan, rows, chosen, outcomes)
 
     def decide(
         self,
-        ground: SearchContext,
+        context: SearchContext,
         plan: CompressionPlan,
         rows: list[Row],
         chosen: int | None,
@@ -102,19 +102,19 @@ class CompressionPhase:
         points = [
             (row["error"], row["resource_usage"]["cycles"][2], row["resource_usage"]["parameter_bytes"]) for row in rows
         ]
-        budget = ground.spec.compression.budget
+        budget = context.spec.compression.budget
         facts: dict[str, Any] = {
             "on": True,
-            "budget": recipe_of(ground).to_json()["budget"],
-            "sessions": {"train": list(ground.training), "validation": list(ground.validation)},
-            "second": list(ground.second),
+            "budget": recipe_of(context).to_json()["budget"],
+            "sessions": {"train": list(context.training), "validation": list(context.validation)},
+            "second": list(context.second),
             "rows": rows,
             "front": pareto(points),
             "chosen": chosen,
             "notes": list(plan.notes),
             "held_out_test": None,
         }
-        sentences = [f"{len(rows)} networks and formats were compared on {', '.join(ground.validation)}."]
+        sentences = [f"{len(rows)} networks and formats were compared on {', '.join(context.validation)}."]
         if chosen is None:
             return Decision(NAME, facts, (*sentences, f"None of them fits the budget '{budget.name}'."))
         row = rows[chosen]
@@ -139,48 +139,48 @@ class CompressionPhase:
         error = relative(scores["chosen"], scores["teacher"])
         facts["held_out_test"] = {"scores": scores, "error": error}
         sentences.append(
-            f"On the second test set ({', '.join(ground.second)}), opened for these two alone: "
+            f"On the second test set ({', '.join(context.second)}), opened for these two alone: "
             f"{100 * (error - 1):+.1f} % against the teacher's error."
         )
         return Decision(NAME, facts, tuple(sentences))
 
 
-def teacher_settings(ground: SearchContext) -> Table:
+def teacher_settings(context: SearchContext) -> Table:
     """Settings of the winner of the search."""
-    settings: Table = ground.decided["exploration"].facts["teacher_settings"]
+    settings: Table = context.decided["exploration"].facts["teacher_settings"]
     return settings
 
 
-def recipe_of(ground: SearchContext, units: int | None = None, pruned: bool = False) -> Recipe:
+def recipe_of(context: SearchContext, units: int | None = None, pruned: bool = False) -> Recipe:
     """A recipe under the settings of this search."""
-    spec = ground.spec.compression
-    steps = spec.updates or ground.spec.final_updates
-    return Recipe(steps, spec.formats or tuple(FORMATS), spec.budget, ground.validation, units, pruned)
+    spec = context.spec.compression
+    steps = spec.updates or context.spec.final_updates
+    return Recipe(steps, spec.formats or tuple(FORMATS), spec.budget, context.validation, units, pruned)
 
 
-def order_of(ground: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
+def order_of(context: SearchContext, settings: Table, recipe: Recipe, judged: Sequence[str] = ()) -> TrainingRequest:
     """The order that makes a network of a recipe and judges it, by default on the sessions that compare."""
     return TrainingRequest(
         settings,
-        ground.source,
-        ground.training,
-        tuple(judged) or ground.validation,
-        ground.seed(NAME),
-        ground.spec.final_updates,
+        context.source,
+        context.training,
+        tuple(judged) or context.validation,
+        context.seed(NAME),
+        context.spec.final_updates,
         recipe=recipe.to_json(),
-        **ground.several(ground.validation),
+        **context.several(context.validation),
     )
 
 
-def plan_of(ground: SearchContext, settings: Table) -> CompressionPlan:
+def plan_of(context: SearchContext, settings: Table) -> CompressionPlan:
     """Which networks are made.
 
     Raises:
         ConfigError: a budget that no network of this kind meets.
     """
-    spec = ground.spec.compression
+    spec = context.spec.compression
     experiment = build(Experiment, settings, "of the search")
-    task = experiment.task.resolve(100.0, ground.channels, experiment.model.physics)
+    task = experiment.task.resolve(100.0, context.channels, experiment.model.physics)
     network = build_model(task, experiment.model, blank_scaler(task), seed=0)
     units = [width for width in spec.units if width <= width_of(experiment.model)]
     return make_plan(network, spec.budget, units, spec.formats, shares=spec.shares)
@@ -191,7 +191,7 @@ def _better(networks: Sequence[_Made], units: int) -> _Made:
     return min((one for one in networks if one.recipe.units == units), key=lambda one: one.error)
 
 
-def rows_of(ground: SearchContext, teacher: _Made, networks: Sequence[_Made]) -> list[Row]:
+def rows_of(context: SearchContext, teacher: _Made, networks: Sequence[_Made]) -> list[Row]:
     """Every network in every format that it can be in, in the order in which they were made."""
     rows: list[Row] = []
     base = teacher.outcome.result or {}
@@ -233,13 +233,13 @@ def chosen_of(rows: Sequence[Row]) -> int | None:
     )
 
 
-def _final(ground: SearchContext, row: Row) -> Recipe:
-    return replace(recipe_of(ground, row["units"], row["pruned"]), rounded=row["rounded"], final=row["format"])
+def _final(context: SearchContext, row: Row) -> Recipe:
+    return replace(recipe_of(context, row["units"], row["pruned"]), rounded=row["rounded"], final=row["format"])
 
 
-def _nothing(ground: SearchContext, why: str) -> Decision:
+def _nothing(context: SearchContext, why: str) -> Decision:
     facts = {"on": True, "rows": [], "front": [], "chosen": None, "notes": [why], "held_out_test": None}
-    facts |= {"second": list(ground.second), "budget": recipe_of(ground).to_json()["budget"]}
+    facts |= {"second": list(context.second), "budget": recipe_of(context).to_json()["budget"]}
     return Decision(NAME, facts, (why, "The second test set stays closed."))
 
 

@@ -28,37 +28,37 @@ class Confirmation:
 
     title = "confirmation"
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """Were nothing dropped at an interim analysis; before the screening, with half of the modules."""
-        spec, decided = ground.spec, ground.decided
+        spec, decided = context.spec, context.decided
         arms = len(decided["screening"].facts["passed"]) if "screening" in decided else len(MODULES) // 2
         runs = int(decided["planning"].facts["runs"]) if "planning" in decided else spec.most_runs
         return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """Trainings of the mode, and what is confirmed."""
-        passed = list(ground.decided["screening"].facts["passed"])
+        passed = list(context.decided["screening"].facts["passed"])
         if not passed:
             yield from ()
             return Decision("confirmation", {"confirmed": [], "evidence": []}, ("No module passed the screening.",))
-        base = baseline_of(ground)[0]
-        arms = [base, *(ground.network(base, [name]) for name in passed)]
-        return (yield from (_thesis if ground.spec.mode == "thesis" else _sound)(ground, passed, arms))
+        base = baseline_of(context)[0]
+        arms = [base, *(context.network(base, [name]) for name in passed)]
+        return (yield from (_thesis if context.spec.mode == "thesis" else _sound)(context, passed, arms))
 
 
-def _sound(ground: SearchContext, passed: list[str], arms: list[Table]) -> Course:
+def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Course:
     """One interim analysis after the other; a dropped module is not trained any more."""
-    runs = int(ground.decided["planning"].facts["runs"])
+    runs = int(context.decided["planning"].facts["runs"])
     looks = tuple(look for look in LOOKS if look.runs < runs)
-    mask = ground.folds(runs)
-    scores = np.full((len(arms), runs, len(ground.development)), np.nan)
+    mask = context.folds(runs)
+    scores = np.full((len(arms), runs, len(context.development)), np.nan)
     alive = list(range(len(arms)))
     start = 0
     for stop in (*(look.runs for look in looks), runs):
-        outcomes = yield [order for arm in alive for order in ground.orders(arms[arm], range(start, stop))]
+        outcomes = yield [order for arm in alive for order in context.orders(arms[arm], range(start, stop))]
         for index, arm in enumerate(alive):
             own = outcomes[index * (stop - start) : (index + 1) * (stop - start)]
-            scores[arm, start:stop] = ground.table(own)
+            scores[arm, start:stop] = context.table(own)
         start = stop
         filled = fill_worst(scores[alive, :stop], mask[:stop])
         if stop < runs:
@@ -69,9 +69,9 @@ def _sound(ground: SearchContext, passed: list[str], arms: list[Table]) -> Cours
     evidence = confirm(
         scores[:, :start],
         passed,
-        ground.decided["screening"].facts["registered"],
+        context.decided["screening"].facts["registered"],
         mask[:start],
-        Rule(alpha=ground.spec.alpha, least_gain=ground.spec.least_gain, looks=looks),
+        Rule(alpha=context.spec.alpha, least_gain=context.spec.least_gain, looks=looks),
     )
     return _decision(
         [_plain(module_evidence) for module_evidence in evidence],
@@ -88,21 +88,21 @@ def _hopeless(filled: Array, mask: Mask, stop: int, looks: Sequence[Look]) -> li
     return [bool(value > level) for value in np.atleast_1d(p)]
 
 
-def _thesis(ground: SearchContext, passed: list[str], arms: list[Table]) -> Course:
-    runs, seeds = int(ground.decided["planning"].facts["runs"]), ground.spec.run_seeds
+def _thesis(context: SearchContext, passed: list[str], arms: list[Table]) -> Course:
+    runs, seeds = int(context.decided["planning"].facts["runs"]), context.spec.run_seeds
     outcomes = yield [
-        order for arm in arms for seed in range(seeds) for order in ground.orders(arm, range(runs), seed=seed)
+        order for arm in arms for seed in range(seeds) for order in context.orders(arm, range(runs), seed=seed)
     ]
-    scores = _by_metric(ground, outcomes, len(arms), seeds, runs)
-    evidence = thesis_confirm(scores, passed, METRICS, ground.spec.alpha)
+    scores = _by_metric(context, outcomes, len(arms), seeds, runs)
+    evidence = thesis_confirm(scores, passed, METRICS, context.spec.alpha)
     confirmed = [name for name in passed if any(entry.confirmed for entry in evidence if entry.module == name)]
     texts = [_thesis_text(name, [entry for entry in evidence if entry.module == name]) for name in passed]
     return _decision([asdict(entry) for entry in evidence], confirmed, texts)
 
 
-def _by_metric(ground: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
+def _by_metric(context: SearchContext, outcomes: Sequence[Outcome], arms: int, seeds: int, runs: int) -> Array:
     """``(metric, arm, split, seed)``; a failed training has the worst of its metric."""
-    rows = [[outcome.mean(ground.spec.horizon, metric) for outcome in outcomes] for metric in METRICS]
+    rows = [[outcome.mean(context.spec.horizon, metric) for outcome in outcomes] for metric in METRICS]
     scores = np.array(rows).reshape(len(METRICS), arms, seeds, runs).swapaxes(2, 3)
     for own in scores:
         own[~np.isfinite(own)] = np.nanmax(np.where(np.isfinite(own), own, np.nan))

@@ -21,39 +21,39 @@ class Exploration:
 
     title = "exploration"
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """The questions, and both winners on fresh folds."""
-        return ground.spec.free_trials * ground.spec.trial_runs + 2 * len(fresh_runs(ground))
+        return context.spec.free_trials * context.spec.trial_runs + 2 * len(fresh_runs(context))
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """Ask about all modules and options of those that are on; then both winners on fresh folds, same seeds."""
-        spec = ground.spec
-        base = baseline_of(ground)[0]
-        free = fitting(base, ground.channels)
-        earlier = ground.decided["synthesis"].facts
+        spec = context.spec
+        base = baseline_of(context)[0]
+        free = fitting(base, context.channels)
+        earlier = context.decided["synthesis"].facts
         starts = [(earlier["values"], earlier["modules"])]
-        options = {name: options_of(base, name, ground.shaped) for name in free}
+        options = {name: options_of(base, name, context.shaped) for name in free}
         switches = [*free, *spec.toggles]
-        answers = yield from ask_together(ground, "exploration", switches, spec.free_trials, starts, options)
-        facts = winner_of(ground, "exploration", switches, answers)
+        answers = yield from ask_together(context, "exploration", switches, spec.free_trials, starts, options)
+        facts = winner_of(context, "exploration", switches, answers)
         facts["options"] = {key: list(choice.options) for own in options.values() for key, choice in own.items()}
-        runs = fresh_runs(ground)
+        runs = fresh_runs(context)
         arms = (earlier["settings"], facts["settings"])
-        outcomes = yield [order for settings in arms for order in ground.orders(settings, runs)]
-        return self.decide(ground, facts, outcomes)
+        outcomes = yield [order for settings in arms for order in context.orders(settings, runs)]
+        return self.decide(context, facts, outcomes)
 
-    def decide(self, ground: SearchContext, facts: dict[str, Any], outcomes: Sequence[Outcome]) -> Decision:
+    def decide(self, context: SearchContext, facts: dict[str, Any], outcomes: Sequence[Outcome]) -> Decision:
         """The teacher: the winner of phase 5 where fresh folds bear it out, else that of phase 4."""
-        earlier = ground.decided["synthesis"].facts
+        earlier = context.decided["synthesis"].facts
         size = len(outcomes) // 2
-        mask = ground.folds(fresh_runs(ground)[-1] + 1)[-size:]
+        mask = context.folds(fresh_runs(context)[-1] + 1)[-size:]
         seen = mask.any(axis=0)
-        scores = np.stack([ground.table(part)[:, seen] for part in (outcomes[:size], outcomes[size:])])
+        scores = np.stack([context.table(part)[:, seen] for part in (outcomes[:size], outcomes[size:])])
         filled = fill_worst(scores, mask[:, seen])
         test = clustered_t(filled[1] - filled[0], mask[:, seen])
         fresh = [float(own[mask[:, seen]].mean()) for own in filled]
         comparison = changed(test, fresh[0])
-        better = comparison["change"] < 0 and comparison["p"] < ground.spec.alpha
+        better = comparison["change"] < 0 and comparison["p"] < context.spec.alpha
         names = ", ".join(map(title_of, facts["modules"])) or "no module"
         facts |= {
             **comparison,
@@ -72,9 +72,9 @@ class Exploration:
         return Decision("exploration", facts, sentences)
 
 
-def fresh_runs(ground: SearchContext) -> range:
+def fresh_runs(context: SearchContext) -> range:
     """Two repeats of the folds behind all that phases 0 to 4 may have used."""
-    spec = ground.spec
+    spec = context.spec
     used = max(spec.most_runs, spec.variance_runs, spec.trial_runs, spec.screening_repeats)
     start = -(-used // spec.folds) * spec.folds
     return range(start, start + 2 * spec.folds)

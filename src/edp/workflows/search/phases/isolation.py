@@ -48,34 +48,34 @@ class Isolation:
 
     title = "isolation and variance"
 
-    def arms(self, ground: SearchContext) -> list[tuple[str, str]]:
+    def arms(self, context: SearchContext) -> list[tuple[str, str]]:
         """Backbone and feature set of each arm."""
-        return [(backbone, features) for backbone in ground.spec.backbones for features in ground.spec.feature_sets]
+        return [(backbone, features) for backbone in context.spec.backbones for features in context.spec.feature_sets]
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """All of them at once."""
-        return len(self.arms(ground)) * ground.spec.variance_runs * ground.spec.variance_seeds
+        return len(self.arms(context)) * context.spec.variance_runs * context.spec.variance_seeds
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """All arms on the same folds with the same seeds, in one batch."""
-        spec = ground.spec
+        spec = context.spec
         outcomes = yield [
             order
-            for backbone, features in self.arms(ground)
+            for backbone, features in self.arms(context)
             for seed in range(spec.variance_seeds)
-            for order in ground.orders(
-                ground.shaped(arm_settings(ground.base, backbone, spec.feature_sets[features])),
+            for order in context.orders(
+                context.shaped(arm_settings(context.base, backbone, spec.feature_sets[features])),
                 range(spec.variance_runs),
                 seed=seed,
             )
         ]
-        return self.decide(ground, outcomes)
+        return self.decide(context, outcomes)
 
-    def decide(self, ground: SearchContext, outcomes: Sequence[Outcome]) -> Decision:
+    def decide(self, context: SearchContext, outcomes: Sequence[Outcome]) -> Decision:
         """Variance components of each arm; the feature set with the lowest mean score over all backbones."""
-        spec, arms = ground.spec, self.arms(ground)
-        tables = _tables(ground, outcomes, len(arms))
-        errors = _tables(ground, outcomes, len(arms), "mae")
+        spec, arms = context.spec, self.arms(context)
+        tables = _tables(context, outcomes, len(arms))
+        errors = _tables(context, outcomes, len(arms), "mae")
         facts: dict[str, Any] = {"arms": {}, "runs": spec.variance_runs, "seeds": spec.variance_seeds}
         estimate = thesis_variance if spec.mode == "thesis" else split_variance
         for (backbone, features), scores, mae in zip(arms, tables, errors, strict=True):
@@ -91,14 +91,14 @@ class Isolation:
             for features in spec.feature_sets
         }
         chosen = min(means, key=lambda name: means[name])
-        facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(ground, tables, chosen)}
+        facts |= {"features": chosen, "mean_scores": means, "comparisons": self._comparisons(context, tables, chosen)}
         own = {name: arm_table.mean(axis=0) for (name, f), arm_table in zip(arms, tables, strict=True) if f == chosen}
-        facts["backbones"] = lowest_against_others(own, _judged(ground)[0])
-        facts["variance"] = _proxy(ground, tables, arms)
+        facts["backbones"] = lowest_against_others(own, _judged(context)[0])
+        facts["variance"] = _proxy(context, tables, arms)
         sentences = [
             f"Feature set {chosen} goes on: mean {what} "
             + ", ".join(f"{name} {value:.3g}" for name, value in means.items())
-            + f" {ground.unit} over all backbones."
+            + f" {context.unit} over all backbones."
         ]
         for backbone, comparison in facts["comparisons"].items():
             sentences.append(
@@ -113,9 +113,9 @@ class Isolation:
             )
         return Decision("isolation", facts, tuple(sentences))
 
-    def _comparisons(self, ground: SearchContext, tables: list[Array], chosen: str) -> dict[str, Any]:
+    def _comparisons(self, context: SearchContext, tables: list[Array], chosen: str) -> dict[str, Any]:
         """The chosen feature set against the next best one, for each backbone."""
-        spec = ground.spec
+        spec = context.spec
         rivals = [name for name in spec.feature_sets if name != chosen]
         comparisons = {}
         for index, backbone in enumerate(spec.backbones):
@@ -124,7 +124,7 @@ class Isolation:
                 continue
             rival = min(rivals, key=lambda name: float(np.nanmean(own[name])))
             first, second = (own[name].mean(axis=0) for name in (chosen, rival))
-            mask, _ = _judged(ground)
+            mask, _ = _judged(context)
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
             comparisons[backbone] = {"rival": rival, **changed(test, float(np.nanmean(second)))}
         return comparisons
@@ -146,32 +146,32 @@ def lowest_against_others(tables: Mapping[str, Array], mask: NDArray[np.bool_]) 
     }
 
 
-def _tables(ground: SearchContext, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
+def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name: str = "composite") -> list[Array]:
     """Scores of each arm ``(seed, run, session)``; failed trainings count as the worst of all arms."""
-    spec = ground.spec
+    spec = context.spec
     size = spec.variance_runs
-    mask, seen = _judged(ground)
-    raw = np.stack([ground.table(outcomes[at : at + size], name)[:, seen] for at in range(0, len(outcomes), size)])
+    mask, seen = _judged(context)
+    raw = np.stack([context.table(outcomes[at : at + size], name)[:, seen] for at in range(0, len(outcomes), size)])
     filled = fill_worst(raw, mask)
     filled[:, ~mask] = np.nan
     return list(filled.reshape(arms, spec.variance_seeds, size, -1))
 
 
-def _judged(ground: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _judged(context: SearchContext) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Cells ``(run, session)`` of the sessions that some run is judged on, and which sessions these are."""
-    mask = ground.folds(ground.spec.variance_runs)
+    mask = context.folds(context.spec.variance_runs)
     seen = np.asarray(mask.any(axis=0))
     return mask[:, seen], seen
 
 
-def _proxy(ground: SearchContext, tables: list[Array], arms: list[tuple[str, str]]) -> dict[str, float]:
+def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, str]]) -> dict[str, float]:
     """The variance of paired differences that planning takes for that of a module's effect.
 
     Before a module was ever trained the variance of its effect is not known. That between the feature sets of one
     backbone stands in for it; with one feature set, that between backbones, and with one arm, that between seeds. The
     largest of them counts.
     """
-    mask, _ = _judged(ground)
+    mask, _ = _judged(context)
     pairs = [(i, j) for i in range(len(arms)) for j in range(i + 1, len(arms))]
     alike = [(i, j) for i, j in pairs if arms[i][0] == arms[j][0]] or pairs
     differences = [tables[i][0] - tables[j][0] for i, j in alike] or [tables[0][0] - own for own in tables[0][1:]]

@@ -28,7 +28,7 @@ Asked = Generator[list[TrainingRequest], list[Outcome], list[AnsweredQuestion]]
 
 
 def ask_together(
-    ground: SearchContext,
+    context: SearchContext,
     name: str,
     modules: Sequence[str],
     trials: int,
@@ -38,32 +38,32 @@ def ask_together(
     """Questions about modules on or off, rates inside the window and what was deferred, with warm starts first.
 
     Args:
-        ground: with the baseline of phase 1.
+        context: with the baseline of phase 1.
         name: of the phase.
         modules: and toggles that may be on.
         trials: how many questions, the warm starts among them.
         starts: values and modules to begin with.
         options: what is varied of a module where it is on.
     """
-    base, _, window = baseline_of(ground)
-    space = {**window, **ground.spec.deferred}
-    study = new_study(ground, name, space, modules, contradicting(base, modules, ground.channels))
+    base, _, window = baseline_of(context)
+    space = {**window, **context.spec.deferred}
+    study = new_study(context, name, space, modules, contradicting(base, modules, context.channels))
     study.options = options or {}
     for values, flags in starts[:trials]:
-        present = present_options(base, flags, ground.shaped) if options else None
+        present = present_options(base, flags, context.shaped) if options else None
         study.suggest(_inside(space, values), flags, present)
 
     def settings(trial: Trial) -> Table:
-        return ground.network(apply(base, trial.values), trial.flags, trial.options)
+        return context.network(apply(base, trial.values), trial.flags, trial.options)
 
     # The thesis prunes in phase 1 only (3.3.2).
-    stops = () if ground.spec.mode == "thesis" else ground.spec.stops
-    (answers,) = yield from answer_all(ground, [Quest(study, settings, trials)], stops)
+    stops = () if context.spec.mode == "thesis" else context.spec.stops
+    (answers,) = yield from answer_all(context, [Quest(study, settings, trials)], stops)
     return answers
 
 
 def winner_of(
-    ground: SearchContext, name: str, modules: Sequence[str], answers: list[AnsweredQuestion]
+    context: SearchContext, name: str, modules: Sequence[str], answers: list[AnsweredQuestion]
 ) -> dict[str, Any]:
     """The best answer, how often each module was on, and the front where a cost counts.
 
@@ -87,16 +87,16 @@ def winner_of(
                 "values": {**answer.trial.values, **answer.trial.options},
                 "modules": list(answer.trial.flags),
                 "score": answer.score,
-                "mae": None if answer.pruned else mean_of(ground, answer.outcomes, "mae"),
+                "mae": None if answer.pruned else mean_of(context, answer.outcomes, "mae"),
                 **answer.costs,
                 **answer.course(),
             }
             for answer in answers
         ],
     }
-    facts["said_of_pruned"] = said_of_pruned(ground, answers)
-    if ground.spec.cost != "none":
-        points = [(answer.score or 0.0, answer.costs[ground.spec.cost]) for answer in done]
+    facts["said_of_pruned"] = said_of_pruned(context, answers)
+    if context.spec.cost != "none":
+        points = [(answer.score or 0.0, answer.costs[context.spec.cost]) for answer in done]
         facts["front"] = [done[index].trial.number for index in pareto(points)]
     return facts
 

@@ -16,48 +16,48 @@ class Planning:
 
     title = "power"
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """None."""
         return 0
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """Decide at once."""
         yield from ()
-        return _thesis(ground) if ground.spec.mode == "thesis" else _sound(ground)
+        return _thesis(context) if context.spec.mode == "thesis" else _sound(context)
 
 
-def _sound(ground: SearchContext) -> Decision:
+def _sound(context: SearchContext) -> Decision:
     """Closed form for the clustered test, at the level that a single true module has to pass."""
-    spec = ground.spec
-    facts = ground.decided["isolation"].facts
+    spec = context.spec
+    facts = context.decided["isolation"].facts
     mean = facts["mean_scores"][facts["features"]]
-    modules = max(1, len(ground.decided["screening"].facts["registered"]))
+    modules = max(1, len(context.decided["screening"].facts["registered"]))
     plan = plan_runs(
         spec.least_effect * mean,
         PairedVariance(**facts["variance"]),
-        len(ground.development),
+        len(context.development),
         folds=spec.folds,
         alpha=spec.alpha / modules,
         target=spec.power,
         most=spec.most_runs,
     )
     runs = plan.runs or spec.most_runs - spec.most_runs % spec.folds
-    sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} {ground.unit}: {plan.reason}."]
+    sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} {context.unit}: {plan.reason}."]
     if plan.runs is None:
         sentences.append(f"{runs} runs are made nevertheless; effects below what they can show will be missed.")
     return Decision("planning", {**asdict(plan), "runs": runs, "enough": plan.runs}, tuple(sentences))
 
 
-def _thesis(ground: SearchContext) -> Decision:
+def _thesis(context: SearchContext) -> Decision:
     """J after eq. 3.42 on the mean absolute error.
 
     The standard deviation between seeds is the largest of all backbones (3.3.1); the error of which a share is to be
     seen is that of the baseline's backbone in phase 0. Both with the feature set that went on.
     """
-    spec = ground.spec
-    features = ground.decided["isolation"].facts["features"]
-    backbone = ground.decided["calibration"].facts["backbone"]
-    arms = {name: arm["mae"] for name, arm in ground.decided["isolation"].facts["arms"].items()}
+    spec = context.spec
+    features = context.decided["isolation"].facts["features"]
+    backbone = context.decided["calibration"].facts["backbone"]
+    arms = {name: arm["mae"] for name, arm in context.decided["isolation"].facts["arms"].items()}
     sigma = max((arms[f"{one} {features}"]["seed"] or 0.0) for one in spec.backbones)
     mean = arms[f"{backbone} {features}"]["mean"]
     if sigma <= 0.0:
@@ -70,7 +70,7 @@ def _thesis(ground: SearchContext) -> Decision:
     runs = min(int(plan["splits"] or 2), spec.most_runs)
     text = (
         f"J = {plan['splits']} splits of {spec.run_seeds} seeds after eq. 3.42 (seeds differ by {sigma:.3g} "
-        f"{ground.unit}, {100 * spec.least_effect:g} % of an MAE of {mean:.3g} are to be seen); {runs} are made."
+        f"{context.unit}, {100 * spec.least_effect:g} % of an MAE of {mean:.3g} are to be seen); {runs} are made."
     )
     return Decision("planning", {**plan, "runs": runs, "mae": mean, "sigma_seed": sigma}, (text,))
 

@@ -22,48 +22,48 @@ class ModuleScreening:
 
     title = "screening"
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """The design, or the questions of all modules with the baseline's seeds."""
-        spec = ground.spec
+        spec = context.spec
         if spec.mode == "thesis":
             return spec.run_seeds + len(MODULES) * spec.module_trials * spec.trial_runs
         return spec.screening_runs * spec.screening_repeats
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """Trainings of the mode, and what passes."""
-        return (yield from (_thesis(ground) if ground.spec.mode == "thesis" else _sound(ground)))
+        return (yield from (_thesis(context) if context.spec.mode == "thesis" else _sound(context)))
 
 
-def baseline_of(ground: SearchContext) -> tuple[Table, Candidate, Space]:
+def baseline_of(context: SearchContext) -> tuple[Table, Candidate, Space]:
     """Settings of the baseline, its values, and the window around them in which candidates are tuned."""
-    facts = ground.decided["calibration"].facts
-    space = {name: dimension for name, dimension in ground.spec.space.items() if name in ground.spec.elastic}
-    beyond = ground.spec.mode == "thesis"
-    return facts["settings"], facts["baseline"], elastic(space, facts["baseline"], ground.spec.elastic, beyond)
+    facts = context.decided["calibration"].facts
+    space = {name: dimension for name, dimension in context.spec.space.items() if name in context.spec.elastic}
+    beyond = context.spec.mode == "thesis"
+    return facts["settings"], facts["baseline"], elastic(space, facts["baseline"], context.spec.elastic, beyond)
 
 
-def _sound(ground: SearchContext) -> Course:
-    spec = ground.spec
-    base, _, window = baseline_of(ground)
-    free = fitting(base, ground.channels)
-    barred = [sorted(pair) for pair in contradicting(base, free, ground.channels)]
+def _sound(context: SearchContext) -> Course:
+    spec = context.spec
+    base, _, window = baseline_of(context)
+    free = fitting(base, context.channels)
+    barred = [sorted(pair) for pair in contradicting(base, free, context.channels)]
     design = two_level_design(free, spec.screening_runs, sorted(barred))
-    drawn = _drawn(ground, window, spec.screening_repeats * len(design.levels))
+    drawn = _drawn(context, window, spec.screening_repeats * len(design.levels))
     orders, rows = [], []
     for repeat in range(spec.screening_repeats):
         for row, levels in enumerate(design.levels):
             values = drawn[repeat * len(design.levels) + row]
             chosen = [name for name, on in zip(free, levels, strict=True) if on]
-            settings = ground.network(apply(base, values), chosen)
-            orders += ground.orders(settings, [repeat])
+            settings = context.network(apply(base, values), chosen)
+            orders += context.orders(settings, [repeat])
             rows.append((levels, values, repeat))
     outcomes = yield orders
-    return _passed_by_design(ground, design, rows, outcomes)
+    return _passed_by_design(context, design, rows, outcomes)
 
 
-def _drawn(ground: SearchContext, window: Space, count: int) -> list[dict[str, float]]:
+def _drawn(context: SearchContext, window: Space, count: int) -> list[dict[str, float]]:
     """Values inside the window by chance, so that effects are averages over it."""
-    rng = np.random.default_rng(ground.seed("screening"))
+    rng = np.random.default_rng(context.seed("screening"))
     candidates = []
     for _ in range(count):
         values = {}
@@ -81,18 +81,18 @@ def _drawn(ground: SearchContext, window: Space, count: int) -> list[dict[str, f
 
 
 def _passed_by_design(
-    ground: SearchContext,
+    context: SearchContext,
     design: Factorial,
     rows: Sequence[tuple[Any, dict[str, float], int]],
     outcomes: Sequence[Outcome],
 ) -> Decision:
     """Main effects by least squares, with the drawn values and the fold as covariates; what shows a sign passes."""
-    scores = np.array([outcome.mean(ground.spec.horizon) for outcome in outcomes])
+    scores = np.array([outcome.mean(context.spec.horizon) for outcome in outcomes])
     failed = int((~np.isfinite(scores)).sum())
     if failed < len(scores):
         scores = np.where(np.isfinite(scores), scores, np.nanmax(scores))
     drawn = [[np.log10(v) if v > 0 and name != "dropout" else v for name, v in row[1].items()] for row in rows]
-    folds = [[float(row[2] == repeat) for repeat in range(1, ground.spec.screening_repeats)] for row in rows]
+    folds = [[float(row[2] == repeat) for repeat in range(1, context.spec.screening_repeats)] for row in rows]
     covariates = np.hstack([np.array(drawn), np.array(folds).reshape(len(rows), -1)])
     covariates = covariates[:, covariates.std(axis=0) > 0]
     levels = np.stack([row[0] for row in rows])
@@ -108,29 +108,29 @@ def _passed_by_design(
     return Decision("screening", facts, tuple(sentences))
 
 
-def _thesis(ground: SearchContext) -> Course:
+def _thesis(context: SearchContext) -> Course:
     """The best of some questions of each module against the median of the baseline over seeds, as the thesis does."""
-    spec = ground.spec
-    base, _, window = baseline_of(ground)
-    free = fitting(base, ground.channels)
-    median = yield [order for seed in range(spec.run_seeds) for order in ground.orders(base, [0], seed=seed)]
+    spec = context.spec
+    base, _, window = baseline_of(context)
+    free = fitting(base, context.channels)
+    median = yield [order for seed in range(spec.run_seeds) for order in context.orders(base, [0], seed=seed)]
     reference = float(np.median([outcome.mean(spec.horizon) for outcome in median]))
-    quests = [_quest(ground, base, name, window) for name in free]
-    answers = yield from answer_all(ground, quests)
+    quests = [_quest(context, base, name, window) for name in free]
+    answers = yield from answer_all(context, quests)
     table = {name: _gain(own, reference) for name, own in zip(free, answers, strict=True)}
     passed = [name for name, row in table.items() if row["gain"] is not None and row["gain"] > 0]
     sentences = (
         f"{len(passed)} of {len(free)} modules have a trial below the baseline's median of {reference:.3g} "
-        f"{ground.unit} and go on; by chance alone most do, since the best of {spec.module_trials} is compared with a "
+        f"{context.unit} and go on; by chance alone most do, since the best of {spec.module_trials} is compared with a "
         "median.",
     )
     return Decision("screening", {"passed": passed, "registered": list(free), "modules": table}, sentences)
 
 
-def _quest(ground: SearchContext, base: Table, module: str, window: Space) -> Quest:
-    settings = ground.network(base, [module])
-    study = new_study(ground, f"screening {module}", window)
-    return Quest(study, lambda trial: apply(settings, trial.values), ground.spec.module_trials)
+def _quest(context: SearchContext, base: Table, module: str, window: Space) -> Quest:
+    settings = context.network(base, [module])
+    study = new_study(context, f"screening {module}", window)
+    return Quest(study, lambda trial: apply(settings, trial.values), context.spec.module_trials)
 
 
 def _gain(answers: list[AnsweredQuestion], reference: float) -> dict[str, float | None]:

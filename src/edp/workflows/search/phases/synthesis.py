@@ -22,91 +22,91 @@ class Synthesis:
 
     title = "synthesis"
 
-    def trainings(self, ground: SearchContext) -> int:
+    def trainings(self, context: SearchContext) -> int:
         """The questions, and both arms at length."""
-        return ground.spec.joint_trials * ground.spec.trial_runs + 2 * ground.spec.run_seeds
+        return context.spec.joint_trials * context.spec.trial_runs + 2 * context.spec.run_seeds
 
-    def run(self, ground: SearchContext) -> Course:
+    def run(self, context: SearchContext) -> Course:
         """Tune modules and rates together; then train the best and the baseline at length and judge both once."""
-        confirmed = list(ground.decided["confirmation"].facts["confirmed"])
-        switches = [*confirmed, *ground.spec.toggles]
-        base, values, _ = baseline_of(ground)
+        confirmed = list(context.decided["confirmation"].facts["confirmed"])
+        switches = [*confirmed, *context.spec.toggles]
+        base, values, _ = baseline_of(context)
         starts = [(values, confirmed), (values, [])] if confirmed else [(values, [])]
-        if ground.spec.mode == "thesis":  # whose phase 4 has no warm start (3.3.5)
+        if context.spec.mode == "thesis":  # whose phase 4 has no warm start (3.3.5)
             starts = []
-        answers = yield from ask_together(ground, "synthesis", switches, ground.spec.joint_trials, starts)
-        facts = winner_of(ground, "synthesis", switches, answers)
+        answers = yield from ask_together(context, "synthesis", switches, context.spec.joint_trials, starts)
+        facts = winner_of(context, "synthesis", switches, answers)
         arms = {"synthesis": facts["settings"], "baseline": base}
-        outcomes = yield [order for settings in arms.values() for order in final_orders(ground, settings)]
-        facts["test"] = judged(ground, list(arms), outcomes)
-        facts["test_gain"] = gained(ground, outcomes)
-        return self.decide(ground, confirmed, facts)
+        outcomes = yield [order for settings in arms.values() for order in final_orders(context, settings)]
+        facts["test"] = judged(context, list(arms), outcomes)
+        facts["test_gain"] = gained(context, outcomes)
+        return self.decide(context, confirmed, facts)
 
-    def decide(self, ground: SearchContext, confirmed: Sequence[str], facts: dict[str, Any]) -> Decision:
+    def decide(self, context: SearchContext, confirmed: Sequence[str], facts: dict[str, Any]) -> Decision:
         """What stays, what works against the others, and what the test sessions say."""
         facts["antagonistic"] = [name for name in confirmed if name not in facts["modules"]]
         names = ", ".join(map(title_of, facts["modules"])) or "no module"
-        sentences = [f"Best together: {names}; {facts['score']:.3g} {ground.unit} on development sessions."]
+        sentences = [f"Best together: {names}; {facts['score']:.3g} {context.unit} on development sessions."]
         sentences += facts["said_of_pruned"]
         if facts["antagonistic"]:
             left = ", ".join(map(title_of, facts["antagonistic"]))
             sentences.append(f"Confirmed alone, but not wanted together: {left}.")
         test = facts["test"]
-        ours, base = (_shown(test[arm]["composite"], ground.unit) for arm in ("synthesis", "baseline"))
+        ours, base = (_shown(test[arm]["composite"], context.unit) for arm in ("synthesis", "baseline"))
         gain = facts["test_gain"]
         interval = "" if gain is None else f"; {100 * gain['change']:+.2f} %, p {gain['p']:.2g}"
         sentences.append(
-            f"On {len(ground.test)} test sessions, opened once: {ours}, the baseline {base} (composite score, mean of "
-            f"{ground.spec.run_seeds} seeds{interval})."
+            f"On {len(context.test)} test sessions, opened once: {ours}, the baseline {base} (composite score, mean of "
+            f"{context.spec.run_seeds} seeds{interval})."
         )
         return Decision("synthesis", facts, tuple(sentences))
 
 
-def final_orders(ground: SearchContext, settings: Table) -> list[TrainingRequest]:
+def final_orders(context: SearchContext, settings: Table) -> list[TrainingRequest]:
     """Trainings on all development sessions at full length, judged on the test sessions; an order a seed.
 
     Several epochs are validated by the development sessions that judge the first run, which then do not train: the test
     sessions have no say.
     """
-    train = ground.development
+    train = context.development
     validation: tuple[str, ...] = ()
-    if ground.spec.epochs > 1:
-        first = ground.orders(settings, [0])[0]
+    if context.spec.epochs > 1:
+        first = context.orders(settings, [0])[0]
         train, validation = first.train, first.judged
     return [
         TrainingRequest(
             settings,
-            ground.source,
+            context.source,
             train,
-            ground.test,
-            ground.seed("final", seed),
-            ground.spec.final_updates,
-            **ground.several(validation),
+            context.test,
+            context.seed("final", seed),
+            context.spec.final_updates,
+            **context.several(validation),
         )
-        for seed in range(ground.spec.run_seeds)
+        for seed in range(context.spec.run_seeds)
     ]
 
 
 def judged(
-    ground: SearchContext, arms: Sequence[str], outcomes: Sequence[Outcome]
+    context: SearchContext, arms: Sequence[str], outcomes: Sequence[Outcome]
 ) -> dict[str, dict[str, float | None]]:
     """Means over seeds of each score on the test sessions, by arm; None where a training did not end well."""
-    seeds = ground.spec.run_seeds
+    seeds = context.spec.run_seeds
     arm_scores: dict[str, dict[str, float | None]] = {}
     for index, arm in enumerate(arms):
         own = outcomes[index * seeds : (index + 1) * seeds]
-        means = {name: float(np.mean([o.mean(ground.spec.horizon, name) for o in own])) for name in SCORES}
+        means = {name: float(np.mean([o.mean(context.spec.horizon, name) for o in own])) for name in SCORES}
         arm_scores[arm] = {name: value if np.isfinite(value) else None for name, value in means.items()}
     return arm_scores
 
 
-def gained(ground: SearchContext, outcomes: Sequence[Outcome]) -> dict[str, float] | None:
+def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> dict[str, float] | None:
     """The first arm against the second on the test sessions, clustered by session and seed.
 
     None with one test session, one seed, or a training that did not end well.
     """
-    scores = np.array([[o.score(name, ground.spec.horizon) for name in ground.test] for o in outcomes])
-    arms = scores.reshape(2, ground.spec.run_seeds, len(ground.test))
+    scores = np.array([[o.score(name, context.spec.horizon) for name in context.test] for o in outcomes])
+    arms = scores.reshape(2, context.spec.run_seeds, len(context.test))
     if min(arms.shape[1:]) < 2 or not np.isfinite(arms).all():
         return None
     return changed(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))
