@@ -69,19 +69,19 @@ def main() -> None:
     teacher = fit(data, experiment.model, training).predictor
     model = student(teacher.spec, units=16, levels=1)
     small = fit(
-        data, model, training, lesson=Distillation([teacher], start=prune(teacher, model, data.train))
+        data, model, training, strategy=Distillation([teacher], start=prune(teacher, model, data.train))
     ).predictor
-    lesson = Distillation([teacher])
+    strategy = Distillation([teacher])
     further = {
         "float": Distillation([teacher], start=small),
-        "rounded, 16 bits": QuantisationAware(small, lesson),
-        "rounded, 8 bits": QuantisationAware(small, lesson, RoundingSpec(activation_bits=8)),
+        "rounded, 16 bits": QuantisationAware(small, strategy),
+        "rounded, 8 bits": QuantisationAware(small, strategy, RoundingSpec(activation_bits=8)),
     }
     found = {"before": errors(small, data)}
     for name, way in further.items():
         began = time.process_time()
         spec = replace(tuning(training), epochs=2)
-        found[f"trained on in {name}"] = errors(fit(data, model, spec, lesson=way).predictor, data)
+        found[f"trained on in {name}"] = errors(fit(data, model, spec, strategy=way).predictor, data)
         print(f"{name}: {time.process_time() - began:.0f} processor s", flush=True)
     table(["network", *FORMS], [[name, *row.values()] for name, row in found.items()])
     plain, rounded = (found[f"trained on in {name}"] for name in ("float", "rounded, 16 bits"))

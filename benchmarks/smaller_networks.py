@@ -43,9 +43,9 @@ def ways(teacher: Predictor, data: Prepared, training: TrainingSpec, units: int)
         "distilled with hint": Distillation([teacher], DistillationSpec(hint=0.1)),
         "pruned and distilled": Distillation([teacher], start=pruned),
     }
-    for name, lesson in lessons.items():
+    for name, strategy in lessons.items():
         began = time.process_time()
-        fitted = fit(data, model, training, lesson=lesson).predictor
+        fitted = fit(data, model, training, strategy=strategy).predictor
         made[name] = (fitted, time.process_time() - began)
         print(f"{name}: {made[name][1]:.0f} processor s", flush=True)
     return made

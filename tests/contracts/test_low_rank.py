@@ -19,8 +19,8 @@ def test_changes_begin_at_nothing_and_are_added_at_the_end(structure, predictor_
             return which(x, which.initial_state(1, x))[0]
 
     before = answer(start)
-    lesson = LowRank(start, rank=2)
-    assert lesson.begin(net, TrainingSpec())
+    strategy = LowRank(start, rank=2)
+    assert strategy.begin(net, TrainingSpec())
     torch.testing.assert_close(answer(net), before, rtol=1e-12, atol=1e-12)
     learned = [name for name, parameter in net.named_parameters() if parameter.requires_grad]
     assert learned
@@ -31,7 +31,7 @@ def test_changes_begin_at_nothing_and_are_added_at_the_end(structure, predictor_
             change.b.copy_(0.1 * torch.randn(change.b.shape, generator=draw, dtype=torch.float64))
     changed = answer(net)
     assert not torch.allclose(changed, before)
-    lesson.end(net)
+    strategy.end(net)
     assert net.state_dict().keys() == start.state_dict().keys()
     torch.testing.assert_close(answer(net), changed, rtol=1e-9, atol=1e-9)
     wanted = {name for name, parameter in start.named_parameters() if parameter.requires_grad}

@@ -67,8 +67,8 @@ def same(one, other):
 def test_a_student_of_the_teacher_alone_does_as_it_does_whatever_the_truth_says(tiny, brief, teacher, small):
     spec = dataclasses.replace(brief, updates=150)
     teacher_targets, plain = (
-        fit(tiny, small, spec, lesson=lesson).predictor
-        for lesson in (Distillation([teacher], DistillationSpec(truth=0.0)), None)
+        fit(tiny, small, spec, strategy=strategy).predictor
+        for strategy in (Distillation([teacher], DistillationSpec(truth=0.0)), None)
     )
     assert gap(teacher_targets, teacher, tiny.test) < 0.5 * gap(plain, teacher, tiny.test)
 
@@ -79,17 +79,17 @@ def test_loss_is_the_dual_objective(tiny, tiny_training, teacher, small):
     objective = Objective(training, net.code)
 
     def loss(truth):
-        lesson = Distillation([teacher], DistillationSpec(truth=truth, soft=MeanSquared()))
-        teacher_targets = lesson.series(tiny.task, tiny.train)
+        strategy = Distillation([teacher], DistillationSpec(truth=truth, soft=MeanSquared()))
+        teacher_targets = strategy.series(tiny.task, tiny.train)
         batch = next(ChunkSampler(teacher_targets, tiny.task.horizons, training.chunks, 0).epoch(0))
         x = torch.from_numpy(batch.inputs)
         answer, features, hidden, _ = net.forward_features(x, net.initial_state(len(x), x))
         future, valid, said = (torch.from_numpy(part) for part in (batch.future, batch.valid, batch.teacher_targets))
-        moment = BatchContext(answer, future, features, hidden, valid, said)
+        batch_context = BatchContext(answer, future, features, hidden, valid, said)
         hard = objective.evaluate(answer, future, features, valid)
         goal = objective.code.encode(said[..., 1:].unflatten(-1, (2, 3)), features)
         soft = ((answer.center - goal) ** 2)[valid].mean()
-        return [float(value.detach()) for value in (lesson.loss(objective, moment), hard, soft)]
+        return [float(value.detach()) for value in (strategy.loss(objective, batch_context), hard, soft)]
 
     for truth in (0.0, 0.3, 0.9):
         total, hard, soft = loss(truth)
@@ -122,9 +122,9 @@ def test_series_without_truth_teach_without_a_share_in_the_loss_of_the_truth(tin
     part = tiny.train[0]
     further = [dataclasses.replace(part, targets=np.full_like(part.targets, value)) for value in (0.5, np.nan)]
     lessons = [Distillation([teacher], further=[part]) for part in further]
-    made = [fit(tiny, small, brief, lesson=lesson).predictor for lesson in lessons]
+    made = [fit(tiny, small, brief, strategy=strategy).predictor for strategy in lessons]
     assert same(*made)
-    assert not same(made[0], fit(tiny, small, brief, lesson=Distillation([teacher])).predictor)
+    assert not same(made[0], fit(tiny, small, brief, strategy=Distillation([teacher])).predictor)
     assert torch.equal(made[0].code.width, build_model(tiny.task, small, tiny.scaler(), seed=0).code.width)
     assert [part.teacher_targets[0, 0] for part in lessons[0].series(tiny.task, tiny.train)] == [1, 1, 0]
 
@@ -144,9 +144,9 @@ def test_unlabelled_takes_a_recording_that_has_inputs_only(tiny):
 
 
 def test_a_lesson_that_was_stopped_goes_on_to_the_same_bits(tiny, tiny_training, teacher, small, tmp_path):
-    lesson = Distillation([teacher], DistillationSpec(hint=0.1, components=4))
+    strategy = Distillation([teacher], DistillationSpec(hint=0.1, components=4))
     spec = dataclasses.replace(tiny_training, epochs=3, updates=4, chunks=ChunkSpec(length=32, batch=8, burn_in=20))
-    whole = fit(tiny, small, spec, lesson=lesson).predictor
+    whole = fit(tiny, small, spec, strategy=strategy).predictor
 
     class Stop(Exception):
         pass
@@ -158,21 +158,21 @@ def test_a_lesson_that_was_stopped_goes_on_to_the_same_bits(tiny, tiny_training,
     with RunFolder(tmp_path / "run") as run:
         run.claim("key", "")
         with pytest.raises(Stop):
-            fit(tiny, small, spec, (run, "key"), stop, lesson)
-        again = fit(tiny, small, spec, (run, "key"), lesson=lesson)
+            fit(tiny, small, spec, (run, "key"), stop, strategy)
+        again = fit(tiny, small, spec, (run, "key"), strategy=strategy)
     assert again.resumed_at == 2
     assert same(again.predictor, whole)
 
 
 def test_a_refit_learns_from_the_teacher_too(tiny, tiny_training, teacher, small):
     spec = dataclasses.replace(tiny_training, epochs=1, updates=3, refit="whole")
-    lesson = Distillation([teacher], DistillationSpec(truth=0.0))
-    assert not same(fit(tiny, small, spec).predictor, fit(tiny, small, spec, lesson=lesson).predictor)
+    strategy = Distillation([teacher], DistillationSpec(truth=0.0))
+    assert not same(fit(tiny, small, spec).predictor, fit(tiny, small, spec, strategy=strategy).predictor)
 
 
 def test_the_gradient_of_a_hint_pulls_hidden_features_towards_the_teachers(tiny, teacher, small):
-    lesson = Distillation([teacher], DistillationSpec(hint=1.0, components=6))
-    part = lesson.series(tiny.task, tiny.train)[0]
+    strategy = Distillation([teacher], DistillationSpec(hint=1.0, components=6))
+    part = strategy.series(tiny.task, tiny.train)[0]
     wanted, x = torch.from_numpy(part.teacher_targets[None, :, 7:]), torch.from_numpy(part.inputs[None])
     net = build_model(tiny.task, small, tiny.scaler(), seed=1)
     optimizer = torch.optim.Adam(net.backbone.parameters(), 1e-2)
@@ -284,12 +284,12 @@ def test_teacher_and_student_must_read_and_predict_the_same(tiny, tiny_model, ti
 def test_a_batch_too_small_for_a_hint_is_refused(tiny, tiny_training, teacher, small):
     spec = dataclasses.replace(tiny_training, chunks=ChunkSpec(regime="window", length=10, batch=8))
     with pytest.raises(ConfigError, match="a batch has 8 ticks with a loss, too few to compare 8 hidden features"):
-        fit(tiny, small, spec, lesson=Distillation([teacher], DistillationSpec(hint=1.0)))
+        fit(tiny, small, spec, strategy=Distillation([teacher], DistillationSpec(hint=1.0)))
 
 
 def test_training_begins_with_the_weights_of_a_start(tiny, tiny_model, brief, teacher):
     spec = dataclasses.replace(brief, updates=1, optimizer=dataclasses.replace(brief.optimizer, learning_rate=1e-12))
-    made = fit(tiny, tiny_model, spec, lesson=Distillation([teacher], start=teacher)).predictor
+    made = fit(tiny, tiny_model, spec, strategy=Distillation([teacher], start=teacher)).predictor
     for one, other in zip(made.parameters(), teacher.parameters(), strict=True):
         torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
 

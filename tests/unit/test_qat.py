@@ -49,7 +49,7 @@ def same(one, other):
 
 
 def test_the_result_is_an_ordinary_network_on_the_grid(tiny, tiny_model, brief, start, tmp_path):
-    fitted = fit(tiny, tiny_model, brief, lesson=QuantisationAware(start, Distillation([start])))
+    fitted = fit(tiny, tiny_model, brief, strategy=QuantisationAware(start, Distillation([start])))
     net = fitted.predictor
     matrices = matrices_of(net)
     assert [matrix.name for matrix in matrices if "recurrent" in matrix.name] == [
@@ -73,8 +73,8 @@ def test_the_result_is_an_ordinary_network_on_the_grid(tiny, tiny_model, brief, 
 
 def test_the_validated_score_is_that_of_the_rounded_network(tiny, tiny_model, brief, start):
     """With weights alone the network that is left computes what was validated."""
-    lesson = QuantisationAware(start, spec=RoundingSpec(activation_bits=0))
-    fitted = fit(tiny, tiny_model, brief, lesson=lesson)
+    strategy = QuantisationAware(start, spec=RoundingSpec(activation_bits=0))
+    fitted = fit(tiny, tiny_model, brief, strategy=strategy)
     best = [row for row in fitted.history if row["best"]]
     score = validation_scores(fitted.predictor, tiny.validation, brief, tiny)[0]
     assert not best or score == pytest.approx(best[-1]["validation_score"], rel=1e-5)
@@ -92,15 +92,15 @@ def test_training_rounded_is_better_than_rounding_afterwards(tiny, tiny_model, b
         return float(np.abs(said[20:-3, 1] - truth[23:]).mean())
 
     spec = dataclasses.replace(brief, epochs=3, updates=30)
-    lesson = QuantisationAware(start, spec=RoundingSpec(activation_bits=8))
-    assert error(fit(tiny, tiny_model, spec, lesson=lesson).predictor) < error(start)
+    strategy = QuantisationAware(start, spec=RoundingSpec(activation_bits=8))
+    assert error(fit(tiny, tiny_model, spec, strategy=strategy).predictor) < error(start)
 
 
 def test_a_stop_changes_nothing(tiny, tiny_model, brief, start, tmp_path):
-    def lesson():
+    def strategy():
         return QuantisationAware(start, Distillation([start]))
 
-    whole = fit(tiny, tiny_model, brief, lesson=lesson())
+    whole = fit(tiny, tiny_model, brief, strategy=strategy())
 
     class Pulled(Exception):
         pass
@@ -111,15 +111,15 @@ def test_a_stop_changes_nothing(tiny, tiny_model, brief, start, tmp_path):
 
     with RunFolder(tmp_path / "run") as run:
         with pytest.raises(Pulled):
-            fit(tiny, tiny_model, brief, (run, "key"), pull, lesson=lesson())
-        resumed = fit(tiny, tiny_model, brief, (run, "key"), lesson=lesson())
+            fit(tiny, tiny_model, brief, (run, "key"), pull, strategy=strategy())
+        resumed = fit(tiny, tiny_model, brief, (run, "key"), strategy=strategy())
     assert resumed.resumed_at == 1
     assert same(whole.predictor, resumed.predictor)
 
 
 def test_another_network_to_begin_with_is_refused(tiny, tiny_bypass, brief, start):
     with pytest.raises(ConfigError, match="train with its own"):
-        fit(tiny, tiny_bypass, brief, lesson=QuantisationAware(start, Distillation([start], DistillationSpec())))
+        fit(tiny, tiny_bypass, brief, strategy=QuantisationAware(start, Distillation([start], DistillationSpec())))
 
 
 def test_a_site_finds_the_range_that_loses_least():
@@ -151,7 +151,7 @@ def test_sizes_are_those_of_table_4_9(name, size):
 
 def test_whole_numbers_of_a_deployed_network_are_those_that_training_saw(tiny, tiny_model, brief, start):
     """W8A16 of `edp.ir.w8a16`, with weights of least error on data, finds the levels that are there already."""
-    net = fit(tiny, tiny_model, brief, lesson=QuantisationAware(start, Distillation([start]))).predictor
+    net = fit(tiny, tiny_model, brief, strategy=QuantisationAware(start, Distillation([start]))).predictor
     graph = net.graph()
     found = weights_of(quantise(graph, calibrate(graph, [part.inputs for part in tiny.train])))
     assert len(found) == len(matrices_of(net)) == 8

@@ -86,7 +86,7 @@ class TimeWarp:
     """Time runs faster and slower along the stretch, for inputs and targets alike; both ends stay.
 
     The speed is one plus three sines of random phase, whose periods lie between a quarter of the stretch and the whole.
-    Values are interpolated, not scaled: what changes is how fast the plant answers. So is what a lesson says.
+    Values are interpolated, not scaled: what changes is how fast the plant answers. So are teacher predictions.
 
     Attributes:
         strength: largest change of the speed.

@@ -84,7 +84,7 @@ class Batch:
         future: ``(batch, time, horizon, target)``: the target channels at t + k, SI units.
         valid: ``(batch, time)``: where a loss is taken.
         reset: ``(batch,)``: streams that start anew with this chunk.
-        teacher_targets: ``(batch, time, column)``: what a lesson says of each tick; None without one.
+        teacher_targets: ``(batch, time, column)``: teacher predictions of each tick; None without a teacher.
     """
 
     inputs: NDArray[np.float32]
@@ -100,7 +100,7 @@ class Batch:
 
 
 Piece = tuple[Any, Any, Any, Any]
-"""Inputs, future targets, validity and lesson of some ticks."""
+"""Inputs, future targets, validity and teacher targets of some ticks."""
 
 
 class Sampler(Protocol):
@@ -256,7 +256,7 @@ class ChunkSampler:
 
 
 def cut(part: Series, ticks: range, horizons: tuple[int, ...], silent: int) -> Piece:
-    """Inputs, future targets, validity and lesson of a piece of a series.
+    """Inputs, future targets, validity and teacher targets of a piece of a series.
 
     Args:
         part: the series.

@@ -15,7 +15,7 @@ class Series:
         name: the recording it comes from (with the row range when it is a part of one).
         inputs: float32 ``(time, input)``; row t is what is known at tick t.
         targets: float32 ``(time, target)``; row t is the target channel *at* t (a horizon k asks for row t + k).
-        teacher_targets: float32 ``(time, column)``, what a lesson says of tick t; None without one.
+        teacher_targets: float32 ``(time, column)``, teacher predictions of tick t; None without a teacher.
         machine: which machine it was recorded on; empty where that is not known.
     """
 

@@ -11,7 +11,7 @@ from edp.recording import Recording
 
 
 def unlabelled(task: Task, recording: Recording) -> Series:
-    """The inputs of a recording for a lesson; the targets need not be in it.
+    """The inputs of a recording for a training strategy; the targets need not be in it.
 
     Raises:
         DataError: another rate, a missing input, or one that is not finite.

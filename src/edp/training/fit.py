@@ -36,7 +36,7 @@ def fit(
     spec: TrainingSpec,
     run: tuple[RunFolder, str] | None = None,
     on_event: Callable[[TrainingProgress], None] | None = None,
-    lesson: TrainingStrategy | None = None,
+    strategy: TrainingStrategy | None = None,
 ) -> Fitted:
     """Train on ``data.train``, choose by ``data.validation``; ``data.test`` is not touched.
 
@@ -46,7 +46,7 @@ def fit(
         spec: how to train.
         run: folder and key of the run; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
-        lesson: weights to begin with, or a teacher; it is part of what the key of `run` must tell apart.
+        strategy: weights to begin with, or a teacher; it is part of what the key of `run` must tell apart.
 
     Raises:
         ConfigError: settings that contradict one another.
@@ -55,12 +55,12 @@ def fit(
     """
     torch.set_num_threads(thread_count(spec))
     tell = on_event or (lambda event: None)
-    fitted = Loop(data, model, spec, run, lesson).fit(tell)
+    fitted = Loop(data, model, spec, run, strategy).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:
         return fitted
     try:
-        again = Loop(data, model, spec, run, lesson, _rows_of_refit(fitted.history, best, spec)).fit(tell)
+        again = Loop(data, model, spec, run, strategy, _rows_of_refit(fitted.history, best, spec)).fit(tell)
     except Diverged as end:
         raise Diverged(str(end), fitted, end.facts) from end
     again.predictor.output.load_state_dict(fitted.predictor.output.state_dict())
@@ -93,20 +93,20 @@ class Loop:
         model: ModelSpec,
         spec: TrainingSpec,
         run: tuple[RunFolder, str] | None,
-        lesson: TrainingStrategy | None = None,
+        strategy: TrainingStrategy | None = None,
         refitted: list[dict[str, Any]] | None = None,
         windowed: bool = False,
     ) -> None:
-        self.data, self.spec, self.run, self.lesson, self.refitted = data, spec, run, lesson, refitted
+        self.data, self.spec, self.run, self.strategy, self.refitted = data, spec, run, strategy, refitted
         self.epochs = spec.epochs if refitted is None else len(refitted)
         self.file = run[0].path / (FILE if refitted is None else REFIT) if run else None
         self.device = _device(spec.device)
         check_training(data.task, model, spec)
         self.net = build_model(data.task, model, data.scaler(), spec.seed)
-        check_training_memory(self.net, data, spec, getattr(lesson, "passes", 1))
+        check_training_memory(self.net, data, spec, getattr(strategy, "passes", 1))
         own_series = data.train if refitted is None else [*data.train, *data.validation]
-        lessons = own_series if lesson is None else lesson.series(data.task, own_series)
-        self.sampler = self._sampler(lessons)
+        taught_series = own_series if strategy is None else strategy.series(data.task, own_series)
+        self.sampler = self._sampler(taught_series)
         for part in data.validation:
             if part.samples <= spec.chunks.burn_in + data.task.max_horizon:
                 raise DataError(
@@ -116,8 +116,8 @@ class Loop:
         if self.net.physics is not None:
             self.net.physics.settle([torch.from_numpy(part.inputs) for part in data.train])
         started = start_bypass(self.net, data.train, data.validation)
-        if lesson is not None:
-            started = lesson.begin(self.net, spec) or started
+        if strategy is not None:
+            started = strategy.begin(self.net, spec) or started
         self.net.to(self.device)
         named = [(name, parameter) for name, parameter in self.net.named_parameters() if parameter.requires_grad]
         self.optimizer = spec.optimizer.build(named)
@@ -137,10 +137,10 @@ class Loop:
             self.progress.best_score = self._validate()[0]
 
     def _sampler(self, series: Sequence[Series]) -> Sampler:
-        """Where batches come from: carried chunks or windows, or what the lesson deals out."""
+        """Where batches come from: carried chunks or windows, or what the strategy deals out."""
         task, spec = self.data.task, self.spec
-        if isinstance(self.lesson, EpisodicStrategy):
-            return self.lesson.sampler(series, task, spec)
+        if isinstance(self.strategy, EpisodicStrategy):
+            return self.strategy.sampler(series, task, spec)
         return ChunkSampler(series, task.horizons, spec.chunks, spec.seed, spec.augmentations)
 
     def fit(self, on_event: Callable[[TrainingProgress], None]) -> Fitted:
@@ -171,8 +171,8 @@ class Loop:
                 parameter.copy_(self.best[name])
         if self.net.spec.output.calibrated and self.refitted is None:
             calibrate(self.net, self.data.validation, self.spec)
-        if self.lesson is not None:
-            self.lesson.end(self.net)
+        if self.strategy is not None:
+            self.strategy.end(self.net)
         return Fitted(self.net.eval(), self.progress.history, self.progress.seconds, self.rate, self.resumed_at)
 
     def _diverged(self, what: str, value: float) -> Diverged:
@@ -266,17 +266,17 @@ class Loop:
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * self._factor()
         future, valid = (torch.from_numpy(part).to(self.device) for part in (batch.future, batch.valid))
-        if isinstance(self.lesson, EpisodicStrategy):
-            loss = self.lesson.episode(self.net, self.objective, (x, future, valid))
+        if isinstance(self.strategy, EpisodicStrategy):
+            loss = self.strategy.episode(self.net, self.objective, (x, future, valid))
         else:
             answer, features, hidden, state = self.net.forward_features(x, state)
-            if self.lesson is None or batch.teacher_targets is None:
+            if self.strategy is None or batch.teacher_targets is None:
                 loss = self.objective.evaluate(answer, future, features, valid)
             else:
                 teacher_targets = torch.from_numpy(batch.teacher_targets).to(self.device)
                 done = self.progress.updates / (self.updates * self.spec.epochs)
-                moment = BatchContext(answer, future, features, hidden, valid, teacher_targets, done)
-                loss = self.lesson.loss(self.objective, moment)
+                batch_context = BatchContext(answer, future, features, hidden, valid, teacher_targets, done)
+                loss = self.strategy.loss(self.objective, batch_context)
         self.progress.updates += 1
         value = float(loss.detach())
         if not math.isfinite(value):
@@ -356,8 +356,8 @@ class Loop:
             for name, parameter in self.net.named_parameters():
                 parameter.copy_(self.average[name])
         try:
-            if isinstance(self.lesson, EpisodicStrategy):
-                return self.lesson.judge(self.net, self.objective, self.data)
+            if isinstance(self.strategy, EpisodicStrategy):
+                return self.strategy.judge(self.net, self.objective, self.data)
             return validation_scores(self.net, self.data.validation, self.spec, self.data, self.windowed)
         finally:
             with torch.no_grad():

@@ -20,7 +20,7 @@ from edp.training.spec import TrainingSpec
 
 @dataclass(frozen=True, eq=False)
 class BatchContext:
-    """A batch as a lesson sees it.
+    """A batch as a training strategy sees it.
 
     Attributes:
         answer: what the network says, standardised.
@@ -28,7 +28,7 @@ class BatchContext:
         features: physical, ``(batch, time, feature)``.
         hidden: representation of the backbone, ``(batch, time, width)``.
         valid: ``(batch, time)``: ticks that count.
-        teacher_targets: ``(batch, time, column)``: what the lesson said of these ticks.
+        teacher_targets: ``(batch, time, column)``: teacher predictions and marks of these ticks.
         progress: share of the training that is done, from 0 to 1.
     """
 
@@ -55,11 +55,11 @@ class TrainingStrategy(Protocol):
         """Set weights before the first update; whether the network is a candidate as it then is.
 
         Raises:
-            ConfigError: the lesson does not fit the network or the way of training.
+            ConfigError: the strategy does not fit the network or the regime of training.
         """
         ...
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+    def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
         """The loss of a batch; `objective` gives that of the truth."""
         ...
 
@@ -70,7 +70,7 @@ class TrainingStrategy(Protocol):
 
 @runtime_checkable
 class EpisodicStrategy(TrainingStrategy, Protocol):
-    """A lesson that deals out its own batches, each of which is learned from and judged within one update."""
+    """A training strategy that forms its own batches; each update learns from one and judges it."""
 
     def sampler(self, series: Sequence[Series], task: Task, spec: TrainingSpec) -> Sampler:
         """Where the batches come from; all streams of a batch start from reset.

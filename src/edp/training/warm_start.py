@@ -53,9 +53,11 @@ class WarmStart:
             raise ConfigError("fine-tuning: every parameter is frozen, so nothing can learn; freeze fewer")
         return True
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+    def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
         """The objective on the recorded targets."""
-        return objective.evaluate(moment.answer, moment.future, moment.features, moment.valid)
+        return objective.evaluate(
+            batch_context.answer, batch_context.future, batch_context.features, batch_context.valid
+        )
 
     def end(self, net: Predictor) -> None:
         """Undo the freezing and the unfreezing."""

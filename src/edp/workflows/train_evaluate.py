@@ -94,12 +94,12 @@ class StrategyFactory:
 
     Attributes:
         facts: plain values that decide what is taught; they are part of the run's key and provenance.
-        lesson: makes the lesson for the prepared data.
+        strategy: makes the strategy for the prepared data.
         frozen: names by digest of sessions that stay frozen for what comes of the run, beside those of its split.
     """
 
     facts: Mapping[str, Any]
-    lesson: Callable[[Prepared], TrainingStrategy]
+    strategy: Callable[[Prepared], TrainingStrategy]
     frozen: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -108,7 +108,7 @@ def train(
     experiment: Experiment,
     out: str | Path,
     on_event: Callable[[TrainingProgress], None] | None = None,
-    teaching: StrategyFactory | None = None,
+    strategy_factory: StrategyFactory | None = None,
     data: Prepared | None = None,
 ) -> Bundle:
     """Train on a data set and write a run folder with its bundle; an interrupted run goes on where it stopped.
@@ -118,7 +118,7 @@ def train(
         experiment: the settings.
         out: run folder.
         on_event: called with progress.
-        teaching: teachers, weights to begin with.
+        strategy_factory: teachers, weights to begin with.
         data: what `prepare_data` gave for this source and experiment, where it is there already.
 
     Raises:
@@ -129,8 +129,8 @@ def train(
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
     if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read
         settings["machine"] = experiment.model.physics.digest()
-    taught = {} if teaching is None else {"lesson": dict(teaching.facts)}
-    frozen = {} if teaching is None else teaching.frozen
+    taught = {} if strategy_factory is None else {"lesson": dict(strategy_factory.facts)}
+    frozen = {} if strategy_factory is None else strategy_factory.frozen
     data = data or prepare_data(source, experiment, frozen)
     key = run_key(settings | taught, data.digest)
     with RunFolder(out) as run:
@@ -138,8 +138,8 @@ def train(
         _refuse_diverged(run)
         run.write_status("running")
         try:
-            lesson = None if teaching is None else teaching.lesson(data)
-            fitted = fit(data, experiment.model, experiment.training, (run, key), on_event, lesson)
+            strategy = None if strategy_factory is None else strategy_factory.strategy(data)
+            fitted = fit(data, experiment.model, experiment.training, (run, key), on_event, strategy)
         except Diverged as end:
             if end.fitted is not None:
                 provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen) | taught

@@ -52,15 +52,15 @@ def episode(prepared_machines, experiment):
 
 
 def lesson_of(method, net, experiment, meta=META):
-    lesson = PRETRAININGS[method]().lesson(meta, None)
-    lesson.begin(net, experiment.training)
-    return lesson
+    strategy = PRETRAININGS[method]().strategy(meta, None)
+    strategy.begin(net, experiment.training)
+    return strategy
 
 
-def gradient(lesson, episode):
+def gradient(strategy, episode):
     net, objective, support, query = episode
     net.zero_grad()
-    cost = lesson.cost(net, objective, support, query)
+    cost = strategy.cost(net, objective, support, query)
     cost.backward()
     return cost.item(), {name: p.grad.clone() for name, p in net.named_parameters()}
 
@@ -130,8 +130,8 @@ def test_few_steps_take_rate_and_head_of_the_meta_learning(machines, experiment,
 def test_second_order_gradient_is_that_of_the_error_after_adaptation(episode, experiment):
     """Held to differences of the cost itself, along a random direction of all weights."""
     net, objective, support, query = episode
-    lesson = lesson_of("maml", net, experiment)
-    _, found = gradient(lesson, episode)
+    strategy = lesson_of("maml", net, experiment)
+    _, found = gradient(strategy, episode)
     torch.manual_seed(0)
     way = {name: torch.randn_like(p) for name, p in net.named_parameters()}
     slope = sum(float((found[name] * way[name]).sum()) for name in way)
@@ -140,7 +140,7 @@ def test_second_order_gradient_is_that_of_the_error_after_adaptation(episode, ex
         with torch.no_grad():
             for name, parameter in net.named_parameters():
                 parameter.add_(way[name], alpha=step)
-        value = float(lesson.cost(net, objective, support, query).detach())
+        value = float(strategy.cost(net, objective, support, query).detach())
         with torch.no_grad():
             for name, parameter in net.named_parameters():
                 parameter.add_(way[name], alpha=-step)
@@ -197,9 +197,9 @@ def test_reptile_goes_the_way_to_the_adapted_weights(episode, experiment):
 
 def test_with_the_head_alone_the_backbone_learns_but_does_not_adapt(episode, experiment):
     net = episode[0]
-    lesson = lesson_of("maml", net, experiment, dataclasses.replace(META, head_only=True))
-    assert set(lesson.start_of(net)) == set(decompose(net).head)
-    _, found = gradient(lesson, episode)
+    strategy = lesson_of("maml", net, experiment, dataclasses.replace(META, head_only=True))
+    assert set(strategy.start_of(net)) == set(decompose(net).head)
+    _, found = gradient(strategy, episode)
     assert all(found[name].abs().max() > 0 for name in decompose(net).encoding)
 
 
@@ -216,12 +216,12 @@ def test_an_epoch_is_chosen_by_the_error_after_adaptation(prepared_machines, exp
     """The judgement is that of a network that was adapted by hand to the first half of each series."""
     net = build_model(prepared_machines.task, experiment.model, prepared_machines.scaler(), 3).eval()
     objective = Objective(experiment.training, net.code)
-    lesson = lesson_of("fomaml", net, experiment)
-    assert isinstance(lesson, EpisodicStrategy)
+    strategy = lesson_of("fomaml", net, experiment)
+    assert isinstance(strategy, EpisodicStrategy)
     before = {name: p.detach().clone() for name, p in net.named_parameters()}
-    found = lesson.judge(net, objective, prepared_machines)
+    found = strategy.judge(net, objective, prepared_machines)
     assert all(torch.equal(before[name], p) for name, p in net.named_parameters())
-    support, rest = lesson._halves(net, prepared_machines.validation)
+    support, rest = strategy._halves(net, prepared_machines.validation)
     assert all(part.samples == 450 for part in rest)
     _, came = by_hand(net, objective, [support] * META.inner_steps, META.steps)
     put(net, came)
@@ -254,7 +254,7 @@ def test_what_cannot_be_is_refused(machines, experiment, tmp_path, prepared_mach
     with pytest.raises(ConfigError, match=r'split\.kind = "machines"'):
         pretrain(machines, load_experiment(preset="quick"), Pretrain(), tmp_path / "out")
     with pytest.raises(ConfigError, match="head_only"):
-        PRETRAININGS["reptile"]().lesson(MetaSpec(head_only=True), None)
+        PRETRAININGS["reptile"]().strategy(MetaSpec(head_only=True), None)
     with pytest.raises(ConfigError, match="unknown"):
         Pretrain(method="mamml")
     for change in ({"inner_rate": 0.0}, {"inner_steps": 0}, {"shots": 0}):

@@ -25,8 +25,8 @@ def kept(tiny):
 
 
 def test_both_domains_have_equal_shares_and_the_network_of_the_source_teaches_its_own(tiny, start):
-    lesson = BothDomains(start, kept(tiny), BothSpec(soft=0.5))
-    found = lesson.series(tiny.task, tiny.train)
+    strategy = BothDomains(start, kept(tiny), BothSpec(soft=0.5))
+    found = strategy.series(tiny.task, tiny.train)
     ticks = {name: sum(p.samples for p in found if p.name.startswith("kept") == name) for name in (True, False)}
     assert max(ticks.values()) <= 1.5 * min(ticks.values())
     for part in found:
@@ -63,27 +63,29 @@ def test_the_classifier_learns_while_the_network_hides(tiny, start):
     """One step: the classifier goes down its loss, the representation up."""
     torch.manual_seed(0)
     classifier, hidden = Classifier(16), torch.randn(8, 20, 16, requires_grad=True)
-    lesson = BothDomains(start, kept(tiny), BothSpec(reversal=1.0))
+    strategy = BothDomains(start, kept(tiny), BothSpec(reversal=1.0))
     here = torch.zeros(8, 20, dtype=torch.bool)
     here[:4] = True
-    plain = lesson._confusion(classifier(hidden), here, ~here)
+    plain = strategy._confusion(classifier(hidden), here, ~here)
     down = torch.autograd.grad(plain, [hidden, *classifier.parameters()])
-    turned = lesson._confusion(classifier(reverse(hidden, 0.5)), here, ~here)
+    turned = strategy._confusion(classifier(reverse(hidden, 0.5)), here, ~here)
     other = torch.autograd.grad(turned, [hidden, *classifier.parameters()])
     assert torch.allclose(other[0], -0.5 * down[0])
     for mine, its in zip(other[1:], down[1:], strict=True):
         assert torch.equal(mine, its)
     nothing = torch.zeros_like(here)
-    assert float(lesson._confusion(classifier(hidden), nothing, nothing).detach()) == 0.0
+    assert float(strategy._confusion(classifier(hidden), nothing, nothing).detach()) == 0.0
 
 
 def test_the_classifier_is_taken_away_and_the_progress_is_told(tiny, tiny_model, tiny_training, start):
-    lesson = BothDomains(start, kept(tiny), BothSpec(reversal=0.5))
+    strategy = BothDomains(start, kept(tiny), BothSpec(reversal=0.5))
     seen = []
-    inner = lesson.loss
-    lesson.loss = lambda objective, moment: seen.append(moment.progress) or inner(objective, moment)  # type: ignore[method-assign]
+    inner = strategy.loss
+    strategy.loss = lambda objective, batch_context: (
+        seen.append(batch_context.progress) or inner(objective, batch_context)
+    )  # type: ignore[method-assign]
     spec = dataclasses.replace(tiny_training, epochs=2, updates=4)
-    net = fit(tiny, tiny_model, spec, lesson=lesson).predictor
+    net = fit(tiny, tiny_model, spec, strategy=strategy).predictor
     assert seen == [i / 8 for i in range(8)]
     assert not hasattr(net, "classifier")
     assert net.state_dict().keys() == start.state_dict().keys()

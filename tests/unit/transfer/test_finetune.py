@@ -282,11 +282,11 @@ def test_lessons_leave_every_parameter_as_free_as_it_was(run):
     source = read_source(run).predictor
     spec = read_source(run).experiment.training
     source.heads.biases[-1].requires_grad_(False)
-    for lesson in (WarmStart(source), LowRank(source, 2), BothDomains(source, [], BothSpec())):
+    for strategy in (WarmStart(source), LowRank(source, 2), BothDomains(source, [], BothSpec())):
         net = copy.deepcopy(source)
-        lesson.begin(net, spec)
-        assert net.heads.biases[-1].requires_grad == (not isinstance(lesson, LowRank))
-        lesson.end(net)
+        strategy.begin(net, spec)
+        assert net.heads.biases[-1].requires_grad == (not isinstance(strategy, LowRank))
+        strategy.end(net)
         assert [name for name, p in net.named_parameters() if not p.requires_grad] == ["heads.biases.1"]
 
 

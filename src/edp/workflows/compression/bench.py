@@ -59,7 +59,7 @@ class CompressionRequest:
             return spec
         return tuning(spec)
 
-    def lesson(
+    def strategy(
         self, teachers: Sequence[Predictor], data: Prepared, start: Predictor | None, further: Sequence[Series] = ()
     ) -> TrainingStrategy:
         """What the training has besides its data; `start` is the network of `of`.
@@ -68,10 +68,10 @@ class CompressionRequest:
             ConfigError: teachers that contradict one another, or a network that cannot be pruned.
         """
         narrow = prune(teachers[0], self.model(teachers[0].spec), data.train) if self.pruned else None
-        lesson = Distillation(teachers, self.distillation, further, narrow)
+        strategy = Distillation(teachers, self.distillation, further, narrow)
         if self.rounding is None:
-            return lesson
-        return QuantisationAware(teachers[0] if start is None else start, lesson, self.rounding)
+            return strategy
+        return QuantisationAware(teachers[0] if start is None else start, strategy, self.rounding)
 
 
 def tuning(spec: TrainingSpec) -> TrainingSpec:
@@ -104,6 +104,6 @@ class Bench:
 
     def train(self, order: CompressionRequest, start: Predictor | None) -> Predictor:
         """Carry out an order; `start` is the network that it goes on from."""
-        lesson = order.lesson([self.teacher], self.data, start)
+        strategy = order.strategy([self.teacher], self.data, start)
         spec = order.training(self.training)
-        return fit(self.data, order.model(self.teacher.spec), spec, lesson=lesson).predictor
+        return fit(self.data, order.model(self.teacher.spec), spec, strategy=strategy).predictor

@@ -87,11 +87,11 @@ def distil(
     series, digests = _unlabelled(teacher, spec.further, frozen)
     facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
 
-    def lesson(data: Prepared) -> TrainingStrategy:
-        return order.lesson(teachers, data, None, series)
+    def strategy(data: Prepared) -> TrainingStrategy:
+        return order.strategy(teachers, data, None, series)
 
     student_experiment = replace(experiment, model=model)
-    return train(source or own, student_experiment, out, on_event, StrategyFactory(facts, lesson, frozen))
+    return train(source or own, student_experiment, out, on_event, StrategyFactory(facts, strategy, frozen))
 
 
 def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, Experiment, DataSource]:

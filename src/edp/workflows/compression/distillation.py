@@ -83,7 +83,7 @@ class DistillationSpec:
 
 
 class Distillation:
-    """A lesson of teachers: what they say of each tick is found once, as a stream from the start of its recording.
+    """Distillation: teacher predictions of each tick are computed once, as a stream from the start of its recording.
 
     Several teachers say the mean of their predictions in SI units. They may differ from the student and from one
     another in everything but inputs, targets, horizons and rate. Where an augmentation changes the inputs, the student
@@ -116,7 +116,7 @@ class Distillation:
         self.components: Components | None = None
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """All series with their lesson: a mark whether there is truth, predictions in SI units, hidden components."""
+        """Series with teacher targets: a mark whether there is truth, predictions in SI units, hidden components."""
         check_same_ends(task, self.teachers[0].task, "the student", "the teacher")
         if self.spec.hint and self.components is None:
             self.components = Components.fitted((self._hidden(part) for part in own_series), self.spec.components)
@@ -140,17 +140,23 @@ class Distillation:
         continue_from(net, self.start)
         return True
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+    def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
         """The dual objective of a batch; ticks without truth count for the teachers only."""
-        spec, teacher_targets = self.spec, moment.teacher_targets
-        labelled = moment.valid & (teacher_targets[..., 0] > 0.5)
-        teacher_predictions = teacher_targets[..., 1 : 1 + self.said].unflatten(-1, moment.future.shape[2:])
-        target = objective.code.encode(teacher_predictions, moment.features)
-        loss = (1.0 - spec.truth) * masked_loss(spec.soft, moment.answer, target, moment.valid, objective.weights)
+        spec, teacher_targets = self.spec, batch_context.teacher_targets
+        labelled = batch_context.valid & (teacher_targets[..., 0] > 0.5)
+        teacher_predictions = teacher_targets[..., 1 : 1 + self.said].unflatten(-1, batch_context.future.shape[2:])
+        target = objective.code.encode(teacher_predictions, batch_context.features)
+        loss = (1.0 - spec.truth) * masked_loss(
+            spec.soft, batch_context.answer, target, batch_context.valid, objective.weights
+        )
         if spec.truth:
-            loss = loss + spec.truth * objective.evaluate(moment.answer, moment.future, moment.features, labelled)
+            loss = loss + spec.truth * objective.evaluate(
+                batch_context.answer, batch_context.future, batch_context.features, labelled
+            )
         if spec.hint:
-            loss = loss + spec.hint * hint_error(moment.hidden, teacher_targets[..., 1 + self.said :], moment.valid)
+            loss = loss + spec.hint * hint_error(
+                batch_context.hidden, teacher_targets[..., 1 + self.said :], batch_context.valid
+            )
         return loss
 
     def end(self, net: Predictor) -> None:

@@ -39,28 +39,28 @@ class RoundingSpec:
 
 
 class QuantisationAware:
-    """A lesson that goes on from a trained network with rounded weights and activations (straight-through gradients).
+    """Training that continues from a trained network with rounded weights and activations (straight-through gradients).
 
     The network is validated rounded, and the start is a candidate itself. What training leaves is an ordinary float
     network whose rounded weights lie on their grid: to round them again, with a step for each output, changes nothing.
 
     Args:
         start: a trained network; the training must be of its own specs.
-        lesson: teachers, see `Distillation`; None learns from the truth alone.
+        strategy: teachers, see `Distillation`; None learns from the truth alone.
         spec: what is rounded.
     """
 
     def __init__(
-        self, start: Predictor, lesson: TrainingStrategy | None = None, spec: RoundingSpec | None = None
+        self, start: Predictor, strategy: TrainingStrategy | None = None, spec: RoundingSpec | None = None
     ) -> None:
-        self.start, self.lesson, self.spec = start, lesson, spec or RoundingSpec()
+        self.start, self.strategy, self.spec = start, strategy, spec or RoundingSpec()
         self._known: Sequence[Series] = ()
         self._rounding: NetworkRounding | None = None
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series with what the teachers say of them, where there are any."""
         self._known = own_series
-        return list(own_series) if self.lesson is None else self.lesson.series(task, own_series)
+        return list(own_series) if self.strategy is None else self.strategy.series(task, own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
         """Go on from the start, rounded; ranges of activations are found on the training series.
@@ -68,22 +68,24 @@ class QuantisationAware:
         Raises:
             ConfigError: the start has other specs.
         """
-        if self.lesson is not None:
-            self.lesson.begin(net, spec)
+        if self.strategy is not None:
+            self.strategy.begin(net, spec)
         continue_from(net, self.start)
         self._rounding = NetworkRounding(net, self.spec.activation_bits, self.spec.recurrent)
         self._rounding.install(self._known)
         return True
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
-        """The loss of the teachers' lesson.
+    def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
+        """The loss of the teachers' strategy.
 
         Raises:
             ConfigError: there are no teachers.
         """
-        if self.lesson is None:
-            raise ConfigError("quantisation-aware training: series carry a lesson, but there is no teacher; give one")
-        return self.lesson.loss(objective, moment)
+        if self.strategy is None:
+            raise ConfigError(
+                "quantisation-aware training: series carry teacher targets, but there is no teacher; give one"
+            )
+        return self.strategy.loss(objective, batch_context)
 
     def end(self, net: Predictor) -> None:
         """Leave an ordinary network with rounded weights."""
@@ -91,5 +93,5 @@ class QuantisationAware:
             self._rounding.remove()
             self._rounding.keep()
             self._rounding = None
-        if self.lesson is not None:
-            self.lesson.end(net)
+        if self.strategy is not None:
+            self.strategy.end(net)

@@ -123,19 +123,19 @@ class DiskBench(Bench):
             if bundle.provenance.get("lesson") == facts:
                 return bundle.predictor
 
-        def lesson(data: Prepared) -> TrainingStrategy:
-            return order.lesson([self.teacher], data, start)
+        def strategy(data: Prepared) -> TrainingStrategy:
+            return order.strategy([self.teacher], data, start)
 
         model, training = order.model(self.teacher.spec), order.training(self.training)
         student_experiment = replace(self.experiment, model=model, training=training)
         tell = self.callbacks.on_training
-        teaching = StrategyFactory(facts, lesson, self.frozen)
+        strategy_factory = StrategyFactory(facts, strategy, self.frozen)
         return train(
             self.source,
             student_experiment,
             run,
             lambda event: tell(order.name, done, self.count, event),
-            teaching,
+            strategy_factory,
             self.data,
         ).predictor
 

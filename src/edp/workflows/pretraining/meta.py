@@ -28,7 +28,7 @@ from edp.workflows.pretraining.spec import MetaSpec
 
 
 class Meta(ABC):
-    """A lesson of episodes: each update adapts to some machines, and makes small what is left after that.
+    """A strategy of episodes: each update adapts to some machines and minimises the error after adaptation.
 
     Args:
         spec: the inner loop.
@@ -57,11 +57,13 @@ class Meta(ABC):
         continue_from(net, self.start)
         return True
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+    def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
         """Not asked: episodes have a cost of their own."""
-        return objective.evaluate(moment.answer, moment.future, moment.features, moment.valid)
+        return objective.evaluate(
+            batch_context.answer, batch_context.future, batch_context.features, batch_context.valid
+        )
 
-    def end(self, net: Predictor) -> None:  # noqa: B027 - a lesson has it, and there is nothing to take back
+    def end(self, net: Predictor) -> None:  # noqa: B027 - part of the interface; there is nothing to undo
         """Nothing was done to the network but to its weights."""
 
     def sampler(self, series: Sequence[Series], task: Task, spec: TrainingSpec) -> Sampler:

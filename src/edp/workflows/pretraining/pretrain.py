@@ -84,16 +84,16 @@ def pretrain(
         )
     method = PRETRAININGS[order.method]()
     begun, frozen = (None, {}) if order.start is None else _start(order.start)
-    lesson = method.lesson(order.meta, begun)
+    strategy = method.strategy(order.meta, begun)
     data = prepare_data(source, experiment, frozen)
     experiment = _carrying(experiment, method.episodic, data.task.rate_hz)
-    teaching = None
-    if lesson is not None:
+    strategy_factory = None
+    if strategy is not None:
         facts: dict[str, Any] = {"method": order.method, "start": None if begun is None else weights_digest(begun)}
         facts |= {"meta": asdict(order.meta)} if method.episodic else {}
-        strategy = lesson
-        teaching = StrategyFactory(facts, lambda prepared: strategy, frozen)
-    network = train(source, experiment, out, on_event, teaching, data).predictor
+        chosen = strategy
+        strategy_factory = StrategyFactory(facts, lambda prepared: chosen, frozen)
+    network = train(source, experiment, out, on_event, strategy_factory, data).predictor
     if on_step is not None:
         on_step("judging on machines that were never seen")
     contexts = context_errors(network, data.test, data.target_kinds)

@@ -160,13 +160,13 @@ def _made(recipe: Recipe, experiment: Experiment, data: Prepared, weights_by_nam
     """The network of a recipe; it and all that it is made of are in `weights_by_name` afterwards."""
     if recipe.name not in weights_by_name:
         own = recipe.experiment(experiment)
-        order, lesson = recipe.order(), None
+        order, strategy = recipe.order(), None
         if order is not None:
             plain = replace(recipe, rounded=False)
             teacher = _made(replace(plain, pruned=False, units=None), experiment, data, weights_by_name)
             begun = _made(plain, experiment, data, weights_by_name) if recipe.rounded else None
-            lesson = order.lesson([teacher], data, begun)
-        weights_by_name[recipe.name] = _weights(fit(data, own.model, own.training, lesson=lesson).predictor)
+            strategy = order.strategy([teacher], data, begun)
+        weights_by_name[recipe.name] = _weights(fit(data, own.model, own.training, strategy=strategy).predictor)
     # Always through its weights, so that a network that was kept and one that was trained just now are the same.
     return _restored(weights_by_name[recipe.name], data.task, recipe.model(experiment))
 

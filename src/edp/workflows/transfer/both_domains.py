@@ -49,7 +49,7 @@ class BothSpec:
 
 
 class BothDomains:
-    """A lesson that goes on from the source's network with recordings of both domains, in equal shares of ticks.
+    """Training that continues from the source's network with recordings of both domains, in equal shares of ticks.
 
     Args:
         start: the source's network.
@@ -92,21 +92,21 @@ class BothDomains:
             self._classifier = net.get_submodule("classifier")
         return True
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+    def loss(self, objective: Objective, batch: BatchContext) -> Tensor:
         """The loss of the target, that of the source, and that of the classifier with its gradient reversed."""
-        spec, domain = self.spec, moment.teacher_targets[..., 0]
-        here, there = moment.valid & (domain < 0.5), moment.valid & (domain > 0.5)
-        loss = objective.evaluate(moment.answer, moment.future, moment.features, here)
+        spec, domain = self.spec, batch.teacher_targets[..., 0]
+        here, there = batch.valid & (domain < 0.5), batch.valid & (domain > 0.5)
+        loss = objective.evaluate(batch.answer, batch.future, batch.features, here)
         if spec.soft < 1:
-            truth = objective.evaluate(moment.answer, moment.future, moment.features, there)
+            truth = objective.evaluate(batch.answer, batch.future, batch.features, there)
             loss = loss + spec.weight * (1 - spec.soft) * truth
         if spec.soft:
-            source_predictions = moment.teacher_targets[..., 1:].unflatten(-1, moment.future.shape[2:])
-            goal = objective.code.encode(source_predictions, moment.features)
-            soft = masked_loss(Huber(), moment.answer, goal, there, objective.weights)
+            source_predictions = batch.teacher_targets[..., 1:].unflatten(-1, batch.future.shape[2:])
+            goal = objective.code.encode(source_predictions, batch.features)
+            soft = masked_loss(Huber(), batch.answer, goal, there, objective.weights)
             loss = loss + spec.weight * spec.soft * soft
         if spec.reversal:
-            hidden = reverse(moment.hidden, spec.reversal * ramp(moment.progress))
+            hidden = reverse(batch.hidden, spec.reversal * ramp(batch.progress))
             loss = loss + self._confusion(self._classifier(hidden), here, there)
         return loss
 

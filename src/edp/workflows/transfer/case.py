@@ -53,7 +53,7 @@ class TransferCase:
         self,
         name: str,
         training: TrainingSpec,
-        lesson: Callable[[], TrainingStrategy] | None,
+        strategy: Callable[[], TrainingStrategy] | None,
         facts: Mapping[str, Any] | None = None,
         phase: str = "",
         judged: Sequence[Series] = (),
@@ -64,25 +64,27 @@ class TransferCase:
         Args:
             name: what progress calls it.
             training: how.
-            lesson: makes what the training begins with; None begins at random.
-            facts: plain values that decide the lesson beside the source.
+            strategy: makes what the training begins with; None begins at random.
+            facts: plain values that decide the strategy beside the source.
             phase: name of a phase that a later one goes on from.
             judged: further series that choose the best epoch.
             centred: whether the mean error over the target's logs may be taken out at the end, if the specs ask for it.
         """
-        teaching = None
-        if lesson is not None:
-            make, training_facts = lesson, {"method": name, "source": self.source.facts, **(facts or {})}
+        strategy_factory = None
+        if strategy is not None:
+            make, training_facts = strategy, {"method": name, "source": self.source.facts, **(facts or {})}
             if centred and self.spec.center and not phase:
-                teaching = StrategyFactory(
+                strategy_factory = StrategyFactory(
                     {**training_facts, "centred": True}, lambda data: Centred(make()), self.source.frozen
                 )
             else:
-                teaching = StrategyFactory(training_facts, lambda data: make(), self.source.frozen)
+                strategy_factory = StrategyFactory(training_facts, lambda data: make(), self.source.frozen)
         experiment = replace(self.experiment, training=training)
         folder = self.folder / "phases" / phase if phase else self.folder
         data = replace(self.data, validation=[*self.data.validation, *judged])
-        return train(self.logs, experiment, folder, lambda event: self.tell(name, event), teaching, data).predictor
+        return train(
+            self.logs, experiment, folder, lambda event: self.tell(name, event), strategy_factory, data
+        ).predictor
 
     def tuning(self, optimizer: OptimizerSpec | None = None, epochs: int | None = None) -> TrainingSpec:
         """How a network is trained on, see `tuned`."""

@@ -29,10 +29,10 @@ DEAREST = 1.01  # most that it may cost of the mean absolute error
 
 
 class Centred:
-    """A lesson after which the mean error over the training series is taken out of the trained network.
+    """A strategy after which the mean error over the training series is subtracted from the trained network.
 
     Args:
-        base: the lesson itself.
+        base: the strategy itself.
     """
 
     def __init__(self, base: TrainingStrategy) -> None:
@@ -40,20 +40,20 @@ class Centred:
         self._known: list[Series] = []
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
-        """Those of the lesson."""
+        """Those of the base strategy."""
         self._known = list(own_series)
         return self.base.series(task, own_series)
 
     def begin(self, net: Predictor, spec: TrainingSpec) -> bool:
-        """As the lesson begins."""
+        """As the base strategy begins."""
         return self.base.begin(net, spec)
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
-        """That of the lesson."""
-        return self.base.loss(objective, moment)
+    def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
+        """That of the base strategy."""
+        return self.base.loss(objective, batch_context)
 
     def end(self, net: Predictor) -> None:
-        """End the lesson, and centre what it taught, unless the logs are too short for a mean to hold elsewhere."""
+        """End the base strategy, and centre its result, unless the logs are too short for a mean to hold elsewhere."""
         self.base.end(net)
         if sum(part.samples for part in self._known) >= SHORTEST_S * net.task.rate_hz:
             centre(net, self._known)

@@ -18,7 +18,7 @@ from edp.training.warm_start import WarmStart
 
 
 class LowRank:
-    """A lesson that learns a change of low rank for each weight matrix, ``W + B A`` (Hu et al. 2021, arXiv 2106.09685).
+    """Training of a low-rank change for each weight matrix, ``W + B A`` (Hu et al. 2021, arXiv 2106.09685).
 
     A begins random, B at zero, so the first network is the start. Everything else is held. At the end the changes are
     added to the weights: what is left is an ordinary network.
@@ -55,9 +55,9 @@ class LowRank:
             self._swap([both for both in self._changes if both[0].part is part], part)
         return True
 
-    def loss(self, objective: Objective, moment: BatchContext) -> Tensor:
+    def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
         """Not asked: nothing is taught but the truth."""
-        return self.base.loss(objective, moment)
+        return self.base.loss(objective, batch_context)
 
     def end(self, net: Predictor) -> None:
         """Add the changes to the weights and take them out."""

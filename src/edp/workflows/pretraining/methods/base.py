@@ -18,7 +18,7 @@ class Pretraining(Protocol):
     episodic: ClassVar[bool]
     """Whether it adapts to machines within an update; the others walk carried chunks."""
 
-    def lesson(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
+    def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
         """What the training has beside its data; None for nothing.
 
         Raises:

@@ -18,6 +18,6 @@ class Joint:
     label: ClassVar[str] = "Joint"
     episodic: ClassVar[bool] = False
 
-    def lesson(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
+    def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
         """The start, where there is one."""
         return None if start is None else WarmStart(start, unfreeze=False)

@@ -22,7 +22,7 @@ class Maml:
     label: ClassVar[str] = "MAML, second order"
     episodic: ClassVar[bool] = True
 
-    def lesson(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
+    def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
         """Episodes with second derivatives."""
         return AfterAdaptation(spec, start, second_order=True)
 
@@ -34,7 +34,7 @@ class FirstOrderMaml:
     label: ClassVar[str] = "MAML, first order"
     episodic: ClassVar[bool] = True
 
-    def lesson(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
+    def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
         """Episodes without second derivatives."""
         return AfterAdaptation(spec, start, second_order=False)
 

@@ -24,7 +24,7 @@ class Reptile:
     label: ClassVar[str] = "Reptile"
     episodic: ClassVar[bool] = True
 
-    def lesson(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
+    def strategy(self, spec: MetaSpec, start: Predictor | None) -> TrainingStrategy | None:
         """Episodes without derivatives of the adaptation.
 
         Raises:
