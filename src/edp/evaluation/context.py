@@ -1,4 +1,4 @@
-"""What memory is worth: the error at the same ticks after a reset so many seconds before them."""
+"""Value of memory: the error at the same ticks after a reset so many seconds before them."""
 
 from __future__ import annotations
 

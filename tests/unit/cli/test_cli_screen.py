@@ -134,7 +134,7 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     assert names == ["proposed", "all candidates", "mine", "random 1"]
     assert drawn == [out / "pictures"] * 2
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "What the sets are worth to a model" in page
+    assert "Held-out errors of the sets" in page
     for trial in facts["trials"]["trials"]:
         assert trial["name"] in page
     assert facts["files"]["trials"] == str(out / "trials")

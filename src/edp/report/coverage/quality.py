@@ -86,7 +86,7 @@ def findings_table(quality: DataQuality) -> TextTable:
         for (severity, channel, what, advice), names in sorted(grouped.items(), key=lambda item: item[0][0])
     )
     columns = (("Channel", ""), ("", ""), ("Finding", ""), ("Where", ""), ("What to do", ""))
-    return TextTable("What to look at", columns, rows)
+    return TextTable("Findings", columns, rows)
 
 
 def _key(finding: Finding) -> tuple[str, str, str, str]:

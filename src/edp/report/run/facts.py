@@ -102,7 +102,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
 
     Args:
         run_folder: the folder.
-        limit: file of the limit of predictability, or a folder with one; None looks beside the run's data.
+        limit: file of the limit of predictability, or a folder with one; None reads that beside the run's data.
 
     Raises:
         StorageError: the folder is missing, holds no part of a run, or a part is damaged.
@@ -301,8 +301,8 @@ def verdict_lines(facts: Facts) -> list[str]:
     return lines
 
 
-def recordings_won(facts: Facts, rival: str) -> tuple[int, int]:
-    """Recordings on which the network's mean error is below a rival's, and how many have both scores."""
+def recordings_won(facts: Facts, baseline: str) -> tuple[int, int]:
+    """Recordings on which the network's mean error is below a baseline's, and how many have both scores."""
     samples = str(main_horizon(facts))
 
     def errors(name: str) -> dict[str, float]:
@@ -310,7 +310,7 @@ def recordings_won(facts: Facts, rival: str) -> tuple[int, int]:
         recording_errors = {key: value.get(samples, {}).get("mean", {}).get("mae") for key, value in scored.items()}
         return {key: value for key, value in recording_errors.items() if value is not None}
 
-    ours, theirs = errors(NETWORK), errors(rival)
+    ours, theirs = errors(NETWORK), errors(baseline)
     both = ours.keys() & theirs.keys()
     return sum(ours[key] < theirs[key] for key in both), len(both)
 

@@ -1,4 +1,4 @@
-"""What a network of many machines is worth on machines that it never saw: tables of ``foundation.json``."""
+"""Errors of a network of many machines on unseen machines: tables of ``foundation.json``."""
 
 from __future__ import annotations
 

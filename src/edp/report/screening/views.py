@@ -137,7 +137,7 @@ def lag_ranges(screening: ScreeningResult, within: Sequence[str] | None = None) 
 
     Args:
         screening: the screening.
-        within: channels to look at; None takes all that no flag names.
+        within: channels to include; None takes all without a flag.
     """
     flagged = {flag.channel for flag in screening.flags}
     names = [name for name in screening.channels if name not in flagged] if within is None else list(within)

@@ -60,7 +60,7 @@ def features_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     rows: tuple[tuple[Value, ...], ...] = tuple(
         (
             titled(backbone),
-            f"{facts['features']} against {comparison['rival']}",
+            f"{facts['features']} against {comparison['reference']}",
             100 * real(comparison["change"]),
             span(comparison),
             real(comparison["p"]),
@@ -117,11 +117,11 @@ def calibration_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | No
     columns = (
         *(Column("Architecture"), Column("Questions", "done")),
         *_numbers(heads, [row[2:9] for row in rows]),
-        Column("Parameters", "of the taken", _count),
+        Column("Parameters", "of the choice", _count),
     )
     marked = frozenset(i for i, name in enumerate(facts["backbones"]) if name == facts["backbone"])
     features = study.facts["isolation"]["features"]
-    caption = f"Questions of phase 1 with feature set {features}; taken is the smallest size that no larger one repays"
+    caption = f"Questions of phase 1 with feature set {features}; chosen is the smallest size that no larger one repays"
     return Sheet("calibration", caption, columns, tuple(rows), marked)
 
 

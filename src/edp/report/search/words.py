@@ -119,9 +119,9 @@ def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
     if "confirmation" in study.facts:
         confirmed, asked = study.facts["confirmation"]["confirmed"], study.facts["screening"]["registered"]
         tiles.append((whole(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
-    looks = len(study.openings)
+    openings = len(study.openings)
     sealed = _count(len(study.test) + len(study.second), "session")
-    tiles.append((whole(looks), "", f"look{'s' * (looks != 1)} at {sealed} set apart"))
+    tiles.append((whole(openings), "", f"opening{'s' * (openings != 1)} of {sealed} set apart"))
     return tiles
 
 

@@ -29,7 +29,7 @@ def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> P
     """A network of the specs `model` made of the most important features of `predictor`; fine-tune it afterwards.
 
     Channels of each convolution, units of each recurrent layer and hidden features of each head are kept by what they
-    are worth on `series` (`importance`). Levels whose residual path has no weights keep the same channels.
+    contribute on `series` (`importance`). Levels whose residual path has no weights keep the same channels.
 
     Args:
         predictor: a trained network.
@@ -41,33 +41,35 @@ def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> P
     """
     check_pruning(predictor.spec, model)
     small = Predictor(predictor.task, model, blank_scaler(predictor.task)).eval()
-    worth = importance(predictor, series)
+    importances = importance(predictor, series)
     with torch.no_grad():
         for name in ("front", "code", "output", "activation", "bypass", "physics"):
             part = getattr(small, name)
             if part is not None:
                 part.load_state_dict(getattr(predictor, name).state_dict())
         features = torch.arange(len(predictor.task.features.features))
-        kept_features = _backbone(predictor.backbone, small.backbone, features, worth)
+        kept_features = _backbone(predictor.backbone, small.backbone, features, importances)
         if small.gate is not None:
             for own, its in zip(small.gate.parameters(), predictor.gate.parameters(), strict=True):  # type: ignore[union-attr]
                 own.copy_(its[:, kept_features])
-        _heads(predictor.heads, small.heads, kept_features, worth.hidden)
+        _heads(predictor.heads, small.heads, kept_features, importances.hidden)
     return small
 
 
-def _backbone(big: nn.Module, small: nn.Module, input_features: Tensor, worth: FeatureImportance) -> Tensor:
+def _backbone(big: nn.Module, small: nn.Module, input_features: Tensor, importances: FeatureImportance) -> Tensor:
     """Copy what is kept; the features kept of the representation."""
     if isinstance(big, ConvolutionStack) and isinstance(small, ConvolutionStack):
-        return _stack(big, small, input_features, worth)
+        return _stack(big, small, input_features, importances)
     if not isinstance(big, RecurrentBackbone) or not isinstance(small, RecurrentBackbone):
         pairs = list(zip(_children(big, "branches"), _children(small, "branches"), strict=True))
-        return _side_by_side([(_backbone(one, other, input_features, worth), _width(one)) for one, other in pairs])
+        return _side_by_side(
+            [(_backbone(one, other, input_features, importances), _width(one)) for one, other in pairs]
+        )
     if big.encoder is not None and small.encoder is not None:
-        input_features = _backbone(big.encoder, small.encoder, input_features, worth)
+        input_features = _backbone(big.encoder, small.encoder, input_features, importances)
     units = input_features
     for layer, narrow in zip(_children(big.recurrent, "layers"), _children(small.recurrent, "layers"), strict=True):
-        units = _best(worth.sites[layer], _units(narrow))
+        units = _best(importances.sites[layer], _units(narrow))
         _recurrent(layer, narrow, input_features, units)
         input_features = units
     small.pooling.score.weight.copy_(big.pooling.score.weight[:, units])
@@ -75,19 +77,21 @@ def _backbone(big: nn.Module, small: nn.Module, input_features: Tensor, worth: F
     return _side_by_side([(units, big.pooling.units)] * (2 + len(big.extras)))
 
 
-def _stack(big: ConvolutionStack, small: ConvolutionStack, input_features: Tensor, worth: FeatureImportance) -> Tensor:
+def _stack(
+    big: ConvolutionStack, small: ConvolutionStack, input_features: Tensor, importances: FeatureImportance
+) -> Tensor:
     pairs = list(zip(big._blocks(), small._blocks(), strict=True))
     for index, (block, narrow) in enumerate(pairs):
         if block.shortcut is None and narrow.shortcut is None:
             out = input_features
         else:
-            total = worth.sites[block].clone()
+            total = importances.sites[block].clone()
             for later, other in pairs[index + 1 :]:  # what follows without weights on its path keeps the same channels
                 if later.shortcut is not None or other.shortcut is not None:
                     break
-                total += worth.sites[later]
+                total += importances.sites[later]
             out = _best(total, len(narrow.second.bias))
-        inner = _best(worth.sites[block.first], len(narrow.first.bias))
+        inner = _best(importances.sites[block.first], len(narrow.first.bias))
         _convolution(block.first, narrow.first, input_features, inner)
         _convolution(block.second, narrow.second, inner, out)
         _shortcut(block, narrow, input_features, out)
@@ -123,13 +127,13 @@ def _recurrent(big: nn.Module, small: nn.Module, input_features: Tensor, units: 
         own.copy_(its[rows] if its.ndim == 1 else its[rows][:, units if "_hh" in name else input_features])
 
 
-def _heads(big: Heads, small: Heads, input_features: Tensor, worth: Sequence[Tensor]) -> None:
+def _heads(big: Heads, small: Heads, input_features: Tensor, importances: Sequence[Tensor]) -> None:
     """Each output keeps hidden features of its own."""
     for output in range(big.outputs):
         into = input_features
         for layer in range(len(big.weights)):
             if layer < len(big.units):
-                best = _best(worth[layer][output], small.widths[layer + 1])
+                best = _best(importances[layer][output], small.widths[layer + 1])
                 factor = big.units[layer].factor
                 out = torch.cat([best + half * big.widths[layer + 1] for half in range(factor)])
             else:
@@ -139,9 +143,9 @@ def _heads(big: Heads, small: Heads, input_features: Tensor, worth: Sequence[Ten
             into = best
 
 
-def _best(worth: Tensor, count: int) -> Tensor:
+def _best(importances: Tensor, count: int) -> Tensor:
     """The `count` most important features, in their order."""
-    return torch.sort(torch.argsort(worth, descending=True, stable=True)[:count]).values
+    return torch.sort(torch.argsort(importances, descending=True, stable=True)[:count]).values
 
 
 def _side_by_side(parts: Sequence[tuple[Tensor, int]]) -> Tensor:

@@ -1,4 +1,4 @@
-"""What each channel, recurrent unit and hidden feature of a network is worth on data."""
+"""Importance of each channel, recurrent unit and hidden feature of a network on data."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from edp.workflows.search.executor import RETRIES, ClosedAtExit, Job, ended, ref
 from edp.workflows.search.worker import BEGUN
 
 TICK_S = 0.1
-"""Between looks at the memory of a training; without a cap the pool sleeps until something happens."""
+"""Interval of checks of the memory of a training; without a cap the pool sleeps until something happens."""
 START_S = 300.0
 """What a process may take until the function of its training is called."""
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")

@@ -26,7 +26,7 @@ class Module:
         title: what the thesis calls it.
         change: settings laid over the baseline's.
         block: a block that is appended to the baseline's; None for none.
-        options: values worth searching where the module is on, by the place of the setting: keys joined by points, or
+        options: values to search where the module is on, by the place of the setting: keys joined by points, or
             the name of an option of the block.
         alter: changes settings in place, where what changes depends on them; None for nothing.
     """

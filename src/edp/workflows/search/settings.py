@@ -103,7 +103,7 @@ class SearchSpec:
         most_runs: phase 3: training runs of each arm that may be spent at most.
         run_seeds: phase 3, thesis: seeds of each split.
         alpha: level of the confirmation.
-        least_gain: improvement that is worth having, as a share of the baseline's mean score.
+        least_gain: least relevant improvement, as a share of the baseline's mean score.
         joint_trials: phase 4: questions about the confirmed modules together.
         free_trials: phase 5: questions about all modules together.
         batch: questions that are asked before the first of them is answered.

@@ -102,7 +102,7 @@ class Isolation:
         ]
         for backbone, comparison in facts["comparisons"].items():
             sentences.append(
-                f"{backbone}: {chosen} against {comparison['rival']} {100 * comparison['change']:+.2f} % "
+                f"{backbone}: {chosen} against {comparison['reference']} {100 * comparison['change']:+.2f} % "
                 f"(one-sided p {comparison['p']:.2g}, two-way clustered t over {spec.variance_runs} runs)."
             )
         for backbone, comparison in facts["backbones"].items():
@@ -116,17 +116,17 @@ class Isolation:
     def _comparisons(self, context: SearchContext, tables: list[Array], chosen: str) -> dict[str, Any]:
         """The chosen feature set against the next best one, for each backbone."""
         spec = context.spec
-        rivals = [name for name in spec.feature_sets if name != chosen]
+        references = [name for name in spec.feature_sets if name != chosen]
         comparisons = {}
         for index, backbone in enumerate(spec.backbones):
             own = {f: tables[index * len(spec.features) + i] for i, f in enumerate(spec.feature_sets)}
-            if not rivals:
+            if not references:
                 continue
-            rival = min(rivals, key=lambda name: float(np.nanmean(own[name])))
-            first, second = (own[name].mean(axis=0) for name in (chosen, rival))
+            reference = min(references, key=lambda name: float(np.nanmean(own[name])))
+            first, second = (own[name].mean(axis=0) for name in (chosen, reference))
             mask, _ = _judged(context)
             test = clustered_t(np.where(mask, first - second, 0.0), mask)
-            comparisons[backbone] = {"rival": rival, **changed(test, float(np.nanmean(second)))}
+            comparisons[backbone] = {"reference": reference, **changed(test, float(np.nanmean(second)))}
         return comparisons
 
 

@@ -1,4 +1,4 @@
-"""Phase 2: which modules are worth a confirmation (thesis 3.3.3)."""
+"""Phase 2: which modules go to confirmation (thesis 3.3.3)."""
 
 from __future__ import annotations
 
