@@ -39,7 +39,7 @@ def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
     names = ["spectrum", "excitation", "occupancy", "joint_command", "joint_head", "joint_rod", "joint_velocities"]
     assert list(figures_of(text)) == names == list(coverage_plots(found))
     assert all(f'id="figure-{name}"' in text for name in names)
-    assert "Not looked at" not in text
+    assert "Not examined" not in text
     for words in ("Reversals", "Both pumps shared", "Power limit", "From test to training", "of 216 cells", "not met"):
         assert words in text
 
