@@ -7,7 +7,7 @@ import pytest
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 CLEAN = (
-    *("cli/", "config/", "evaluation/", "report/", "settings/", "storage/", "training/", "workflows/"),
+    *("cli/", "config/", "evaluation/", "report/", "settings/", "storage/", "testing/", "training/", "workflows/"),
     *("errors.py", "registry.py", "signals.py"),
 )
 """Rooms without a variable of a banned name (`BANNED` of the benchmark)."""

@@ -22,13 +22,15 @@ def expect(condition: bool, message: str) -> None:
         raise ContractError(message)
 
 
-def expect_near(actual: Tensor | ArrayLike, wanted: Tensor | ArrayLike, message: str, rtol: float, atol: float) -> None:
+def expect_near(
+    actual: Tensor | ArrayLike, expected: Tensor | ArrayLike, message: str, rtol: float, atol: float
+) -> None:
     """Go on where two arrays are equal within a tolerance; NaN equals NaN.
 
     Raises:
         ContractError: they are not; `message` says what is wrong, and the largest difference follows.
     """
-    first, second = (_array(values) for values in (actual, wanted))
+    first, second = (_array(values) for values in (actual, expected))
     expect(first.shape == second.shape, f"{message}: shapes {first.shape} and {second.shape}")
     near = np.isclose(first, second, rtol=rtol, atol=atol, equal_nan=True)
     if not near.all():

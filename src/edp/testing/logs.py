@@ -42,10 +42,10 @@ def read_log(form: LogFormat, path: Path) -> Recording:
         EdpError: the file cannot be used.
     """
     raw = form.read(path, SignalMap())
-    wanted, problems = resolve(raw, SignalMap())
+    entries, problems = resolve(raw, SignalMap())
     if problems:
         raise problems[0]
-    return assemble(raw, wanted, SignalMap(), Repair())[0]
+    return assemble(raw, entries, SignalMap(), Repair())[0]
 
 
 def check_round_trip(form: LogFormat, recording: Recording) -> None:
@@ -54,8 +54,8 @@ def check_round_trip(form: LogFormat, recording: Recording) -> None:
     Raises:
         ContractError: something of it is lost or changed.
     """
-    with tempfile.TemporaryDirectory(prefix="edp-format-") as place:
-        path = written_log(form, recording, Path(place))
+    with tempfile.TemporaryDirectory(prefix="edp-format-") as folder:
+        path = written_log(form, recording, Path(folder))
         again = read_log(form, path)
         if path.is_file():
             with path.open("rb") as stream:
@@ -73,8 +73,8 @@ def check_damage(form: LogFormat) -> None:
     Raises:
         ContractError: another exception, or noise that is read as a log.
     """
-    with tempfile.TemporaryDirectory(prefix="edp-format-") as place:
-        path = written_log(form, sample_recording(), Path(place))
+    with tempfile.TemporaryDirectory(prefix="edp-format-") as folder:
+        path = written_log(form, sample_recording(), Path(folder))
         if not path.is_file():
             return
         content = path.read_bytes()

@@ -215,11 +215,11 @@ def check_graph(predictor: Predictor) -> None:
         ExportError: a part has no form as layers.
     """
     graph = predictor.graph()
-    x, wanted = _streamed(predictor)
+    x, expected = _streamed(predictor)
     reference = Reference(graph)
     results = [reference.results(row) for row in x]
-    expect(set(results[0]) == set(wanted), f"the list gives {sorted(results[0])}; {sorted(wanted)} must hold")
-    for meaning, values in wanted.items():
+    expect(set(results[0]) == set(expected), f"the list gives {sorted(results[0])}; {sorted(expected)} must hold")
+    for meaning, values in expected.items():
         # Folding rounds once more, in single precision.
         near = 1e-5 * max(1.0, float(np.median(np.abs(values))))
         rows = [row[meaning] for row in results]

@@ -104,10 +104,10 @@ def check_export_target(target: type, **options: object) -> None:
         ),
     ]
     reasons = []
-    with tempfile.TemporaryDirectory(prefix="edp-target-") as place:
+    with tempfile.TemporaryDirectory(prefix="edp-target-") as folder:
         for number, model in enumerate(models):
             bundle = bundle_around(small_network(model, small_task(model)))
-            reasons.append(refusal_of(name, bundle, Path(place) / f"network_{number}", options))
+            reasons.append(refusal_of(name, bundle, Path(folder) / f"network_{number}", options))
         expect("" in reasons, f"export target '{name}' refuses every network: {'; '.join(dict.fromkeys(reasons))}")
         bundle = bundle_around(small_network(plain, small_task(plain)))
-        check_names_refused(name, bundle, Path(place) / "names", options)
+        check_names_refused(name, bundle, Path(folder) / "names", options)

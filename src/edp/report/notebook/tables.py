@@ -19,7 +19,7 @@ def html_of(tables: Iterable[TextTable], title: str = "") -> str:
     """Tables one below the other, escaped; the rows of the network are bold."""
     parts = [f"<p><b>{_safe(title)}</b></p>"] if title else []
     for table in tables:
-        cells = "".join(_tag("th", _headed(*column), place) for place, column in enumerate(table.columns))
+        cells = "".join(_tag("th", _headed(*column), column_index) for column_index, column in enumerate(table.columns))
         head = f"<thead><tr>{cells}</tr></thead>" if any(map(any, table.columns)) else ""
         rows = "".join(_row(row, number in table.marked) for number, row in enumerate(table.rows))
         caption = f"<caption>{_safe(table.caption)}</caption>" if table.caption else ""
@@ -55,19 +55,19 @@ def _headed(heading: str, unit: str) -> str:
 
 def _aligned(cells: Sequence[str], widths: Sequence[int]) -> str:
     first, *others = (
-        cell.ljust(width) if place == 0 else cell.rjust(width)
-        for place, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        cell.ljust(width) if column_index == 0 else cell.rjust(width)
+        for column_index, (cell, width) in enumerate(zip(cells, widths, strict=True))
     )
     return "  ".join([first, *others]).rstrip()
 
 
 def _row(cells: Sequence[str], marked: bool) -> str:
     style = ' style="font-weight:600"' if marked else ""
-    return f"<tr{style}>{''.join(_tag('td', cell, place) for place, cell in enumerate(cells))}</tr>"
+    return f"<tr{style}>{''.join(_tag('td', cell, column_index) for column_index, cell in enumerate(cells))}</tr>"
 
 
-def _tag(name: str, text: str, place: int) -> str:
-    return f'<{name} style="{_CELL}{"left" if place == 0 else "right"}">{_safe(text)}</{name}>'
+def _tag(name: str, text: str, column_index: int) -> str:
+    return f'<{name} style="{_CELL}{"left" if column_index == 0 else "right"}">{_safe(text)}</{name}>'
 
 
 def _safe(text: str) -> str:

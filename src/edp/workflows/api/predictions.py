@@ -82,7 +82,7 @@ class Predictions:
         if ahead not in self.horizons:
             raise ConfigError(f"horizon = {ahead}; this predictor has {', '.join(map(str, self.horizons))}")
         source = self.recordings[which]
-        lines = [self._line(source, which, place, ahead) for place in range(len(self.targets))]
+        lines = [self._line(source, which, output, ahead) for output in range(len(self.targets))]
         title = f"{source.name}, {1000 * ahead / source.rate_hz:g} ms ahead"
         return prediction_figure(lines, source.rate_hz, title)
 
@@ -96,15 +96,15 @@ class Predictions:
             raise DataError(f"there are predictions of {len(names)} recording(s); {recording} is not one of them")
         return recording
 
-    def _line(self, source: Recording, which: int, place: int, horizon: int) -> BandLine:
-        column, name = self.horizons.index(horizon), self.targets[place]
+    def _line(self, source: Recording, which: int, output: int, horizon: int) -> BandLine:
+        column, name = self.horizons.index(horizon), self.targets[output]
         lower = upper = None
         if self.bounds is not None:
             # The first coverage is the widest.
-            lower, upper = (aligned(self.bounds[which][:, 0, side, column, place], horizon) for side in (0, 1))
+            lower, upper = (aligned(self.bounds[which][:, 0, side, column, output], horizon) for side in (0, 1))
         return BandLine(
-            channel=Channel(name, self.kinds[place]),
-            predicted=aligned(self.values[which][:, column, place], horizon),
+            channel=Channel(name, self.kinds[output]),
+            predicted=aligned(self.values[which][:, column, output], horizon),
             measured=source.column(name) if name in source.channel_names else None,
             lower=lower,
             upper=upper,
@@ -115,13 +115,13 @@ class Predictions:
             "recording": [entry.name for entry in self.recordings for _ in range(entry.samples)],
             "time_s": np.concatenate([np.arange(entry.samples) / entry.rate_hz for entry in self.recordings]),
         }
-        for place, target in enumerate(self.targets):
+        for output, target in enumerate(self.targets):
             for number, horizon in enumerate(self.horizons):
                 name = f"{target}+{horizon}"
-                columns[name] = np.concatenate([values[:, number, place] for values in self.values])
+                columns[name] = np.concatenate([values[:, number, output] for values in self.values])
                 for which, coverage in enumerate(self.coverages if self.bounds is not None else ()):
                     for side, word in enumerate(("lower", "upper")):
-                        parts = [bounds[:, which, side, number, place] for bounds in self.bounds or ()]
+                        parts = [bounds[:, which, side, number, output] for bounds in self.bounds or ()]
                         columns[f"{name} {word} {coverage:g}"] = np.concatenate(parts)
         return columns
 

@@ -220,7 +220,7 @@ class Recordings(Sequence[Recording]):
         order = np.random.default_rng(seed).permutation(len(self))
         count = min(max(1, round(test * len(self))), len(self) - 1)
         tests = set(order[:count].tolist())
-        parts = [[r for i, r in enumerate(self._recordings) if (i in tests) == wanted] for wanted in (False, True)]
+        parts = [[r for i, r in enumerate(self._recordings) if (i in tests) == testing] for testing in (False, True)]
         return Recordings(parts[0]), Recordings(parts[1])
 
     def plot(self, recording: int | str = 0, channels: Sequence[str] = ()) -> Any:
@@ -271,15 +271,15 @@ def read(
         DataError: nothing to read, or a log that cannot be used as it is.
         ConfigError: a map or a repair that cannot be.
     """
-    place = Path(path)
+    location = Path(path)
     if map is None:
         # The maps of a data-set file are in it.
-        signal_map = None if place.suffix == ".toml" else SignalMap(others=True)
+        signal_map = None if location.suffix == ".toml" else SignalMap(others=True)
     elif isinstance(map, Mapping):
         signal_map = map_of_table(dict(map), "map")
     else:
         signal_map = load_signal_map(map)
-    source = DataSource(place, signal_map, repair_of(repair))
+    source = DataSource(location, signal_map, repair_of(repair))
     return Recordings(source.read(), source)
 
 
