@@ -23,7 +23,7 @@ from edp.stats.mixed import MixedModel, mixed_model
 from edp.stats.multiple import adjust_registered, benjamini_hochberg, holm
 from edp.stats.paired import fill_worst, paired, run_means
 from edp.stats.power import ConfirmationPlan, plan_runs, power, simulate_differences, simulated_power
-from edp.stats.race import LOOKS, Look, RaceRates, RaceResult, race, race_rates
+from edp.stats.race import INTERIM_ANALYSES, InterimAnalysis, RaceRates, RaceResult, race, race_rates
 from edp.stats.resampled import paired_t, printed_p, resampled_t
 from edp.stats.thesis_confirm import ThesisEvidence, thesis_confirm
 from edp.stats.thesis_power import ThesisPlan, thesis_plan, thesis_power, thesis_splits_analytical
@@ -37,12 +37,12 @@ from edp.stats.variance import (
 )
 
 __all__ = [
-    "LOOKS",
+    "INTERIM_ANALYSES",
     "Concordance",
     "ConfirmationPlan",
     "EffectSize",
     "Factorial",
-    "Look",
+    "InterimAnalysis",
     "MainEffect",
     "MeanTest",
     "MixedModel",

@@ -15,7 +15,7 @@ from edp.stats.effects import EffectSize, effect_size, rank_stability
 from edp.stats.mixed import mixed_model
 from edp.stats.multiple import adjust_registered
 from edp.stats.paired import fill_worst, run_means
-from edp.stats.race import LOOKS, Look, race
+from edp.stats.race import INTERIM_ANALYSES, InterimAnalysis, race
 from edp.stats.resampled import paired_t, resampled_t
 
 
@@ -26,13 +26,13 @@ class Rule:
     Attributes:
         alpha: level of the adjusted p-value.
         least_gain: improvement of the mean score over the baseline's that is worth having, as a share.
-        looks: of the race; none: every module goes all the way.
+        interim_analyses: of the race; none: every module goes all the way.
         level: of the intervals.
     """
 
     alpha: float = 0.05
     least_gain: float = 0.01
-    looks: tuple[Look, ...] = LOOKS
+    interim_analyses: tuple[InterimAnalysis, ...] = INTERIM_ANALYSES
     level: float = 0.95
 
     def __post_init__(self) -> None:
@@ -113,7 +113,7 @@ def confirm(
     mask = tested_mask(tested, array.shape)
     filled = fill_worst(array, mask, worst)
     differences = filled[1:] - filled[0]
-    raced = race(differences, mask, rule.looks)
+    raced = race(differences, mask, rule.interim_analyses)
     adjusted = adjust_registered({name: float(p) for name, p in zip(modules, raced.p)}, registered)
     evidence = {}
     for index, name in enumerate(modules):

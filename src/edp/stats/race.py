@@ -16,8 +16,8 @@ from edp.stats.variance import PairedVariance
 
 
 @dataclass(frozen=True)
-class Look:
-    """A look at the data so far.
+class InterimAnalysis:
+    """An interim analysis of the data so far.
 
     Attributes:
         runs: after which it is taken.
@@ -28,8 +28,8 @@ class Look:
     drop_above: float
 
 
-LOOKS = (Look(5, 0.35), Look(10, 0.15), Look(15, 0.08))
-"""Looks after one, two and three repeats of five folds."""
+INTERIM_ANALYSES = (InterimAnalysis(5, 0.35), InterimAnalysis(10, 0.15), InterimAnalysis(15, 0.08))
+"""Interim analyses after one, two and three repeats of five folds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +47,34 @@ class RaceResult:
     p: Array
 
 
-def race(differences: ArrayLike, tested: ArrayLike | None = None, looks: Sequence[Look] = LOOKS) -> RaceResult:
-    """Walk through the looks, then test what is left over all runs.
+def race(
+    differences: ArrayLike,
+    tested: ArrayLike | None = None,
+    interim_analyses: Sequence[InterimAnalysis] = INTERIM_ANALYSES,
+) -> RaceResult:
+    """Perform the interim analyses, then test what is left over all runs.
 
-    Looks can only drop. A module that no look dropped is judged by the same test as without looks, so under the
-    null the probability of confirming it can only fall: futility looks spend no alpha.
+    They can only stop for futility. A module that none of them dropped is judged by the same test as without them, so
+    under the null the probability of confirming it can only fall: futility analyses spend no alpha.
 
     Args:
-        differences: ``(..., run, session)`` in the order of the runs; what comes after the look that drops a
+        differences: ``(..., run, session)`` in the order of the runs; values after the analysis that drops a
             module is not used.
         tested: ``(run, session)``; None: all.
-        looks: in ascending order; those at or beyond the number of runs are not taken.
+        interim_analyses: in ascending order; those at or beyond the number of runs are not taken.
 
     Raises:
-        ConfigError: looks out of order, before the second run, or with levels outside 0 to 1.
+        ConfigError: analyses out of order, before the second run, or with levels outside 0 to 1.
         DataError: as `clustered_t`.
     """
-    _check(looks)
+    _check(interim_analyses)
     array = np.asarray(differences, dtype=np.float64)
     mask = tested_mask(tested, array.shape)
     dropped = np.zeros(array.shape[:-2], dtype=np.int64)
-    for look in looks:
-        if look.runs < mask.shape[0]:
-            hopeless = clustered_t(array[..., : look.runs, :], mask[: look.runs]).p > look.drop_above
-            dropped = np.where((dropped == 0) & hopeless, look.runs, dropped)
+    for analysis in interim_analyses:
+        if analysis.runs < mask.shape[0]:
+            hopeless = clustered_t(array[..., : analysis.runs, :], mask[: analysis.runs]).p > analysis.drop_above
+            dropped = np.where((dropped == 0) & hopeless, analysis.runs, dropped)
     p = np.where(dropped == 0, clustered_t(array, mask).p, 1.0)
     return RaceResult(dropped, np.where(dropped == 0, mask.shape[0], dropped), p)
 
@@ -81,8 +85,8 @@ class RaceRates:
 
     Attributes:
         confirmed: share with p below alpha at the end.
-        confirmed_without: the same with no look.
-        dropped: share dropped at each look, by its number of runs.
+        confirmed_without: the same without interim analyses.
+        dropped: share dropped at each interim analysis, by its number of runs.
         mean_runs: of the module.
     """
 
@@ -96,7 +100,7 @@ def race_rates(
     delta: float,
     variance: PairedVariance,
     tested: ArrayLike,
-    looks: Sequence[Look] = LOOKS,
+    interim_analyses: Sequence[InterimAnalysis] = INTERIM_ANALYSES,
     *,
     alpha: float = 0.05,
     repetitions: int = 2000,
@@ -108,25 +112,27 @@ def race_rates(
         delta: improvement, in the unit of the scores.
         variance: of the paired differences.
         tested: ``(run, session)``.
-        looks: in ascending order.
+        interim_analyses: in ascending order.
         alpha: level of the test at the end.
         repetitions: simulated studies.
         seed: of the draws.
     """
     mask = tested_mask(tested, np.asarray(tested).shape)
     draws = simulate_differences(variance, mask, -delta, repetitions, np.random.default_rng(seed))
-    raced = race(draws, mask, looks)
+    raced = race(draws, mask, interim_analyses)
     return RaceRates(
         confirmed=float((raced.p < alpha).mean()),
         confirmed_without=float((clustered_t(draws, mask).p < alpha).mean()),
-        dropped={look.runs: float((raced.dropped_after == look.runs).mean()) for look in looks},
+        dropped={analysis.runs: float((raced.dropped_after == analysis.runs).mean()) for analysis in interim_analyses},
         mean_runs=float(raced.runs.mean()),
     )
 
 
-def _check(looks: Sequence[Look]) -> None:
-    runs = [look.runs for look in looks]
+def _check(interim_analyses: Sequence[InterimAnalysis]) -> None:
+    runs = [analysis.runs for analysis in interim_analyses]
     if runs != sorted(set(runs)) or any(n < 2 for n in runs):
-        raise ConfigError(f"looks after {runs} runs came; they must ascend and the first be after 2 runs or more")
-    if any(not 0.0 < look.drop_above <= 1.0 for look in looks):
-        raise ConfigError("a look drops above a p-value between 0 and 1")
+        raise ConfigError(
+            f"interim analyses after {runs} runs came; they must ascend and the first be after 2 runs or more"
+        )
+    if any(not 0.0 < analysis.drop_above <= 1.0 for analysis in interim_analyses):
+        raise ConfigError("an interim analysis drops above a p-value between 0 and 1")

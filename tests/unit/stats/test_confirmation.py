@@ -76,7 +76,7 @@ def test_says_so_where_the_test_for_shared_training_sets_disagrees(scores):
     assert "does not agree" not in by_name(confirm(scores, NAMES, REGISTERED, MASK))["good"].reason
     noisy = scores.copy()
     noisy[1] += 0.2 * np.random.default_rng(2).normal(size=(30, 1))  # runs differ by as much as the module brings
-    good = by_name(confirm(noisy, NAMES, NAMES, MASK, Rule(looks=())))["good"]
+    good = by_name(confirm(noisy, NAMES, NAMES, MASK, Rule(interim_analyses=())))["good"]
     assert good.confirmed
     assert good.resampled_p > 0.05 > good.adjusted
     assert "more sessions are needed" in good.reason
@@ -84,7 +84,7 @@ def test_says_so_where_the_test_for_shared_training_sets_disagrees(scores):
 
 def test_identical_arms_are_never_confirmed(scores):
     same = np.repeat(scores[:1], 4, axis=0)
-    assert not any(one.confirmed for one in confirm(same, NAMES, REGISTERED, MASK, Rule(looks=())))
+    assert not any(one.confirmed for one in confirm(same, NAMES, REGISTERED, MASK, Rule(interim_analyses=())))
 
 
 def test_thesis_gates_any_metric_suffices():

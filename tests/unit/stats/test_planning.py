@@ -7,8 +7,8 @@ import pytest
 
 from edp.errors import ConfigError, DataError
 from edp.stats import (
-    LOOKS,
-    Look,
+    INTERIM_ANALYSES,
+    InterimAnalysis,
     PairedVariance,
     SizeScore,
     clustered_t,
@@ -139,7 +139,7 @@ def test_race_spends_no_alpha_and_saves_runs():
     assert sum(null.dropped.values()) <= 1.0
     strong = race_rates(0.06, WORLD, mask, repetitions=400)
     assert strong.confirmed > 0.95
-    assert race_rates(0.0, WORLD, mask, looks=(), repetitions=50).mean_runs == 30
+    assert race_rates(0.0, WORLD, mask, interim_analyses=(), repetitions=50).mean_runs == 30
 
 
 def test_smallest_network_that_a_larger_one_does_not_repay():
@@ -171,8 +171,12 @@ def test_smallest_network_that_a_larger_one_does_not_repay():
         (lambda: thesis_variance(np.zeros((1, 3))), DataError, "at least two splits"),
         (lambda: seed_correlation(np.zeros((3, 2)), np.ones((3, 2))), DataError, "do not differ"),
         (lambda: seed_correlation(np.zeros((3, 1)), np.ones((3, 1))), DataError, "at least two seeds"),
-        (lambda: race(np.zeros((6, 4)), looks=(Look(4, 0.1), Look(3, 0.1))), ConfigError, "ascend"),
-        (lambda: race(np.zeros((6, 4)), looks=(Look(4, 1.4),)), ConfigError, "between 0 and 1"),
+        (
+            lambda: race(np.zeros((6, 4)), interim_analyses=(InterimAnalysis(4, 0.1), InterimAnalysis(3, 0.1))),
+            ConfigError,
+            "ascend",
+        ),
+        (lambda: race(np.zeros((6, 4)), interim_analyses=(InterimAnalysis(4, 1.4),)), ConfigError, "between 0 and 1"),
         (lambda: most_efficient([]), DataError, "no candidate"),
         (lambda: most_efficient([SizeScore("a", 1.0, math.nan)]), DataError, "'a'"),
         (lambda: most_efficient([SizeScore("a", 1.0, 2.0), SizeScore("b", 1.0, 3.0)]), DataError, "one size"),
@@ -186,5 +190,9 @@ def test_refusals_say_what_to_do(call, error, words):
         call()
 
 
-def test_looks_are_those_of_the_design():
-    assert [(look.runs, look.drop_above) for look in LOOKS] == [(5, 0.35), (10, 0.15), (15, 0.08)]
+def test_interim_analyses_are_those_of_the_design():
+    assert [(analysis.runs, analysis.drop_above) for analysis in INTERIM_ANALYSES] == [
+        (5, 0.35),
+        (10, 0.15),
+        (15, 0.08),
+    ]

@@ -13,7 +13,7 @@ from edp.stats.checks import Mask
 from edp.stats.clustered import clustered_t
 from edp.stats.confirm import ModuleEvidence, Rule, confirm
 from edp.stats.paired import fill_worst
-from edp.stats.race import LOOKS, Look
+from edp.stats.race import INTERIM_ANALYSES, InterimAnalysis
 from edp.stats.thesis_confirm import ThesisEvidence, thesis_confirm
 from edp.workflows.search.context import Array, Decision, Outcome, SearchContext
 from edp.workflows.search.modules import MODULES
@@ -49,12 +49,12 @@ class Confirmation:
 def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Course:
     """One interim analysis after the other; a dropped module is not trained any more."""
     runs = int(context.decided["planning"].facts["runs"])
-    looks = tuple(look for look in LOOKS if look.runs < runs)
+    interim_analyses = tuple(analysis for analysis in INTERIM_ANALYSES if analysis.runs < runs)
     mask = context.folds(runs)
     scores = np.full((len(arms), runs, len(context.development)), np.nan)
     alive = list(range(len(arms)))
     start = 0
-    for stop in (*(look.runs for look in looks), runs):
+    for stop in (*(analysis.runs for analysis in interim_analyses), runs):
         outcomes = yield [order for arm in alive for order in context.orders(arms[arm], range(start, stop))]
         for index, arm in enumerate(alive):
             own = outcomes[index * (stop - start) : (index + 1) * (stop - start)]
@@ -62,7 +62,7 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
         start = stop
         filled = fill_worst(scores[alive, :stop], mask[:stop])
         if stop < runs:
-            hopeless = _hopeless(filled, mask[:stop], stop, looks)
+            hopeless = _hopeless(filled, mask[:stop], stop, interim_analyses)
             alive = [0, *(arm for arm, out in zip(alive[1:], hopeless, strict=True) if not out)]
         if len(alive) == 1:
             break
@@ -71,7 +71,7 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
         passed,
         context.decided["screening"].facts["registered"],
         mask[:start],
-        Rule(alpha=context.spec.alpha, least_gain=context.spec.least_gain, looks=looks),
+        Rule(alpha=context.spec.alpha, least_gain=context.spec.least_gain, interim_analyses=interim_analyses),
     )
     return _decision(
         [_plain(module_evidence) for module_evidence in evidence],
@@ -80,9 +80,9 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
     )
 
 
-def _hopeless(filled: Array, mask: Mask, stop: int, looks: Sequence[Look]) -> list[bool]:
+def _hopeless(filled: Array, mask: Mask, stop: int, interim_analyses: Sequence[InterimAnalysis]) -> list[bool]:
     """Which modules the interim analysis after `stop` runs drops."""
-    level = next(look.drop_above for look in looks if look.runs == stop)
+    level = next(analysis.drop_above for analysis in interim_analyses if analysis.runs == stop)
     seen = mask.any(axis=0)
     p = clustered_t((filled[1:] - filled[0])[..., seen], mask[:, seen]).p
     return [bool(value > level) for value in np.atleast_1d(p)]
