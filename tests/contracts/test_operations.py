@@ -7,102 +7,12 @@ import torch
 
 from edp.evaluation.mac_check import Trace, trace
 from edp.networks.activations import ACTIVATIONS
-from edp.networks.streaming import Operation, Streaming, operations_of
-
-# Which declarations allow an operation of PyTorch; double precision keeps recurrent layers off the fused kernels.
-PRODUCTS = {Operation.LINEAR, Operation.MATMUL, Operation.LSTM, Operation.GRU}
-ALLOWED = {
-    "mm": PRODUCTS,
-    "addmm": PRODUCTS,
-    "bmm": PRODUCTS,
-    "baddbmm": PRODUCTS,
-    "convolution": {Operation.CONV1D},
-    "linalg_vector_norm": {Operation.CONV1D},  # the weight norm, folded when exported
-    "sigmoid": {Operation.SIGMOID, Operation.LSTM, Operation.GRU},
-    "tanh": {Operation.TANH, Operation.LSTM, Operation.GRU},
-    "relu": {Operation.RELU},
-    "gelu": {Operation.GELU},
-    "glu": {Operation.GLU},
-    "softplus": {Operation.SOFTPLUS},
-    "_softmax": {Operation.SOFTMAX},
-    "native_layer_norm": {Operation.LAYER_NORM},
-    "sqrt": {Operation.SQRT},
-    "exp": {Operation.EXP},
-    "expm1": {Operation.EXP},
-    "sin": {Operation.SINE},
-    "cos": {Operation.SINE},
-}
-# Moving numbers, making masks, and element-wise arithmetic: understood, not declared.
-FREE = {
-    *("_reshape_alias", "_to_copy", "_unsafe_view", "alias", "cat", "clone", "constant_pad_nd", "copy", "detach"),
-    *(
-        "expand",
-        "index",
-        "lift_fresh",
-        "permute",
-        "select",
-        "slice",
-        "split",
-        "split_with_sizes",
-        "squeeze",
-        "stack",
-        "t",
-        "transpose",
-    ),
-    *("unbind", "unsafe_chunk", "unsafe_split", "unsqueeze", "view", "view_as_complex", "view_as_real", "unfold"),
-    *(
-        "arange",
-        "empty",
-        "empty_like",
-        "full",
-        "new_empty",
-        "new_full",
-        "new_zeros",
-        "ones_like",
-        "zeros",
-        "zeros_like",
-    ),
-    *("bitwise_and", "bitwise_not", "bitwise_or", "eq", "ge", "gt", "lt", "masked_fill", "remainder", "where"),
-    *(
-        "abs",
-        "add",
-        "addcmul",
-        "clamp",
-        "cumsum",
-        "div",
-        "flip",
-        "maximum",
-        "minimum",
-        "mul",
-        "neg",
-        "pow",
-        "reciprocal",
-        "rsub",
-    ),
-    *("addcmul", "lerp", "sign", "sub", "sum"),
-}
-
-
-def complaints(network, seen):
-    """Where the traced operations and the declared ones differ."""
-    modules, found = dict(network.named_modules()), []
-    for name, module in modules.items():
-        declared = getattr(module, "operations", frozenset())
-        used = set(seen.operations.get(name, ())) - FREE
-        found += [f"{name}: {operation} has no word in Operation" for operation in used - set(ALLOWED)]
-        used &= set(ALLOWED)
-        found += [f"{name}: {operation} is not declared" for operation in used if not ALLOWED[operation] & declared]
-        found += [f"{name}: {word} is not used" for word in declared if not any(word in ALLOWED[o] for o in used)]
-    return found
+from edp.networks.streaming import Operation, Streaming
+from edp.testing.operations import check_operations, declaration_errors
 
 
 def test_parts_declare_exactly_the_operations_they_use(structure, predictor_of):
-    predictor = predictor_of(structure)
-    seen, _ = trace(predictor, 12)
-    assert complaints(predictor, seen) == []
-    words = operations_of(predictor)
-    used = {operation for counts in seen.operations.values() for operation in counts} & set(ALLOWED)
-    assert all(ALLOWED[operation] & words for operation in used)
+    check_operations(predictor_of(structure))
 
 
 def test_a_false_declaration_is_found():
@@ -115,7 +25,7 @@ def test_a_false_declaration_is_found():
     module = False_()
     with torch.no_grad(), Trace(module) as seen:
         module(torch.zeros(2))
-    assert complaints(module, seen) == [
+    assert declaration_errors(module, seen) == [
         ": erfinv has no word in Operation",
         ": tanh is not declared",
         ": gelu is not used",
@@ -127,7 +37,7 @@ def test_activations_declare_exactly_the_operations_they_use(name):
     module = ACTIVATIONS[name]().build(2).double()
     with torch.no_grad(), Trace(module) as seen:
         module(torch.zeros(3, 2, dtype=torch.float64))
-    assert complaints(module, seen) == []
+    assert declaration_errors(module, seen) == []
 
 
 def cost(rows):

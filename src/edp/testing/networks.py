@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from edp.data.features import Derived, FeatureSet
 from edp.data.scaling import Scaler
 from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
-from edp.networks.backbones import BACKBONES, GruSpec, HybridSpec, LstmSpec, TcnSpec
+from edp.networks.backbones import BACKBONES, BackboneSpec, GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.networks.blocks import BLOCKS
 from edp.networks.blocks.base import OUTPUT_SLOTS, BlockSlot, BlockSpec
 from edp.networks.heads import MlpHead
@@ -33,7 +34,7 @@ FEATURES = FeatureSet(
 TARGETS = ("CylVels_1", "CylVels_3")
 FORMS = tuple((horizons, mode) for horizons in ((3,), (1, 4)) for mode in (TargetMode.DELTA, TargetMode.ABSOLUTE))
 """Horizons and encodings in which networks are tried."""
-SMALL_BACKBONES = {
+SMALL_BACKBONES: Mapping[str, BackboneSpec] = {
     "lstm": LstmSpec(units=6),
     "gru": GruSpec(units=6),
     "tcn": TcnSpec(channels=(6, 4), kernel=3, dropout=0.2),

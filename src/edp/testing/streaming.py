@@ -16,6 +16,7 @@ from edp.networks.predictor import Predictor
 from edp.networks.stream import Stream
 from edp.networks.streaming import State, detach_state, map_state, parameters_of, reset_where, state_numbers
 from edp.testing.expectations import ContractError, expect, expect_near
+from edp.testing.operations import check_operations
 
 TICKS = 24
 MACHINE_CONSTANTS = 800
@@ -138,7 +139,7 @@ def check_determinism(predictor: Predictor) -> None:
     expect(torch.equal(run_network(predictor, x)[0], first), "two evaluations of the same inputs differ")
     other = copy.deepcopy(predictor)
     expect(torch.equal(run_network(other, x)[0], first), "a copy of the network gives another result")
-    if predictor.spec.backbone.dropout:
+    if getattr(predictor.spec.backbone, "dropout", 0.0):
         expect(not torch.equal(run_network(other.train(), x)[0], first), "dropout does nothing in training")
 
 
@@ -258,12 +259,21 @@ def check_network(predictor: Predictor) -> None:
     for check in (check_shapes, check_determinism):
         check(single)
     others = (check_causality, check_chunks, check_reset, check_state_is_left, check_batch, check_gradients)
-    for check in (*others, check_parameters_counted, check_work_counted, check_graph, check_graph_costs):
+    counts = (check_parameters_counted, check_work_counted, check_operations)
+    for check in (*others, *counts, check_graph, check_graph_costs):
         check(double)
 
 
-def _layout(state: State) -> object:
-    return map_state(lambda tensor: (tensor.shape, tensor.dtype), state)
+def _layout(state: State) -> list[tuple[torch.Size, torch.dtype]]:
+    """Shapes and types of a state's tensors, in their order."""
+    layout = []
+
+    def note(tensor: Tensor) -> Tensor:
+        layout.append((tensor.shape, tensor.dtype))
+        return tensor
+
+    map_state(note, state)
+    return layout
 
 
 def _streamed(predictor: Predictor) -> tuple[np.ndarray, dict[str, np.ndarray]]:

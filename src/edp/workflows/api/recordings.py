@@ -21,7 +21,7 @@ from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, recordings_figure, text_of
 from edp.settings.bounds import SEED, between, check_bounds
 from edp.settings.tree import build
-from edp.signals import KINDS, SignalMap
+from edp.signals import KINDS, Kind, SignalMap
 from edp.workflows.api.frames import columns_of, frame_of
 
 SHOWN_CHANNELS = 12
@@ -393,7 +393,9 @@ def _units(units: Sequence[str | None] | Mapping[str, str] | None, names: Sequen
         pairs = [(name, unit) for name, unit in zip(names, units, strict=True) if unit is not None]
     wrong = [name for name, unit in pairs if not isinstance(unit, str)]
     if wrong:
-        raise DataError(f"units: that of '{wrong[0]}' is no text; give its name, such as {KINDS['pressure'].si_unit}")
+        raise DataError(
+            f"units: that of '{wrong[0]}' is no text; give its name, such as {KINDS[Kind.PRESSURE].si_unit}"
+        )
     return dict(pairs)
 
 
