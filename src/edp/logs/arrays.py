@@ -16,8 +16,11 @@ from edp.logs.repair import Repair
 from edp.logs.resolve import resolve
 from edp.logs.units import kind_of_unit, normalise_unit
 from edp.recording import Recording
+from edp.settings.bounds import above, shown
 from edp.signals import UNITS, VOCABULARY, Kind, SignalMap
 
+RATE = above(0.0, 1e9)
+"""Of samples in Hz: clocks of logs count nanoseconds."""
 IN_MEMORY = "memory"
 """Source of a recording that came from no file."""
 
@@ -48,8 +51,10 @@ def recording_of_columns(
     signal_map, units = signal_map or SignalMap(others=True), units or {}
     if not columns:
         raise DataError(f"recording '{name}' has no columns; give at least one")
-    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
-        raise DataError(f"recording '{name}': rate_hz = {rate_hz:g}; give the samples per second, a number above 0")
+    if rate_hz is not None and not RATE.holds(rate_hz):
+        raise DataError(
+            f"recording '{name}': rate_hz = {shown(rate_hz)}; give the samples per second, a number above 0"
+        )
     where = Path(name)
     time_name = find_time(list(columns), signal_map, where) if rate_hz is None else None
     if rate_hz is None and time_name is None and signal_map.sample_time_s is None:
@@ -66,12 +71,12 @@ def recording_of_columns(
         if column != time_name
     }
     raw = RawLog(where, signals, rate_hz=rate_hz, name=name, source=IN_MEMORY)
-    wanted, problems = resolve(raw, signal_map)
+    channels, problems = resolve(raw, signal_map)
     if problems:
-        raise type(problems[0])(str(problems[0]))
-    if not wanted:
+        raise problems[0]
+    if not channels:
         raise DataError(f"recording '{name}' has no column of numbers besides its time; give at least one")
-    return assemble(raw, wanted, signal_map, repair or Repair())[0]
+    return assemble(raw, channels, signal_map, repair or Repair())[0]
 
 
 def _signal(

@@ -188,6 +188,7 @@ def test_hostile_names_stay_text_in_everything_that_is_shown(tiny_settings):
         ({"targets": "speed"}, ConfigError, "give a list of names"),
         ({"horizons": [0]}, ConfigError, "horizon 0"),
         ({"horizons": []}, ConfigError, "horizons"),
+        ({"horizons": 10}, ConfigError, r"such as \[10\]"),
         ({"features": "FG9"}, ConfigError, "no feature set 'FG9'"),
         ({"features": ["lever", "speeed"]}, (DataError, ConfigError), "speed"),
         ({"preset": "fast"}, ConfigError, "no preset 'fast'"),

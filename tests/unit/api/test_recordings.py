@@ -76,6 +76,9 @@ def test_one_array_is_one_recording_and_three_axes_are_several():
         ([np.zeros((5, 2))], {"recording_names": ["a", "b"]}, "recording_names has 2 entries for 1 recordings"),
         ([np.zeros((5, 2))], {"rate_hz": 0}, "rate_hz = 0; give the samples per second, a number above 0"),
         ([np.zeros((5, 2))], {"rate_hz": float("nan")}, "rate_hz = nan"),
+        ([np.zeros((5, 2))], {"rate_hz": "100"}, "rate_hz = '100'"),
+        (5, {}, "arrays is a int; give a list of arrays"),
+        ([[[1.0, 2.0], [3.0]]], {}, r"array 0 is no array \(time, channel\)"),
     ],
 )
 def test_what_cannot_be_recordings_is_one_error(arrays, options, message):

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, closest
 from edp.logs.arrays import recording_of_columns
-from edp.logs.read import RATE_TOLERANCE
 from edp.logs.repair import Repair
 from edp.logs.source import DataSource, load_signal_map, map_of_table
 from edp.recording import FloatArray, Recording
@@ -21,7 +20,8 @@ from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, recordings_figure, text_of
 from edp.settings.bounds import SEED, between, check_bounds
 from edp.settings.tree import build
-from edp.signals import KINDS, Kind, SignalMap
+from edp.signals import SignalMap
+from edp.workflows.api.arguments import check_together, check_width, matrix_of, names_of, units_of
 from edp.workflows.api.frames import columns_of, frame_of
 
 SHOWN_CHANNELS = 12
@@ -45,7 +45,7 @@ class Recordings(Sequence[Recording]):
 
     def __init__(self, recordings: Sequence[Recording], source: DataSource | None = None) -> None:
         self._recordings, self._source = tuple(recordings), source
-        _check_together(self._recordings)
+        check_together(self._recordings)
 
     @classmethod
     def from_arrays(
@@ -72,14 +72,16 @@ class Recordings(Sequence[Recording]):
         Raises:
             DataError: shapes, names or units that do not fit, a rate that is not positive, or missing values.
         """
+        if not isinstance(arrays, Sequence | np.ndarray) or isinstance(arrays, str):
+            raise DataError(f"arrays is a {type(arrays).__name__}; give a list of arrays (time, channel)")
         matrices = [arrays] if isinstance(arrays, np.ndarray) and arrays.ndim == 2 else list(arrays)
-        tables = [_matrix(values, number) for number, values in enumerate(matrices)]
+        tables = [matrix_of(values, number) for number, values in enumerate(matrices)]
         if not tables:
             raise DataError("no arrays given; give one array (time, channel) for each recording")
         width = tables[0].shape[1]
-        channel_names = _names(names, [f"channel_{i}" for i in range(width)], "names", "channels")
-        columns = [dict(zip(channel_names, values.T, strict=True)) for values in _of_one_width(tables, channel_names)]
-        return cls._of_columns(columns, rate_hz, _units(units, channel_names), recording_names, repair)
+        channel_names = names_of(names, [f"channel_{i}" for i in range(width)], "names", "channels")
+        columns = [dict(zip(channel_names, values.T, strict=True)) for values in check_width(tables, channel_names)]
+        return cls._of_columns(columns, rate_hz, units_of(units, channel_names), recording_names, repair)
 
     @classmethod
     def from_frames(
@@ -108,7 +110,7 @@ class Recordings(Sequence[Recording]):
         if not listed:
             raise DataError("no frames given; give one DataFrame for each recording")
         columns = [columns_of(frame, f"frame {number}") for number, frame in enumerate(listed)]
-        return cls._of_columns(columns, rate_hz, _units(units, list(columns[0])), recording_names, repair)
+        return cls._of_columns(columns, rate_hz, units_of(units, list(columns[0])), recording_names, repair)
 
     @classmethod
     def _of_columns(
@@ -119,7 +121,9 @@ class Recordings(Sequence[Recording]):
         recording_names: Sequence[str] | None,
         repair: Mapping[str, str] | None,
     ) -> Recordings:
-        names = _names(recording_names, [f"recording_{i}" for i in range(len(tables))], "recording_names", "recordings")
+        names = names_of(
+            recording_names, [f"recording_{i}" for i in range(len(tables))], "recording_names", "recordings"
+        )
         mend = repair_of(repair)
         return cls(
             [
@@ -318,85 +322,6 @@ def repair_of(table: Mapping[str, str] | None) -> Repair | None:
         ConfigError: an unknown repair or choice.
     """
     return None if table is None else build(Repair, dict(table), "repair")
-
-
-def _check_together(recordings: Sequence[Recording]) -> None:
-    if not recordings:
-        raise DataError("no recordings are left; give at least one")
-    first = recordings[0]
-    names = [recording.name for recording in recordings]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise DataError(f"recording name(s) {', '.join(twice)} occur twice; give each its own")
-    for recording in recordings:
-        if abs(recording.rate_hz - first.rate_hz) > RATE_TOLERANCE * first.rate_hz:
-            raise DataError(
-                f"mixed rates: '{first.name}' {first.rate_hz:g} Hz, '{recording.name}' {recording.rate_hz:g} Hz; bring "
-                "them to one rate"
-            )
-        ours, theirs = ([(c.name, c.unit) for c in entry.channels] for entry in (first, recording))
-        if ours != theirs:
-            both = zip(ours, theirs)
-            other = next((f"'{a[0]}' ({a[1]}) is '{b[0]}' ({b[1]}) there" for a, b in both if a != b), "")
-            counts = f"{len(first.channels)} and {len(recording.channels)} channels"
-            raise DataError(
-                f"mixed channels: '{first.name}' and '{recording.name}' differ: {other or counts}; give equal channels "
-                "in equal order"
-            )
-
-
-def _matrix(values: Any, number: int) -> NDArray[Any]:
-    matrix = np.asarray(values)
-    if matrix.ndim != 2 or 0 in matrix.shape:
-        advice = "; numpy.column_stack([u, y]) makes one of single channels" if matrix.ndim == 1 else ""
-        raise DataError(
-            f"array {number} has shape {matrix.shape}; (time, channel) must hold, one array for each recording{advice}"
-        )
-    if matrix.dtype.kind not in "fiub":
-        raise DataError(f"array {number} holds {matrix.dtype}; numbers must hold")
-    return matrix
-
-
-def _of_one_width(tables: Sequence[NDArray[Any]], names: Sequence[str]) -> Sequence[NDArray[Any]]:
-    for number, values in enumerate(tables):
-        if values.shape[1] != len(names):
-            raise DataError(
-                f"array {number} has shape {values.shape}; {len(names)} channels must hold ({', '.join(names[:8])})"
-            )
-    return tables
-
-
-def _names(names: Sequence[str] | None, usual: list[str], what: str, counted: str) -> list[str]:
-    if names is None:
-        return usual
-    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise DataError(f"{what} must be a list of texts, one for each of the {counted}")
-    if len(names) != len(usual):
-        raise DataError(f"{what} has {len(names)} entries for {len(usual)} {counted}; give one for each")
-    twice = sorted({name for name in names if list(names).count(name) > 1})
-    if twice or "" in names:
-        raise DataError(f"{what}: {f'{twice[0]!r} occurs twice' if twice else 'one is empty'}; give each its own")
-    return list(names)
-
-
-def _units(units: Sequence[str | None] | Mapping[str, str] | None, names: Sequence[str]) -> dict[str, str]:
-    if units is None:
-        return {}
-    if isinstance(units, Mapping):
-        for name in units:
-            if name not in names:
-                raise DataError(f"units: there is no channel '{name}'{closest(str(name), names)}")
-        pairs = list(units.items())
-    else:
-        if isinstance(units, str) or len(units) != len(names):
-            raise DataError(f"units has {len(units)} entries for {len(names)} channels; give one for each")
-        pairs = [(name, unit) for name, unit in zip(names, units, strict=True) if unit is not None]
-    wrong = [name for name, unit in pairs if not isinstance(unit, str)]
-    if wrong:
-        raise DataError(
-            f"units: that of '{wrong[0]}' is no text; give its name, such as {KINDS[Kind.PRESSURE].si_unit}"
-        )
-    return dict(pairs)
 
 
 def _columns(recording: Recording) -> dict[str, NDArray[Any]]:

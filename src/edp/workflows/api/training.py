@@ -108,6 +108,8 @@ def _experiment(
 ) -> Experiment:
     if isinstance(targets, str):
         raise ConfigError(f"targets = '{targets}'; give a list of names, such as [\"{targets}\"]")
+    if not isinstance(horizons, Sequence):
+        raise ConfigError(f"horizons = {horizons}; give a list of samples ahead, such as [{horizons}]")
     table = preset_table(preset)
     own = _table(settings)
     task: Table = {"targets": list(targets), "horizons": list(horizons)}
