@@ -160,10 +160,10 @@ def show_importance(run: Path, truth: Sequence[Cause], quick: bool) -> dict[str,
         cause = matter.get(row.members[0]) if len(row.members) == 1 else None
         said = "" if cause is None else "needed" if cause.needed else "given" if cause.matters else "no cause"
         rows.append([", ".join(row.members), row.renewed.mean, f"{row.renewed.low:.2f} to {row.renewed.high:.2f}",
-                     row.exchanged.mean, f"{row.told:.0%}", said])  # fmt: skip
+                     row.exchanged.mean, f"{row.explained:.0%}", said])  # fmt: skip
     print(f"\nGrowth of the error of the network on FG1 (MAE {found.error['10']['mean']:.2f} {found.units['mean']})")
-    table(["taken away", "renewed", "95 %", "exchanged", "told by others", "simulator"], rows)
-    return {"rows": [dict(zip(("channels", "renewed", "interval", "exchanged", "told", "truth"), r)) for r in rows]}
+    table(["taken away", "renewed", "95 %", "exchanged", "explained by others", "simulator"], rows)
+    return {"rows": [dict(zip(("channels", "renewed", "interval", "exchanged", "explained", "truth"), r)) for r in rows]}
 
 
 def main() -> None:
