@@ -7,7 +7,7 @@ INSTALL := pip install --quiet --no-deps
 BENCHMARKS = $(filter-out benchmarks/common.py benchmarks/decoys.py benchmarks/m22_truth.py benchmarks/onnx_rivals.py benchmarks/score_worlds.py,$(wildcard benchmarks/*.py))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup lock demo test test-slow lint bench system-packages clean
+.PHONY: help setup lock demo check test test-slow lint bench system-packages clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-16s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,9 @@ lock: ## write requirements.lock from pyproject.toml and constraints.txt; give t
 
 demo: $(READY) ## the main job, small: simulate, train, judge, write a report page
 	$(BIN)/edp demo --out demo
+
+check: lint ## lint, and contracts and unit tests that start no process
+	$(BIN)/python -m pytest -n $(WORKERS) --no-processes tests/contracts tests/unit
 
 test: $(READY) ## the fast tests
 	$(BIN)/python -m pytest -n $(WORKERS)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-import subprocess
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from functools import cache
 from typing import NamedTuple
 
+import compiled
 import numpy as np
+import process_guard
 import pytest
 import torch
 
@@ -158,11 +158,34 @@ def task_of(form: Form, model: ModelSpec) -> Task:
     return small_task(model, form[1], form[2])
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--no-processes", action="store_true", help="leave out what starts processes, and refuse them")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Fill the cache of compiled code before workers start: side by side each would compile its own variant."""
+    if config.getoption("--no-processes"):
+        process_guard.install()
+    cache = config.rootpath / ".pytest_cache" / "compiled"
+    compiled.install(cache)
     if not hasattr(config, "workerinput"):
-        program = "from edp.sim import Scenario, simulate; simulate(Scenario(duration_s=0.5))"
-        subprocess.run([sys.executable, "-c", program], check=True)
+        compiled.warm_numba(cache)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what starts processes by where it lies and by its fixtures; `--no-processes` leaves that out."""
+    for item in items:
+        if process_guard.starts_processes(item):
+            item.add_marker("processes")
+    if config.getoption("--no-processes"):
+        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("processes")])
+        items[:] = [item for item in items if not item.get_closest_marker("processes")]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    with process_guard.watching():
+        return (yield)
 
 
 @cache

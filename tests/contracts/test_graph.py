@@ -62,7 +62,7 @@ def test_every_kind_of_layer_has_a_reference():
         if isinstance(kind, type) and issubclass(kind, base.Layer) and kind is not base.Layer and name[0] != "_"
     }
     assert kinds - {memory.PrefixCorrection} == set(STEPS)
-    assert len(kinds) == 28
+    assert memory.PrefixCorrection in kinds
 
 
 def test_weights_that_are_not_finite_are_refused(predictor_of):

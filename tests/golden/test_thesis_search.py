@@ -11,7 +11,7 @@ import pytest
 
 from edp.errors import ConfigError
 from edp.workflows.search.context import Outcome, SearchContext
-from edp.workflows.search.modules import MODULES, TOGGLES, fitting
+from edp.workflows.search.modules import THESIS_MODULES, TOGGLES, fitting
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.phases.isolation import arm_settings
 from edp.workflows.search.plan import load_plan
@@ -98,10 +98,10 @@ def test_every_point_of_the_space_makes_a_network_of_every_backbone():
 
 def test_all_fourteen_modules_can_be_screened_and_none_is_in_the_baseline():
     base = network({"units": 128, "layers": 3, "kernel": 7})
-    assert fitting(base) == tuple(MODULES)
-    assert len(MODULES) == 14
+    assert fitting(base, among=PLAN.spec.modules) == tuple(THESIS_MODULES) == PLAN.spec.modules
+    assert len(THESIS_MODULES) == 14
     plain = costs_of(base)["parameters"]
-    for name in MODULES:
+    for name in THESIS_MODULES:
         changed = context().network(base, [name])
         assert changed != base
         assert (costs_of(changed)["parameters"] == plain) == (name in ("zoneout", "physics_residual"))
@@ -124,7 +124,7 @@ def test_widths_are_those_whatever_is_repeated():
 def test_toggles_are_those_of_table_4_6_that_are_no_module():
     table = {"SWA", "Correlation Loss", "Focal Loss"}
     assert {TOGGLES[name].title for name in PLAN.spec.toggles} == table
-    assert not table & {module.title for module in MODULES.values()}
+    assert not table & {module.title for module in THESIS_MODULES.values()}
     held = context()
     made = held.network(held.base, PLAN.spec.toggles)["training"]
     assert made["average"] == {"kind": "swa"}
@@ -281,7 +281,7 @@ def test_only_phase_1_is_pruned_and_phase_4_begins_without_a_warm_start(walked):
     on = found.decided["synthesis"].facts["on"]
     assert set(PLAN.spec.toggles) <= set(on)
     assert set(on) - set(PLAN.spec.toggles) == set(found.decided["confirmation"].facts["confirmed"])
-    registered = fitting(found.decided["calibration"].facts["settings"])
+    registered = fitting(found.decided["calibration"].facts["settings"], among=PLAN.spec.modules)
     assert set(found.decided["exploration"].facts["on"]) == {*registered, *PLAN.spec.toggles}
     first = found.decided["exploration"].facts["trials"][0]
     earlier = found.decided["synthesis"].facts

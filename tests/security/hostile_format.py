@@ -107,7 +107,6 @@ class HostileFormat:
     name = "hostile"
     suffixes = (".hostile",)
     content = "a hostile file"
-    parts = False
 
     def claims(self, head):
         return True

@@ -24,7 +24,7 @@ import torch
 from asammdf.blocks.conversion_utils import from_dict
 from safetensors.numpy import save_file
 
-from edp.logs import WriteOptions, write_recording
+from edp.logs import FORMATS, WriteOptions, write_recording
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, Kind
 
@@ -63,8 +63,8 @@ class Corpus:
         return Recording("R1", channels, values, 100.0, source, {"note": extra})
 
     def honest(self) -> None:
-        for suffix in (".csv", ".parquet", ".mf4", ".mcap", ".db3", ".bag"):
-            write_recording(self.recording(), self.file(f"honest{suffix}"))
+        for part in FORMATS.values():
+            write_recording(self.recording(), self.file(f"honest{part.suffixes[0]}"))
         for version in ("v5", "v7.3"):
             for layout in ("struct", "dataset"):
                 name = f"honest_{layout}_{version.replace('.', '')}.mat"

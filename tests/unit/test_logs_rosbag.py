@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from edp.errors import DataError
-from edp.logs import find_recordings, inspect_log, read_data_set, read_recording, write_recording
+from edp.logs import FORMATS, find_recordings, inspect_log, read_data_set, read_recording, write_recording
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, Kind, SignalMap
 
@@ -102,11 +102,12 @@ def test_a_bag_folder_is_one_log(tmp_path, container):
 def test_a_folder_of_mixed_formats_is_one_data_set(tmp_path):
     channels = (TABLE_A1["CylVels_1"],)
     values = np.zeros((50, 1), dtype=np.float32)
-    for suffix in (".csv", ".parquet", ".mat", ".mf4", ".mcap", ".db3", ".bag"):
-        write_recording(Recording(suffix[1:], channels, values, 100.0), tmp_path / f"{suffix[1:]}{suffix}")
+    suffixes = [part.suffixes[0][1:] for part in FORMATS.values()]
+    for suffix in suffixes:
+        write_recording(Recording(suffix, channels, values, 100.0), tmp_path / f"{suffix}.{suffix}")
     drive(tmp_path, "mcap", name="folder").close()
     read = read_data_set(tmp_path)
-    assert [recording.name for recording in read] == ["bag", "csv", "db3", "folder", "mat", "mcap", "mf4", "parquet"]
+    assert [recording.name for recording in read] == sorted([*suffixes, "folder"])
     assert {recording.channel_names for recording in read} == {("CylVels_1",)}
     assert {recording.rate_hz for recording in read} == {100.0}
 

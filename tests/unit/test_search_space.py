@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from edp.config.experiment import Experiment, build, load_experiment, merged, plain_tree
 from edp.errors import ConfigError
+from edp.networks.blocks import BLOCKS
 from edp.networks.predictor import check_combination
-from edp.workflows.search.modules import MODULES, conflicts, contradicting, fitting, with_modules
+from edp.workflows.search.modules import MODULES, THESIS_MODULES, conflicts, contradicting, fitting, with_modules
 from edp.workflows.search.space import DIMENSIONS, THESIS, Choice, Real, applicable, apply, check, elastic, names
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
@@ -36,8 +37,14 @@ def test_each_module_is_what_the_settings_page_says(title, setting):
     assert made == wanted
 
 
-def test_there_are_fourteen():
-    assert len(MODULES) == len(listed()) == 14
+def test_the_thesis_has_fourteen():
+    assert len(THESIS_MODULES) == len(listed()) == 14
+
+
+def test_every_block_with_a_space_is_a_module():
+    assert {name for name in BLOCKS if BLOCKS[name].space} <= set(MODULES)
+    assert set(MODULES) - set(THESIS_MODULES) <= set(BLOCKS)
+    assert fitting(settings(), among=["stanh", "linear_bypass"]) == ("stanh", "linear_bypass")
 
 
 @pytest.mark.parametrize("backbone", BACKBONES)
@@ -55,18 +62,20 @@ def test_modules_that_fit_can_be_built_in_any_pair_that_does_not_contradict(back
 
 
 def test_what_fits_depends_on_the_network():
-    assert len(fitting(settings())) == 14
-    assert contradicting(settings(), MODULES) == {frozenset({"gru", "layer_norm_lstm"}), frozenset({"gru", "zoneout"})}
+    assert fitting(settings()) == tuple(MODULES)
+    pairs = {frozenset({"gru", "layer_norm_lstm"}), frozenset({"gru", "zoneout"})}
+    assert contradicting(settings(), THESIS_MODULES) == pairs
+    assert contradicting(settings(), ["physics_residual", "linear_bypass"])
     assert not {"gru", "zoneout", "temporal_difference"} & set(fitting(settings("tcn")))
     has_it = settings("hybrid", 'model.blocks=["temporal_difference"]')
     assert "temporal_difference" not in fitting(has_it)
     assert with_modules(has_it, ["temporal_difference"]) == has_it
 
 
-def test_all_fourteen_less_the_contradictions_go_together():
-    made = with_modules(settings(), set(MODULES) - {"gru"})
+def test_all_less_the_contradictions_go_together():
+    made = with_modules(settings(), set(MODULES) - {"gru", "physics_residual"})
     kinds = [block["kind"] for block in made["model"]["blocks"]]
-    assert len(kinds) == 7
+    assert sorted(kinds) == sorted(set(MODULES) & set(BLOCKS))
     assert build(Experiment, made, "test").model.backbone.zoneout == 0.1
 
 
@@ -90,7 +99,7 @@ def test_contradictions_say_why():
 def test_the_feature_set_of_all_channels_needs_their_names():
     every = merged(settings(), {"task": {"features": "all"}})
     channels = load_experiment(None, "quick").task.resolve(100.0).features.channels
-    assert len(fitting(every, channels)) == 14
+    assert fitting(every, channels) == tuple(MODULES)
     assert fitting(every) == ()
 
 

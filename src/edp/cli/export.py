@@ -11,14 +11,27 @@ from edp.cli.console import JsonFlag, emit, out
 from edp.errors import ConfigError
 
 
+def _list_forms(wanted: bool) -> None:
+    """Every registered target, with the first line of what is said about it."""
+    if wanted:
+        from edp.export import TARGETS
+
+        for name, target in TARGETS.items():
+            out.print(f"{name}: {(target.__doc__ or '').strip().splitlines()[0]}", soft_wrap=True, markup=False)
+        raise typer.Exit
+
+
 def export(
     bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train.")],
-    to: Annotated[str, typer.Option(help="Form: c (C99 for controllers), casadi, fmu, onnx, ros2 or simulink.")],
+    to: Annotated[str, typer.Option(help="Form, such as c (C99 for controllers); --forms lists all.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an existing export is replaced.")],
     name: Annotated[str, typer.Option(help="Name of the network in the exported files.")] = "predictor",
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
     ] = None,
+    forms: Annotated[
+        bool, typer.Option("--forms", callback=_list_forms, is_eager=True, help="List the forms and end.")
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Write a trained network in a form that runs without EDP; it reads and gives SI units.

@@ -11,7 +11,7 @@ import numpy as np
 from edp.errors import DataError
 from edp.logs.assemble import assemble, parts, prepare
 from edp.logs.detect import BAG_MARK, format_for, known_suffixes, open_log
-from edp.logs.formats.base import TRUTH, RawLog, is_truth
+from edp.logs.formats.base import TRUTH, RawLog, holds_truth_apart, is_truth
 from edp.logs.formats.names import name_of_file
 from edp.logs.repair import Repair
 from edp.logs.resolve import ChannelSource, resolve
@@ -100,7 +100,7 @@ def read_truth(path: str | Path) -> Recording | None:
     beside = truth_path(log)
     if beside.is_file():
         return read_recording(beside)
-    if not format_for(log).parts:
+    if not holds_truth_apart(format_for(log)):
         return None
     try:
         return read_recording(log, SignalMap(variable=TRUTH))

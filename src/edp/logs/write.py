@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edp.errors import DataError
 from edp.logs.detect import format_for
-from edp.logs.formats.base import TRUTH, LogFormat, WriteOptions, parted
+from edp.logs.formats.base import TRUTH, LogFormat, WriteOptions, holds_truth_apart, parted
 from edp.recording import Recording
 from edp.storage import replacing
 
@@ -17,7 +17,7 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
 
     Args:
         recording: what to write.
-        path: ``.csv``, ``.parquet`` or ``.mat``; an existing file is replaced only by a complete new one.
+        path: its ending is one of `edp.logs.known_suffixes`; an existing file is replaced only by a complete new one.
         options: the layout of a MAT file; where truth goes.
 
     Raises:
@@ -39,7 +39,7 @@ def write_recording(recording: Recording, path: str | Path, options: WriteOption
         )
     if truth is None or options.truth == "without":
         return _write(chosen, measured, target, replace(options, truth="without"))
-    if chosen.parts:
+    if holds_truth_apart(chosen):
         return _write(chosen, recording, target, options)
     # The log last: where it lies, its truth lies beside it.
     _write(chosen, truth, truth_path(target), options)

@@ -22,6 +22,8 @@ class AttentionPooling(Streaming):
     """
 
     operations = frozenset({Operation.LINEAR, Operation.MATMUL, Operation.SOFTMAX})
+    # A softmax does not notice a shift of all scores; the thesis counts this bias, so it is kept.
+    indifferent = ("score.bias",)
 
     def __init__(self, units: int, window: int) -> None:
         super().__init__()

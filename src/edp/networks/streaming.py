@@ -81,9 +81,13 @@ class Streaming(nn.Module, ABC):
         operations: what the part itself computes, without the parts inside it.
         matrices: weights of multiply-accumulates among its own parameters: name, and axes of its outputs. Those of
             PyTorch's layers inside it are known.
+        fixed: names of its parameters that no training changes (``requires_grad`` is False).
+        indifferent: names of its parameters on which its output does not depend.
     """
 
     operations: frozenset[Operation] = frozenset()
+    fixed: tuple[str, ...] = ()
+    indifferent: tuple[str, ...] = ()
     matrices: ClassVar[tuple[tuple[str, tuple[int, ...]], ...]] = ()
 
     @abstractmethod
@@ -120,6 +124,22 @@ class Streaming(nn.Module, ABC):
         """Run the module (typed shadow of ``nn.Module.__call__``)."""
         result: tuple[Tensor, State] = super().__call__(x, state)
         return result
+
+
+def fixed_parameters(model: nn.Module) -> set[str]:
+    """Full names of the parameters that parts of a model declare as `Streaming.fixed`."""
+    return _declared(model, "fixed")
+
+
+def indifferent_parameters(model: nn.Module) -> set[str]:
+    """Full names of the parameters that parts of a model declare as `Streaming.indifferent`."""
+    return _declared(model, "indifferent")
+
+
+def _declared(model: nn.Module, attribute: str) -> set[str]:
+    parts = model.named_modules()
+    names = ((prefix, name) for prefix, part in parts for name in getattr(part, attribute, ()))
+    return {f"{prefix}.{name}" if prefix else name for prefix, name in names}
 
 
 class Chain(Streaming):

@@ -76,12 +76,15 @@ def two_level_design(
     return Factorial(names, levels, groups, float(alias), float(error))
 
 
+def least_runs(factors: int) -> int:
+    """The smallest power of two in which a design of resolution IV holds so many factors."""
+    return max(4, 1 << (2 * factors - 1).bit_length())
+
+
 def _checked_runs(names: tuple[str, ...], runs: int | None) -> int:
     if len(names) < 2 or len(set(names)) != len(names):
         raise ConfigError(f"factors {list(names)} came; give at least two, each once")
-    least = 4
-    while least < 2 * len(names):
-        least *= 2
+    least = least_runs(len(names))
     if least > MOST_RUNS:
         raise ConfigError(f"{len(names)} factors need {least} runs; screen at most {MOST_RUNS // 2} at a time")
     if runs is None:

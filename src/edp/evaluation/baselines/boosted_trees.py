@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
-from sklearn.ensemble import HistGradientBoostingRegressor
 
 from edp.data.lags import DoubleArray, target_means
 from edp.data.series import Series
 from edp.evaluation.baselines.base import BASELINES, Baseline, BaselineTask
 from edp.evaluation.baselines.lags import LagTable, predict_from_lags, sample_table
 from edp.recording import FloatArray
+
+if TYPE_CHECKING:  # scikit-learn takes 1.7 s to import, which every process that never fits a baseline would pay
+    from sklearn.ensemble import HistGradientBoostingRegressor
 
 VALIDATION_ROWS = 20_000
 
@@ -44,6 +47,8 @@ class BoostedTrees(Baseline):
 
     def _grow(self, table: LagTable, held_out: LagTable, output: int) -> tuple[HistGradientBoostingRegressor, int]:
         """One ensemble and the number of its trees to use."""
+        from sklearn.ensemble import HistGradientBoostingRegressor
+
         model = HistGradientBoostingRegressor(
             learning_rate=0.1,
             max_iter=self._trees,

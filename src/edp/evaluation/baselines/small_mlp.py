@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from sklearn.neural_network import MLPRegressor
 
 from edp.data.lags import DoubleArray, target_means
 from edp.data.series import Series
@@ -40,6 +39,9 @@ class SmallMlp(Baseline):
         self._patience = patience
 
     def _fit(self, train: Sequence[Series], validation: Sequence[Series]) -> None:
+        # Imported here: scikit-learn takes 1.7 s, which every process that never fits a baseline would pay.
+        from sklearn.neural_network import MLPRegressor
+
         self._means = target_means(train)
         table = sample_table(train, self.task, self._means, self._row_cap)
         held_out = sample_table(validation, self.task, self._means, VALIDATION_ROWS)

@@ -210,14 +210,13 @@ def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
 class LogFormat(Protocol):
     """One file format; instances are entered in `FORMATS`.
 
-    `parts`: whether one file can hold truth apart. A format may also have `libraries`: names of modules that reading
-    imports, which the sandbox then imports once instead of once a log.
+    A format may also have `parts`, whether one file can hold truth apart (`holds_truth_apart`), and `libraries`, names
+    of modules that reading imports, which the sandbox then imports once instead of once a log.
     """
 
     name: str
     suffixes: tuple[str, ...]
     content: str
-    parts: bool
 
     def claims(self, head: bytes) -> bool:
         """Whether a file that begins with `head` (up to 4 KiB) holds this format."""
@@ -230,6 +229,12 @@ class LogFormat(Protocol):
 
 
 FORMATS: Registry[LogFormat] = Registry("file format")
+
+
+def holds_truth_apart(log_format: LogFormat) -> bool:
+    """Whether one file of a format can hold the truth apart from what sensors show."""
+    return bool(getattr(log_format, "parts", False))
+
 
 _TIME_NAMES = ("time_s", "time", "timestamp", "timestamps", "tout", "time_ms", "time_us", "time_ns")
 _TIME_UNIT_NAMES = {"sec": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}

@@ -47,7 +47,6 @@ class CsvFormat:
     name = "csv"
     suffixes: tuple[str, ...] = (".csv", ".tsv")
     content = "CSV text"
-    parts = False
     libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
     def claims(self, head: bytes) -> bool:

@@ -47,7 +47,6 @@ class MdfFormat:
     name = "mdf"
     suffixes: tuple[str, ...] = (".mf4", ".mdf")
     content = "MDF"
-    parts = False
     libraries = ("asammdf",)
 
     def claims(self, head: bytes) -> bool:

@@ -57,7 +57,6 @@ class ParquetFormat:
     name = "parquet"
     suffixes: tuple[str, ...] = (".parquet", ".pq")
     content = "Parquet"
-    parts = False
     libraries = ("pandas",)  # which pyarrow imports when columns become arrays
 
     def claims(self, head: bytes) -> bool:

@@ -37,7 +37,6 @@ _LOG_TIME, _HEADER_TIME = "log_time", "header.stamp"
 class BagFormat:
     """One container of messages."""
 
-    parts = False
     libraries = ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")
 
     def __init__(self, name: str, suffix: str, content: str, magic: bytes) -> None:

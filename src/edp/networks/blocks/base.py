@@ -69,7 +69,7 @@ class BlockSpec(Protocol):
 
     Attributes:
         slot: where it sits.
-        space: values worth searching, by option.
+        space: values worth searching, by option; a block that has some is among the modules of every search.
     """
 
     slot: ClassVar[BlockSlot]

@@ -64,6 +64,7 @@ class Bypass(Streaming):
         self.spec, self.features, self.horizons, self.outputs = spec, features, horizons, outputs
         self.weight = nn.Parameter(torch.zeros(horizons * outputs, features, spec.taps), requires_grad=spec.trained)
         self.bias = nn.Parameter(torch.zeros(horizons * outputs), requires_grad=spec.trained)
+        self.fixed = () if spec.trained else ("weight", "bias")
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         return like.new_zeros(batch, self.spec.taps - 1, self.features)

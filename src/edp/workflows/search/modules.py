@@ -1,4 +1,4 @@
-"""The modules that a search may add to a network: the fourteen of the thesis's Table 4.5, each a change of settings."""
+"""The modules that a search may add to a network: the fourteen of the thesis's Table 4.5, and every other block."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import combinations
 from typing import Any, TypeAlias, cast
 
 from edp.config.experiment import Experiment, Table, build, merged, plain_tree
-from edp.errors import ConfigError
+from edp.errors import ConfigError, closest
 from edp.networks.blocks import BLOCKS, BlockSpec
 from edp.networks.heads import GluHead
 from edp.networks.losses import Correlation
@@ -23,7 +23,7 @@ class Module:
     """One optional part of a network.
 
     Attributes:
-        title: what the thesis calls it.
+        title: what the thesis calls it; a block beyond the thesis bears its name.
         change: settings laid over the baseline's.
         block: a block that is appended to the baseline's; None for none.
         options: values to search where the module is on, by the place of the setting: keys joined by points, or
@@ -38,7 +38,38 @@ class Module:
     alter: Callable[[Table], None] | None = None
 
 
-MODULES: Registry[Module] = Registry("module")
+class _Modules(Mapping[str, Module]):
+    """The thesis's modules in its order, then every registered block that is none of them and may be searched.
+
+    Blocks are looked up when asked for, so that a block that is registered later is searched, too.
+    """
+
+    def __getitem__(self, name: str) -> Module:
+        if name in THESIS_MODULES:
+            return THESIS_MODULES[name]
+        if name in self._further():
+            return Module(name.replace("_", " ").title(), block={"kind": name}, options=_space(name))
+        raise ConfigError(f"unknown module '{name}'{closest(name, list(self))}")
+
+    def __contains__(self, name: object) -> bool:
+        return name in THESIS_MODULES or name in self._further()
+
+    def __iter__(self) -> Iterator[str]:
+        yield from THESIS_MODULES
+        yield from self._further()
+
+    def __len__(self) -> int:
+        return len(THESIS_MODULES) + len(self._further())
+
+    @staticmethod
+    def _further() -> list[str]:
+        return [name for name in BLOCKS if name not in THESIS_MODULES and cast(type[BlockSpec], BLOCKS[name]).space]
+
+
+THESIS_MODULES: Registry[Module] = Registry("module")
+"""Thesis Table 4.5."""
+MODULES = _Modules()
+"""All modules by name: what a search takes unless ``search.modules`` names some."""
 TOGGLES: Registry[Module] = Registry("toggle")
 """Parts of the training that thesis Table 4.6 lists among what phases 4 and 5 may switch on; no module of Table 4.5."""
 
@@ -46,16 +77,21 @@ Shape: TypeAlias = Callable[[Table], Table]
 """Gives settings the widths that follow from others (`edp.workflows.search.space.WIDTHS`)."""
 
 
+def _space(name: str) -> Mapping[str, Sequence[Any]]:
+    """Values worth searching of a block's options."""
+    return cast(type[BlockSpec], BLOCKS[name]).space
+
+
 def _block(name: str, title: str, **fixed: Any) -> None:
-    free = {key: values for key, values in cast(type[BlockSpec], BLOCKS[name]).space.items() if key not in fixed}
-    MODULES.register(name)(Module(title, block={"kind": name, **fixed}, options=free))
+    free = {key: values for key, values in _space(name).items() if key not in fixed}
+    THESIS_MODULES.register(name)(Module(title, block={"kind": name, **fixed}, options=free))
 
 
 def _change(
     name: str, title: str, part: str, change: Mapping[str, Any], options: Mapping[str, Sequence[Any]] | None = None
 ) -> None:
     placed = {f"model.{part}.{key}": values for key, values in (options or {}).items()}
-    MODULES.register(name)(Module(title, {"model": {part: change}}, options=placed))
+    THESIS_MODULES.register(name)(Module(title, {"model": {part: change}}, options=placed))
 
 
 _block("cylinder_gate", "Cyl Gate Diagonal", form="diagonal")
@@ -240,9 +276,15 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
     return []
 
 
-def fitting(settings: Table, channels: Sequence[str] = ()) -> tuple[str, ...]:
-    """Modules that this network can have, in the order of the registry, and does not have already."""
-    free = (name for name in MODULES if _added(settings, {name}) != settings)
+def fitting(settings: Table, channels: Sequence[str] = (), among: Sequence[str] = ()) -> tuple[str, ...]:
+    """Modules that this network can have, in the order of the registry, and does not have already.
+
+    Args:
+        settings: of the network.
+        channels: of the recordings, for the feature set ``all``.
+        among: names of those that are asked about; empty for all.
+    """
+    free = (name for name in MODULES if (not among or name in among) and _added(settings, {name}) != settings)
     return tuple(name for name in free if not conflicts(settings, (name,), channels))
 
 

@@ -24,7 +24,7 @@ from edp.settings.bounds import (
 )
 from edp.workflows.compression import FORMATS
 from edp.workflows.compression.planning import SHARES
-from edp.workflows.search.modules import TOGGLES
+from edp.workflows.search.modules import MODULES, TOGGLES
 from edp.workflows.search.space import ELASTIC, THESIS, WIDTHS, Space
 from edp.workflows.search.study import PRUNERS, SamplerSpec
 
@@ -95,7 +95,7 @@ class SearchSpec:
         trials: phase 1: questions for each backbone.
         warm_rounds: phase 1: rounds in which every size is asked once before the sampler is free to choose.
         trial_runs: runs over which a question of phases 1, 4 and 5 is judged.
-        screening_runs: phase 2, sound: runs of the two-level design; a power of two.
+        screening_runs: phase 2, sound: runs of the two-level design, a power of two; more where the modules need more.
         screening_repeats: phase 2, sound: how often the design is repeated, each time on another fold.
         module_trials: phase 2, thesis: questions for each module.
         least_effect: phase 2.5: the effect to be seen, as a share of the baseline's mean score.
@@ -110,6 +110,7 @@ class SearchSpec:
         space: dimensions and ranges of phase 1.
         elastic: reach of the window around the baseline in later phases.
         deferred: further dimensions of phases 4 and 5.
+        modules: which are screened (`edp.workflows.search.modules.MODULES`); empty for all that fit the network.
         toggles: parts of the training that may be on or off in phases 4 and 5, beside the modules.
         widths: ``equal``: every level has as many channels as units, and the head is left as it is; ``halved``: as in
             the thesis (`edp.workflows.search.space.halved`).
@@ -159,6 +160,7 @@ class SearchSpec:
     space: Space = field(default_factory=lambda: dict(THESIS))
     elastic: dict[str, float] = field(default_factory=lambda: dict(ELASTIC))
     deferred: Space = field(default_factory=dict)
+    modules: tuple[str, ...] = ()
     toggles: tuple[str, ...] = ()
     widths: str = "equal"
     sampler: SamplerSpec = field(default_factory=SamplerSpec)
@@ -191,6 +193,7 @@ class SearchSpec:
         wrong += self._wrong_rungs()
         if self.widths not in WIDTHS:
             wrong.append(f"widths = '{self.widths}' ({' or '.join(WIDTHS)})")
+        wrong += [f"modules = '{name}'{closest(name, MODULES)}" for name in self.modules if name not in MODULES]
         wrong += [f"toggles = '{name}' ({', '.join(TOGGLES)})" for name in self.toggles if name not in TOGGLES]
         wrong += [f"deferred.{name} (which is in the space)" for name in self.deferred if name in self.space]
         wrong += [f"limits.{name} ({' or '.join(COSTS)})" for name in self.limits if name not in COSTS]

@@ -31,7 +31,8 @@ class Confirmation:
     def trainings(self, context: SearchContext) -> int:
         """Were nothing dropped at an interim analysis; before the screening, with half of the modules."""
         spec, decided = context.spec, context.decided
-        arms = len(decided["screening"].facts["passed"]) if "screening" in decided else len(MODULES) // 2
+        half = len(spec.modules or MODULES) // 2
+        arms = len(decided["screening"].facts["passed"]) if "screening" in decided else half
         runs = int(decided["planning"].facts["runs"]) if "planning" in decided else spec.most_runs
         return (1 + arms) * runs * (spec.run_seeds if spec.mode == "thesis" else 1) if arms else 0
 

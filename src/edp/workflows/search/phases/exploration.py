@@ -29,7 +29,7 @@ class Exploration:
         """Ask about all modules and options of those that are on; then both winners on fresh folds, same seeds."""
         spec = context.spec
         base = baseline_of(context)[0]
-        free = fitting(base, context.channels)
+        free = fitting(base, context.channels, spec.modules)
         earlier = context.decided["synthesis"].facts
         starts = [(earlier["values"], earlier["modules"])]
         options = {name: options_of(base, name, context.shaped) for name in free}

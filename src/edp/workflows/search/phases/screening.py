@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.experiment import Table
-from edp.stats.factorial import Factorial, two_level_design
+from edp.stats.factorial import Factorial, least_runs, two_level_design
 from edp.stats.importance import main_effects
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import MODULES, contradicting, fitting
@@ -26,8 +26,8 @@ class ModuleScreening:
         """The design, or the questions of all modules with the baseline's seeds."""
         spec = context.spec
         if spec.mode == "thesis":
-            return spec.run_seeds + len(MODULES) * spec.module_trials * spec.trial_runs
-        return spec.screening_runs * spec.screening_repeats
+            return spec.run_seeds + len(spec.modules or MODULES) * spec.module_trials * spec.trial_runs
+        return max(spec.screening_runs, least_runs(len(spec.modules or MODULES))) * spec.screening_repeats
 
     def run(self, context: SearchContext) -> Course:
         """Trainings of the mode, and what passes."""
@@ -45,9 +45,9 @@ def baseline_of(context: SearchContext) -> tuple[Table, Candidate, Space]:
 def _sound(context: SearchContext) -> Course:
     spec = context.spec
     base, _, window = baseline_of(context)
-    free = fitting(base, context.channels)
+    free = fitting(base, context.channels, spec.modules)
     barred = [sorted(pair) for pair in contradicting(base, free, context.channels)]
-    design = two_level_design(free, spec.screening_runs, sorted(barred))
+    design = two_level_design(free, max(spec.screening_runs, least_runs(len(free))), sorted(barred))
     drawn = _drawn(context, window, spec.screening_repeats * len(design.levels))
     orders, rows = [], []
     for repeat in range(spec.screening_repeats):
@@ -112,7 +112,7 @@ def _thesis(context: SearchContext) -> Course:
     """The best of some questions of each module against the median of the baseline over seeds, as the thesis does."""
     spec = context.spec
     base, _, window = baseline_of(context)
-    free = fitting(base, context.channels)
+    free = fitting(base, context.channels, spec.modules)
     median = yield [order for seed in range(spec.run_seeds) for order in context.orders(base, [0], seed=seed)]
     reference = float(np.median([outcome.mean(spec.horizon) for outcome in median]))
     quests = [_quest(context, base, name, window) for name in free]

@@ -1,0 +1,77 @@
+"""The cache of compiled programs: what a compiler reads decides, not where it lies."""
+
+import sys
+from pathlib import Path
+
+import compiled
+import process_guard
+import pytest
+
+OPTIONS = {"capture_output": True}
+
+
+@pytest.fixture
+def key(tmp_path, monkeypatch):
+    """The key of a call in a folder with a program of two files."""
+    monkeypatch.setattr(compiled.shutil, "which", lambda _: sys.executable)
+
+    def make(folder, *words, header="#define A 0", output="program"):
+        place = tmp_path / folder
+        place.mkdir(exist_ok=True)
+        (place / "a.c").write_text('#include "a.h"\nint main(void) { return A; }\n')
+        (place / "a.h").write_text(header)
+        command = ["gcc", *(words or ("-O1",)), "a.c", "-o", output]
+        return compiled.call_of(command, {**OPTIONS, "cwd": place}).key
+
+    return make
+
+
+def test_the_folder_does_not_count_but_flags_and_headers_do(key, tmp_path):
+    assert key("one") == key("two")
+    (tmp_path / "one" / "program").write_bytes(b"of an earlier call")
+    assert key("one") == key("two")
+    assert len({key("one"), key("one", "-O2"), key("one", header="#define A 1"), key("one", output="other")}) == 4
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (["gcc", "-fsyntax-only", "a.c"], OPTIONS),
+        (["python", "-c", "0", "-o", "a"], OPTIONS),
+        ("gcc a.c -o a", OPTIONS),
+        (["gcc", "a.c", "-o", "a"], {}),
+    ],
+)
+def test_other_programs_are_run(command, options):
+    assert compiled.call_of(command, options) is None
+
+
+def test_a_program_is_kept_and_comes_back(tmp_path, monkeypatch):
+    calls = []
+
+    def compiler(command, **options):
+        calls.append(command)
+        (Path(options["cwd"]) / command[-1]).write_text(f"made {len(calls)}")
+        return compiled.subprocess.CompletedProcess(command, 0, b"", b"")
+
+    monkeypatch.setattr(compiled.shutil, "which", lambda _: sys.executable)
+    monkeypatch.setattr(compiled, "_plain", compiler)
+    monkeypatch.setattr(compiled.subprocess, "run", None)
+    compiled.install(tmp_path / "cache")
+    texts = []
+    for folder, anew in (("one", False), ("two", False), ("three", True)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.c").write_text("int a;")
+        if anew:
+            with compiled.fresh():
+                compiled.subprocess.run(["gcc", "a.c", "-o", "a"], cwd=tmp_path / folder, capture_output=True)
+        else:
+            compiled.subprocess.run(["gcc", "a.c", "-o", "a"], cwd=tmp_path / folder, capture_output=True)
+        texts.append((tmp_path / folder / "a").read_text())
+    assert texts == ["made 1", "made 1", "made 2"]
+
+
+def test_the_guard_refuses_processes():
+    process_guard.install()
+    with process_guard.watching(), pytest.raises(process_guard.ProcessStartedError, match="starts no process"):
+        compiled.subprocess.Popen([sys.executable, "-c", "0"])
