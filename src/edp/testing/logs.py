@@ -101,7 +101,7 @@ def check_log_format(form: LogFormat) -> None:
     for suffix in form.suffixes:
         right = suffix.startswith(".") and suffix == suffix.lower()
         expect(right, f"format '{form.name}': the ending '{suffix}' must begin with a dot, in lower case")
-    expect(isinstance(form.parts, bool), f"format '{form.name}': `parts` must be True or False")
+    expect(isinstance(getattr(form, "parts", False), bool), f"format '{form.name}': `parts` must be True or False")
     for rate_hz in RATES_HZ:
         check_round_trip(form, sample_recording(rate_hz))
     check_damage(form)

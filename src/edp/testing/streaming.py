@@ -14,7 +14,16 @@ from edp.export.golden import random_inputs
 from edp.ir.reference import Reference
 from edp.networks.predictor import Predictor
 from edp.networks.stream import Stream
-from edp.networks.streaming import State, detach_state, map_state, parameters_of, reset_where, state_numbers
+from edp.networks.streaming import (
+    State,
+    detach_state,
+    fixed_parameters,
+    indifferent_parameters,
+    map_state,
+    parameters_of,
+    reset_where,
+    state_numbers,
+)
 from edp.testing.expectations import ContractError, expect, expect_near
 from edp.testing.operations import check_operations
 
@@ -169,15 +178,13 @@ def check_gradients(predictor: Predictor) -> None:
     loss = (code - code.detach() - torch.randn(code.shape, dtype=code.dtype)).square().sum()
     learned = {name: parameter for name, parameter in predictor.named_parameters() if parameter.requires_grad}
     fixed = {name for name, _ in predictor.named_parameters()} - set(learned)
-    bypass = getattr(predictor.bypass, "spec", None)
-    allowed = set() if getattr(bypass, "trained", True) else {"bypass.weight", "bypass.bias"}
-    expect(fixed == allowed, f"parameters that do not learn: {', '.join(sorted(fixed)) or 'none'}")
+    expect(fixed == fixed_parameters(predictor), f"parameters that do not learn: {', '.join(sorted(fixed)) or 'none'}")
+    indifferent = indifferent_parameters(predictor)
     gradients = torch.autograd.grad(loss, list(learned.values()), allow_unused=True)
     for name, gradient in zip(learned, gradients, strict=True):
         expect(gradient is not None, f"the error does not reach '{name}'")
         size = float(gradient.abs().sum())
-        # A softmax does not notice a shift of all scores; the thesis counts this bias, so it is kept.
-        silent = name.endswith("pooling.score.bias")
+        silent = name in indifferent
         expect(size < 1e-8 if silent else size > 1e-9, f"the gradient of '{name}' adds up to {size:.3g}")
 
 

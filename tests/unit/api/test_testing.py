@@ -12,9 +12,10 @@ import torch
 from torch import nn
 
 import edp
+from edp.config.experiment import load_experiment, plain_tree
 from edp.errors import ConfigError, DataError, ExportError
 from edp.export import TARGETS
-from edp.logs.formats.base import RawLog, RawSignal
+from edp.logs.formats.base import RawLog, RawSignal, holds_truth_apart
 from edp.networks.blocks import BLOCKS
 from edp.networks.blocks.base import BlockSlot
 from edp.networks.losses import LOSSES
@@ -22,6 +23,7 @@ from edp.networks.losses.base import Penalty
 from edp.networks.streaming import Cost, Streaming
 from edp.registry import Registry
 from edp.signals import Kind
+from edp.workflows.search.modules import MODULES, fitting, with_modules
 
 
 def entered(monkeypatch, registry: Registry, name: str, part: object) -> object:
@@ -93,6 +95,11 @@ def block_of(module):
 
 def test_a_sound_block_of_a_third_party_passes(monkeypatch):
     edp.testing.check_block(entered(monkeypatch, BLOCKS, "gain", block_of(Gain)))
+    # A search screens it, with its options, and nothing but the registration told it so.
+    assert MODULES["gain"].options == {"strength": [1.0, 2.0]}
+    settings = plain_tree(load_experiment(None, "quick", ["model.blocks=[]"]))
+    assert fitting(settings)[-1] == "gain"
+    assert with_modules(settings, ["gain"])["model"]["blocks"] == [{"kind": "gain"}]
 
 
 @pytest.mark.parametrize(
@@ -150,7 +157,7 @@ def test_a_loss_is_least_at_a_perfect_prediction(monkeypatch, sound):
 class PlainText:
     """A format of a third party: a header in JSON, then numbers."""
 
-    name, suffixes, content, parts = "plain", (".plain",), "text", False
+    name, suffixes, content = "plain", (".plain",), "text"
 
     def __init__(self, digits=9, crash=False):
         self.digits, self.crash = digits, crash
@@ -184,6 +191,7 @@ class PlainText:
 
 def test_a_sound_format_of_a_third_party_passes():
     edp.testing.check_log_format(PlainText())
+    assert not holds_truth_apart(PlainText())
 
 
 @pytest.mark.parametrize(
