@@ -38,7 +38,7 @@ lock: ## write requirements.lock from pyproject.toml and constraints.txt; give t
 demo: $(READY) ## the main job, small: simulate, train, judge, write a report page
 	$(BIN)/edp demo --out demo
 
-check: lint ## lint, and contracts and unit tests that start no process
+check: lint ## lint, contracts and unit tests that start no process and train for no seconds
 	$(BIN)/python -m pytest -n $(WORKERS) --no-processes tests/contracts tests/unit
 
 test: $(READY) ## the fast tests

@@ -177,13 +177,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if process_guard.starts_processes(item):
             item.add_marker("processes")
+        elif process_guard.takes_long(item):
+            item.add_marker("training")
     if config.getoption("--no-processes"):
-        config.hook.pytest_deselected(items=[item for item in items if item.get_closest_marker("processes")])
-        items[:] = [item for item in items if not item.get_closest_marker("processes")]
+        left_out = [item for item in items if any(map(item.get_closest_marker, ("processes", "training")))]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    if not item.config.getoption("--no-processes"):
+        return (yield)
     with process_guard.watching():
         return (yield)
 
@@ -286,17 +291,22 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
     Backbones alone and with full slots take every form; the others every fifth, each from another start, so that all
     activations, horizons and modes still meet every block. With the mark
-    `covering`, structures beyond `COVERING` are slow.
+    `covering`, structures beyond `COVERING` are slow. `make check` takes the covering ones alone, each in every fifth
+    form.
     """
+    quick = metafunc.config.getoption("--no-processes")
     if {"structure", "form"} <= set(metafunc.fixturenames):
         pairs = []
         for number, structure in enumerate(STRUCTURES):
+            if quick and structure not in COVERING:
+                continue
             agreed = forms_of(structure)
-            some = agreed if "+" not in structure or structure.endswith("+all") else agreed[number % 5 :: 5]
+            every = not quick and ("+" not in structure or structure.endswith("+all"))
+            some = agreed if every else agreed[number % 5 :: 5]
             pairs += [(structure, form) for form in some]
         ids = [f"{structure}-{form[0]}-{len(form[1])}-{form[2]}" for structure, form in pairs]
         metafunc.parametrize(("structure", "form"), pairs, ids=ids)
     elif "structure" in metafunc.fixturenames:
-        fast = COVERING if metafunc.definition.get_closest_marker("covering") else STRUCTURES
+        fast = COVERING if quick or metafunc.definition.get_closest_marker("covering") else STRUCTURES
         marks = {name: () if name in fast else pytest.mark.slow for name in STRUCTURES}
         metafunc.parametrize("structure", [pytest.param(name, marks=mark) for name, mark in marks.items()])

@@ -20,6 +20,44 @@ FOLDERS = ("examples", "export", "fuzz", "golden", "parity", "properties", "secu
 """Whose tests run compilers, commands and workers, or belong to no quick check."""
 FIXTURES = frozenset({"edp", "lever_sessions", "six_sessions"})
 """Reading a log starts the sandbox of the readers, and all of these read logs."""
+FILES = frozenset(
+    (
+        *("pretraining/test_pretraining", "report/test_animation", "search/test_cluster", "search/test_kill_storm"),
+        *("search/test_ledger", "search/test_local_pool", "test_logs_errors", "test_logs_formats", "test_logs_mdf"),
+        *("test_logs_octave", "test_logs_parquet", "test_logs_rosbag", "test_logs_time_and_quality", "test_logs_truth"),
+        *("test_workflow", "test_trials", "transfer/test_checks", "transfer/test_finetune", "transfer/test_centring"),
+        *("test_sim_limit", "test_sim_recordings", "test_front_door"),
+    )
+)
+"""Of ``tests/unit``: whose tests read logs or start workers."""
+NAMES = (
+    *("boosted_trees", "test_data_set_tells_repeats_and_a_channel", "test_nothing_but_a_proposal_is_a_page_too"),
+    *("test_inverse_kinematics_undo", "test_a_family_takes_the_place_of_the_file", "test_closed_loops_give_the_same"),
+    *("test_a_process_killed_while_it_writes", "test_films", "test_the_contracts_need_no_test_runner"),
+)
+"""How single tests begin, or what stands in their name, where the rest of the file starts nothing."""
+TRAINING = frozenset(
+    (
+        *(
+            "test_training_resume",
+            "test_training_fit",
+            "test_training_parts",
+            "test_search_phases",
+            "test_search_study",
+        ),
+        *(
+            "test_search_study",
+            "test_starting_channels",
+            "test_distillation",
+            "test_discriminative",
+            "test_qat",
+            "test_ridge_start",
+        ),
+        *("report/study/test_study_page", "screening/test_screening_figures", "stats/test_null_calibration"),
+        *("report/test_screening_page", "report/test_transfer_page", "test_compress_search", "test_downsizing"),
+    )
+)
+"""Of ``tests/unit``: whose tests train networks or draw pages for seconds each."""
 EVENTS = frozenset(
     ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.spawn", "os.system", "os.exec", "pty.spawn")
 )
@@ -33,10 +71,23 @@ class ProcessStartedError(BaseException):
 
 def starts_processes(item: pytest.Item) -> bool:
     """Whether a test's folder or one of its fixtures starts processes."""
-    place = item.path.relative_to(HERE).as_posix() if item.path.is_relative_to(HERE) else ""
-    return place.startswith(tuple(f"{folder}/" for folder in FOLDERS)) or bool(
-        FIXTURES & set(getattr(item, "fixturenames", ()))
-    )
+    place = _place(item)
+    of_folder = place.startswith(tuple(f"{folder}/" for folder in (*FOLDERS, "unit/api"))) or _in_unit(place, FILES)
+    of_name = any(name in item.name for name in NAMES)
+    return of_folder or of_name or bool(FIXTURES & set(getattr(item, "fixturenames", ())))
+
+
+def takes_long(item: pytest.Item) -> bool:
+    """Whether a test trains networks for seconds: none of the quick check either."""
+    return _in_unit(_place(item), TRAINING)
+
+
+def _place(item: pytest.Item) -> str:
+    return item.path.relative_to(HERE).as_posix() if item.path.is_relative_to(HERE) else ""
+
+
+def _in_unit(place: str, names: frozenset[str]) -> bool:
+    return place.removeprefix("unit/").removesuffix(".py") in names
 
 
 def install() -> None:
