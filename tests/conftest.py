@@ -17,7 +17,7 @@ from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError, ExportError
 from edp.ir.w8a16 import calibrate
 from edp.networks.activations import ACTIVATIONS
-from edp.networks.backbones import BACKBONES, GruSpec, HybridSpec, LstmSpec, TcnSpec
+from edp.networks.backbones import BACKBONES, CommitteeSpec, GruSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.networks.blocks import BLOCKS
 from edp.networks.blocks.base import OUTPUT_SLOTS, SHARED_SLOTS
 from edp.networks.cells import CELLS
@@ -47,6 +47,10 @@ SMALL = {
             HybridSpec(channels=(4,), kernel=2, units=3, initial=spec)
             for spec in (INITIAL_STATES["constant"](), INITIAL_STATES["prefix"](ticks=5, hidden=3))
         ),
+    ],
+    "committee": [
+        CommitteeSpec(lags=(1, 3, 4, 6), members=2, units=3),
+        CommitteeSpec(lags=(2,), members=1, units=4, layers=1, activations=("relu",), dropout=0.2),
     ],
     "cylinder_gate": [BLOCKS["cylinder_gate"](), BLOCKS["cylinder_gate"](form="linear")],
     "attention_bridge": [BLOCKS["attention_bridge"](heads=2)],

@@ -20,7 +20,7 @@ from edp.networks.streaming import Cost, Streaming
 from edp.testing.streaming import check_work_counted
 from edp.training.bundle import blank_scaler
 from edp.workflows.compression import dynamic_int8
-from edp.workflows.train_evaluate import footprint_of
+from edp.workflows.deployment import footprint_of
 
 
 def test_every_network_of_the_registries_passes(structure, predictor_of):

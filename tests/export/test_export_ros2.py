@@ -78,7 +78,7 @@ def test_the_core_predicts_what_pytorch_predicts(whole, package_of, bundle_of):
     inputs = random_inputs(predictor, 60, seed=3)
     found = []
     for row in inputs:
-        assert made.step(row.tolist()) <= core.Status.WARMING
+        assert made.step(row.tolist()) <= core.CallStatus.WARMING
         other.step((2 * row).tolist())  # another machine beside it
         found.append(np.concatenate([np.ravel(made.result(meaning)) for meaning in made.results]))
     wanted = stream(predictor, inputs)
@@ -117,7 +117,7 @@ def test_missed_ticks_are_held_and_long_gaps_forget(ticks, bundle_of):
     held = np.concatenate([rows[:20], rows[[19, 19, 20]]])
     np.testing.assert_allclose(same.ravel(), stream(bundle_of("hybrid+all").predictor, held)[-1], rtol=1e-3, atol=1e-4)
     tick = fed(ticks, rows[21], 0.22 + 0.07)
-    assert (tick.missed, tick.status, ticks.core.counts["restarts"]) == (6, core.Status.WARMING, 1)
+    assert (tick.missed, tick.status, ticks.core.counts["restarts"]) == (6, core.CallStatus.WARMING, 1)
 
 
 def test_late_and_double_messages_are_no_ticks(ticks, bundle_of):
@@ -131,7 +131,7 @@ def test_late_and_double_messages_are_no_ticks(ticks, bundle_of):
     assert fed(ticks, rows[12], 0.12).valid
     assert (ticks.rejected, ticks.core.counts["ticks"]) == (4, 13)
     tick = fed(ticks, rows[0], -50.0)  # another recording
-    assert (tick.status, ticks.core.counts["ticks"]) == (core.Status.WARMING, 1)
+    assert (tick.status, ticks.core.counts["ticks"]) == (core.CallStatus.WARMING, 1)
 
 
 @pytest.mark.parametrize(("rate", "said"), [(50.0, "at 50.0 Hz"), (125.0, "at 125.0 Hz"), (1000.0, "at 1000.0 Hz")])
@@ -168,7 +168,7 @@ def test_missing_old_and_bad_inputs_are_held_and_named(changed, said, ticks, bun
         tick = fed(
             ticks, np.array(changed.get("row", rows[12])), 0.12, names=changed.get("names", ["stick", "bucket", "boom"])
         )
-    assert tick.status is core.Status.HELD
+    assert tick.status is core.CallStatus.HELD
     assert not tick.valid
     assert said in tick.why
     for at in range(13, 30):
@@ -280,7 +280,7 @@ def node_of(package_of, monkeypatch):
         node = importlib.import_module("edp.export.ros2.package.node")
         folder = package_of("hybrid+all")
         monkeypatch.setattr(node, "Core", lambda: core.Core(folder))
-        return node.Predictor(), sent, logged
+        return node.PredictorNode(), sent, logged
 
     return make
 

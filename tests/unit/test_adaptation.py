@@ -20,7 +20,8 @@ from edp.storage import read_json, write_json
 from edp.training import load_bundle, save_bundle
 from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
 from edp.workflows.adaptation import adapt, fit_adaptation, replay
-from edp.workflows.train_evaluate import evaluate, footprint_of, train, trained_run
+from edp.workflows.deployment import footprint_of
+from edp.workflows.train_evaluate import evaluate, train, trained_run
 
 SETTINGS = (
     'task.features={name="levers", channels=["speed", "lever"]}',

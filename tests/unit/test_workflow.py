@@ -21,12 +21,12 @@ from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, TABLE_A1, Channel, Kind, SignalMap
 from edp.training import Diverged, load_bundle
 from edp.training.objective import Objective
+from edp.workflows.deployment import footprint_of
 from edp.workflows.train_evaluate import (
     DataSource,
     SimulationOrder,
     build_report,
     evaluate,
-    footprint_of,
     judge_bundle,
     prepare_data,
     simulate_data_set,

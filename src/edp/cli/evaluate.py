@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
     from edp.logs.source import DataSource
 
+BEATEN = 6
+"""Exit code where a baseline has less error than the network."""
+
 
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train.")],
@@ -31,14 +34,21 @@ def evaluate(
 ) -> None:
     """Score a trained model on held-out recordings beside baselines.
 
+    Ends with exit code 6 where a baseline has less error than the network.
+
     Example: `edp evaluate runs/first` or `edp evaluate runs/first --data logs/monday --map mine.toml`
     """
     names = None if baselines is None else [n for n in baselines.split(",") if n and n != "none"]
     source = None if data is None else source_of(data, signal_map, repair)
+    from edp.evaluation.guard import beaten_by
+
     folder, scores = run_evaluation(run, source, names, as_json)
+    beaten = beaten_by(scores)
     importances = run_importance(run, source, as_json) if channel_importance else None
 
     def show() -> None:
+        if beaten is not None:
+            out.print(beaten.sentence(), style="bold red")
         score_table(scores)
         out.print(f"scores in {folder / 'scores.json'}")
         if importances is not None:
@@ -46,8 +56,11 @@ def evaluate(
             out.print(f"importance of the channels in {folder / 'channel_importance.json'}")
         out.print(f"next: edp report {folder}")
 
+    facts = {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **scores}
     importance_json = {} if importances is None else {"channel_importance": importances.to_json()}
-    emit(as_json, {"folder": str(folder), **scores} | importance_json, show)
+    emit(as_json, facts | importance_json, show)
+    if beaten is not None:
+        raise typer.Exit(BEATEN)
 
 
 def run_evaluation(

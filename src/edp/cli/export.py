@@ -38,7 +38,7 @@ def export(
 
     Example: `edp export runs/first --to c --out firmware/predictor`
     """
-    from edp.workflows.train_evaluate import export_bundle, unheld_adaptation
+    from edp.workflows.deployment import export_bundle, unheld_adaptation
 
     files = export_bundle(bundle, to, folder, name, dict(map(_option, changes or [])))
 

@@ -23,7 +23,7 @@ def footprint(
     Example: `edp footprint examples/thesis/table_b1.toml --budget examples/budgets/small_controller.toml`
     """
     from edp.evaluation.controller import CORES, Budget, load_budget
-    from edp.workflows.train_evaluate import footprint_of
+    from edp.workflows.deployment import footprint_of
 
     limits_of = Budget() if budget is None else load_budget(budget)
     counts, name = footprint_of(file, None if budget is None else limits_of)

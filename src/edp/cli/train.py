@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from edp.logs.source import DataSource
     from edp.training import Bundle, TrainingProgress
 
+AUTO = "auto"
+"""`edp.config.experiment.AUTO`, known here without loading that module."""
 MapOption = Annotated[Path | None, typer.Option("--map", help="Signal map (TOML) from your columns to channels.")]
 RepairOption = Annotated[
     list[str], typer.Option("--repair", help="Repair logs: nan=hold, gaps=hold|cut, duplicates=last, falling=sort.")
@@ -26,7 +30,15 @@ def train(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
-    preset: Annotated[str, typer.Option(help="quick, small, standard or thesis.")] = "standard",
+    preset: Annotated[
+        str,
+        typer.Option(
+            help="auto tries several models and keeps the best; or quick, small, committee, standard, thesis."
+        ),
+    ] = "auto",
+    minutes: Annotated[
+        float | None, typer.Option(help="Of the preset auto: processor time to spend on training; default 5.")
+    ] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example training.epochs=10.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -34,11 +46,19 @@ def train(
 ) -> None:
     """Train a causal network on recordings and write a bundle.
 
-    Ends with exit code 4 where the training diverged; the bundle then holds the best weights before that.
+    The preset auto, the default, tries several models, keeps the simplest of those that predict left-out recordings
+    best, and says which one and why. Ends with exit code 4 where the training diverged; the bundle then holds the best
+    weights before that.
 
-    Example: `edp train data/m22 --out runs/first --preset quick --set "task.horizons=[1, 10]"`
+    Example: `edp train data/m22 --out runs/first --set "task.horizons=[1, 10]"`
     """
-    bundle, best = run(data, folder, config, preset, changes, source_of(data, signal_map, repair), as_json)
+    source = source_of(data, signal_map, repair)
+    if preset == AUTO:
+        _train_auto(source, folder, config, changes, minutes, as_json)
+        return
+    if minutes is not None:
+        raise ConfigError(f"--minutes came with the preset '{preset}'; only the preset auto has a budget: leave it out")
+    bundle, best = run(data, folder, config, preset, changes, source, as_json)
     facts = {
         "run": str(folder),
         "bundle": str(folder / "bundle"),
@@ -53,6 +73,39 @@ def train(
         out.print(f"next: edp evaluate {folder}")
 
     emit(as_json, facts, show)
+
+
+def _train_auto(
+    source: DataSource, folder: Path, config: Path | None, changes: Sequence[str], minutes: float | None, quiet: bool
+) -> None:
+    """Train the portfolio with a progress display, and say what was chosen."""
+    from edp.workflows.auto import load_auto, train_auto
+
+    own = [] if minutes is None else [f"auto.minutes={minutes!r}"]
+    settings = load_auto(config, [*changes, *own])
+    with progress(quiet) as shown:
+        display = TrainingDisplay(shown, Steps(quiet))
+        result = train_auto(source, settings, folder, display.on_event, display.on_candidate)
+    facts = {"run": str(folder), "bundle": str(folder / "bundle"), **result.facts}
+
+    def show() -> None:
+        out.print(result.sentence)
+        _promise_table(result.facts)
+        out.print(f"bundle in {folder / 'bundle'}")
+        out.print(f"next: edp evaluate {folder}")
+
+    emit(quiet, facts, show)
+
+
+def _promise_table(facts: dict[str, Any]) -> None:
+    """Print what each candidate promises, by output."""
+    rows = []
+    for name, one in facts["candidates"].items():
+        mark = "*" if name == facts["chosen"] else ""
+        share = f"{100 * math.exp(facts['excess'][name] - facts['excess'][facts['chosen']]) - 100:+.1f} %"
+        rows.append([f"{one['label']} {mark}".strip(), f"{one['parameters']:,}", duration(one["seconds"]), share])
+    title = f"error on left-out data against the model that is kept (*), within {facts['minutes']:g} min"
+    table(title, ["model", "parameters", "trained in", "error"], rows)
 
 
 def run(
@@ -99,6 +152,12 @@ class TrainingDisplay:
         self.shown, self.steps = shown, steps
         self.bar = shown.add_task("train", total=1.0, note="")
         self.best: float | None = None
+        self.model = ""
+
+    def on_candidate(self, label: str, done: int, count: int) -> None:
+        """The training of another model begins, after `done` of `count`."""
+        self.best, self.model = None, f"{label} ({done + 1} of {count}), "
+        self.steps.say(f"train: {label}, model {done + 1} of {count}", force=True)
 
     def on_event(self, event: TrainingProgress) -> None:
         """Show one event."""
@@ -106,7 +165,7 @@ class TrainingDisplay:
             self.best = event.row["validation_mae"]
         score = "" if self.best is None else f", validation MAE {self.best:.4g}"
         stage = "refit, " if event.refit else ""
-        note = f"{stage}epoch {event.epoch}/{event.epochs}, {event.targets_per_s:,.0f} targets/s{score}"
+        note = f"{self.model}{stage}epoch {event.epoch}/{event.epochs}, {event.targets_per_s:,.0f} targets/s{score}"
         self.shown.update(self.bar, completed=event.share, note=note)
         self.steps.say(f"train: {note}, {duration(event.seconds_left)} left", force=event.row is not None)
 

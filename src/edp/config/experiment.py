@@ -44,7 +44,9 @@ SETTINGS = SettingsTree(
 """Reads and writes the tables of an experiment and of its parts."""
 build = SETTINGS.build
 plain_tree = SETTINGS.plain
-PRESETS = ("quick", "small", "standard", "thesis")
+PRESETS = ("quick", "small", "committee", "standard", "thesis")
+AUTO = "auto"
+"""The preset that leaves network and training to `edp.workflows.auto`; it is no experiment by itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +137,11 @@ def load_experiment(
     """
     table: Table = {}
     where = f"preset '{preset}'"
+    if preset == AUTO:
+        raise ConfigError(
+            f"the preset '{AUTO}' chooses a network by the recordings; only edp train does so. Here name one of "
+            f"{', '.join(PRESETS)}"
+        )
     if preset is not None:
         table = preset_table(preset)
     if path is not None:
@@ -152,8 +159,8 @@ def preset_table(name: str) -> Table:
     Raises:
         ConfigError: there is none of this name.
     """
-    if name not in PRESETS:
-        raise ConfigError(f"there is no preset '{name}'{closest(name, PRESETS)}")
+    if name not in (*PRESETS, AUTO):
+        raise ConfigError(f"there is no preset '{name}'{closest(name, (*PRESETS, AUTO))}")
     text = resources.files("edp.config").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8")
     return storage.parse_toml(text, f"preset '{name}'", ConfigError)
 

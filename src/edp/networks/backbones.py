@@ -9,13 +9,15 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from edp.errors import ConfigError
+from edp.errors import ConfigError, closest
 from edp.ir import Builder
 from edp.networks.blocks.base import BlockSlot, BranchMaker
 from edp.networks.cells import CellSpec, GruCell, LstmCell, Stack
 from edp.networks.cells.base import check_cell
+from edp.networks.committee import NON_LINEAR, Committee, Members
 from edp.networks.convolution import ConvolutionStack, receptive_field
 from edp.networks.initial import InitialSpec, ZeroState
+from edp.networks.lag_bank import LagBank, check_lags
 from edp.networks.pooling import AttentionPooling
 from edp.networks.streaming import Chain, Cost, State, Streaming
 from edp.registry import Registry
@@ -24,6 +26,7 @@ from edp.settings.bounds import (
     MOST_KERNEL,
     MOST_LAYERS,
     MOST_LEVELS,
+    MOST_NAMES,
     MOST_UNITS,
     below,
     check_bounds,
@@ -218,6 +221,61 @@ class HybridSpec:
         encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
         stack = Stack(self.cell, width, self.units, self.layers, self.dropout, self.zoneout)
         net = RecurrentBackbone(encoder, self.initial.build(stack, width), self.units, self.dropout, window, blocks)
+        return net, net.width
+
+
+@BACKBONES.register("committee")
+@dataclass(frozen=True, kw_only=True)
+class CommitteeSpec:
+    """Perceptrons side by side on present values and their changes over several spans, for a linear head.
+
+    Without recurrence: a member sees the changes over `lags` ticks and nothing older. With the head ``linear`` the
+    prediction is a linear map of the changes plus a weighted mean of the members.
+
+    Attributes:
+        lags: spans in ticks, rising.
+        members: perceptrons for each activation.
+        units: hidden units of each layer of a member.
+        layers: hidden layers of a member.
+        activations: ``tanh``, ``relu`` or both; each has its own group of members. None leaves the linear model.
+        dropout: rate after each hidden layer, in training.
+    """
+
+    lags: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    members: int = 10
+    units: int = 64
+    layers: int = 2
+    activations: tuple[str, ...] = ("tanh", "relu")
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_count("backbone", "lags", self.lags, MOST_LEVELS, least=1)
+        check_lags(self.lags)
+        check_count("backbone", "activations", self.activations, len(NON_LINEAR))
+        check_bounds("backbone", self, members=whole(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
+        for name in self.activations:
+            if name not in NON_LINEAR or self.activations.count(name) > 1:
+                raise ConfigError(
+                    f"committee: activations = {list(self.activations)}; each of {', '.join(NON_LINEAR)} at most once "
+                    f"must hold{closest(name, [*NON_LINEAR])}"
+                )
+
+    def slots(self) -> tuple[BlockSlot, ...]:
+        """None: the members are all there is."""
+        return ()
+
+    def parts(self) -> tuple[str, ...]:
+        """The members; the changes have no weights."""
+        return ("groups",)
+
+    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+        """The bank of changes and the members on it."""
+        bank = LagBank(features, self.lags)
+        groups = [
+            Members(bank.columns, self.members, self.units, self.layers, name, self.dropout)
+            for name in self.activations
+        ]
+        net = Committee(bank, groups)
         return net, net.width
 
 

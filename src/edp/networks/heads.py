@@ -90,6 +90,31 @@ class GluHead:
         return Heads(width, outputs, values, [GATED] + [RELU] * (self.layers - 1), self.hidden, mix)
 
 
+@HEADS.register("linear")
+@dataclass(frozen=True, kw_only=True)
+class LinearHead:
+    """``y_c = w_c h + b_c`` for each output c: no hidden layer.
+
+    A block that mixes the hidden features of outputs has nothing to mix, and is refused.
+    """
+
+    @property
+    def hidden(self) -> int:
+        """None: what a part sees that asks for the width of hidden features."""
+        return 1
+
+    def conflicts(self, model: Any, task: Any) -> str | None:
+        """A block on the hidden features of outputs, of which there are none."""
+        mixing = [type(block).__name__ for block in model.blocks if getattr(block, "slot", None) == "mix"]
+        if mixing:
+            return f"the head 'linear' has no hidden features for the block {mixing[0]}; take the head 'mlp' or 'glu'"
+        return None
+
+    def build(self, width: int, outputs: int, values: int, mix: Streaming | None = None) -> Heads:
+        """Heads of one linear layer."""
+        return Heads(width, outputs, values, [], 1, mix)
+
+
 @dataclass(frozen=True)
 class GatedUnit:
     """A non-linearity behind a linear layer that is `factor` times as wide as what it gives."""
@@ -152,6 +177,8 @@ class Heads(Streaming):
             y = (x @ shared).unflatten(-1, (self.outputs, -1)) + self.biases[0]
         else:
             y = self._layer(0, x)
+        if not self.units:
+            return y.transpose(2, 3), state
         y = self.units[0].apply(y)
         for layer, unit in enumerate(self.units[1:], start=1):
             y = unit.apply(self._layer(layer, y))
@@ -170,14 +197,15 @@ class Heads(Streaming):
             x = build.add(Dense, "layer1", x, weight=first, bias=bias)
         else:
             x = build.add(GroupedDense, "layer1", x, weight=weights[0], bias=self.biases[0])
-        x = self.units[0].lower(build, x, self.outputs)
-        for number, unit in enumerate(self.units[1:], start=1):
-            x = build.add(GroupedDense, f"layer{number + 1}", x, weight=weights[number], bias=self.biases[number])
-            x = unit.lower(build, x, self.outputs)
-        if self.mix is not None:
-            x = self.mix.lower(build, x)
-        last = f"layer{len(self.weights)}"
-        x = build.add(GroupedDense, last, x, weight=weights[-1], bias=self.biases[-1])
+        if self.units:
+            x = self.units[0].lower(build, x, self.outputs)
+            for number, unit in enumerate(self.units[1:], start=1):
+                x = build.add(GroupedDense, f"layer{number + 1}", x, weight=weights[number], bias=self.biases[number])
+                x = unit.lower(build, x, self.outputs)
+            if self.mix is not None:
+                x = self.mix.lower(build, x)
+            last = f"layer{len(self.weights)}"
+            x = build.add(GroupedDense, last, x, weight=weights[-1], bias=self.biases[-1])
         values = self.widths[-1]
         return build.pick("by_value", x, [c * values + v for v in range(values) for c in range(self.outputs)])
 

@@ -52,5 +52,7 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
         changed["channels"] = tuple(narrower(width) for width in channels[:levels])
     elif levels is not None:
         raise ConfigError(f"student: levels = {levels}, but the teacher has no convolutions; leave it out")
-    head = replace(model.head, hidden=narrower(model.head.hidden))  # type: ignore[type-var]
+    head = model.head
+    if "hidden" in {entry.name for entry in fields(head)}:  # type: ignore[arg-type]
+        head = replace(head, hidden=narrower(head.hidden))  # type: ignore[type-var]
     return replace(model, backbone=replace(model.backbone, **changed), head=head)  # type: ignore[type-var]

@@ -12,7 +12,7 @@ from edp.data.task import Task
 MOST_PARAMETERS = 50_000_000
 # Numbers that a stream carries from tick to tick: 0.4 GB as float32, and a training has a stream for each lane.
 MOST_STATE = 100_000_000
-NO_WIDTHS = ("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations")
+NO_WIDTHS = ("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations", "lags")
 """Options in whole numbers that are not the width of anything."""
 
 
@@ -30,6 +30,9 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
         return max((value for key, value in options if key == name), default=1)
 
     width = max([features, *(value for key, value in options if key not in NO_WIDTHS)])
+    spans = sum(key == "lags" for key, _ in options)
+    if spans:  # the representation of a committee: changes over each span, and all members
+        width = features * (1 + spans) + 2 * most("members") * most("units")
     levels = sum(key == "channels" for key, _ in options)
     stacks = max(1, sum(key == "first_dilations" for key, _ in options))
     layers = sum(value for key, value in options if key == "layers")
@@ -43,7 +46,13 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
     values = len(task.horizons) * spec.output.values
     ends = targets * values * (2 * width + features * most("taps"))
     small = 64 * stacks * (targets + levels + layers + 1) * width  # biases, norms, gates by feature
-    reach = spec.window + 2 * most("kernel") * most("first_dilations") * 2**levels + most("taps") + most("ticks")
+    reach = (
+        spec.window
+        + 2 * most("kernel") * most("first_dilations") * 2**levels
+        + most("taps")
+        + most("ticks")
+        + 2 * most("lags")
+    )
     return squares * width**2 + ends + small, 4 * reach * stacks * (levels + layers + 2) * width
 
 

@@ -20,6 +20,7 @@ from edp.errors import ConfigError, DataError
 from edp.networks.predictor import ModelSpec, build_model, trainable
 from edp.networks.streaming import State, detach_state, reset_where
 from edp.storage.runs import RunFolder
+from edp.training.bagging import fit_in_folds
 from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, damaged, load_checkpoint, save_checkpoint
 from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
@@ -55,6 +56,8 @@ def fit(
     """
     torch.set_num_threads(thread_count(spec))
     tell = on_event or (lambda event: None)
+    if spec.bagging is not None:
+        return fit_in_folds(data, model, spec, run[0] if run else None, tell, strategy)
     fitted = Loop(data, model, spec, run, strategy).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:
@@ -131,9 +134,7 @@ class Loop:
         self.windowed = windowed
         self.objective = Objective(spec, self.net.code)
         self.updates = spec.updates or max(1, self.sampler.updates())
-        if (
-            started and refitted is None
-        ):  # The regression is a candidate itself: training must improve on it to be kept.
+        if started and refitted is None:  # the regression is a candidate itself: training must improve on it
             self.progress.best_score = self._validate()[0]
 
     def _sampler(self, series: Sequence[Series]) -> Sampler:

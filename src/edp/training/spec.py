@@ -8,7 +8,11 @@ from edp.data.augment import AugmentationSpec
 from edp.data.chunks import ChunkSpec
 from edp.data.task import Task
 from edp.errors import ConfigError
+from edp.networks.activations import Identity
+from edp.networks.backbones import CommitteeSpec
+from edp.networks.heads import LinearHead
 from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights, Huber, LossSpec, TermSpec
+from edp.networks.losses.base import Penalty
 from edp.networks.outputs import OUTPUTS
 from edp.networks.predictor import ModelSpec
 from edp.settings.bounds import (
@@ -24,6 +28,7 @@ from edp.settings.bounds import (
     whole,
 )
 from edp.training.averages import AverageSpec, Exponential
+from edp.training.bagging_spec import BaggingSpec
 from edp.training.optimizers import AdamW, OptimizerSpec
 from edp.training.schedules import Cosine, ScheduleSpec
 
@@ -54,6 +59,8 @@ class TrainingSpec:
         refit: train anew on training and validation stretches together, for short data: ``best`` for as many epochs as
             were best before, ``whole`` for all of them, to the end of the schedule, ``none`` not at all. The
             calibration of intervals stays that of the first training.
+        bagging: train a committee on folds, by rows and not by chunks; of the other settings only `loss`, `seed` and
+            `threads` then count. None trains in chunks.
         clip_norm: largest global gradient norm.
         seed: root of every random choice.
         threads: CPU threads, 0 for all cores; more than one pays for wide networks on an idle machine only, and
@@ -78,6 +85,7 @@ class TrainingSpec:
     updates: int = 0
     patience: int = 8
     refit: str = "none"
+    bagging: BaggingSpec | None = None
     clip_norm: float = 1.0
     seed: int = 0
     threads: int = 1
@@ -142,8 +150,41 @@ def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:
             f"adaptive.blend = {spec.adaptive.blend} weighs outputs against one another, but the task has one target "
             f"('{task.targets[0]}'); set it to 0"
         )
+    if spec.bagging is not None:
+        reasons += _against_bagging(model, spec, spec.bagging)
     if reasons:
         raise ConfigError("training: " + "; ".join(reasons))
+
+
+def _against_bagging(model: ModelSpec, spec: TrainingSpec, bagging: BaggingSpec) -> list[str]:
+    """What stands against training on folds."""
+    reasons = []
+    if not isinstance(model.backbone, CommitteeSpec) or not isinstance(model.head, LinearHead):
+        reasons.append(
+            "bagging trains model.backbone = 'committee' with model.head = 'linear'; take these, or leave it"
+        )
+    elif model.backbone.members % bagging.folds:
+        reasons.append(
+            f"bagging.folds = {bagging.folds} with {model.backbone.members} members; a multiple of the folds must hold"
+        )
+    parts = [
+        name
+        for name, present in (
+            ("model.blocks", bool(model.blocks)),
+            ("model.physics", model.physics is not None),
+            ("model.output", OUTPUTS.name_of(model.output) != "point"),
+            ("model.activation", not isinstance(model.activation, Identity)),
+            ("training.terms", bool(spec.terms)),
+            ("training.augmentations", bool(spec.augmentations)),
+        )
+        if present
+    ]
+    if parts:
+        reasons.append(f"bagging does not train {', '.join(parts)}; leave it out")
+    if not isinstance(spec.loss, Penalty):
+        fitting = [name for name, part in LOSSES.items() if issubclass(part, Penalty)]
+        reasons.append(f"bagging with the loss '{LOSSES.name_of(spec.loss)}'; {_either(fitting)} must hold")
+    return reasons
 
 
 def _either(names: tuple[str, ...] | list[str]) -> str:

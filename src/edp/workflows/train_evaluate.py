@@ -28,21 +28,16 @@ from edp.errors import DataError
 from edp.evaluation.channel_importance import ChannelImportances, ChannelImportanceSpec, measure_channel_importance
 from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
-from edp.evaluation.footprint import Footprint, check_possible, footprint
+from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
-from edp.evaluation.mac_check import check_counted
-from edp.export import TARGETS, make_target
-from edp.ir.rls import Adaptation
 from edp.logs.source import DataSource
-from edp.networks.integer import IntegerPredictor
-from edp.networks.narrow import student
-from edp.networks.predictor import ModelSpec, Predictor, build_model, check_combination, describe
+from edp.networks.predictor import check_combination, describe
 from edp.report import build_report
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import check_writable, make_folder, read_object, write_bytes, write_json
 from edp.storage.runs import RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, fit, load_bundle, make_bundle, save_bundle
-from edp.training.bundle import blank_scaler, weights_digest
+from edp.training.bundle import weights_digest
 from edp.training.fit import thread_count
 from edp.training.spec import check_training
 from edp.training.strategy import TrainingStrategy
@@ -147,6 +142,30 @@ def train(
             run.write_status("diverged", message=str(end), **end.facts)
             raise
         bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, frozen) | taught, data)
+        run.write_status("finished")
+    return bundle
+
+
+def keep_fitted(
+    out: Path, made_of: tuple[DataSource, Experiment, Prepared], fitted: Fitted, facts: dict[str, Any]
+) -> Bundle:
+    """Write the run folder of a training that was run elsewhere, as `train` would have.
+
+    Args:
+        out: run folder.
+        made_of: recordings, settings and what was prepared from both.
+        fitted: what the training gave.
+        facts: further plain values of the provenance.
+
+    Raises:
+        StorageError: the folder holds another run.
+    """
+    source, experiment, data = made_of
+    settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+    with RunFolder(out) as run:
+        run.claim(run_key(settings, data.digest), experiment_toml(experiment))
+        run.write_history(fitted.history)
+        bundle = _keep(run, fitted, _provenance(source, experiment, data, fitted.seconds, {}) | facts, data)
         run.write_status("finished")
     return bundle
 
@@ -329,58 +348,6 @@ def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) 
     return judge(bundle.predictor, data, spec or JudgeSpec(), describe(bundle.predictor.spec))
 
 
-def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footprint, str]:
-    """Footprint of a bundle, a run folder, or a settings file, and what it is called.
-
-    Raises:
-        EdpError: neither a bundle nor valid settings, a budget that no network of these inputs and targets meets, or a
-            part that counts other work than it does.
-    """
-    predictor, name, adaptation = _predictor_of(path)
-    check_counted(predictor)
-    if budget is not None:
-        alone = replace(predictor.spec, blocks=(), physics=None)
-        check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
-    return footprint(predictor, adaptation), name
-
-
-def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
-    source = Path(path)
-    if source.suffix == ".toml":
-        experiment = load_experiment(source)
-        task = experiment.task.resolve(100.0, physics=experiment.model.physics)
-        return _untrained(experiment.model, task), source.stem, None
-    bundle = load_bundle(source)
-    predictor = bundle.predictor
-    # Integer networks have the counts of the network that they were quantised from.
-    counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
-    return counted, describe(predictor.spec), bundle.adaptation
-
-
-def export_bundle(
-    path: str | Path,
-    to: str,
-    folder: str | Path,
-    name: str = "predictor",
-    options: Mapping[str, object] | None = None,
-) -> list[Path]:
-    """Write a bundle or the bundle of a run folder in the form `to`; returns the files, the one to read first in front.
-
-    Raises:
-        EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
-    """
-    return make_target(to, options).write(load_bundle(path), name, Path(folder))
-
-
-def unheld_adaptation(path: str | Path, to: str) -> bool:
-    """Whether a bundle has an adaptation that the form `to` leaves out."""
-    return load_bundle(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
-
-
-def _untrained(model: ModelSpec, task: Any) -> Predictor:
-    return build_model(task, model, blank_scaler(task), seed=0)
-
-
 __all__ = [
     "DataSource",
     "SimulationOrder",
@@ -389,12 +356,9 @@ __all__ = [
     "channel_importance",
     "coverage",
     "evaluate",
-    "export_bundle",
-    "footprint_of",
     "judge_bundle",
     "prepare_data",
     "simulate_data_set",
     "train",
     "trained_run",
-    "unheld_adaptation",
 ]

@@ -53,5 +53,6 @@ def rig_model(tmp_path_factory: pytest.TempPathFactory) -> edp.TrainedPredictor:
         horizons=[2, 5],
         test=data[3:],
         out=tmp_path_factory.mktemp("api") / "run",
+        preset="quick",
         settings=TINY | {"model.output": {"kind": "quantiles"}, "training.loss": {"kind": "quantile"}},
     )

@@ -33,14 +33,14 @@ def test_a_run_on_disk_is_what_the_commands_work_on(rig_model, rig):
 
 def test_a_finished_training_is_read_again_and_another_one_refused(rig_model, rig, tiny_settings):
     settings = tiny_settings | {"model.output": {"kind": "quantiles"}, "training.loss": {"kind": "quantile"}}
-    same = edp.train(rig[:3], ["speed"], [2, 5], test=rig[3:], out=rig_model.folder, settings=settings)
+    same = edp.train(rig[:3], ["speed"], [2, 5], test=rig[3:], out=rig_model.folder, preset="quick", settings=settings)
     assert same.folder == rig_model.folder
     with pytest.raises(StorageError, match="holds another run"):
-        edp.train(rig[:3], ["speed"], [2], test=rig[3:], out=rig_model.folder, settings=settings)
+        edp.train(rig[:3], ["speed"], [2], test=rig[3:], out=rig_model.folder, preset="quick", settings=settings)
 
 
 def test_a_training_without_a_folder_leaves_nothing_behind(rig, tiny_settings):
-    model = edp.train(rig, targets=["speed"], settings=tiny_settings)
+    model = edp.train(rig, targets=["speed"], preset="quick", settings=tiny_settings)
     folder = model.folder
     assert model.evaluate(baselines=[]).folder == folder
     assert (folder / "bundle").is_dir()
@@ -50,7 +50,7 @@ def test_a_training_without_a_folder_leaves_nothing_behind(rig, tiny_settings):
 
 
 def test_one_recording_is_divided_in_time(tiny_settings, rig):
-    model = edp.train(rig[0], targets=["speed"], horizons=[1], settings=tiny_settings)
+    model = edp.train(rig[0], targets=["speed"], horizons=[1], preset="quick", settings=tiny_settings)
     assert list(model.evaluate(baselines=[]).to_dict()["models"]) == ["network"]
 
 
@@ -105,7 +105,12 @@ def test_what_is_drawn_stands_at_the_time_that_it_speaks_of(rig_model, rig):
 
 def test_predictions_need_no_targets(rig, tiny_settings):
     model = edp.train(
-        rig, ["speed"], [2], features=["lever"], settings=tiny_settings | {"task.mode": "absolute", "model.blocks": []}
+        rig,
+        ["speed"],
+        [2],
+        features=["lever"],
+        preset="quick",
+        settings=tiny_settings | {"task.mode": "absolute", "model.blocks": []},
     )
     levers = edp.Recordings.from_arrays(rig[0].values[:, :1], rate_hz=100, names=["lever"])
     predictions = model.predict(levers)
@@ -133,7 +138,9 @@ def test_every_export_target_is_written(rig, tiny_settings, target, tmp_path, po
 def point_model(tmp_path_factory, tiny_settings):
     drives = np.cumsum(np.random.default_rng(0).normal(size=(3, 200, 2)), axis=1)
     data = edp.Recordings.from_arrays(drives, rate_hz=50, names=["a", "b"])
-    return edp.train(data, ["b"], [1], out=tmp_path_factory.mktemp("point") / "run", settings=tiny_settings)
+    return edp.train(
+        data, ["b"], [1], out=tmp_path_factory.mktemp("point") / "run", preset="quick", settings=tiny_settings
+    )
 
 
 def test_unknown_targets_options_and_folders_are_one_error(point_model, tmp_path):
@@ -168,7 +175,7 @@ def test_hostile_names_stay_text_in_everything_that_is_shown(tiny_settings):
     names = ["<script>a</script>", "<img src=x onerror=alert(1)>"]
     recordings = [f"<b>{i}" for i in range(3)]
     data = edp.Recordings.from_arrays(drives, rate_hz=50, names=names, recording_names=recordings)
-    model = edp.train(data, [names[1]], [1], settings=tiny_settings)
+    model = edp.train(data, [names[1]], [1], preset="quick", settings=tiny_settings)
     scores = model.evaluate(data, baselines=[])
     predictions = model.predict(data)
     for shown in (model, scores, scores.table(), predictions):
@@ -199,24 +206,26 @@ def test_hostile_names_stay_text_in_everything_that_is_shown(tiny_settings):
     ],
 )
 def test_what_cannot_be_trained_is_one_error(rig, tiny_settings, options, error, message):
-    chosen = {"data": rig, "targets": ["speed"], "settings": tiny_settings, **options}
+    chosen = {"data": rig, "targets": ["speed"], "preset": "quick", "settings": tiny_settings, **options}
     with pytest.raises(error, match=message):
         edp.train(**chosen)
 
 
 def test_a_split_and_a_test_set_are_not_both_taken(rig, tiny_settings):
     with pytest.raises(ConfigError, match="leave one of them out"):
-        edp.train(rig[:3], ["speed"], test=rig[3:], settings=tiny_settings | {"split": {"kind": "time"}})
+        edp.train(
+            rig[:3], ["speed"], test=rig[3:], preset="quick", settings=tiny_settings | {"split": {"kind": "time"}}
+        )
 
 
 def test_arrays_of_both_parts_may_have_the_same_names(tiny_settings, rig):
-    model = edp.train(rig[:2], ["speed"], [2], test=edp.Recordings([rig[0]]), settings=tiny_settings)
+    model = edp.train(rig[:2], ["speed"], [2], test=edp.Recordings([rig[0]]), preset="quick", settings=tiny_settings)
     assert list(model.evaluate(baselines=[]).to_dict()["models"]["network"]["recordings"]) == ["test recording_0"]
 
 
 def test_recordings_that_are_too_short_are_one_error(tiny_settings, rig):
     with pytest.raises(DataError, match="too short"):
-        edp.train(rig[0].rows(0, 15), ["speed"], settings=tiny_settings)
+        edp.train(rig[0].rows(0, 15), ["speed"], preset="quick", settings=tiny_settings)
 
 
 def test_missing_values_in_what_is_read_are_one_error(tiny_settings):
@@ -224,7 +233,7 @@ def test_missing_values_in_what_is_read_are_one_error(tiny_settings):
     values[1, 50, 0] = np.nan
     data = edp.Recordings.from_arrays(values, rate_hz=50, repair={"nan": "keep"})
     with pytest.raises(DataError, match="'channel_0' has 1 missing"):
-        edp.train(data, ["channel_1"], [1], settings=tiny_settings)
+        edp.train(data, ["channel_1"], [1], preset="quick", settings=tiny_settings)
 
 
 def test_other_rates_and_missing_inputs_are_one_error(rig_model, rig):
@@ -240,5 +249,5 @@ def test_other_rates_and_missing_inputs_are_one_error(rig_model, rig):
 def test_a_training_that_diverges_keeps_its_folder(rig, tiny_settings, tmp_path):
     settings = tiny_settings | {"training.optimizer": {"kind": "adamw", "learning_rate": 1e30}, "training.epochs": 3}
     with pytest.raises(Diverged):
-        edp.train(rig, ["speed"], [2], out=tmp_path / "run", settings=settings)
+        edp.train(rig, ["speed"], [2], out=tmp_path / "run", preset="quick", settings=settings)
     assert json.loads((tmp_path / "run" / "status.json").read_text(encoding="utf-8"))["status"] == "diverged"

@@ -23,7 +23,8 @@ from edp.storage import write_bytes, write_json
 from edp.storage.runs import RunFolder
 from edp.training import save_bundle
 from edp.workflows.adaptation.replay import replay
-from edp.workflows.train_evaluate import footprint_of, trained_run
+from edp.workflows.deployment import footprint_of
+from edp.workflows.train_evaluate import trained_run
 
 Rows = NDArray[np.float64]
 COPIED = ("config.toml", "history.jsonl")

@@ -21,7 +21,7 @@ from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, text_of
 from edp.signals import KINDS
 from edp.training import load_bundle
-from edp.workflows import train_evaluate
+from edp.workflows import deployment, train_evaluate
 from edp.workflows.api.predictions import Predictions
 from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
 from edp.workflows.api.scores import JudgedScores
@@ -153,7 +153,7 @@ class TrainedPredictor:
             ConfigError: an unknown target or option.
             ExportError: a network or a name that this form cannot hold.
         """
-        return train_evaluate.export_bundle(self.folder, target, folder, name, options)
+        return deployment.export_bundle(self.folder, target, folder, name, options)
 
     def stream(self) -> Stream:
         """It as a stream: ``step(row)`` takes one tick of `inputs` and gives prediction, intervals and a status.

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edp.config.experiment import Experiment, build, preset_table, with_set_file
+from edp.config.experiment import AUTO, Experiment, build, preset_table, with_set_file
 from edp.data.features import FEATURE_SETS
 from edp.errors import ConfigError, DataError, closest
 from edp.logs.source import DataSource
@@ -21,6 +21,7 @@ from edp.training import Diverged, TrainingProgress
 from edp.workflows import train_evaluate
 from edp.workflows.api.predictor import TrainedPredictor
 from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
+from edp.workflows.auto import AutoSettings, auto_settings, train_auto
 
 RECORDINGS = "recordings"
 """Folder of a run that holds the recordings of a training whose data came from memory."""
@@ -34,7 +35,7 @@ def train(
     test: Recordings | Recording | Sequence[Recording] | None = None,
     features: Sequence[str] | str | None = None,
     out: str | Path | None = None,
-    preset: str = "quick",
+    preset: str = "auto",
     settings: Mapping[str, Any] | str | Path | None = None,
     on_progress: Callable[[TrainingProgress], None] | None = None,
 ) -> TrainedPredictor:
@@ -51,7 +52,8 @@ def train(
         features: channels to read, or the name of a feature set. Without them those of the preset where the recordings
             have them all, else every channel.
         out: folder of the run; without it a temporary one, which is removed with the predictor.
-        preset: ``quick``, ``small``, ``standard`` or ``thesis``.
+        preset: ``auto`` trains a portfolio and keeps the simplest of the best, which its ``auto.json`` tells;
+            ``quick``, ``small``, ``committee``, ``standard`` and ``thesis`` are one model each.
         settings: laid over the preset: a TOML file, or a mapping with the keys of docs/settings.md, nested or dotted
             (``{"training.epochs": 3}``).
         on_progress: called with the progress.
@@ -81,10 +83,16 @@ def train(
 
 
 def _train(
-    source: DataSource, experiment: Experiment, folder: Path, on_progress: Callable[[TrainingProgress], None] | None
+    source: DataSource,
+    experiment: Experiment | AutoSettings,
+    folder: Path,
+    on_progress: Callable[[TrainingProgress], None] | None,
 ) -> None:
     try:
-        train_evaluate.train(source, experiment, folder, on_progress)
+        if isinstance(experiment, AutoSettings):
+            train_auto(source, experiment, folder, on_progress)
+        else:
+            train_evaluate.train(source, experiment, folder, on_progress)
     except Diverged:
         _write(source)
         raise
@@ -105,7 +113,7 @@ def _experiment(
     features: Sequence[str] | str | None,
     preset: str,
     settings: Mapping[str, Any] | str | Path | None,
-) -> Experiment:
+) -> Experiment | AutoSettings:
     if isinstance(targets, str):
         raise ConfigError(f"targets = '{targets}'; give a list of names, such as [\"{targets}\"]")
     if not isinstance(horizons, Sequence):
@@ -131,7 +139,8 @@ def _experiment(
         table["split"] = {"kind": "recordings", "test": list(tests.recording_names)}
     elif len(data) == 1 and "split" not in own:
         table["split"] = {"kind": "time"}
-    experiment = build(Experiment, merged(table, own), f"preset '{preset}' with settings")
+    where, table = f"preset '{preset}' with settings", merged(table, own)
+    experiment = auto_settings(table, where) if preset == AUTO else build(Experiment, table, where)
     _check_targets(data, experiment)
     return experiment
 
@@ -163,8 +172,9 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _check_targets(data: Recordings, experiment: Experiment) -> None:
-    task = experiment.task.resolve(data.rate_hz, data.names, experiment.model.physics)
+def _check_targets(data: Recordings, experiment: Experiment | AutoSettings) -> None:
+    physics = experiment.model.physics if isinstance(experiment, Experiment) else None
+    task = experiment.task.resolve(data.rate_hz, data.names, physics)
     names = [*data.names, *(entry.name for entry in task.derived)]
     for target in task.targets:
         if target not in names:

@@ -1,0 +1,74 @@
+"""Blocked cross-validation: contiguous folds of the rows of all stretches, with a gap beside what is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import DataError
+
+FEWEST_ROWS = 20
+"""Rows that a fold must have; fewer say nothing about an error."""
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """Which rows each fold leaves out and trains on.
+
+    Attributes:
+        owner: fold that leaves a row out, ``(row,)``.
+        training: rows that each fold trains on, one array a fold; rows within the gap are in neither.
+    """
+
+    owner: NDArray[np.int64]
+    training: tuple[NDArray[np.int64], ...]
+
+    @property
+    def count(self) -> int:
+        """Number of folds."""
+        return len(self.training)
+
+    def left_out(self, fold: int) -> NDArray[np.int64]:
+        """Rows that `fold` is judged by."""
+        return np.flatnonzero(self.owner == fold)
+
+
+def blocked_folds(lengths: Sequence[int], folds: int, gap: int) -> Folds:
+    """Contiguous folds with nearly equal shares of the rows of all stretches, laid end to end.
+
+    Args:
+        lengths: rows of each stretch, in order.
+        folds: number of folds, 2 or more.
+        gap: rows beside a fold, in the same stretch, that share history or future with it and do not train.
+
+    Raises:
+        DataError: too few rows for so many folds, or a fold would have nothing to train on.
+    """
+    total = int(sum(lengths))
+    if total < folds * FEWEST_ROWS:
+        raise DataError(
+            f"cross-validation: {total} rows for {folds} folds; each fold needs {FEWEST_ROWS}: record longer, or take "
+            "fewer folds"
+        )
+    owner = np.arange(total) * folds // total
+    ends = np.cumsum(lengths)
+    stretch = np.repeat(np.arange(len(lengths)), lengths)
+    training = []
+    for fold in range(folds):
+        trains = owner != fold
+        rows = np.flatnonzero(~trains)
+        for number in np.unique(stretch[rows]):
+            inside = rows[stretch[rows] == number]
+            first, last = ends[number] - lengths[number], ends[number]
+            trains[max(first, inside[0] - gap) : min(last, inside[-1] + 1 + gap)] = False
+        training.append(np.flatnonzero(trains))
+        if len(training[-1]) < FEWEST_ROWS:
+            raise DataError(
+                f"cross-validation: fold {fold + 1} of {folds} leaves {len(training[-1])} rows to train on beside a "
+                f"gap of {gap}; {FEWEST_ROWS} or more must be left: record at least two independent stretches, each "
+                "longer than the largest horizon and the longest lag, or shorten these"
+            )
+    return Folds(owner, tuple(training))

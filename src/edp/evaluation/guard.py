@@ -1,0 +1,76 @@
+"""Whether a simple rival does better than the network after all, by the scores of held-out recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+NETWORK = "network"
+LEAST = 1e-3
+"""Share of error below which two models count as equal: rounding and threads make as much."""
+
+
+@dataclass(frozen=True)
+class Beaten:
+    """A baseline with less error than the network.
+
+    Attributes:
+        label: how tables call it.
+        less: by which share its error is less, over all outputs and horizons.
+        outputs: targets on which it has less error, over all horizons.
+    """
+
+    label: str
+    less: float
+    outputs: tuple[str, ...]
+
+    def sentence(self) -> str:
+        """For the first line of what a person reads."""
+        where = f" (on {', '.join(self.outputs)})" if self.outputs else ""
+        return (
+            f"On the held-out recordings {self.label} has {100 * self.less:.1f} % less error than the network{where}: "
+            "do not use this network; train with the preset auto, or on more recordings."
+        )
+
+
+def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
+    """The baseline that beats the network by most; None where none does.
+
+    Errors are compared by the geometric mean of the ratio of root-mean-square errors over horizons and targets, so
+    that no unit counts for more than another.
+
+    Args:
+        scores: the content of ``scores.json``.
+    """
+    models = scores["models"]
+    if NETWORK not in models:
+        return None
+    better = []
+    for name, model in models.items():
+        if name == NETWORK:
+            continue
+        by_target = {
+            target["name"]: _logarithm(models[NETWORK], model, target["name"], scores["task"]["horizons"])
+            for target in scores["targets"]
+        }
+        finite = [value for value in by_target.values() if math.isfinite(value)]
+        if finite:
+            mean = sum(finite) / len(finite)
+            lost = tuple(target for target, value in by_target.items() if value > LEAST)
+            better.append((mean, Beaten(str(model["label"]), 1.0 - math.exp(-mean), lost)))
+    mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
+    return worst if mean > LEAST else None
+
+
+def _logarithm(network: Mapping[str, Any], model: Mapping[str, Any], target: str, horizons: list[int]) -> float:
+    """Mean over horizons of the logarithm of the network's error over a model's; NaN where one of them is zero."""
+    values = []
+    for horizon in horizons:
+        ours, theirs = (
+            entry["overall"].get(str(horizon), {}).get(target, {}).get("rmse") for entry in (network, model)
+        )
+        if ours and theirs:
+            values.append(math.log(ours / theirs))
+    return sum(values) / len(values) if values else math.nan

@@ -1,0 +1,50 @@
+"""Settings of a training that averages networks trained on different folds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.settings.bounds import MOST_BATCH, MOST_EPOCHS, MOST_ROWS, MOST_WEIGHT, above, check_bounds, span, whole
+
+MOST_FOLDS = 100
+MOST_RATE = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaggingSpec:
+    """Train the members of a committee on folds of the training and validation parts together.
+
+    Attributes:
+        folds: contiguous folds; each member leaves one out, stops where its error there is least, and so do the
+            members together tell the error to expect. A committee's members are dealt out evenly.
+        steps: updates of each member.
+        batch: rows of each update.
+        learning_rate: largest one, of AdamW; it rises over a tenth of the steps and falls as a cosine.
+        weight_decay: of AdamW.
+        checks: how often members are compared on the rows that they leave out.
+        rows: rows that train at most, evenly spread over longer recordings.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    folds: int = 5
+    steps: int = 1500
+    batch: int = 256
+    learning_rate: float = 3e-3
+    weight_decay: float = 1e-2
+    checks: int = 15
+    rows: int = 200_000
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "training.bagging",
+            self,
+            folds=whole(2, MOST_FOLDS),
+            steps=whole(1, MOST_EPOCHS),
+            batch=whole(1, MOST_BATCH),
+            learning_rate=above(0.0, MOST_RATE),
+            weight_decay=span(0.0, MOST_WEIGHT),
+            checks=whole(1, MOST_EPOCHS),
+            rows=whole(100, MOST_ROWS),
+        )

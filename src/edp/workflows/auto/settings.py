@@ -1,0 +1,94 @@
+"""Settings of the automatic preset: everything of an experiment but the network and its training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from edp.config.experiment import (
+    Experiment,
+    TaskSettings,
+    build,
+    plain_tree,
+    preset_table,
+    with_set_file,
+)
+from edp.data.splits import ByRecording, SplitSpec
+from edp.errors import ConfigError
+from edp.evaluation.judge import JudgeSpec
+from edp.settings.bounds import MOST_THREADS, SEED, above, check_bounds, whole
+from edp.settings.tree import Table, merged, override, read_toml
+
+MOST_MINUTES = 10_000.0
+CHOSEN = ("model", "training")
+"""Tables of an experiment that the portfolio fills in."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Portfolio:
+    """The table ``[auto]``.
+
+    Attributes:
+        minutes: processor time to spend on training; sizes of networks and lengths of trainings follow from it, so
+            that equal settings and data give equal results on every machine.
+        candidates: names of registered candidates, the simplest first; none takes all of them.
+        seed: of all random choices.
+        threads: CPU threads of a training; another count gives other bits.
+    """
+
+    minutes: float = 5.0
+    candidates: tuple[str, ...] = ()
+    seed: int = 0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        check_bounds("auto", self, minutes=above(0.0, MOST_MINUTES), seed=SEED, threads=whole(0, MOST_THREADS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AutoSettings:
+    """What settles an automatic training and its judgement."""
+
+    task: TaskSettings = field(default_factory=TaskSettings)
+    split: SplitSpec = field(default_factory=ByRecording)
+    auto: Portfolio = field(default_factory=Portfolio)
+    judge: JudgeSpec = field(default_factory=JudgeSpec)
+
+    def experiment(self, model_and_training: Table) -> Experiment:
+        """The experiment of a candidate, from its tables ``model`` and ``training``."""
+        plain = {part: values for part, values in plain_tree(self).items() if part != "auto"}
+        return build(Experiment, merged(plain, model_and_training), "of a candidate of the automatic preset")
+
+
+def load_auto(path: str | Path | None = None, overrides: Sequence[str] = ()) -> AutoSettings:
+    """Settings from the preset ``auto``, changed by a TOML file, changed by ``key.path=value`` overrides.
+
+    Raises:
+        ConfigError: names every unknown key, wrong type and impossible value at once; settings of the network or of
+            its training, which the portfolio chooses.
+    """
+    table = preset_table("auto")
+    where = "preset 'auto'"
+    if path is not None:
+        table = merged(table, with_set_file(read_toml(path), Path(path).parent))
+        where = f"'{path}' with preset 'auto'"
+    for text in overrides:
+        table = merged(table, with_set_file(override(text), Path()))
+    return auto_settings(table, where)
+
+
+def auto_settings(table: Table, where: str) -> AutoSettings:
+    """Settings from a table.
+
+    Raises:
+        ConfigError: as `load_auto`.
+    """
+    present = [part for part in CHOSEN if part in table]
+    if present:
+        raise ConfigError(
+            f"{where}: [{'], ['.join(present)}] came with the preset 'auto', which chooses the network and its "
+            "training; take them out (the seed is auto.seed), or name the preset that they change, for example "
+            "--preset standard"
+        )
+    return build(AutoSettings, table, where)

@@ -1,0 +1,332 @@
+"""Train the portfolio, choose by left-out data, and write the winner as a run of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edp.config.experiment import Experiment, experiment_toml, plain_tree
+from edp.data.features import FEATURE_SETS
+from edp.data.lags import DoubleArray
+from edp.data.prepared import Prepared
+from edp.errors import ConfigError, DataError, StorageError
+from edp.logs.source import DataSource
+from edp.networks.predictor import Predictor
+from edp.recording import Recording
+from edp.storage import make_folder, read_object, write_json
+from edp.storage.runs import RunFolder, run_key
+from edp.training import Bundle, Diverged, Fitted, TrainingProgress, fit, load_bundle
+from edp.training.bagging import fit_bagged
+from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
+from edp.workflows.auto.promise import (
+    PortfolioChoice,
+    Promise,
+    blocks_of,
+    choose,
+    in_report_units,
+    promise_of,
+    standard_truth,
+    streamed,
+    to_json,
+)
+from edp.workflows.auto.settings import AutoSettings
+from edp.workflows.train_evaluate import keep_fitted, prepare_data
+
+FILE = "auto.json"
+USUAL = "FG2"
+"""The feature set that is taken without a word where the recordings have its channels."""
+MOST_LISTED = 20
+"""Channels that a message lists."""
+STILL = 1e-9
+"""Share of a channel's size below which it does not move."""
+
+
+@dataclass(frozen=True, eq=False)
+class AutoResult:
+    """What an automatic training gives.
+
+    Attributes:
+        bundle: the winner's.
+        facts: the content of ``auto.json``.
+    """
+
+    bundle: Bundle
+    facts: dict[str, Any]
+
+    @property
+    def sentence(self) -> str:
+        """What was chosen and why."""
+        return str(self.facts["sentence"])
+
+
+@dataclass(frozen=True, eq=False)
+class _Trained:
+    experiment: Experiment
+    fitted: Fitted
+    promise: Promise
+
+
+def train_auto(
+    source: DataSource,
+    settings: AutoSettings,
+    out: str | Path,
+    on_event: Callable[[TrainingProgress], None] | None = None,
+    on_candidate: Callable[[str, int, int], None] | None = None,
+) -> AutoResult:
+    """Train every candidate that suits the data, choose, and write the winner's run folder.
+
+    Args:
+        source: where the recordings are.
+        settings: task, split, budget, judge.
+        out: run folder; a finished one of the same settings and data is read, not made again.
+        on_event: called with progress of the training at work.
+        on_candidate: called with a candidate's label, how many are done and of how many.
+
+    Raises:
+        EdpError: the data, settings or folder cannot be used; what was on disk stays.
+    """
+    once = _ReadOnce(source)
+    settings = _of_these_channels(once, settings)
+    data, amount = _prepare(once, settings)
+    key = run_key({"auto": plain_tree(settings)}, data.digest)
+    folder = make_folder(out)
+    finished = _finished(folder, key)
+    if finished is not None:
+        return finished
+    _check_moving(data)
+    experiments = _experiments(settings, amount)
+    blocks = blocks_of(data, amount.window)
+    trained: dict[str, _Trained] = {}
+    failed: dict[str, str] = {}
+    for number, (name, experiment) in enumerate(experiments.items()):
+        if on_candidate is not None:
+            on_candidate(CANDIDATES[name].label, number, len(experiments))
+        try:
+            trained[name] = _train(name, experiment, data, folder, on_event, blocks)
+        except Diverged as end:
+            failed[name] = str(end)
+    if not trained:
+        raise ConfigError(f"automatic choice: every candidate diverged: {'; '.join(failed.values())}")
+    choice = choose({name: one.promise for name, one in trained.items()})
+    facts = _facts(choice, trained, failed, data, settings, amount, key)
+    winner = trained[choice.name]
+    bundle = keep_fitted(folder, (source, winner.experiment, data), winner.fitted, {"auto": facts["sentence"]})
+    write_json(folder / FILE, facts)
+    return AutoResult(bundle, facts)
+
+
+def _finished(folder: Path, key: str) -> AutoResult | None:
+    """A result that is there already.
+
+    Raises:
+        StorageError: the folder holds another run.
+    """
+    file = folder / FILE
+    if file.is_file():
+        facts = read_object(file, ("key", "sentence", "chosen"))
+        if facts["key"] == key:
+            return AutoResult(load_bundle(folder), facts)
+    if file.is_file() or (folder / "run.json").exists():
+        raise StorageError(
+            f"run folder '{folder}' holds another run (other settings, data or version); nothing was changed. Choose "
+            "another folder with --out, or remove this one"
+        )
+    return None
+
+
+class _ReadOnce:
+    """A source whose recordings are read when they are first asked for."""
+
+    def __init__(self, source: DataSource) -> None:
+        self.path, self._source = source.path, source
+        self._recordings: list[Recording] = []
+
+    def read(self) -> list[Recording]:
+        """The recordings."""
+        self._recordings = self._recordings or self._source.read()
+        return self._recordings
+
+    def to_plain(self) -> dict[str, Any]:
+        """As the source has it."""
+        return self._source.to_plain()
+
+
+def _of_these_channels(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
+    """Settings that read every channel where the recordings have not those of the usual feature set.
+
+    Raises:
+        ConfigError: a target is no channel of the recordings.
+    """
+    names = source.read()[0].channel_names
+    task = settings.task
+    if task.features == USUAL and not set(FEATURE_SETS[USUAL].inputs) <= set(names):
+        task = replace(task, features="all")
+    derived = () if isinstance(task.features, str) else task.features.derived
+    channels = {*names, *(entry.name for entry in (*derived, *task.derived_targets))}
+    absent = [target for target in task.targets if target not in channels]
+    if absent:
+        listed = ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "")
+        raise ConfigError(
+            f"task.targets: {', '.join(absent[:MOST_LISTED])} is no channel of '{source.path}', which has {listed}; "
+            f"name what to predict, for example --set 'task.targets=[\"{names[-1]}\"]'"
+        )
+    return replace(settings, task=task)
+
+
+def _prepare(source: _ReadOnce, settings: AutoSettings) -> tuple[Prepared, Amount]:
+    """The data cut for the candidates' common window, and what there is of it."""
+
+    def cut(window: int) -> tuple[Prepared, Amount]:
+        model = {"model": {"window": window, "backbone": {"kind": "committee"}, "head": {"kind": "linear"}}}
+        data = prepare_data(source, settings.experiment(model))
+        parts = [*data.train, *data.validation]
+        auto = settings.auto
+        return data, Amount(
+            rows=sum(part.samples for part in parts),
+            shortest=min(part.samples for part in parts),
+            features=len(data.task.features.features),
+            outputs=len(data.task.horizons) * len(data.task.targets),
+            horizon=data.task.max_horizon,
+            minutes=auto.minutes,
+            seed=auto.seed,
+            threads=auto.threads,
+        )
+
+    try:
+        data, amount = cut(LEAST_SPAN + 1)
+    except DataError:
+        data, amount = cut(1)  # recordings of seconds: shorter spans will do
+    if amount.window != LEAST_SPAN + 1:
+        data, final = cut(amount.window)
+        amount = replace(amount, rows=final.rows)
+    return data, amount
+
+
+def _check_moving(data: Prepared) -> None:
+    """Refuse data that hold nothing to learn.
+
+    Raises:
+        DataError: a target or all inputs never move in the training part.
+    """
+    targets = np.concatenate([part.targets for part in data.train])
+    inputs = np.concatenate([part.inputs for part in data.train])
+    still = [
+        name
+        for name, column in zip(data.task.targets, targets.T, strict=True)
+        if np.ptp(column) <= STILL * max(1.0, float(np.abs(column).max()))
+    ]
+    if still:
+        raise DataError(
+            f"the target {', '.join(still)} never moves in the training part; there is nothing to learn of it: take it "
+            "out of task.targets, or record it while the machine works"
+        )
+    if np.ptp(inputs, axis=0).max() <= STILL * max(1.0, float(np.abs(inputs).max())):
+        raise DataError(
+            "no input moves in the training part; a model of these recordings could only repeat a constant: record "
+            "while the machine works, or check the signal map"
+        )
+
+
+def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment]:
+    """The candidates that suit the data, the simplest first."""
+    names = settings.auto.candidates or tuple(CANDIDATES)
+    chosen = [name for name in CANDIDATES if name in names]
+    _ = [CANDIDATES[name] for name in names]  # an unknown name is answered with the closest
+    tables = {name: CANDIDATES[name].tables(amount) for name in chosen}
+    experiments = {name: settings.experiment(table) for name, table in tables.items() if table is not None}
+    if not experiments:
+        raise ConfigError(
+            f"auto.candidates = {list(names)}: none of them suits {amount.rows:,} ticks of training; add 'linear' or "
+            "'committee'"
+        )
+    return experiments
+
+
+def _train(
+    name: str,
+    experiment: Experiment,
+    data: Prepared,
+    folder: Path,
+    on_event: Callable[[TrainingProgress], None] | None,
+    blocks: Sequence[tuple[int, int, int]],
+) -> _Trained:
+    if experiment.training.bagging is not None:
+        bagged = fit_bagged(data, experiment.model, experiment.training, on_event)
+        net = bagged.fitted.predictor
+        truth = standard_truth(net, data)
+        return _Trained(experiment, bagged.fitted, promise_of(bagged.of_validation(truth), truth, blocks))
+    with RunFolder(folder / "candidates" / name) as run:  # a stop is gone on from
+        settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
+        key = run_key(settings, data.digest)
+        run.claim(key, experiment_toml(experiment))
+        fitted = fit(data, experiment.model, experiment.training, (run, key), on_event)
+    net = fitted.predictor
+    return _Trained(experiment, fitted, promise_of(streamed(net, data), standard_truth(net, data), blocks))
+
+
+def _facts(
+    choice: PortfolioChoice,
+    trained: dict[str, _Trained],
+    failed: dict[str, str],
+    data: Prepared,
+    settings: AutoSettings,
+    amount: Amount,
+    key: str,
+) -> dict[str, Any]:
+    """The content of ``auto.json``."""
+    candidates = {
+        name: {
+            "label": CANDIDATES[name].label,
+            "seconds": round(one.fitted.seconds, 2),
+            "parameters": sum(parameter.numel() for parameter in one.fitted.predictor.parameters()),
+            "promise": in_report_units(one.promise.error(), one.fitted.predictor, data),
+        }
+        for name, one in trained.items()
+    }
+    net = trained[choice.name].fitted.predictor
+    unchanged = in_report_units(_persistence(net, data, amount), net, data)
+    return {
+        "schema": 1,
+        "key": key,
+        "minutes": settings.auto.minutes,
+        "rows": amount.rows,
+        **to_json(choice),
+        "sentence": sentence(choice, trained, amount, data),
+        "candidates": candidates,
+        "persistence": unchanged,
+        "failed": failed,
+    }
+
+
+def _persistence(net: Predictor, data: Prepared, amount: Amount) -> DoubleArray:
+    """Error of the present value, or of the mean in absolute mode, on the judged rows, standardised ``(output,)``."""
+    truth = standard_truth(net, data)  # zero is no change, or in absolute mode the mean
+    blocks = blocks_of(data, amount.window)
+    return promise_of([np.zeros_like(one) for one in truth], truth, blocks).error()
+
+
+def sentence(choice: PortfolioChoice, trained: dict[str, _Trained], amount: Amount, data: Prepared) -> str:
+    """What was chosen and why, for a person."""
+    label = CANDIDATES[choice.name].label
+    minutes = amount.rows / data.task.rate_hz / 60
+    start = f"Of {len(trained)} models on {minutes:.1f} min of recordings, {label} is kept"
+    others = [name for name in trained if name != choice.name]
+    if not others:
+        return f"{start}: no other one suits so few data."
+    if choice.name != choice.best:
+        gain = 100 * (1 - np.exp(-choice.excess[choice.name]))
+        best = CANDIDATES[choice.best].label
+        return (
+            f"{start}: {best} had {gain:.1f} % less error on left-out data, but that is within one standard error, and "
+            "the simpler model wins a tie."
+        )
+    second = min(others, key=lambda name: choice.excess[name])
+    gain = 100 * (1 - np.exp(-choice.excess[second]))
+    return (
+        f"{start}: on left-out data its error is {gain:.1f} % less than that of the next best, "
+        f"{CANDIDATES[second].label}."
+    )

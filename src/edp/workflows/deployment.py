@@ -1,0 +1,72 @@
+"""What a trained network costs, and its exported forms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from edp.config.experiment import load_experiment
+from edp.evaluation.controller import Budget
+from edp.evaluation.footprint import Footprint, check_possible, footprint
+from edp.evaluation.mac_check import check_counted
+from edp.export import TARGETS, make_target
+from edp.ir.rls import Adaptation
+from edp.networks.integer import IntegerPredictor
+from edp.networks.narrow import student
+from edp.networks.predictor import ModelSpec, Predictor, build_model, describe
+from edp.training import load_bundle
+from edp.training.bundle import blank_scaler
+
+
+def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footprint, str]:
+    """Footprint of a bundle, a run folder, or a settings file, and what it is called.
+
+    Raises:
+        EdpError: neither a bundle nor valid settings, a budget that no network of these inputs and targets meets, or a
+            part that counts other work than it does.
+    """
+    predictor, name, adaptation = _predictor_of(path)
+    check_counted(predictor)
+    if budget is not None:
+        alone = replace(predictor.spec, blocks=(), physics=None)
+        check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
+    return footprint(predictor, adaptation), name
+
+
+def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
+    source = Path(path)
+    if source.suffix == ".toml":
+        experiment = load_experiment(source)
+        task = experiment.task.resolve(100.0, physics=experiment.model.physics)
+        return _untrained(experiment.model, task), source.stem, None
+    bundle = load_bundle(source)
+    predictor = bundle.predictor
+    # Integer networks have the counts of the network that they were quantised from.
+    counted = predictor.in_float() if isinstance(predictor, IntegerPredictor) else predictor
+    return counted, describe(predictor.spec), bundle.adaptation
+
+
+def export_bundle(
+    path: str | Path,
+    to: str,
+    folder: str | Path,
+    name: str = "predictor",
+    options: Mapping[str, object] | None = None,
+) -> list[Path]:
+    """Write a bundle or the bundle of a run folder in the form `to`; returns the files, the one to read first in front.
+
+    Raises:
+        EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
+    """
+    return make_target(to, options).write(load_bundle(path), name, Path(folder))
+
+
+def unheld_adaptation(path: str | Path, to: str) -> bool:
+    """Whether a bundle has an adaptation that the form `to` leaves out."""
+    return load_bundle(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
+
+
+def _untrained(model: ModelSpec, task: Any) -> Predictor:
+    return build_model(task, model, blank_scaler(task), seed=0)

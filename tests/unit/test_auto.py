@@ -1,0 +1,156 @@
+"""The preset auto: what it chooses, what it promises, what it writes and refuses."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.errors import ConfigError, DataError, StorageError
+from edp.evaluation.guard import beaten_by
+from edp.training import load_bundle
+from edp.workflows.auto import load_auto, train_auto
+from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half, spans_by_two
+from edp.workflows.auto.promise import Promise, choose
+from edp.workflows.train_evaluate import DataSource, evaluate, trained_run
+
+RATE = 50.0
+SET = ["task.targets=['y']", "task.horizons=[1, 4]", "auto.minutes=0.01", "split.kind='time'", "judge.baselines=[]"]
+
+
+def write(folder, y=None, ticks=900, seed=0, u=None):
+    """A log of a saturated plant as a CSV with a map."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-2, 2, ticks // 10 + 1), 10)[:ticks] if u is None else u
+    if y is None:
+        y = np.zeros(ticks)
+        for tick in range(1, ticks):
+            y[tick] = 0.9 * y[tick - 1] + 0.3 * np.tanh(2 * u[tick - 1]) + 0.01 * rng.normal()
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = [f"{tick / RATE:.4f},{a:.6f},{b:.6f}" for tick, (a, b) in enumerate(zip(u, y, strict=True))]
+    (folder / "log.csv").write_text("time,u,y\n" + "\n".join(rows) + "\n")
+    (folder / "map.toml").write_text(
+        'time = "time"\n[channels.u]\ncolumn = "u"\nkind = "generic"\n[channels.y]\ncolumn = "y"\nkind = "generic"\n'
+    )
+    return DataSource.of(folder / "log.csv", folder / "map.toml")
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("auto")
+    source = write(folder / "logs")
+    return source, folder / "run", train_auto(source, load_auto(None, SET), folder / "run")
+
+
+def test_the_run_is_that_of_the_chosen_candidate(result):
+    _, folder, found = result
+    assert found.facts["chosen"] in found.facts["candidates"]
+    assert json.loads((folder / "auto.json").read_text())["sentence"] == found.sentence
+    bundle, experiment, provenance, _ = trained_run(folder)
+    assert provenance["auto"] == found.sentence
+    assert experiment.training.bagging is not None
+    assert load_bundle(folder).predictor.spec == bundle.predictor.spec
+    for one in found.facts["candidates"].values():
+        assert set(one["promise"]) == {"1", "4"}
+        assert set(one["promise"]["1"]) == {"y"}
+
+
+def test_the_promise_is_kept_on_the_test_part(result):
+    _, folder, found = result
+    evaluate(folder)
+    scores = json.loads((folder / "scores.json").read_text())["models"]["network"]["overall"]
+    for horizon, promised in found.facts["candidates"][found.facts["chosen"]]["promise"].items():
+        assert scores[horizon]["y"]["rmse"] < 1.5 * promised["y"]
+        assert scores[horizon]["y"]["rmse"] < found.facts["persistence"][horizon]["y"]
+
+
+def test_a_finished_run_is_read_again_and_another_one_refused(result):
+    source, folder, _ = result
+    before = (folder / "auto.json").read_bytes()
+    assert train_auto(source, load_auto(None, SET), folder).facts == json.loads(before)
+    with pytest.raises(StorageError, match="another run"):
+        train_auto(source, load_auto(None, [*SET, "auto.seed=1"]), folder)
+    assert (folder / "auto.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["model.window=5"], "chooses the network"),
+        (["training.epochs=5"], "chooses the network"),
+        (["auto.minutes=0"], "minutes"),
+        (["auto.seconds=5"], "did you mean|unknown"),
+        (["auto.candidates=['liner']"], "linear"),
+        (["auto.candidates=['recurrent']"], "suits"),
+        (["task.targets=['z']"], "no channel"),
+        (["task.horizons=[400]"], "longer|horizon"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_error(tmp_path, settings, message):
+    source = write(tmp_path / "logs")
+    with pytest.raises((ConfigError, DataError), match=message):
+        train_auto(source, load_auto(None, [*SET, *settings]), tmp_path / "run")
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_a_target_that_never_moves_is_refused(tmp_path):
+    source = write(tmp_path / "logs", y=np.full(900, 2.0))
+    with pytest.raises(DataError, match="never moves"):
+        train_auto(source, load_auto(None, SET), tmp_path / "run")
+
+
+def test_inputs_that_never_move_are_refused(tmp_path):
+    source = write(tmp_path / "logs", u=np.full(900, 0.5), y=np.sin(np.arange(900) / 20))
+    features = ["task.features={name='u', channels=['u']}", "task.mode='absolute'"]
+    with pytest.raises(DataError, match="no input moves"):
+        train_auto(source, load_auto(None, [*SET, *features]), tmp_path / "run")
+
+
+def test_of_equal_models_the_simplest_is_chosen():
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0.9, 1.1, size=(10, 2))
+    rows = np.full(10, 100.0)
+    simple, better = Promise(noise, rows), Promise(noise * rng.uniform(0.97, 1.02, size=(10, 1)), rows)
+    assert choose({"simple": simple, "better": better}).name == "simple"
+    clear = Promise(noise * rng.uniform(0.6, 0.7, size=(10, 1)), rows)
+    choice = choose({"simple": simple, "clear": clear})
+    assert (choice.name, choice.best) == ("clear", "clear")
+    assert choice.excess["simple"] > choice.doubt["simple"]
+
+
+def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
+    amount = Amount(rows=100_000, shortest=100_000, features=5, outputs=2, horizon=10, minutes=5.0)
+    assert spans_by_two(amount) == [1, 2, 4, 8, 16, 32]
+    assert spans_by_half(amount) == [1, 2, 3, 4, 6, 8, 12, 16, 24, 32]
+    assert spans_by_two(replace(amount, horizon=100))[-1] == 256
+    assert spans_by_two(replace(amount, shortest=80))[-1] == 8
+    assert CANDIDATES["recurrent"].tables(replace(amount, rows=5000)) is None
+    steps = [
+        CANDIDATES["committee"].tables(replace(amount, minutes=minutes))["training"]["bagging"]["steps"]
+        for minutes in (0.01, 1.0, 100.0)
+    ]
+    assert steps == sorted(steps)
+    assert steps[0] < steps[-1]
+
+
+def scores(network, **others):
+    def model(errors):
+        return {"overall": {"1": {name: {"rmse": value} for name, value in errors.items()}}, "label": "x"}
+
+    return {
+        "task": {"horizons": [1]},
+        "targets": [{"name": "a"}, {"name": "b"}],
+        "models": {"network": model(network), **{name: model(errors) for name, errors in others.items()}},
+    }
+
+
+def test_the_guard_names_the_baseline_that_wins_and_where():
+    network = {"a": 1.0, "b": 1.0}
+    assert beaten_by(scores(network, ridge={"a": 1.1, "b": 1.0})) is None
+    beaten = beaten_by(scores(network, ridge={"a": 0.9, "b": 1.0}, trees={"a": 0.5, "b": 1.5}))
+    assert beaten is not None
+    assert beaten.outputs == ("a",)
+    assert 0.1 < beaten.less < 0.2
+    assert "do not use" in beaten.sentence()
+    assert beaten_by(scores(network)) is None
+    assert beaten_by(scores(network, ridge={"a": 0.0, "b": 0.0})) is None

@@ -1,0 +1,165 @@
+"""Committees trained on folds: left-out predictions are honest, and the network says what the sum of its parts says."""
+
+import numpy as np
+import pytest
+import torch
+
+from edp.config.experiment import build
+from edp.data.features import FeatureSet
+from edp.data.fold_ridge import fold_ridge
+from edp.data.folds import blocked_folds
+from edp.data.prepared import prepare
+from edp.data.splits import ByTime
+from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError, DataError
+from edp.networks.backbones import CommitteeSpec, HybridSpec
+from edp.networks.heads import LinearHead, MlpHead
+from edp.networks.lag_bank import LagBank
+from edp.networks.predictor import ModelSpec
+from edp.networks.running import stream_predictions
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+from edp.training.bagging import fit_bagged
+from edp.training.bagging_spec import BaggingSpec
+from edp.training.fit import fit
+from edp.training.spec import TrainingSpec
+
+RATE = 50.0
+CHANNELS = (Channel("u", Kind.GENERIC), Channel("y", Kind.GENERIC))
+
+
+def recording(ticks=1500, seed=0, name="log"):
+    """A saturated first-order plant: what is left after a line is a curve."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-2, 2, ticks // 10 + 1), 10)[:ticks]
+    y = np.zeros(ticks)
+    for tick in range(1, ticks):
+        y[tick] = 0.9 * y[tick - 1] + 0.3 * np.tanh(2 * u[tick - 1]) + 0.01 * rng.normal()
+    values = np.stack([u, y], axis=1).astype(np.float32)
+    return Recording(name=name, rate_hz=RATE, channels=CHANNELS, values=values, source="test")
+
+
+def data_of(*recordings, horizons=(1, 4), mode=TargetMode.DELTA, window=10):
+    task = Task(FeatureSet("two", ("u", "y")), ("y",), horizons, mode, RATE)
+    return prepare(list(recordings), task, ByTime(), window)
+
+
+MODEL = ModelSpec(
+    backbone=CommitteeSpec(lags=(1, 2, 4, 8), members=4, units=16), head=LinearHead(), blocks=(), window=10
+)
+
+
+def spec(**bagging):
+    return TrainingSpec(
+        loss=build(TrainingSpec, {"loss": {"kind": "mse"}}, "test").loss,
+        bagging=BaggingSpec(**{"folds": 4, "steps": 200, "batch": 64, "checks": 4, **bagging}),
+    )
+
+
+@pytest.fixture(scope="module")
+def bagged():
+    return fit_bagged(data_of(recording()), MODEL, spec(steps=600, learning_rate=1e-2))
+
+
+def test_members_lower_the_error_of_rows_that_they_did_not_see(bagged):
+    error = np.sqrt(np.square(bagged.left_out - bagged.table.targets).mean(axis=0))
+    linear = np.sqrt(np.square(bagged.linear - bagged.table.targets).mean(axis=0))
+    assert error[0] < 0.8 * linear[0]  # four ticks ahead the unknown input rules
+    assert error[1] < linear[1]
+
+
+def test_the_network_predicts_the_test_part_as_well_as_it_promised(bagged):
+    data, net = data_of(recording()), bagged.fitted.predictor
+    (predicted,) = stream_predictions(net, data.test)
+    part, scale = data.test[0], net.code.width.numpy()
+    for place, k in enumerate(data.task.horizons):
+        error = (predicted[10 : part.samples - k, place] - part.targets[10 + k :]) / scale[place]
+        promised = np.sqrt(np.square(bagged.left_out - bagged.table.targets).mean(axis=0))[place]
+        assert np.sqrt(np.square(error).mean()) < 1.3 * promised
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_others():
+    data = data_of(recording(600))
+    first, again, other = (
+        fit(data, MODEL, spec_of).predictor.state_dict()
+        for spec_of in (spec(steps=20), spec(steps=20), TrainingSpec(**{**vars(spec(steps=20)), "seed": 1}))
+    )
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert any(not torch.equal(first[name], other[name]) for name in first)
+
+
+def test_without_members_it_is_the_linear_model_of_the_folds():
+    data = data_of(recording(), mode=TargetMode.ABSOLUTE)
+    linear = ModelSpec(
+        backbone=CommitteeSpec(lags=(1, 2), members=4, activations=()), head=LinearHead(), blocks=(), window=10
+    )
+    found = fit_bagged(data, linear, spec())
+    np.testing.assert_allclose(found.left_out, found.linear)
+    net, part = found.fitted.predictor, data.train[0]
+    (predicted,) = stream_predictions(net, [part])
+    rows = found.table.columns[: part.samples - data.task.max_horizon].astype(np.float64)
+    weights = net.heads.weights[0].detach().double().numpy()[0]
+    wanted = rows @ weights + net.heads.biases[0].detach().double().numpy()[0]
+    scaled = (predicted[: len(rows), :, 0] - net.code.offset.numpy()[:, 0]) / net.code.width.numpy()[:, 0]
+    np.testing.assert_allclose(scaled, wanted, atol=1e-4)
+
+
+def test_long_recordings_are_thinned_out_evenly():
+    found = fit_bagged(data_of(recording()), MODEL, spec(rows=300, steps=10))
+    assert 250 < len(found.table.columns) <= 310
+    assert found.table.stride > 1
+    truth = [np.zeros((part.samples - 4, 2)) for part in data_of(recording()).validation]
+    assert [len(one) for one in found.of_validation(truth)] == [len(one) for one in truth]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"backbone": HybridSpec()}, "committee"),
+        ({"head": MlpHead()}, "linear"),
+        ({"backbone": CommitteeSpec(members=3)}, "multiple of the folds"),
+    ],
+)
+def test_what_cannot_be_trained_on_folds_is_refused(change, message):
+    model = ModelSpec(**{**{field: getattr(MODEL, field) for field in ("backbone", "head", "blocks")}, **change})
+    with pytest.raises(ConfigError, match=message):
+        fit(data_of(recording(600)), model, spec())
+
+
+def test_too_few_rows_for_the_folds_are_refused():
+    with pytest.raises(DataError, match="fewer folds"):
+        fit(data_of(recording(100), horizons=(1,), window=1), MODEL, spec(folds=4))
+
+
+def test_a_fold_leaves_its_rows_and_their_neighbours_out():
+    folds = blocked_folds([100, 60], 4, gap=5)
+    assert sorted(row for fold in range(4) for row in folds.left_out(fold)) == list(range(160))
+    for fold in range(4):
+        judged, trained = set(folds.left_out(fold)), set(folds.training[fold])
+        for row in judged:
+            same = range(100) if row < 100 else range(100, 160)
+            assert not trained & {near for near in range(row - 5, row + 6) if near in same}
+
+
+def test_fold_ridge_leaves_useless_columns_out():
+    rng = np.random.default_rng(0)
+    table = rng.normal(size=(400, 30))
+    targets = table[:, :2] @ np.array([[1.0], [-2.0]]) + 0.5 * rng.normal(size=(400, 1))
+    found = fold_ridge(table, targets, blocked_folds([400], 5, 0), [np.arange(2), np.arange(30)])
+    assert np.abs(found.mean()[0][2:]).max() == 0
+    np.testing.assert_allclose(found.mean()[0][:2, 0], [1.0, -2.0], atol=0.1)
+
+
+def test_the_bank_gives_changes_over_its_spans():
+    bank, x = LagBank(2, (1, 3, 4)), torch.randn(1, 12, 2, dtype=torch.float64)
+    y, _ = bank(x, bank.initial_state(1, x))
+    for tick in range(4, 12):
+        wanted = [x[0, tick], *(x[0, tick] - x[0, tick - lag] for lag in (1, 3, 4))]
+        torch.testing.assert_close(y[0, tick], torch.cat(wanted), rtol=0, atol=1e-12)
+    assert not y[0, 0, 2:].any()
+
+
+@pytest.mark.parametrize("lags", [(), (0, 1), (2, 1), (1, 1), (5000,)])
+def test_impossible_spans_are_refused(lags):
+    with pytest.raises(ConfigError, match="lags"):
+        CommitteeSpec(lags=lags)
