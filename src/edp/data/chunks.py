@@ -197,15 +197,15 @@ class ChunkSampler:
             [(i, start, stop, at) for i, start, stop in lane for at in range(start, stop, length)]
             for lane in self._plan(rng)
         ]
-        held = [(self.series[0], 0)] * len(steps)
+        current_stretches = [(self.series[0], 0)] * len(steps)
         for step in range(max(len(lane) for lane in steps)):
             rows, resets = [], []
             for which, lane in enumerate(steps):
                 if step < len(lane):
                     i, start, stop, at = lane[step]
                     if at == start:
-                        held[which] = self._stretch(i, start, stop, self._chance(number, i, start))
-                    part, origin = held[which]
+                        current_stretches[which] = self._stretch(i, start, stop, self._chance(number, i, start))
+                    part, origin = current_stretches[which]
                     rows.append(self._cut(part, at - origin, at - start, burn_in))
                     resets.append(at == start)
                 else:  # A lane that has run out: nothing counts.

@@ -207,10 +207,10 @@ def _spectrum(recordings: Sequence[Recording], roles: Roles) -> Spectrum | None:
     used = spectrum.used_hz(recordings[0].rate_hz)
     flat, drop = zip(*(spectrum.flat_to(frequency, power[:, i], used) for i in range(len(sources))))
     # a tenth of an octave is enough for a picture
-    wanted = np.geomspace(frequency[0], frequency[-1], 90) if len(frequency) else np.zeros(0)
-    kept = np.unique(np.minimum(np.searchsorted(frequency, wanted), max(len(frequency) - 1, 0)))
+    plotted_frequencies = np.geomspace(frequency[0], frequency[-1], 90) if len(frequency) else np.zeros(0)
+    bins = np.unique(np.minimum(np.searchsorted(frequency, plotted_frequencies), max(len(frequency) - 1, 0)))
     names = tuple(" - ".join(command) for command in sources)
-    return Spectrum(names, frequency[kept], power[kept], flat, drop, used)
+    return Spectrum(names, frequency[bins], power[bins], flat, drop, used)
 
 
 def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> Occupancy | None:
@@ -232,14 +232,14 @@ def _occupancy(recordings: Sequence[Recording], axes: Sequence[Axis], absent: li
         )
         places = np.concatenate([_integrated(r, names) for r in recordings])
     full: Any = recordings[0].meta.get("full_strokes_m") if source == MEASURED else None
-    known = isinstance(full, list | tuple) and len(full) == len(names)
-    if known:
+    has_ranges = isinstance(full, list | tuple) and len(full) == len(names)
+    if has_ranges:
         span = tuple((0.0, float(length)) for length in full)
     else:
         span = tuple((float(low), float(high)) for low, high in zip(places.min(axis=0), places.max(axis=0)))
     cells = [_cell(places[:, i], *span[i], CELLS) for i in range(len(names))]
     samples = _counted(cells, (CELLS,) * len(names))
-    return Occupancy(source, names, span, known, samples)
+    return Occupancy(source, names, span, has_ranges, samples)
 
 
 def _ends(occupancy: Occupancy) -> dict[str, tuple[float, float]]:
@@ -264,17 +264,17 @@ def _counted(cells: Sequence[NDArray[np.intp]], shape: tuple[int, ...]) -> NDArr
 
 def _joints(recordings: Sequence[Recording], axes: Sequence[Axis], absent: list[str]) -> list[JointHistogram]:
     """Histograms of command, pressures and velocity of each axis, and of velocities with each other."""
-    made = [_joint(recordings, "command", a.command, (a.velocity,)) for a in axes if a.command and a.velocity]
+    joints = [_joint(recordings, "command", a.command, (a.velocity,)) for a in axes if a.command and a.velocity]
     for side, title in enumerate(("head pressure", "rod pressure")):
         chosen = [axis for axis in axes if len(axis.pressures) > side and axis.velocity]
-        made += [_joint(recordings, title, (axis.pressures[side],), (axis.velocity,)) for axis in chosen]
+        joints += [_joint(recordings, title, (axis.pressures[side],), (axis.velocity,)) for axis in chosen]
     speeds = [axis.velocity for axis in axes if axis.velocity]
     pairs = [(a, b) for i, a in enumerate(speeds) for b in speeds[i + 1 :]]
-    made += [_joint(recordings, "velocities", (a,), (b,)) for a, b in pairs]
+    joints += [_joint(recordings, "velocities", (a,), (b,)) for a, b in pairs]
     for title in ("command", "head pressure", "velocities"):
-        if not any(joint.group == title for joint in made):
+        if not any(joint.group == title for joint in joints):
             absent.append(f"joint histograms of {title}: no such channels")
-    return made
+    return joints
 
 
 def _joint(recordings: Sequence[Recording], group: str, x: tuple[str, ...], y: tuple[str, ...]) -> JointHistogram:

@@ -42,20 +42,20 @@ class CoverageTarget:
         return {**asdict(self), "met": self.met}
 
 
-def wanted(found: Coverage) -> tuple[CoverageTarget, ...]:
+def wanted(coverage: Coverage) -> tuple[CoverageTarget, ...]:
     """Every figure that the data allow to judge, by what is wanted of it."""
-    made = []
-    if found.occupancy is not None:
-        made.append(
-            CoverageTarget("cells of the strokes visited", 100 * found.occupancy.share, 100 * OCCUPANCY, True, "%")
+    targets = []
+    if coverage.occupancy is not None:
+        targets.append(
+            CoverageTarget("cells of the strokes visited", 100 * coverage.occupancy.share, 100 * OCCUPANCY, True, "%")
         )
-    inputs = found.spectrum
+    inputs = coverage.spectrum
     if inputs is not None and len(inputs.frequency_hz):
-        made += [
+        targets += [
             CoverageTarget(f"{name}: within {FLAT_DB:g} dB up to", flat, inputs.used_hz, True, "Hz")
             for name, flat in zip(inputs.names, inputs.flat_to_hz, strict=True)
         ]
-    if found.distance is not None:
-        share = 100 * found.distance.beyond
-        made.append(CoverageTarget("tests farther than 95 % of the training", share, 100 * BEYOND, False, "%"))
-    return tuple(made)
+    if coverage.distance is not None:
+        share = 100 * coverage.distance.beyond
+        targets.append(CoverageTarget("tests farther than 95 % of the training", share, 100 * BEYOND, False, "%"))
+    return tuple(targets)

@@ -45,11 +45,12 @@ class EpisodeSampler:
         self.owned = by_machine(self.series)
         needed = 2 * shots
         for machine, places in self.owned.items():
-            found = sum(self._pieces(self.series[place], 0) for place in places)
-            if found < needed:
+            piece_count = sum(self._pieces(self.series[series_index], 0) for series_index in places)
+            if piece_count < needed:
                 raise DataError(
-                    f"machine '{machine}' has {sum(self.series[place].samples for place in places)} ticks, enough for "
-                    f"{found} pieces of {spec.length}; an episode needs {needed}: give longer recordings, fewer shots "
+                    f"machine '{machine}' has {sum(self.series[i].samples for i in places)} ticks, enough for "
+                    f"{piece_count} pieces of {spec.length}; an episode needs {needed}: give longer recordings, "
+                    "fewer shots "
                     "or a smaller training.chunks.length"
                 )
 
@@ -83,9 +84,9 @@ class EpisodeSampler:
 
     def _starts(self, places: Sequence[int], offsets: NDArray[np.int64]) -> list[tuple[int, int]]:
         return [
-            (place, int(offset) + n * self.spec.length)
-            for place, offset in zip(places, offsets, strict=True)
-            for n in range(self._pieces(self.series[place], int(offset)))
+            (series_index, int(offset) + n * self.spec.length)
+            for series_index, offset in zip(places, offsets, strict=True)
+            for n in range(self._pieces(self.series[series_index], int(offset)))
         ]
 
 
@@ -96,11 +97,11 @@ def by_machine(series: Sequence[Series]) -> dict[str, list[int]]:
         DataError: a series that does not know its machine.
     """
     owned: dict[str, list[int]] = {}
-    for place, part in enumerate(series):
+    for series_index, part in enumerate(series):
         if not part.machine:
             raise DataError(
                 f"recording '{part.name}' does not say which machine it is of; list the logs in a data-set file "
                 '(.toml) with machine = "..." in each [[recordings]]'
             )
-        owned.setdefault(part.machine, []).append(place)
+        owned.setdefault(part.machine, []).append(series_index)
     return owned

@@ -71,7 +71,7 @@ def thresholds(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band:
 
 def activity_of(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: float) -> tuple[Activity, ...]:
     """Counts for each axis."""
-    made = []
+    activity = []
     for axis, level in zip(axes, thresholds(recordings, axes, dead_band), strict=True):
         turned = crossed = active = None
         if axis.command:
@@ -79,8 +79,8 @@ def activity_of(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band
             turned = sum(reversals(u, level) for u in commands)
             crossed = sum(rises(u > level) + rises(-u > level) for u in commands)
             active = sum(int(np.count_nonzero(np.abs(u) > level)) for u in commands) / sum(len(u) for u in commands)
-        made.append(Activity(axis.name, turned, crossed, active))
-    return tuple(made)
+        activity.append(Activity(axis.name, turned, crossed, active))
+    return tuple(activity)
 
 
 def together(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: float) -> dict[str, float]:
@@ -112,14 +112,14 @@ def events_of(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, f
         recordings: the data set.
         ends: channel of each stroke with its shortest and longest length, m; None where they are not known.
     """
-    made = [_contacts(recordings, ends)]
+    events = [_contacts(recordings, ends)]
     for name, channel in RECORDED.items():
         if channel not in recordings[0].channel_names:
-            made.append(RareEvent(name, None, None, "not recorded"))
+            events.append(RareEvent(name, None, None, "not recorded"))
             continue
         flags = [r.column(channel) > 0.5 for r in recordings]
-        made.append(RareEvent(name, sum(rises(on) for on in flags), float(np.concatenate(flags).mean())))
-    return tuple(made)
+        events.append(RareEvent(name, sum(rises(on) for on in flags), float(np.concatenate(flags).mean())))
+    return tuple(events)
 
 
 def _contacts(recordings: Sequence[Recording], ends: Mapping[str, tuple[float, float]] | None) -> RareEvent:

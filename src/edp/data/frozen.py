@@ -134,13 +134,13 @@ class ByFrozen:
             validation=tuple(names[i] for i in validation),
             test=tuple(names[i] for i in test),
         )
-        place = dict(enumerate(names))
-        found = rule.split(candidates, gap)
+        recording_index = dict(enumerate(names))
+        drawn_split = rule.split(candidates, gap)
 
         def moved(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-            return tuple(sorted((replace(s, recording=place[s.recording]) for s in stretches), key=_order))
+            return tuple(sorted((replace(s, recording=recording_index[s.recording]) for s in stretches), key=_order))
 
-        return Split(moved(found.train), moved(found.validation), moved(found.test))
+        return Split(moved(drawn_split.train), moved(drawn_split.validation), moved(drawn_split.test))
 
     def _check_there(self, recordings: Sequence[Recording], there: Mapping[str, int]) -> None:
         """Refuse data that lack a frozen session, unless other data are expected."""
@@ -170,13 +170,13 @@ def frozen_before(provenance: Mapping[str, Any]) -> dict[str, str]:
         StorageError: it is no table of names.
     """
     data = provenance.get("data", {})
-    held = data.get("frozen", {}) if isinstance(data, Mapping) else {}
-    if not isinstance(held, Mapping) or not all(isinstance(name, str) for name in held.values()):
+    frozen_names = data.get("frozen", {}) if isinstance(data, Mapping) else {}
+    if not isinstance(frozen_names, Mapping) or not all(isinstance(name, str) for name in frozen_names.values()):
         raise StorageError(
             "provenance.json: data.frozen is no table of hashes and names of sessions; it was edited or is damaged: "
             "restore it"
         )
-    return {str(digest): name for digest, name in held.items()}
+    return {str(digest): name for digest, name in frozen_names.items()}
 
 
 def refuse_frozen(recordings: Sequence[Recording], frozen: Mapping[str, str], what: str) -> None:
@@ -212,10 +212,10 @@ def keep_frozen(before: SplitSpec, after: SplitSpec) -> None:
         )
 
 
-def _refuse_pieces(recordings: Sequence[Recording], frozen: Mapping[str, str], known: set[str]) -> None:
+def _refuse_pieces(recordings: Sequence[Recording], frozen: Mapping[str, str], development: set[str]) -> None:
     """Refuse a recording that the search did not know and that shares rows with a frozen one."""
     strange = [
-        recording for recording in recordings if recording.digest not in frozen and recording.digest not in known
+        recording for recording in recordings if recording.digest not in frozen and recording.digest not in development
     ]
     sealed = [recording for recording in recordings if recording.digest in frozen] if strange else []
     for recording in strange:
@@ -251,8 +251,10 @@ def _whole(recordings: Sequence[Recording], parts: Mapping[str, Sequence[int]]) 
                 f"split: no recording is left for {part}; {len(recordings)} recording(s) given. Give the recordings of "
                 "the search, or, for other data, --set split.missing=draw"
             )
-    made = {part: tuple(Stretch(i, 0, recordings[i].samples) for i in sorted(places)) for part, places in parts.items()}
-    return Split(made["train"], made["validation"], made["test"])
+    stretches = {
+        part: tuple(Stretch(i, 0, recordings[i].samples) for i in sorted(places)) for part, places in parts.items()
+    }
+    return Split(stretches["train"], stretches["validation"], stretches["test"])
 
 
 def _order(stretch: Stretch) -> tuple[int, int]:

@@ -40,11 +40,11 @@ class LagTask:
             raise ConfigError("the lag task has no targets; name at least one")
         if self.history < 1:
             raise ConfigError(f"lag history is {self.history} samples; it must be at least 1 (the present one)")
-        held = [target for target, column in enumerate(self.present) if column is not None]
-        if 0 in self.horizons and held:
+        present_targets = [target for target, column in enumerate(self.present) if column is not None]
+        if 0 in self.horizons and present_targets:
             raise ConfigError(
-                f"horizon 0 asks for target {held[0]} at the very tick at which input column "
-                f"{self.present[held[0]]} holds it; drop that input or predict from horizon 1"
+                f"horizon 0 asks for target {present_targets[0]} at the very tick at which input column "
+                f"{self.present[present_targets[0]]} holds it; drop that input or predict from horizon 1"
             )
 
     @property

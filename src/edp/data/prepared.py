@@ -64,13 +64,13 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
     state.update(repr(parts).encode())
 
     def series(stretches: Sequence[Stretch]) -> list[Series]:
-        made = []
+        prepared_series = []
         for stretch in stretches:
             recording = recordings[stretch.recording]
             whole = stretch.start == 0 and stretch.stop == recording.samples
             name = recording.name if whole else f"{recording.name}[{stretch.start}:{stretch.stop}]"
-            made.append(task.series(recording, stretch.start, stretch.stop, name))
-        return made
+            prepared_series.append(task.series(recording, stretch.start, stretch.stop, name))
+        return prepared_series
 
     return Prepared(
         task=task,

@@ -75,17 +75,17 @@ def roles_of(recording: Recording, inputs: Sequence[str] = ()) -> Roles:
     for name in inputs:
         if name not in names:
             raise DataError(f"input '{name}' is not a channel of '{recording.name}'{closest(name, names)}")
-    known = [] if inputs else [axis for i in range(3) if (axis := _of_table(i, names)) is not None]
-    if known:
-        return Roles(tuple(known), tuple(name for axis in known for name in axis.command))
+    table_axes = [] if inputs else [axis for i in range(3) if (axis := _of_table(i, names)) is not None]
+    if table_axes:
+        return Roles(tuple(table_axes), tuple(name for axis in table_axes for name in axis.command))
     return _by_kind(recording.channels, tuple(inputs))
 
 
 def _of_table(i: int, names: Sequence[str]) -> Axis | None:
     title, command, conflux = _TABLE_A1[i]
 
-    def there(*wanted: str) -> tuple[str, ...]:
-        return tuple(name for name in wanted if name in names)
+    def there(*candidates: str) -> tuple[str, ...]:
+        return tuple(name for name in candidates if name in names)
 
     axis = Axis(
         title,
@@ -102,10 +102,10 @@ def _by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
     """An axis for each velocity; commands, pressures and positions go to them in order where their numbers fit."""
     kinds = {channel.name: channel.kind for channel in channels}
 
-    def of(*wanted: Kind) -> list[str]:
-        return [name for name, kind in kinds.items() if kind in wanted and name not in inputs]
+    def of(*accepted: Kind) -> list[str]:
+        return [name for name, kind in kinds.items() if kind in accepted and name not in inputs]
 
-    commands = list(inputs) or next((found for kind in COMMANDS if (found := of(kind))), [])
+    commands = list(inputs) or next((of_kind for kind in COMMANDS if (of_kind := of(kind))), [])
     speeds = of(Kind.VELOCITY) or of(Kind.ANGULAR_VELOCITY) or (of(Kind.GENERIC) if commands else [])
     places, pressures = of(Kind.POSITION) or of(Kind.ANGLE), of(Kind.PRESSURE)
     count = max(len(speeds), min(len(commands), 1))

@@ -71,8 +71,8 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
     target_offset = np.zeros((len(task.horizons), len(task.targets)))
     target_scale = np.ones_like(target_offset)
     for row, horizon in enumerate(task.horizons):
-        wanted = [_encoded(task, series, horizon) for series in train]
-        _, _, target_mean, target_std = _moments([values for values in wanted if len(values)])
+        encoded_targets = [_encoded(task, series, horizon) for series in train]
+        _, _, target_mean, target_std = _moments([values for values in encoded_targets if len(values)])
         if task.mode is TargetMode.ABSOLUTE:
             target_offset[row] = target_mean
         target_scale[row] = np.where(target_std > 0, target_std, 1.0)

@@ -84,9 +84,9 @@ class ByRecording:
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide by recording."""
         names = [recording.name for recording in recordings]
-        for wanted in (*self.validation, *self.test):
-            if wanted not in names:
-                raise DataError(f"split: there is no recording '{wanted}'{closest(wanted, names)}")
+        for recording_name in (*self.validation, *self.test):
+            if recording_name not in names:
+                raise DataError(f"split: there is no recording '{recording_name}'{closest(recording_name, names)}")
         if set(self.validation) & set(self.test):
             raise DataError("split: a recording is named both in validation and in test; keep it in one")
         test, validation = list(self.test), list(self.validation)
@@ -256,9 +256,9 @@ class ByMachine:
                 'simulate --family), or split by recording (kind = "recordings")'
             )
         named = [[name.lower() for name in part] for part in (self.validation, self.test)]
-        for wanted in itertools.chain(*named):
-            if wanted not in machines:
-                raise DataError(f"split: there is no machine '{wanted}'{closest(wanted, machines)}")
+        for machine_name in itertools.chain(*named):
+            if machine_name not in machines:
+                raise DataError(f"split: there is no machine '{machine_name}'{closest(machine_name, machines)}")
         validation, test = named[0], [*named[1], *self._heavy(recordings, owners)]
         both = sorted(set(validation) & set(test))
         if both:
@@ -269,9 +269,9 @@ class ByMachine:
             test, drawn = _take(drawn, self.test_share, len(machines))
         if not validation:
             validation, drawn = _take(drawn, self.validation_share, len(machines))
-        held = {"train": set(drawn), "validation": set(validation), "test": set(test)}
+        machines_by_part = {"train": set(drawn), "validation": set(validation), "test": set(test)}
         whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
-        parts = {part: [s for s in whole if owners[s.recording] in names] for part, names in held.items()}
+        parts = {part: [s for s in whole if owners[s.recording] in names] for part, names in machines_by_part.items()}
         return _checked(parts, recordings)
 
     def _heavy(self, recordings: Sequence[Recording], owners: Sequence[str]) -> list[str]:
@@ -280,12 +280,16 @@ class ByMachine:
             return []
         low, high = self.test_masses
         masses = {owner: r.meta.get(MASS) for owner, r in zip(owners, recordings, strict=True)}
-        found = [owner for owner, mass in masses.items() if mass is not None and low <= float(mass) <= high]
-        if not found:
-            known = [float(mass) for mass in masses.values() if mass is not None]
-            span = f"they go from {min(known):g} to {max(known):g} t" if known else "no recording says its mass"
+        matching = [owner for owner, mass in masses.items() if mass is not None and low <= float(mass) <= high]
+        if not matching:
+            known_masses = [float(mass) for mass in masses.values() if mass is not None]
+            span = (
+                f"they go from {min(known_masses):g} to {max(known_masses):g} t"
+                if known_masses
+                else "no recording says its mass"
+            )
             raise DataError(f"split: no machine lies within test_masses = {list(self.test_masses)}; {span}")
-        return found
+        return matching
 
 
 def machine_of(recording: Recording) -> str:
@@ -307,12 +311,12 @@ def _spread(names: Sequence[str], families: Mapping[str, str]) -> list[str]:
     """Names in the order given, but each family spread evenly over it, so that any cut has its share of all."""
     size = Counter(families[name] for name in names)
     seen: Counter[str] = Counter()
-    place = {}
+    position = {}
     for name in names:
         family = families[name]
-        place[name] = (seen[family] + 0.5) / size[family]
+        position[name] = (seen[family] + 0.5) / size[family]
         seen[family] += 1
-    return sorted(names, key=lambda name: place[name])
+    return sorted(names, key=lambda name: position[name])
 
 
 def _take(names: list[str], share: float, total: int) -> tuple[list[str], list[str]]:

@@ -43,13 +43,15 @@ def make_target(name: str, options: Mapping[str, object] | None = None) -> Expor
         ConfigError: there is no such target, it has no such option, or text that must be a number is none.
         ExportError: a value that the target does not take.
     """
-    kind, given = TARGETS[name], dict(options or {})
-    known = _options(kind)
-    for option in given:
-        if option not in known:
-            has = f"it has {', '.join(known)}" if known else "it has none"
+    kind, stated_options = TARGETS[name], dict(options or {})
+    option_types = _options(kind)
+    for option in stated_options:
+        if option not in option_types:
+            has = f"it has {', '.join(option_types)}" if option_types else "it has none"
             raise ConfigError(f"export target '{name}' has no option '{option}' ({has}); leave it out")
-    return kind(**{option: _read(name, option, value, known[option]) for option, value in given.items()})
+    return kind(
+        **{option: _read(name, option, value, option_types[option]) for option, value in stated_options.items()}
+    )
 
 
 def _options(kind: type[ExportTarget]) -> dict[str, type]:
@@ -67,8 +69,8 @@ def _read(target: str, option: str, value: object, kind: type) -> object:
     try:
         return _SWITCH[value.lower()] if kind is bool else kind(value)
     except (KeyError, ValueError) as error:
-        wanted = "true or false" if kind is bool else "a whole number" if kind is int else "a number"
-        raise ConfigError(f"option '{option}' of export target '{target}' is '{value}'; it must be {wanted}") from error
+        rule = "true or false" if kind is bool else "a whole number" if kind is int else "a number"
+        raise ConfigError(f"option '{option}' of export target '{target}' is '{value}'; it must be {rule}") from error
 
 
 _SWITCH = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}

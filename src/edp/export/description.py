@@ -118,10 +118,10 @@ def as_json(content: Mapping[str, Any]) -> bytes:
 
 def as_mat(variables: Mapping[str, Any]) -> bytes:
     """Variables as a MAT file (version 5), the same bytes at any time of day; lists become rows of numbers or cells."""
-    made = io.BytesIO()
-    scipy.io.savemat(made, {name: _for_matlab(value) for name, value in variables.items()}, long_field_names=True)
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, {name: _for_matlab(value) for name, value in variables.items()}, long_field_names=True)
     text = f"MATLAB 5.0 MAT-file, written by EDP {__version__}".ljust(116).encode()  # without the time of day
-    return text + made.getvalue()[len(text) :]
+    return text + buffer.getvalue()[len(text) :]
 
 
 def _for_matlab(value: Any) -> Any:

@@ -154,17 +154,17 @@ def shown_names(names: Iterable[str]) -> list[str]:
 
 def distinct(names: Iterable[str], most: int) -> list[str]:
     """The same names, cut to `most` characters; an empty one is `UNNAMED`, equal ones get ``_1``, ``_2`` and so on."""
-    made: list[str] = []
-    taken: set[str] = set()
+    distinct_names: list[str] = []
+    used_names: set[str] = set()
     tried: dict[str, int] = {}
-    for name in (given[:most] or UNNAMED for given in names):
+    for name in (label[:most] or UNNAMED for label in names):
         number = tried.get(name, 0)
-        while (candidate := _numbered(name, number, most)) in taken:
+        while (candidate := _numbered(name, number, most)) in used_names:
             number += 1
         tried[name] = number + 1
-        taken.add(candidate)
-        made.append(candidate)
-    return made
+        used_names.add(candidate)
+        distinct_names.append(candidate)
+    return distinct_names
 
 
 def _numbered(name: str, number: int, most: int) -> str:

@@ -50,8 +50,8 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
             for file, digests in part.items():
                 every[file] = every.get(file, set()) | digests
         stale = [file for file in every if file not in new and _ours(path, file, every[file])]
-        for place in {(path / file).parent for file in files} - {path}:
-            _check_place(path, place)
+        for parent in {(path / file).parent for file in files} - {path}:
+            _check_place(path, parent)
         write_bytes(path / UNFINISHED, _as_list(every))
         _remove(path / LIST)
         _clean(path, every)
@@ -85,18 +85,18 @@ def _held(path: Path) -> Iterator[None]:
 
 def _listed(path: Path) -> Listed:
     """Files of a list with the hashes that they may have; none if it is absent, and none of lines of another form."""
-    made: Listed = {}
+    listed: Listed = {}
     try:
         if path.is_symlink() or not path.is_file() or path.stat().st_size > LONGEST_LIST:
-            return made
+            return listed
         lines = path.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError as error:
         raise storage_error(path, error, "read") from error
-    for found in filter(None, map(_LINE.fullmatch, lines)):
-        parts = PurePosixPath(found[2]).parts
-        if not found[2].startswith("/") and ".." not in parts:
-            made.setdefault("/".join(parts), set()).add(found[1])
-    return made
+    for match in filter(None, map(_LINE.fullmatch, lines)):
+        parts = PurePosixPath(match[2]).parts
+        if not match[2].startswith("/") and ".." not in parts:
+            listed.setdefault("/".join(parts), set()).add(match[1])
+    return listed
 
 
 def _as_list(listed: Mapping[str, set[str]]) -> bytes:
@@ -109,31 +109,31 @@ def _ours(path: Path, file: str, digests: set[str]) -> bool:
     Raises:
         StorageError: it is there with another content.
     """
-    place = path / file
-    if _linked(path, place) or not place.is_file():
+    target = path / file
+    if _linked(path, target) or not target.is_file():
         return False
     try:
-        found = hashlib.sha256(place.read_bytes()).hexdigest()
+        digest = hashlib.sha256(target.read_bytes()).hexdigest()
     except OSError as error:
-        raise storage_error(place, error, "read") from error
-    if found not in digests:
+        raise storage_error(target, error, "read") from error
+    if digest not in digests:
         raise StorageError(
-            f"'{place}' belongs to the export that this folder holds and was changed since; it is none of the new "
+            f"'{target}' belongs to the export that this folder holds and was changed since; it is none of the new "
             "files, so nothing was written. Move it away, or choose another folder with --out"
         )
     return True
 
 
-def _linked(path: Path, place: Path) -> bool:
+def _linked(path: Path, target: Path) -> bool:
     """Whether a place below a folder, or one on the way to it, is a symbolic link."""
-    steps = place.relative_to(path).parts
+    steps = target.relative_to(path).parts
     return any(path.joinpath(*steps[: at + 1]).is_symlink() for at in range(len(steps)))
 
 
-def _check_place(path: Path, place: Path) -> None:
-    if _linked(path, place):
+def _check_place(path: Path, target: Path) -> None:
+    if _linked(path, target):
         raise StorageError(
-            f"'{place}' is a symbolic link, through which files outside of '{path}' would be written; nothing was "
+            f"'{target}' is a symbolic link, through which files outside of '{path}' would be written; nothing was "
             "written. Remove it, or choose another folder with --out"
         )
 
@@ -147,15 +147,15 @@ def _remove(path: Path) -> None:
 
 def _clean(path: Path, every: Mapping[str, object]) -> None:
     """Remove what a killed export has not finished."""
-    for place in {path, *((path / file).parent for file in every)}:
-        if place.is_dir() and not (place != path and _linked(path, place)):
-            for rest in place.iterdir():
+    for folder in {path, *((path / file).parent for file in every)}:
+        if folder.is_dir() and not (folder != path and _linked(path, folder)):
+            for rest in folder.iterdir():
                 if _TEMPORARY.fullmatch(rest.name) and rest.is_file() and not rest.is_symlink():
                     _remove(rest)
 
 
 def _remove_empty(path: Path, stale: list[str]) -> None:
     """Remove folders that hold nothing any more."""
-    for place in sorted({(path / file).parent for file in stale} - {path}, reverse=True):
+    for folder in sorted({(path / file).parent for file in stale} - {path}, reverse=True):
         with contextlib.suppress(OSError):  # not empty
-            place.rmdir()
+            folder.rmdir()

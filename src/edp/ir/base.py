@@ -86,8 +86,8 @@ class Layer(ABC):
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Its constant arrays by name within the layer."""
-        held = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return {name: value for name, value in held.items() if isinstance(value, np.ndarray)}
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,10 @@ def constant(values: Any) -> Array:
         ExportError: one of them is not finite.
     """
     plain = values.detach().cpu().numpy() if hasattr(values, "detach") else values
-    made = np.array(plain, dtype=np.float32, order="C")
-    if not np.isfinite(made).all():
+    array = np.array(plain, dtype=np.float32, order="C")
+    if not np.isfinite(array).all():
         raise ExportError("a weight of the network is NaN or infinite; train again before exporting")
-    return made
+    return array
 
 
 class Builder:
@@ -56,11 +56,11 @@ class Builder:
             The name of its value.
         """
         full = ".".join([*self._scope, name])
-        taken = {layer.name for layer in self.layers}
-        if full in taken or full == INPUT:
-            full = next(f"{full}_{n}" for n in range(2, len(taken) + 3) if f"{full}_{n}" not in taken)
-        given = {key: constant(value) if hasattr(value, "shape") else value for key, value in options.items()}
-        self.layers.append(kind(name=full, inputs=inputs, **given))
+        layer_names = {layer.name for layer in self.layers}
+        if full in layer_names or full == INPUT:
+            full = next(f"{full}_{n}" for n in range(2, len(layer_names) + 3) if f"{full}_{n}" not in layer_names)
+        layer_options = {key: constant(value) if hasattr(value, "shape") else value for key, value in options.items()}
+        self.layers.append(kind(name=full, inputs=inputs, **layer_options))
         return full
 
     def pick(self, name: str, x: str, columns: Sequence[int]) -> str:
@@ -95,10 +95,12 @@ class Builder:
 
     def graph(self, results: dict[str, str], window: int) -> Graph:
         """The finished list without layers whose value nobody reads."""
-        kept: list[Layer] = []
-        wanted = set(results.values())
+        used_layers: list[Layer] = []
+        used_values = set(results.values())
         for layer in reversed(self.layers):
-            if layer.name in wanted or not layer.width:
-                kept.append(layer)
-                wanted |= set(layer.inputs)
-        return Graph(self.inputs, tuple(replace(layer) for layer in reversed(kept)), results, self._initial, window)
+            if layer.name in used_values or not layer.width:
+                used_layers.append(layer)
+                used_values |= set(layer.inputs)
+        return Graph(
+            self.inputs, tuple(replace(layer) for layer in reversed(used_layers)), results, self._initial, window
+        )

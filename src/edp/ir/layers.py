@@ -42,14 +42,14 @@ class Gather(Layer):
 def runs(columns: Sequence[int], widths: Sequence[int]) -> list[tuple[int, int, int]]:
     """Runs of neighbouring columns of inputs that are laid end to end: which input, its first column, how many."""
     origin = [(which, column) for which, width in enumerate(widths) for column in range(width)]
-    found: list[tuple[int, int, int]] = []
+    column_runs: list[tuple[int, int, int]] = []
     for column in columns:
         which, at = origin[column]
-        if found and found[-1][0] == which and sum(found[-1][1:]) == at:
-            found[-1] = (which, found[-1][1], found[-1][2] + 1)
+        if column_runs and column_runs[-1][0] == which and sum(column_runs[-1][1:]) == at:
+            column_runs[-1] = (which, column_runs[-1][1], column_runs[-1][2] + 1)
         else:
-            found.append((which, at, 1))
-    return found
+            column_runs.append((which, at, 1))
+    return column_runs
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

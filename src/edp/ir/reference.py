@@ -44,12 +44,12 @@ class Reference:
         """Feed one tick ``(input,)`` in SI units; returns the value of every layer and the input."""
         values: dict[str, Values] = {INPUT: np.asarray(inputs, dtype=self.dtype)}
         for layer in self.graph.layers:
-            given = [values[name] for name in layer.inputs]
+            layer_inputs = [values[name] for name in layer.inputs]
             if isinstance(layer, memory.PrefixCorrection):
-                self._correct(layer, given[0])
+                self._correct(layer, layer_inputs[0])
                 continue
             run = STEPS[type(layer)]
-            values[layer.name] = run(layer, self._constants[layer.name], self.memory[layer.name], *given)
+            values[layer.name] = run(layer, self._constants[layer.name], self.memory[layer.name], *layer_inputs)
         return values
 
     def results(self, inputs: Values) -> dict[str, Values]:
@@ -58,14 +58,14 @@ class Reference:
         return {meaning: values[name] for meaning, name in self.graph.results.items()}
 
     def _correct(self, layer: memory.PrefixCorrection, x: Values) -> None:
-        held, weights = self.memory[layer.name], self._constants[layer.name]
-        if held["age"][0] >= layer.ticks:
+        state, weights = self.memory[layer.name], self._constants[layer.name]
+        if state["age"][0] >= layer.ticks:
             return
-        held["total"] = held["total"] + x
-        held["age"] = held["age"] + 1
-        if held["age"][0] < layer.ticks:
+        state["total"] = state["total"] + x
+        state["age"] = state["age"] + 1
+        if state["age"][0] < layer.ticks:
             return
-        seen = np.concatenate([held["total"] / self.dtype(layer.ticks), x])
+        seen = np.concatenate([state["total"] / self.dtype(layer.ticks), x])
         hidden = np.tanh(weights["first_weight"] @ seen + weights["first_bias"])
         numbers, at = weights["second_weight"] @ hidden + weights["second_bias"], 0
         for name, slot in layer.corrects:
@@ -237,8 +237,8 @@ def _lstm_states(gates: Values, m: Memory, share: float, squash: Callable[[Value
     i, f, g, o = np.split(gates, 4)
     fresh = sigmoid(f) * m["c"] + sigmoid(i) * np.tanh(g)
     out = sigmoid(o) * np.tanh(squash(fresh))
-    taken = gates.dtype.type(share)
-    m["h"], m["c"] = m["h"] + taken * (out - m["h"]), m["c"] + taken * (fresh - m["c"])
+    dtype_share = gates.dtype.type(share)
+    m["h"], m["c"] = m["h"] + dtype_share * (out - m["h"]), m["c"] + dtype_share * (fresh - m["c"])
     return m["h"]
 
 

@@ -40,24 +40,24 @@ class Assembly:
 
     Attributes:
         raw: the file.
-        wanted: the channels, in order.
+        sources: the channels, in order.
         repair: what may be mended.
         lines: how each time column is sampled.
         rate_hz: of the grid.
         ticks: the ticks of the grid that the recording keeps.
         missing: which of them lie in a gap, shape ``(time,)``.
-        made: the repairs made to time.
+        repairs: those made to time.
         untouched: every row of every channel is taken as it is in the file, by its own rate and map.
     """
 
     raw: RawLog
-    wanted: Sequence[ChannelSource]
+    sources: Sequence[ChannelSource]
     repair: Repair
     lines: dict[int, _Timeline]
     rate_hz: float
     ticks: slice
     missing: Mask
-    made: list[dict[str, Any]] = field(default_factory=list)
+    repairs: list[dict[str, Any]] = field(default_factory=list)
     untouched: bool = False
 
     @property
@@ -87,15 +87,15 @@ class Assembly:
         Raises:
             DataError: a column cannot be read, or holds missing values that may not be mended.
         """
-        values, made = self._mended(start, stop, before)
+        values, repairs = self._mended(start, stop, before)
         meta: dict[str, Any] = dict(self.raw.meta)
-        if self.made or made:
-            meta["repairs"] = [*meta.get("repairs", []), *self.made, *made]
+        if self.repairs or repairs:
+            meta["repairs"] = [*meta.get("repairs", []), *self.repairs, *repairs]
         if self.resampled:
             meta["resampled_from_hz"] = max(clock.rate_hz for clock in self.clocks)
         return Recording(
             name=name or self.raw.name or name_of_file(self.raw.path),
-            channels=tuple(entry.channel for entry in self.wanted),
+            channels=tuple(entry.channel for entry in self.sources),
             values=values,
             rate_hz=self.rate_hz,
             source=self.raw.source or str(self.raw.path),
@@ -110,59 +110,66 @@ class Assembly:
             values[missing] = np.nan
         if before is not None:
             values, missing = np.vstack([before[None], values]), np.append(False, missing)
-        names = [entry.channel.name for entry in self.wanted]
+        names = [entry.channel.name for entry in self.sources]
         offset = start if before is None else start - 1
-        made = mend_values(values, missing, names, self.rate_hz, self.repair, f"'{self.raw.path}'", offset)
-        return (values if before is None else values[1:]), made
+        repairs = mend_values(values, missing, names, self.rate_hz, self.repair, f"'{self.raw.path}'", offset)
+        return (values if before is None else values[1:]), repairs
 
     def _values(self, first: int, last: int) -> FloatArray:
         """Ticks ``first <= k < last`` of the grid, float32, shape ``(time, channel)``."""
         check_memory(
             self.raw.path,
-            4 * (last - first) * len(self.wanted),
-            f"{last - first} samples of {len(self.wanted)} channels",
+            4 * (last - first) * len(self.sources),
+            f"{last - first} samples of {len(self.sources)} channels",
             "read some rows, fewer channels, or in parts (edp.logs.read_parts)",
         )
-        values = np.empty((last - first, len(self.wanted)), dtype=np.float32)
+        values = np.empty((last - first, len(self.sources)), dtype=np.float32)
         tables: dict[tuple[int, int], tuple[ColumnTable, list[int]]] = {}
-        for place, entry in enumerate(self.wanted):
+        for column_index, entry in enumerate(self.sources):
             if entry.signal is None:
-                values[:, place] = entry.constant
+                values[:, column_index] = entry.constant
                 continue
             clock = _clock_key(entry.signal)
             line, table = self.lines[clock], entry.signal.table
             if table is not None and line.order is None:
-                tables.setdefault((id(table), clock), (table, []))[1].append(place)
+                tables.setdefault((id(table), clock), (table, []))[1].append(column_index)
                 continue
             column = entry.signal.values
             if line.order is not None:
                 column = column[line.order]
-            values[:, place] = entry.convert(column[slice(first, last) if line.rows is None else line.rows[first:last]])
+            values[:, column_index] = entry.convert(
+                column[slice(first, last) if line.rows is None else line.rows[first:last]]
+            )
         for table, places in tables.values():
             self._fill(values, table, places, first)
         return values
 
     def _fill(self, values: FloatArray, table: ColumnTable, places: list[int], first: int) -> None:
         """Columns of one table and one clock, piece by piece."""
-        chosen = [(place, entry, entry.signal) for place in places if (entry := self.wanted[place]).signal is not None]
+        chosen = [
+            (column_index, entry, entry.signal)
+            for column_index in places
+            if (entry := self.sources[column_index]).signal is not None
+        ]
         keys = [signal.key for _, _, signal in chosen]
         ticks = slice(first, first + len(values))
         rows = self.lines[_clock_key(chosen[0][2])].rows
-        taken = np.arange(ticks.start, ticks.stop) if rows is None else rows[ticks]
-        at, tick = int(taken[0]), 0
-        for columns in table.pieces(keys, at, int(taken[-1]) + 1):
+        source_rows = np.arange(ticks.start, ticks.stop) if rows is None else rows[ticks]
+        at, tick = int(source_rows[0]), 0
+        for columns in table.pieces(keys, at, int(source_rows[-1]) + 1):
             end = at + len(columns[0])
-            stop = int(np.searchsorted(taken, end))
-            part = taken[tick:stop] - at
+            stop = int(np.searchsorted(source_rows, end))
+            part = source_rows[tick:stop] - at
             plain = len(part) == end - at and rows is None
             converted = [
                 entry.convert(column if plain else column[part]) for (_, entry, _), column in zip(chosen, columns)
             ]
-            _interleave(values[tick:stop], [place for place, _, _ in chosen], converted)
+            _interleave(values[tick:stop], [column_index for column_index, _, _ in chosen], converted)
             at, tick = end, stop
         if tick != len(values):
             raise DataError(
-                f"'{self.raw.path}' ends after {at} rows, {int(taken[-1]) + 1} were announced (truncated or damaged); "
+                f"'{self.raw.path}' ends after {at} rows, {int(source_rows[-1]) + 1} were announced (truncated "
+                "or damaged); "
                 "copy or export it again"
             )
 
@@ -171,24 +178,24 @@ def _interleave(values: FloatArray, places: list[int], columns: list[FloatArray]
     """Write columns into rows, some rows at a time: a whole column at once would leave the cache at each step."""
     for start in range(0, len(values), _CACHED_ROWS):
         block = values[start : start + _CACHED_ROWS]
-        for place, column in zip(places, columns):
-            block[:, place] = column[start : start + _CACHED_ROWS]
+        for column_index, column in zip(places, columns):
+            block[:, column_index] = column[start : start + _CACHED_ROWS]
 
 
 def prepare(
     raw: RawLog,
-    wanted: Sequence[ChannelSource],
+    sources: Sequence[ChannelSource],
     signal_map: SignalMap,
     repair: Repair,
     rows: tuple[int, int | None] | None = None,
 ) -> Assembly:
-    """Bring the times of the wanted channels to one grid; no value is read yet.
+    """Bring the times of the chosen channels to one grid; no value is read yet.
 
     Raises:
         DataError: times that cannot be used or may not be mended; rows outside the log.
     """
     where = f"'{raw.path}'"
-    lines, grid, made = _timelines(raw, wanted, signal_map, repair)
+    lines, grid, repairs = _timelines(raw, sources, signal_map, repair)
     missing = np.zeros(grid.count, dtype=np.bool_)
     for line in lines.values():
         missing |= line.missing
@@ -199,45 +206,53 @@ def prepare(
     own_way = not signal_map.channels and signal_map.rate_hz is None and signal_map.sample_time_s is None
     untouched = own_way and repair == Repair() and (first, last) == (0, grid.count)
     return Assembly(
-        raw, wanted, repair, lines, grid.rate_hz, slice(first, last), missing[first:last], made + gap_facts, untouched
+        raw,
+        sources,
+        repair,
+        lines,
+        grid.rate_hz,
+        slice(first, last),
+        missing[first:last],
+        repairs + gap_facts,
+        untouched,
     )
 
 
 def assemble(
     raw: RawLog,
-    wanted: Sequence[ChannelSource],
+    sources: Sequence[ChannelSource],
     signal_map: SignalMap,
     repair: Repair,
     naming: tuple[str | None, tuple[int, int | None] | None] = (None, None),
 ) -> tuple[Recording, list[Clock]]:
-    """Bring the wanted channels to one grid; also returns the clocks of the file's time columns."""
+    """Bring the chosen channels to one grid; also returns the clocks of the file's time columns."""
     name, rows = naming
-    made = prepare(raw, wanted, signal_map, repair, rows)
-    recording = made.recording(0, made.samples, name)
-    if made.untouched and raw.digest is not None and recording.digest != raw.digest:
+    assembly = prepare(raw, sources, signal_map, repair, rows)
+    recording = assembly.recording(0, assembly.samples, name)
+    if assembly.untouched and raw.digest is not None and recording.digest != raw.digest:
         raise DataError(
             f"'{raw.path}': the values are not the ones that EDP wrote; the file is damaged, or was changed by another "
             "program: copy it again, or where the change is wanted, remove EDP's facts from it (edp_info)"
         )
-    return recording, made.clocks
+    return recording, assembly.clocks
 
 
-def parts(made: Assembly, samples: int, name: str) -> Iterator[Recording]:
+def parts(assembly: Assembly, samples: int, name: str) -> Iterator[Recording]:
     """The recording in consecutive parts of `samples` (the last one shorter), each named by its samples."""
     before: FloatArray | None = None
-    for start in range(0, made.samples, samples):
-        stop = min(start + samples, made.samples)
-        part = made.recording(start, stop, f"{name}[{start}:{stop}]", before)
+    for start in range(0, assembly.samples, samples):
+        stop = min(start + samples, assembly.samples)
+        part = assembly.recording(start, stop, f"{name}[{start}:{stop}]", before)
         before = _last_good(part.values, before)
         yield part
 
 
 def _last_good(values: FloatArray, before: FloatArray | None) -> FloatArray:
     last = np.full(values.shape[1], np.nan, dtype=np.float32) if before is None else before.copy()
-    for place, column in enumerate(values.T):
+    for column_index, column in enumerate(values.T):
         good = np.flatnonzero(np.isfinite(column))
         if len(good):
-            last[place] = column[good[-1]]
+            last[column_index] = column[good[-1]]
     return last
 
 
@@ -246,15 +261,15 @@ def _clock_key(signal: RawSignal) -> int:
 
 
 def _timelines(
-    raw: RawLog, wanted: Sequence[ChannelSource], signal_map: SignalMap, repair: Repair
+    raw: RawLog, sources: Sequence[ChannelSource], signal_map: SignalMap, repair: Repair
 ) -> tuple[dict[int, _Timeline], Grid, list[dict[str, Any]]]:
     if signal_map.rate_hz is not None and not 0 < signal_map.rate_hz < np.inf:
         raise DataError(f"signal map: rate_hz is {signal_map.rate_hz}; it must be a positive number")
-    signals = [entry.signal for entry in wanted if entry.signal is not None]
+    signals = [entry.signal for entry in sources if entry.signal is not None]
     if not signals:
         raise DataError(f"'{raw.path}': no channel is read from the file; map at least one to a column")
     judged: dict[int, tuple[Clock, Rows | None]] = {}
-    made: list[dict[str, Any]] = []
+    repairs: list[dict[str, Any]] = []
     for signal in signals:
         key = _clock_key(signal)
         if key in judged:
@@ -265,15 +280,15 @@ def _timelines(
             judged[key] = (stated, None)
             continue
         if signal.time_s is None:
-            known = ", ".join(list(raw.signals)[:12])
+            signal_names = ", ".join(list(raw.signals)[:12])
             raise DataError(
-                f"'{raw.path}' has no time column that fits '{signal.name}' (columns: {known}); "
+                f"'{raw.path}' has no time column that fits '{signal.name}' (columns: {signal_names}); "
                 "set 'time' in the signal map to its name, or set 'sample_time_s'"
             )
         where = f"'{raw.path}', time of '{signal.name}'"
         clock, order, mended = mend_stamps(signal.time_s, repair, where)
         judged[key] = (clock, order)
-        made += mended
+        repairs += mended
     grid = common_grid([clock for clock, _ in judged.values()], signal_map.rate_hz, f"'{raw.path}'")
     check_memory(
         raw.path,
@@ -282,7 +297,7 @@ def _timelines(
         "check the time column for a stamp that is far off, or set a lower rate_hz in the signal map",
     )
     lines = {key: _Timeline(clock, order, *hold_rows(clock, grid)) for key, (clock, order) in judged.items()}
-    return lines, grid, made
+    return lines, grid, repairs
 
 
 def _stated_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Clock | None:

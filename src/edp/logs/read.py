@@ -48,8 +48,8 @@ def read_recording(
         DataError: the file, a column, a unit, a time stamp or a value cannot be used; the message says what to change.
     """
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
-    raw, wanted = _opened(path, signal_map)
-    return assemble(raw, wanted, signal_map, repair, (name, rows))[0]
+    raw, sources = _opened(path, signal_map)
+    return assemble(raw, sources, signal_map, repair, (name, rows))[0]
 
 
 def read_parts(
@@ -76,18 +76,18 @@ def read_parts(
     if samples < 1:
         raise DataError(f"parts of {samples} samples asked for; give at least 1")
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
-    raw, wanted = _opened(path, signal_map)
-    yield from parts(prepare(raw, wanted, signal_map, repair), samples, raw.name or name_of_file(raw.path))
+    raw, sources = _opened(path, signal_map)
+    yield from parts(prepare(raw, sources, signal_map, repair), samples, raw.name or name_of_file(raw.path))
 
 
 def _opened(path: str | Path, signal_map: SignalMap) -> tuple[RawLog, list[ChannelSource]]:
     """The file and the wanted channels, all of which it has."""
     raw = open_log(path, signal_map)
-    wanted, problems = resolve(raw, signal_map)
+    sources, problems = resolve(raw, signal_map)
     if problems:
         more = f" (and {len(problems) - 1} more problem(s) of this kind)" if len(problems) > 1 else ""
         raise type(problems[0])(f"{problems[0]}{more}")
-    return raw, wanted
+    return raw, sources
 
 
 def read_truth(path: str | Path) -> Recording | None:
@@ -122,17 +122,20 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         return (source,)
     if not source.exists():
         raise DataError(f"'{source}' does not exist; give a log file or a folder of log files")
-    known = known_suffixes()
+    suffixes = known_suffixes()
     bags = {entry.parent for entry in source.rglob(BAG_MARK)}
     files = [
         entry
         for entry in source.rglob("*")
-        if entry.suffix.lower() in known and not entry.name.startswith(".") and entry.is_file() and not _is_truth(entry)
+        if entry.suffix.lower() in suffixes
+        and not entry.name.startswith(".")
+        and entry.is_file()
+        and not _is_truth(entry)
     ]
-    found = sorted([*bags, *(file for file in files if file.parent not in bags)])
-    if not found:
-        raise DataError(f"'{source}' holds no log files; known endings: {', '.join(known)}")
-    return tuple(found)
+    recording_paths = sorted([*bags, *(file for file in files if file.parent not in bags)])
+    if not recording_paths:
+        raise DataError(f"'{source}' holds no log files; known endings: {', '.join(suffixes)}")
+    return tuple(recording_paths)
 
 
 def _is_truth(path: Path) -> bool:
@@ -156,8 +159,8 @@ def read_data_set(
             them hold is left out instead, unless the map asks for it; and so is any channel that only some hold where
             the map takes `others`.
     """
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
-    files = list(dict.fromkeys(file for path in given for file in find_recordings(path)))
+    path_list = [paths] if isinstance(paths, str | Path) else list(paths)
+    files = list(dict.fromkeys(file for path in path_list for file in find_recordings(path)))
     if not files:
         raise DataError("no log files given; give at least one file or folder")
     recordings = [read_recording(file, signal_map, repair=repair) for file in files]
@@ -176,12 +179,14 @@ def _without_partial_truth(recordings: list[Recording]) -> list[Recording]:
     if len({recording.channel_names for recording in recordings}) == 1:
         return recordings
     common = set.intersection(*(set(recording.channel_names) for recording in recordings))
-    made = []
+    reduced = []
     for recording in recordings:
-        kept = [i for i, name in enumerate(recording.channel_names) if name in common or not is_truth(name)]
-        channels = tuple(recording.channels[i] for i in kept)
-        made.append(replace(recording, channels=channels, values=np.ascontiguousarray(recording.values[:, kept])))
-    return made
+        column_indices = [i for i, name in enumerate(recording.channel_names) if name in common or not is_truth(name)]
+        channels = tuple(recording.channels[i] for i in column_indices)
+        reduced.append(
+            replace(recording, channels=channels, values=np.ascontiguousarray(recording.values[:, column_indices]))
+        )
+    return reduced
 
 
 def common_channels(recordings: Sequence[Recording]) -> list[Recording]:

@@ -56,7 +56,7 @@ def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows
         DataError: a defect that `repair` does not allow to mend.
     """
     clock = judge(stamps, where)
-    made: list[dict[str, Any]] = []
+    repairs: list[dict[str, Any]] = []
     order: Rows | None = None
     if len(clock.falling):
         if repair.falling == "refuse":
@@ -64,7 +64,7 @@ def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows
                 f"{where}: time goes back in {len(clock.falling)} row(s), first in row {clock.falling[0]} "
                 f'(t = {stamps[clock.falling[0]]:g} s); mend the file or set repair falling = "sort"'
             )
-        made.append({"repair": "falling = sort", "count": len(clock.falling), "row": int(clock.falling[0])})
+        repairs.append({"repair": "falling = sort", "count": len(clock.falling), "row": int(clock.falling[0])})
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
         clock = judge(stamps, where)
@@ -74,11 +74,11 @@ def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows
                 f"{where}: {len(clock.duplicates)} duplicate time stamp(s), first in row {clock.duplicates[0]} "
                 f'(t = {stamps[clock.duplicates[0]]:g} s); mend the file or set repair duplicates = "last"'
             )
-        made.append({"repair": "duplicates = last", "count": len(clock.duplicates), "row": int(clock.duplicates[0])})
+        repairs.append({"repair": "duplicates = last", "count": len(clock.duplicates), "row": int(clock.duplicates[0])})
         last = np.append(np.diff(stamps) > 0, True)
         order = np.flatnonzero(last) if order is None else order[last]
         clock = judge(stamps[last], where)
-    return clock, order, made
+    return clock, order, repairs
 
 
 def mend_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, Any]]]:
@@ -120,10 +120,10 @@ def mend_values(
     Raises:
         DataError: there are some and `repair` does not allow them, or a channel starts with one.
     """
-    made: list[dict[str, Any]] = []
+    repairs: list[dict[str, Any]] = []
     finite = np.isfinite(values)
     if finite.all():
-        return made
+        return repairs
     sound = np.asarray(finite.all(axis=0))
     for column, name in enumerate(names):
         if sound[column]:
@@ -146,8 +146,8 @@ def mend_values(
             )
         source = np.maximum.accumulate(np.where(bad, 0, np.arange(len(bad))))
         values[own, column] = values[source[own], column]
-        made.append({"repair": "nan = hold", "channel": name, "count": len(rows), "row": first})
-    return made
+        repairs.append({"repair": "nan = hold", "channel": name, "count": len(rows), "row": first})
+    return repairs
 
 
 def runs(mask: Mask) -> tuple[Rows, Rows]:

@@ -44,7 +44,7 @@ class ChannelSource:
 
 def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[ChannelSource], list[EdpError]]:
     """The wanted channels in order, and what is wrong with the map or the file for those that cannot be had."""
-    wanted: list[ChannelSource] = []
+    sources: list[ChannelSource] = []
     problems: list[EdpError] = []
     if not signal_map.channels and not signal_map.others:
         entries = _vocabulary_entries(raw)
@@ -54,10 +54,10 @@ def resolve(raw: RawLog, signal_map: SignalMap) -> tuple[list[ChannelSource], li
         entries = [*signal_map.channels, *(_other_entries(raw, signal_map) if signal_map.others else ())]
     for entry in entries:
         try:
-            wanted.append(_one(raw, entry))
+            sources.append(_one(raw, entry))
         except EdpError as error:
             problems.append(error)
-    return wanted, problems
+    return sources, problems
 
 
 def _vocabulary_entries(raw: RawLog) -> list[ChannelMap]:
@@ -73,14 +73,14 @@ def _other_entries(raw: RawLog, signal_map: SignalMap) -> list[ChannelMap]:
     """Every column of numbers that the map does not name, under its own name."""
     columns = {raw.aliases.get(entry.column, entry.column) for entry in signal_map.channels}
     names = {entry.name for entry in signal_map.channels}
-    found = []
+    entries = []
     for name, signal in raw.signals.items():
         if name in columns or name in names or not _holds_numbers(signal):
             continue
-        known = VOCABULARY.get(name)
-        kind = signal.kind or (known.kind if known is not None else kind_of_unit(signal.unit))
-        found.append(ChannelMap(name, name, kind=kind, description=signal.description))
-    return found
+        usual_channel = VOCABULARY.get(name)
+        kind = signal.kind or (usual_channel.kind if usual_channel is not None else kind_of_unit(signal.unit))
+        entries.append(ChannelMap(name, name, kind=kind, description=signal.description))
+    return entries
 
 
 def _holds_numbers(signal: RawSignal) -> bool:

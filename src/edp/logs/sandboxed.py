@@ -73,12 +73,12 @@ def _raw_log(path: Path, log: _Log, facts: Header) -> RawLog:
     times: dict[int, _Time] = {}
     tables: dict[int, _Table] = {}
     signals: dict[str, RawSignal] = {}
-    for place, (key, entry) in enumerate(facts["signals"]):
+    for signal_index, (key, entry) in enumerate(facts["signals"]):
         name, samples, unit, kind, description, time, table, column = entry
         if type(samples) is not int or samples < 0:
             raise ValueError(f"a column of {samples!r} values")
         served = None if table is None else tables.setdefault(table, _Table(log, int(table)))
-        load = partial(log.load, place) if served is None else partial(_load, path, served, str(column), samples)
+        load = partial(log.load, signal_index) if served is None else partial(_load, path, served, str(column), samples)
         signals[str(key)] = RawSignal(
             str(name),
             load,
@@ -139,9 +139,9 @@ class _Log:
         _raise_refusal(header)
         return header
 
-    def load(self, place: int) -> Column:
+    def load(self, signal_index: int) -> Column:
         """One whole column of a log that has no tables."""
-        return np.asarray(self.array({"do": "load", "of": place}), dtype=np.float64)
+        return np.asarray(self.array({"do": "load", "of": signal_index}), dtype=np.float64)
 
     def array(self, request: Header) -> NDArray[Any]:
         """One array, whose size is weighed before it comes."""

@@ -93,14 +93,14 @@ def _answer(
     """Do some work within the limits and send what it says first; returns what it made, None where it failed."""
     try:
         with allowance.running(allowance.seconds(values)):
-            header, made = work()
+            header, result = work()
         send(write, header)
     except (EOFError, BrokenPipeError):
         raise
     except Exception as error:
         send(write, refusal(error, allowance))
         return None
-    return made
+    return result
 
 
 def refusal(error: Exception, allowance: Allowance) -> Header:
@@ -111,12 +111,12 @@ def refusal(error: Exception, allowance: Allowance) -> Header:
     if is_exhausted(error):
         error = allowance.exhausted()
     if isinstance(error, EdpError):
-        told = str(error)
-        told = told if len(told) <= _TEXT else f"{told[: _TEXT - _END - 5]} ... {told[-_END:]}"
-        return {"refused": told, "kind": type(error).__name__}
-    told = f"{type(error).__name__}: {brief(error)}"
+        message = str(error)
+        message = message if len(message) <= _TEXT else f"{message[: _TEXT - _END - 5]} ... {message[-_END:]}"
+        return {"refused": message, "kind": type(error).__name__}
+    message = f"{type(error).__name__}: {brief(error)}"
     advice = "it may be truncated or damaged: copy or export it again"
-    return {"refused": f"'{allowance.path}' cannot be read ({told}); {advice}", "kind": DataError.__name__}
+    return {"refused": f"'{allowance.path}' cannot be read ({message}); {advice}", "kind": DataError.__name__}
 
 
 @dataclass
@@ -184,7 +184,9 @@ class _Served:
             self._next(request["stream"], write, allowance)
 
     def _time(self, signal: RawSignal) -> int:
-        same = (place for place, time in enumerate(self.times) if time is signal.time or _equal(time, signal.time))
+        same = (
+            time_index for time_index, time in enumerate(self.times) if time is signal.time or _equal(time, signal.time)
+        )
         return next(same)
 
     def _array(
@@ -199,9 +201,9 @@ class _Served:
             check_plain(self.raw.path, [array])
             return {"bytes": array.nbytes}, [array]
 
-        made = _answer(write, allowance, values, work)
-        if made is not None:
-            send(write, {}, made)
+        result = _answer(write, allowance, values, work)
+        if result is not None:
+            send(write, {}, result)
 
     def _next(self, number: int, write: Callable[[Any], None], allowance: Allowance) -> None:
         stream = self.streams.get(number)

@@ -67,12 +67,12 @@ class DataSource:
 
     def to_plain(self) -> dict[str, Any]:
         """What provenance keeps, to read the same data again."""
-        kept: dict[str, Any] = {"path": str(self.path.resolve())}
+        plain: dict[str, Any] = {"path": str(self.path.resolve())}
         if self.signal_map is not None:
-            kept["map"] = plain_tree(self.signal_map)
+            plain["map"] = plain_tree(self.signal_map)
         if self.repair is not None:
-            kept["repair"] = plain_tree(self.repair)
-        return kept
+            plain["repair"] = plain_tree(self.repair)
+        return plain
 
     @staticmethod
     def from_plain(plain: dict[str, Any]) -> DataSource:
@@ -133,8 +133,8 @@ class Log:
 
     def read(self) -> Recording:
         """The recording."""
-        found = read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
-        return replace(found, meta={**found.meta, MACHINE: self.machine}) if self.machine else found
+        recording = read_recording(self.path, self.signal_map, name=self.name, rows=self.rows, repair=self.repair)
+        return replace(recording, meta={**recording.meta, MACHINE: self.machine}) if self.machine else recording
 
 
 def load_signal_map(path: str | Path) -> SignalMap:

@@ -102,8 +102,8 @@ def judge(stamps: Stamps, where: str) -> Clock:
     off = stamps - (start + step * np.arange(len(stamps))) if step > 0 else np.full(len(stamps), np.inf)
     jitter = float(np.sqrt(np.mean(off**2)) / step) if step > 0 else float("inf")
     near = jitter <= UNIFORM_RMS and float(np.abs(off).max()) <= UNIFORM_MAX * step
-    if not near and step > 0 and (found := _rounded_line(stamps, median)) is not None:
-        near, (start, step) = True, found
+    if not near and step > 0 and (rounded_line := _rounded_line(stamps, median)) is not None:
+        near, (start, step) = True, rounded_line
     if near:
         rate = nice_rate(step, len(stamps), jitter)
         line = start + np.arange(len(stamps)) / rate

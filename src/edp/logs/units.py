@@ -64,5 +64,5 @@ def unit_for(stated: str | None, kind: Kind, where: str) -> Unit:
     try:
         return conversion(unit, kind, where)
     except ConfigError as error:
-        known = "" if unit not in UNITS else "; correct the unit or the kind in the signal map"
-        raise DataError(f"{error}{known}") from error
+        advice = "" if unit not in UNITS else "; correct the unit or the kind in the signal map"
+        raise DataError(f"{error}{advice}") from error

@@ -56,8 +56,8 @@ class AdaptedStream(Stream):
             # No prediction to correct: the last corrected one stays, as the output of the exported C does.
             self.adapter.interrupt()
             self.status = RlsStatus.NONE
-            kept = base if self._corrected is None else self._corrected
-            return replace(kept, status=base.status)
+            prediction = base if self._corrected is None else self._corrected
+            return replace(prediction, status=base.status)
         fresh = base.status is StreamStatus.OK
         adapted, self.status = self.adapter.step(self._last, base.prediction, fresh=fresh, learn=self.learn)
         self.correction = adapted - base.prediction

@@ -33,12 +33,12 @@ def decompose(predictor: Predictor) -> Decomposition:
     """The decomposition that the backbone declares (`BackboneSpec.parts`); parts without parameters are left out."""
     names = [name for name, _ in predictor.named_parameters()]
     parts = [f"{BACKBONE}.{part}" for part in predictor.spec.backbone.parts()] or [BACKBONE]
-    held = {part: tuple(name for name in names if name.startswith(f"{part}.")) for part in parts}
-    inside = {name for some in held.values() for name in some}
+    names_by_part = {part: tuple(name for name in names if name.startswith(f"{part}.")) for part in parts}
+    inside = {name for some in names_by_part.values() for name in some}
     depth = len(predictor.heads.weights) - 1
     last = (f"heads.weights.{depth}", f"heads.biases.{depth}")
     return Decomposition(
-        {part: some for part, some in held.items() if some},
+        {part: some for part, some in names_by_part.items() if some},
         tuple(name for name in names if name not in inside),
         tuple(name for name in names if name in last),
     )

@@ -54,9 +54,9 @@ class IntegerPredictor(Predictor):
         """The network that it was made of, in single precision: to be counted or trained on."""
         offset, width = (part.double().numpy() for part in (self.front.offset, self.front.width))
         zero, unit = (part.double().numpy() for part in (self.code.offset, self.code.width))
-        made = Predictor(self.task, self.spec, Scaler(offset, width, zero, unit))
-        made.load_state_dict(self.state_dict())
-        return made.eval()
+        float_predictor = Predictor(self.task, self.spec, Scaler(offset, width, zero, unit))
+        float_predictor.load_state_dict(self.state_dict())
+        return float_predictor.eval()
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         """State at reset for `batch` streams."""
@@ -109,8 +109,8 @@ def integer_predictor(predictor: Predictor, series: Sequence[Series], ticks: int
     """
     some = spread(series, JUDGED_TICKS)
     inputs = [part.inputs for part in series]
-    made = calibrate(predictor.graph(), inputs, ticks, lambda frac: _error_with(predictor, some, frac))
-    return IntegerPredictor(predictor, made)
+    calibration = calibrate(predictor.graph(), inputs, ticks, lambda frac: _error_with(predictor, some, frac))
+    return IntegerPredictor(predictor, calibration)
 
 
 def spread(series: Sequence[Series], ticks: int) -> list[Series]:

@@ -48,18 +48,18 @@ def matrices_of(network: nn.Module, recurrent: bool = True) -> list[Matrix]:
     """
     stacks = [stack for stack in network.modules() if isinstance(stack, Stack)]
     recurring = {part for stack in stacks for layer in stack.layers for part in layer.modules()}
-    found = []
+    matrices = []
     for name, part in network.named_modules():
         if part not in recurring or recurrent:
             for key, axes in _declared(part):
-                held = getattr(part, key)
-                listed = isinstance(held, nn.ParameterList)
-                for last in map(str, range(len(held))) if listed else [key]:
+                parameter = getattr(part, key)
+                listed = isinstance(parameter, nn.ParameterList)
+                for last in map(str, range(len(parameter))) if listed else [key]:
                     full = ".".join(filter(None, (name, key if listed else "", last)))
-                    found.append(Matrix(full, part, held if listed else part, last, axes))
-    return found
+                    matrices.append(Matrix(full, part, parameter if listed else part, last, axes))
+    return matrices
 
 
 def _declared(part: nn.Module) -> Declared:
-    known = next((matrices for kind, matrices in LAYERS.items() if isinstance(part, kind)), ())
-    return known or (part.matrices if isinstance(part, Streaming) else ())
+    declared = next((matrices for kind, matrices in LAYERS.items() if isinstance(part, kind)), ())
+    return declared or (part.matrices if isinstance(part, Streaming) else ())

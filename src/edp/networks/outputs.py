@@ -119,12 +119,12 @@ class Output(nn.Module):
         Raises:
             ConfigError: none has.
         """
-        for which, held in enumerate(self.coverages):
-            if math.isclose(held, coverage, abs_tol=1e-6):
+        for which, own_coverage in enumerate(self.coverages):
+            if math.isclose(own_coverage, coverage, abs_tol=1e-6):
                 return which
         if not self.coverages:
             raise ConfigError("a point output has no intervals; train with model.output kind 'quantiles' or 'normal'")
-        listed = ", ".join(f"{held:g}" for held in self.coverages)
+        listed = ", ".join(f"{own_coverage:g}" for own_coverage in self.coverages)
         raise ConfigError(f"there is no interval of coverage {coverage:g}; this network has {listed}")
 
     def calibrate(self, answer: Prediction, target: Tensor) -> None:
@@ -234,15 +234,15 @@ class _Quantiles(Output):
     def lower_reach(self, build: Builder, y: str) -> tuple[str, str]:
         pairs, (_, horizons, outputs) = self.pairs, self.stretch.shape
         size = horizons * outputs
-        ones, found = torch.ones(pairs * size), []
+        ones, bounds = torch.ones(pairs * size), []
         for side, first in (("down", 1), ("up", 1 + pairs)):
             raw = build.pick(side, y, self.rows(1 + 2 * pairs, range(first, first + pairs)))
             gap = build.add(Activate, f"{side}_softplus", raw, function=Function.SOFTPLUS, size=pairs * size)
             gap = build.add(ScaleShift, f"{side}_gap", gap, gain=ones, shift=SMALLEST * ones)
             total = build.add(Accumulate, f"{side}_total", gap, rows=pairs, size=size)
             widest_first = [row * size + i for row in reversed(range(pairs)) for i in range(size)]
-            found.append(build.pick(f"{side}_ordered", total, widest_first))
-        return found[0], found[1]
+            bounds.append(build.pick(f"{side}_ordered", total, widest_first))
+        return bounds[0], bounds[1]
 
 
 @dataclass(frozen=True, kw_only=True)

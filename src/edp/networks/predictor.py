@@ -60,10 +60,10 @@ class ModelSpec:
                     f"block '{BLOCKS.name_of(block)}' needs the slot '{slot}', which this backbone does not offer "
                     f"(it has {', '.join(sorted(offered))}); remove the block or choose another backbone"
                 )
-        for taken in BlockSlot:
-            names = [BLOCKS.name_of(block) for block in in_slot(self.blocks, taken)]
-            if len(names) > 1 and (taken not in SHARED_SLOTS or len(set(names)) < len(names)):
-                raise ConfigError(f"blocks {', '.join(names)} share the slot '{taken}'; keep one of them")
+        for block_slot in BlockSlot:
+            names = [BLOCKS.name_of(block) for block in in_slot(self.blocks, block_slot)]
+            if len(names) > 1 and (block_slot not in SHARED_SLOTS or len(set(names)) < len(names)):
+                raise ConfigError(f"blocks {', '.join(names)} share the slot '{block_slot}'; keep one of them")
 
 
 def check_combination(task: Task, spec: ModelSpec) -> None:
@@ -74,9 +74,9 @@ def check_combination(task: Task, spec: ModelSpec) -> None:
     """
     parts = (spec.backbone, spec.head, spec.output, spec.activation, *spec.blocks, spec.physics)
     reasons = [part.conflicts(spec, task) for part in parts if isinstance(part, HasConflicts)]
-    given = [reason for reason in reasons if reason]
-    if given:
-        raise ConfigError("; ".join(given))
+    stated_reasons = [reason for reason in reasons if reason]
+    if stated_reasons:
+        raise ConfigError("; ".join(stated_reasons))
 
 
 class Predictor(Streaming):
@@ -113,8 +113,8 @@ class Predictor(Streaming):
 
     def _block(self, slot: BlockSlot, *sizes: object) -> Streaming | None:
         """The block in a slot that takes one, built; None where there is none."""
-        found = in_slot(self.spec.blocks, slot)
-        return found[0].build(*sizes) if found else None  # type: ignore[attr-defined]
+        slot_blocks = in_slot(self.spec.blocks, slot)
+        return slot_blocks[0].build(*sizes) if slot_blocks else None  # type: ignore[attr-defined]
 
     def _present(self) -> tuple[Tensor, Tensor]:
         """Gain and shift, ``(horizon, target)``, from scaled features to present values in target space."""
@@ -161,7 +161,7 @@ class Predictor(Streaming):
         if self.physics is not None:
             # Outside g, so that the bound of g limits the correction and not the physics.
             ahead, new["physics"] = self.physics(x, state["physics"])
-            center = center + self.physics.known * self.code.encode(ahead, features)
+            center = center + self.physics.is_velocity * self.code.encode(ahead, features)
         return self.output.answer(center, values[..., 1:, :]), features, hidden, new
 
     def predict(self, x: Tensor, state: State) -> tuple[Tensor, State]:
@@ -238,8 +238,8 @@ class Predictor(Streaming):
             center = build.add(Add, "with_bypass", center, direct, size=horizons * outputs)
         if self.physics is not None:
             ahead = self.code.lower_encode(build, self.physics.lower(build, x), base)
-            known = self.physics.known.repeat(horizons)
-            ahead = build.add(ScaleShift, "known", ahead, gain=known, shift=torch.zeros_like(known))
+            is_velocity = self.physics.is_velocity.repeat(horizons)
+            ahead = build.add(ScaleShift, "known", ahead, gain=is_velocity, shift=torch.zeros_like(is_velocity))
             center = build.add(Add, "with_physics", center, ahead, size=horizons * outputs)
         return center
 

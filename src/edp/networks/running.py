@@ -52,9 +52,9 @@ def stream_errors(predictor: Predictor, series: Sequence[Series]) -> Iterator[tu
     """
     skip = predictor.spec.window
     for predicted, part in zip(stream_predictions(predictor, series), series, strict=True):
-        for place, k in enumerate(predictor.task.horizons):
+        for horizon_index, k in enumerate(predictor.task.horizons):
             if part.samples > skip + k:
-                yield place, predicted[skip : part.samples - k, place] - part.targets[skip + k :]
+                yield horizon_index, predicted[skip : part.samples - k, horizon_index] - part.targets[skip + k :]
 
 
 def stream_intervals(predictor: Predictor, series: Sequence[Series], batch: int = 16) -> list[NDArray[np.float32]]:
@@ -86,7 +86,7 @@ def stream_answers(
         return torch.cat([answer.center.unsqueeze(-2), answer.spread], dim=-2), new
 
     answers = _windows(predictor, run, series) if windowed else _stream(predictor, run, series, batch)
-    values = [torch.from_numpy(found).double().unsqueeze(0) for found in answers]
+    values = [torch.from_numpy(series_answer).double().unsqueeze(0) for series_answer in answers]
     levels, law = (form[0].levels, form[0].law) if form else ((), "")
     return [Prediction(every[..., 0, :], every[..., 1:, :], levels, law) for every in values]
 
@@ -110,8 +110,8 @@ def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int
         with torch.inference_mode():
             for at in range(0, len(order), batch):
                 group = order[at : at + batch]
-                found = _run_group(predictor, run, [series[i] for i in group])
-                results.update(zip(group, found, strict=True))
+                group_answers = _run_group(predictor, run, [series[i] for i in group])
+                results.update(zip(group, group_answers, strict=True))
     finally:
         predictor.train(was_training)
     return [results[i] for i in range(len(series))]
@@ -124,10 +124,10 @@ def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[N
 
     def answers(x: NDArray[np.float32]) -> NDArray[np.float32]:
         tensor = torch.from_numpy(np.ascontiguousarray(x)).to(device=like.device, dtype=like.dtype)
-        found: NDArray[np.float32] = run(tensor, predictor.initial_state(len(x), like))[0].float().cpu().numpy()
-        return found
+        predictions: NDArray[np.float32] = run(tensor, predictor.initial_state(len(x), like))[0].float().cpu().numpy()
+        return predictions
 
-    made = []
+    batches = []
     try:
         with torch.inference_mode():
             for part in series:
@@ -136,10 +136,10 @@ def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[N
                 for at in range(0, len(ends), PIECE):
                     rows = ends[at : at + PIECE, None] - window + np.arange(window)
                     pieces.append(answers(part.inputs[rows])[:, -1])
-                made.append(np.concatenate(pieces)[: part.samples])
+                batches.append(np.concatenate(pieces)[: part.samples])
     finally:
         predictor.train(was_training)
-    return made
+    return batches
 
 
 def _run_group(predictor: Predictor, run: Run, group: list[Series]) -> list[NDArray[np.float32]]:

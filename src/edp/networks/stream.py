@@ -64,10 +64,10 @@ class StreamTick:
         Raises:
             ConfigError: the network has no interval of this coverage.
         """
-        for row, known in enumerate(self.coverages):
-            if math.isclose(known, coverage, abs_tol=1e-6):
+        for row, own_coverage in enumerate(self.coverages):
+            if math.isclose(own_coverage, coverage, abs_tol=1e-6):
                 return self.lower[row], self.upper[row]
-        known_text = ", ".join(f"{known:g}" for known in self.coverages) or "none: its output is a point"
+        known_text = ", ".join(f"{own_coverage:g}" for own_coverage in self.coverages) or "none: its output is a point"
         raise ConfigError(f"no interval of coverage {coverage:g}; this network has {known_text}")
 
 
@@ -128,7 +128,7 @@ class Stream:
             single = row.astype(np.float32)
         if bool(((single >= self._low) & (single <= self._high)).all()):
             self._last, self._holding = row, 0
-            return self._tick(self._run(held=False))
+            return self._tick(self._run(holding=False))
         self.rejected += 1
         return self._tick(self._hold())
 
@@ -155,17 +155,19 @@ class Stream:
         return self._tick(status)
 
     def _row(self, inputs: Inputs) -> NDArray[np.floating]:
-        wanted = self.predictor.task.inputs
+        input_names = self.predictor.task.inputs
         values = inputs.detach().cpu().numpy() if isinstance(inputs, Tensor) else inputs
         try:
             with np.errstate(over="ignore"):
                 row: NDArray[np.floating] = np.array(values, dtype=np.float64).astype(self._dtype)
         except (TypeError, ValueError) as error:
-            raise DataError(f"a tick of a stream takes {len(wanted)} numbers ({', '.join(wanted)}): {error}") from error
-        if row.shape != (len(wanted),):
             raise DataError(
-                f"a tick of a stream has shape {row.shape}; ({len(wanted)},) must hold, in this order: "
-                f"{', '.join(wanted)}"
+                f"a tick of a stream takes {len(input_names)} numbers ({', '.join(input_names)}): {error}"
+            ) from error
+        if row.shape != (len(input_names),):
+            raise DataError(
+                f"a tick of a stream has shape {row.shape}; ({len(input_names)},) must hold, in this order: "
+                f"{', '.join(input_names)}"
             )
         return row
 
@@ -174,7 +176,7 @@ class Stream:
         self._age = self._holding = 0
         self._state = self.predictor.initial_state(1, self._like)
 
-    def _run(self, held: bool) -> StreamStatus:
+    def _run(self, holding: bool) -> StreamStatus:
         """One tick of the network from the last accepted inputs."""
         self.ticks += 1
         numbers = self._computed()
@@ -184,7 +186,7 @@ class Stream:
             return StreamStatus.RESTARTED
         self._numbers = numbers
         self._age = min(self._age + 1, self.predictor.spec.window)
-        if held:
+        if holding:
             return StreamStatus.HELD
         return StreamStatus.OK if self.warm else StreamStatus.WARMING
 
@@ -203,7 +205,7 @@ class Stream:
         if self._age > 0 and self._holding < HOLD_TICKS:
             self._holding += 1
             self.held += 1
-            return self._run(held=True)
+            return self._run(holding=True)
         self.ticks += 1
         if self._age > 0:
             self.restarts += 1

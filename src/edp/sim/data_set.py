@@ -72,16 +72,17 @@ class SimulationOrder(DataSetSpec):
             values |= {key: value for key, value in files.items() if key != "format"}
             if "format" in files:
                 values["suffix"] = suffix_of(files["format"])
-        given = {key: value for key, value in changes.items() if value is not None}
-        if given.get("family") and "machine" in given:
+        stated_changes = {key: value for key, value in changes.items() if value is not None}
+        if stated_changes.get("family") and "machine" in stated_changes:
             raise ConfigError(
-                f"machine = {given['machine']} and family = {given['family']}: a family takes the machine's place; "
+                f"machine = {stated_changes['machine']} and family = {stated_changes['family']}: a family takes "
+                "the machine's place; "
                 "give one of the two"
             )
-        for text in _leave_out(values, given):
+        for text in _leave_out(values, stated_changes):
             if note is not None:
                 note(f"{text}; the scenario file's is left out")
-        values |= given
+        values |= stated_changes
         try:
             order = SimulationOrder(**values)
             order.files()
@@ -106,14 +107,14 @@ class SimulationOrder(DataSetSpec):
         return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
 
 
-def _leave_out(values: dict[str, Any], given: dict[str, Any]) -> Iterator[str]:
+def _leave_out(values: dict[str, Any], changes: dict[str, Any]) -> Iterator[str]:
     """Take out of a file's `values` what those given make void; says what, and why."""
-    suffix = given.get("suffix", ".mat")
-    if suffix != ".mat" and values.get("layout") and "layout" not in given:
+    suffix = changes.get("suffix", ".mat")
+    if suffix != ".mat" and values.get("layout") and "layout" not in changes:
         yield f"layout '{values.pop('layout')}' is one of MAT files, and format {suffix[1:]} was asked for"
-    if "machine" in given and values.get("family"):
-        yield f"family of {values.pop('family')} machines, and machine {given['machine']} was asked for"
-    if not given.get("family", values.get("family", 0)):
+    if "machine" in changes and values.get("family"):
+        yield f"family of {values.pop('family')} machines, and machine {changes['machine']} was asked for"
+    if not changes.get("family", values.get("family", 0)):
         values.pop("masses", None)
         values.pop("scatter", None)
 
@@ -224,9 +225,9 @@ def find_data_set_limit(
     key = _digest([identity_of(plan, WriteOptions()), asdict(spec)])
     target = make_folder(folder) / LIMIT
     if os.path.lexists(target):
-        kept = read_json(target)
-        if isinstance(kept, dict) and kept.get("key") == key:
-            return kept
+        stored_limit = read_json(target)
+        if isinstance(stored_limit, dict) and stored_limit.get("key") == key:
+            return stored_limit
     check_writable(target.parent)
     jobs, done = len(plan_limit(plan, spec)), 0
 
@@ -236,9 +237,9 @@ def find_data_set_limit(
         if on_done is not None:
             on_done(done, jobs)
 
-    found = find_limit(plan, spec, min(workers or os.cpu_count() or 1, jobs), count) | {"key": key}
-    write_json(target, found)
-    return found
+    limit = find_limit(plan, spec, min(workers or os.cpu_count() or 1, jobs), count) | {"key": key}
+    write_json(target, limit)
+    return limit
 
 
 def _digest(value: Any) -> str:
@@ -252,8 +253,8 @@ def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".p
         identity["files"] = asdict(files)
     if suffix != ".parquet":
         identity["suffix"] = suffix
-    kept: dict[str, Any] = json.loads(json.dumps(identity))
-    return kept
+    plain_identity: dict[str, Any] = json.loads(json.dumps(identity))
+    return plain_identity
 
 
 def bytes_needed(plan: Sequence[Scenario], suffix: str) -> int:

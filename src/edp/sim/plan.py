@@ -144,8 +144,8 @@ class DataSetSpec:
         soils = [""] * len(excitations)
         places = [i for i in _by_family(excitations) if EXCITATIONS[excitations[i]].works_ground]
         if self.materials:
-            for place, chosen in zip(places, hand_out(self.materials, len(places)), strict=True):
-                soils[place] = "" if chosen == AIR else chosen
+            for recording_index, chosen in zip(places, hand_out(self.materials, len(places)), strict=True):
+                soils[recording_index] = "" if chosen == AIR else chosen
         return soils
 
 
@@ -196,7 +196,10 @@ def over_family(
     """
     if count < 1:
         raise ConfigError(f"family = {count} machines; at least one is needed")
-    turns = {place: turn % count for turn, place in enumerate(_by_family([s.excitation for s in scenarios]))}
+    turns = {
+        recording_index: turn % count
+        for turn, recording_index in enumerate(_by_family([s.excitation for s in scenarios]))
+    }
     names = [member_name(seed, turns[i], masses, scatter) for i in range(len(scenarios))]
     return tuple(replace(s, machine=n, name=_named(s.name, n)) for s, n in zip(scenarios, names, strict=True))
 
@@ -210,12 +213,12 @@ def hand_out(shares: Mapping[str, float], count: int) -> list[str]:
 
     Each has its turn once, the largest share first, and then the one that is farthest behind, by Webster's method.
     """
-    given = {name: 0 for name, share in sorted(shares.items(), key=lambda entry: (-entry[1], entry[0])) if share > 0}
+    counts = {name: 0 for name, share in sorted(shares.items(), key=lambda entry: (-entry[1], entry[0])) if share > 0}
     names = []
     for turn in range(count):
-        waiting = given if turn >= len(given) else [name for name, n in given.items() if n == 0]
-        names.append(max(waiting, key=lambda name: shares[name] / (2 * given[name] + 1)))
-        given[names[-1]] += 1
+        waiting = counts if turn >= len(counts) else [name for name, n in counts.items() if n == 0]
+        names.append(max(waiting, key=lambda name: shares[name] / (2 * counts[name] + 1)))
+        counts[names[-1]] += 1
     return names
 
 

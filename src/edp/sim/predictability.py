@@ -96,29 +96,31 @@ def least_mae(values: Array) -> Array:
     ordered_values = np.sort(values, axis=0)
     half = len(values) // 2
     own = (ordered_values[half:].sum(axis=0) - ordered_values[:half].sum(axis=0)) / len(values)
-    found: Array = own + 0.25 * (ordered_values[half] - ordered_values[half - 1])
-    return found
+    least: Array = own + 0.25 * (ordered_values[half] - ordered_values[half - 1])
+    return least
 
 
 def branch_recording(job: LimitJob) -> Array:
     """Errors at each moment of one recording, shape (moment, kind, horizon, target), m/s; kinds are `KINDS`."""
     simulation, spec = Simulation(job.scenario), job.spec
     root = np.random.SeedSequence(job.seed)
-    found = np.empty((len(job.moments), len(KINDS), len(spec.horizons), len(TARGETS)))
+    errors = np.empty((len(job.moments), len(KINDS), len(spec.horizons), len(TARGETS)))
     for n, (moment, seed) in enumerate(zip(job.moments, root.spawn(len(job.moments)), strict=True)):
         simulation.run(moment - simulation.samples)
         snapshot = simulation.snapshot()
         past = simulation.log[-PAST:]
-        known = _futures(simulation, past, spec, seed.spawn(2)[0], known=True)
+        known_futures = _futures(simulation, past, spec, seed.spawn(2)[0], commands_known=True)
         simulation.restore(snapshot)
-        unknown = _futures(simulation, past, spec, seed.spawn(2)[1], known=False)
+        unknown = _futures(simulation, past, spec, seed.spawn(2)[1], commands_known=False)
         simulation.restore(snapshot)
-        found[n, 0], found[n, 1] = least_mae(unknown[:, 1:]), least_mae(known[:, 1:])
-        found[n, 2] = np.abs(unknown[:, 1:] - unknown[:, :1]).mean(axis=0)
-    return found
+        errors[n, 0], errors[n, 1] = least_mae(unknown[:, 1:]), least_mae(known_futures[:, 1:])
+        errors[n, 2] = np.abs(unknown[:, 1:] - unknown[:, :1]).mean(axis=0)
+    return errors
 
 
-def _futures(simulation: Simulation, past: Array, spec: LimitSpec, seed: np.random.SeedSequence, known: bool) -> Array:
+def _futures(
+    simulation: Simulation, past: Array, spec: LimitSpec, seed: np.random.SeedSequence, commands_known: bool
+) -> Array:
     """Measured velocities now and at the horizons in each future, shape (branch, 1 + horizon, target), m/s."""
     snapshot = simulation.snapshot()
     length = spec.horizons[-1] + 1
@@ -129,9 +131,9 @@ def _futures(simulation: Simulation, past: Array, spec: LimitSpec, seed: np.rand
     for b, branch in enumerate(seed.spawn(spec.branches)):
         world, noise = branch.spawn(2)
         # With commands known and no soil there is but one future; sensors alone differ.
-        if not known or simulation.plant.ground is not None:
+        if not commands_known or simulation.plant.ground is not None:
             simulation.restore(snapshot)
-            if known:
+            if commands_known:
                 simulation.branch_soil(world)
                 rows = simulation.follow(commands)
             else:
@@ -144,8 +146,8 @@ def _futures(simulation: Simulation, past: Array, spec: LimitSpec, seed: np.rand
 def _measured(simulation: Simulation, log: Array, seed: np.random.SeedSequence) -> Array:
     scenario = simulation.scenario
     rng = np.random.default_rng(seed) if scenario.sensor_noise else None
-    found = sensors.measured_signals(log, simulation.machine, scenario.rate_hz, rng, log[:, at.LOG_OIL] + 273.15)
-    return found[:, : len(TARGETS)]
+    signals = sensors.measured_signals(log, simulation.machine, scenario.rate_hz, rng, log[:, at.LOG_OIL] + 273.15)
+    return signals[:, : len(TARGETS)]
 
 
 def plan_limit(scenarios: Sequence[Scenario], spec: LimitSpec) -> list[LimitJob]:
@@ -158,10 +160,10 @@ def plan_limit(scenarios: Sequence[Scenario], spec: LimitSpec) -> list[LimitJob]
     count = min(len(scenarios), spec.recordings, spec.moments)
     chosen = sorted(rng.permutation(len(scenarios))[:count].tolist())
     jobs = []
-    for place, index in enumerate(chosen):
+    for job_index, index in enumerate(chosen):
         scenario = scenarios[index]
         last = scenario.samples - spec.horizons[-1] - 1
-        share = spec.moments // count + (1 if place < spec.moments % count else 0)
+        share = spec.moments // count + (1 if job_index < spec.moments % count else 0)
         if last < PAST + share:
             raise ConfigError(
                 f"limit: '{scenario.label}' has {scenario.samples} samples, too few for {share} moments and a "

@@ -105,5 +105,5 @@ class Scenario:
 
 def plain(scenario: Scenario) -> dict[str, Any]:
     """A scenario as JSON gives it back; `Scenario(**plain(s)) == s`."""
-    found = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
-    return {**found, "start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}
+    values = {entry.name: getattr(scenario, entry.name) for entry in fields(scenario)}
+    return {**values, "start_strokes": list(scenario.start_strokes), "sensors": dict(scenario.sensors)}

@@ -45,13 +45,13 @@ def clock_flags(table: CandidateTable, live: Sequence[int]) -> list[Flag]:
     """Channels that rise or fall throughout every recording."""
 
     def of_channel(i: int) -> float:
-        found = []
+        flags = []
         for piece in table.pieces:
             values = max(piece.stretches, key=len)[:, i]
             values = values[:: max(1, len(values) // 2_000)]
             if values.max() > values.min():
-                found.append(abs(float(np.corrcoef(ranks_of(values), np.arange(len(values)))[0, 1])))
-        return min(found) if len(found) > len(table.pieces) // 2 else 0.0
+                flags.append(abs(float(np.corrcoef(ranks_of(values), np.arange(len(values)))[0, 1])))
+        return min(flags) if len(flags) > len(table.pieces) // 2 else 0.0
 
     values = spread(of_channel, live)
     return [
@@ -87,15 +87,17 @@ def changing_flags(
         if not usable[i]:
             return None
         scale = np.sqrt(squares[:, None, i, None] * squares[:, None, :])
-        found: Array = np.divide(lagged.sums[:, :, i], scale, out=np.zeros(lagged.sums[:, :, i].shape), where=scale > 0)
+        correlations: Array = np.divide(
+            lagged.sums[:, :, i], scale, out=np.zeros(lagged.sums[:, :, i].shape), where=scale > 0
+        )
         held_against = np.zeros(len(names), dtype=np.bool_)
         held_against[list(trusted)] = True
         held_against[list(judged)] = support[list(judged)] > 2.0 * support[i]
-        found[:, :, ~(usable & held_against)] = 0.0
-        found[:, :, i] = 0.0
-        least: Array = np.abs(found).min(axis=0)
+        correlations[:, :, ~(usable & held_against)] = 0.0
+        correlations[:, :, i] = 0.0
+        least: Array = np.abs(correlations).min(axis=0)
         lag, j = (int(k) for k in np.unravel_index(int(least.argmax()), least.shape))
-        values = found[:, lag, j]
+        values = correlations[:, lag, j]
         turned = min(int(np.sum(values > 0)), int(np.sum(values < 0)))
         gains = np.abs(values) * np.sqrt(squares[:, i] / squares[:, j])
         changed = float(gains.max() / gains.min()) if least[lag, j] >= EXACT else 1.0
@@ -127,15 +129,15 @@ def broken_flags(
         judged: places in `live` of the channels that may be flagged.
         trusted: places of those that they are held against: of two in question, it cannot be told which one is broken.
     """
-    found = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
-    relations, slopes, squares = (np.array(values) for values in zip(*found, strict=True))
+    piece_moments = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
+    relations, slopes, squares = (np.array(values) for values in zip(*piece_moments, strict=True))
     flags = []
     for i in judged:
         sources = [j for j in trusted if j != i]
-        made = [(_broken(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
-        told = [(*verdict, j) for verdict, j in made if verdict is not None]
-        if told:
-            value, text, j = max(told)
+        verdicts = [(_broken(relations[:, i, j], np.abs(slopes[:, i, j]), squares[:, [i, j]]), j) for j in sources]
+        reported = [(*verdict, j) for verdict, j in verdicts if verdict is not None]
+        if reported:
+            value, text, j = max(reported)
             source = table.names[live[j]]
             flags.append(Flag(table.names[live[i]], FlagKind.ARTEFACT, source, 0, value, f"shows {source} {text}"))
     return flags

@@ -63,7 +63,7 @@ class CopiedChannel:
 
 
 def find_leaks(
-    names: Sequence[str], correlations: Array, trusted: Sequence[int], targets: Sequence[int], known: Sequence[int]
+    names: Sequence[str], correlations: Array, trusted: Sequence[int], targets: Sequence[int], flagged: Sequence[int]
 ) -> list[Flag]:
     """Channels that the future of a trusted channel explains.
 
@@ -72,7 +72,7 @@ def find_leaks(
         correlations: ``[reach + lag, i, j]`` of ``x_i[t + lag]`` and ``x_j[t]``, over all pieces.
         trusted: columns of the channels that are known to be measured.
         targets: columns of the targets.
-        known: columns that need no judging, such as targets.
+        flagged: columns that need no judging, such as targets.
     """
     reach = len(correlations) // 2
     far, near = min(_FAR, reach // 3), [a for a in _NEAR_PAST if a <= reach // 3]
@@ -94,8 +94,8 @@ def find_leaks(
             return None
         return _leak(names, correlations, channel, past, future, (before, after))
 
-    found = spread(judge, [k for k in range(len(names)) if k not in set(known)])
-    return [flag for flag in found if flag is not None]
+    leaks = spread(judge, [k for k in range(len(names)) if k not in set(flagged)])
+    return [flag for flag in leaks if flag is not None]
 
 
 def _leak(
@@ -253,8 +253,8 @@ def innovations(correlations: Array, order: int = 20) -> Array:
     reach = len(correlations) // 2
     order = min(order, reach)
     taps: NDArray[np.int64] = np.arange(1, order + 1)
-    found = []
+    residuals = []
     for i in range(correlations.shape[1]):
         own: list[Tap] = [(i, int(a)) for a in taps]
-        found.append(unexplained(correlations, i, own)[1])
-    return np.array(found)
+        residuals.append(unexplained(correlations, i, own)[1])
+    return np.array(residuals)

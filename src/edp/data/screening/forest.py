@@ -50,11 +50,13 @@ def rows_of(table: CandidateTable, pieces: Sequence[int], columns: Ints, count: 
             usable = len(stretch) - horizon
             if usable < 1:
                 continue
-            wanted = np.linspace(0, usable - 1, max(1, min(usable, count * len(stretch) // total))).astype(np.int64)
-            inputs.append(stretch[wanted][:, columns])
-            ahead = stretch[wanted + horizon][:, table.targets].astype(np.float64)
-            changes.append(ahead - stretch[wanted][:, table.targets] if horizon else ahead)
-            places.append(np.full(len(wanted), p))
+            row_indices = np.linspace(0, usable - 1, max(1, min(usable, count * len(stretch) // total))).astype(
+                np.int64
+            )
+            inputs.append(stretch[row_indices][:, columns])
+            ahead = stretch[row_indices + horizon][:, table.targets].astype(np.float64)
+            changes.append(ahead - stretch[row_indices][:, table.targets] if horizon else ahead)
+            places.append(np.full(len(row_indices), p))
     scaled = (np.concatenate(inputs) - table.mean[columns]) / np.maximum(table.within[columns], 1e-30)
     return Rows(np.ascontiguousarray(scaled, dtype=np.float32), np.concatenate(changes), np.concatenate(places))
 
@@ -65,15 +67,15 @@ def _leaves(
 ) -> None:
     """Leaf of each of `rows`; channels in `columns` are read from row ``swapped[row]`` instead."""
     left, right, feature, threshold = tree
-    for place in range(len(rows)):
-        row = rows[place]
+    for out_index in range(len(rows)):
+        row = rows[out_index]
         other = swapped[row]
         node = 0
         while left[node] >= 0:
             tested = feature[node]
             value = inputs[other, tested] if columns[tested] else inputs[row, tested]
             node = left[node] if value <= threshold[node] else right[node]
-        out[place] = node
+        out[out_index] = node
 
 
 @compiled
@@ -121,9 +123,9 @@ class Permuted:
             for (tree, value), leaves, touched in zip(self.trees, self.leaves, self.touched, strict=True):
                 rows = np.flatnonzero(touched[:, group])
                 if len(rows):
-                    found = np.empty(len(rows), dtype=np.int64)
-                    _leaves(self.rows.inputs, rows, order, columns, tree, found)
-                    total[rows] += value[found] - value[leaves[rows]]
+                    leaf_of_row = np.empty(len(rows), dtype=np.int64)
+                    _leaves(self.rows.inputs, rows, order, columns, tree, leaf_of_row)
+                    total[rows] += value[leaf_of_row] - value[leaves[rows]]
         return np.asarray(np.square(total / len(self.trees) - self.rows.changes))
 
 
@@ -143,7 +145,7 @@ def importances(
     table: CandidateTable,
     columns: Ints,
     groups: Sequence[Sequence[int]],
-    held: Ints,
+    held_out: Ints,
     spec: ScreeningSpec,
     on_share: Callable[[float], None] | None = None,
 ) -> list[GroupImportance]:
@@ -153,16 +155,16 @@ def importances(
         table: the data.
         columns: of the table, that the forest reads.
         groups: places in `columns` that are permuted together.
-        held: pieces held out.
+        held_out: pieces held out.
         spec: sizes and seed.
         on_share: hears the share that is done.
     """
     from sklearn.ensemble import RandomForestRegressor
 
     forest = spec.forest
-    others = [p for p in range(len(table.pieces)) if p not in set(held.tolist())]
+    others = [p for p in range(len(table.pieces)) if p not in set(held_out.tolist())]
     train = rows_of(table, others, columns, forest.samples, spec.horizon)
-    tests = rows_of(table, held.tolist(), columns, forest.tests, spec.horizon)
+    tests = rows_of(table, held_out.tolist(), columns, forest.tests, spec.horizon)
     scale = np.maximum(train.changes.std(axis=0), 1e-30)
     train, tests = (Rows(r.inputs, (r.changes - train.changes.mean(axis=0)) / scale, r.pieces) for r in (train, tests))
     model = RandomForestRegressor(
@@ -181,13 +183,13 @@ def importances(
     def of_group(g: int) -> Array:
         """Mean increase in each held-out piece, ``(piece, target)``."""
         more = np.mean([permuted.errors(g, order) for order in orders], axis=0) - plain
-        return np.stack([more[tests.pieces == p].mean(axis=0) for p in held])
+        return np.stack([more[tests.pieces == p].mean(axis=0) for p in held_out])
 
-    found = np.stack(spread(of_group, range(len(groups))))
-    power = np.stack([np.square(tests.changes[tests.pieces == p]).mean(axis=0) for p in held]).mean(axis=0)
+    increases = np.stack(spread(of_group, range(len(groups))))
+    power = np.stack([np.square(tests.changes[tests.pieces == p]).mean(axis=0) for p in held_out]).mean(axis=0)
     names = [table.names[i] for i in columns]
     return _listed(
-        found / power, [[names[k] for k in group] for group in groups], [table.names[i] for i in table.targets]
+        increases / power, [[names[k] for k in group] for group in groups], [table.names[i] for i in table.targets]
     )
 
 
@@ -201,16 +203,16 @@ def _shuffled(pieces: Ints, seed: int) -> Ints:
     return order
 
 
-def _listed(found: Array, members: Sequence[Sequence[str]], targets: Sequence[str]) -> list[GroupImportance]:
-    """Entries for every group, each target and all; `found` is ``(group, piece, target)``."""
-    columns = [("all", found.mean(axis=2)), *((name, found[:, :, j]) for j, name in enumerate(targets))]
-    made = []
+def _listed(increases: Array, members: Sequence[Sequence[str]], targets: Sequence[str]) -> list[GroupImportance]:
+    """Entries for every group, each target and all; `increases` is ``(group, piece, target)``."""
+    columns = [("all", increases.mean(axis=2)), *((name, increases[:, :, j]) for j, name in enumerate(targets))]
+    importances = []
     for name, values in columns:
         middle = values.mean(axis=1)
         positive = max(float(np.maximum(middle, 0.0).sum()), 1e-30)
         half = student.ppf(0.975, values.shape[1] - 1) * values.std(axis=1, ddof=1) / math.sqrt(values.shape[1])
         for g, group in enumerate(members):
-            made.append(
+            importances.append(
                 GroupImportance(
                     tuple(group),
                     name,
@@ -220,4 +222,4 @@ def _listed(found: Array, members: Sequence[Sequence[str]], targets: Sequence[st
                     max(float(middle[g]), 0.0) / positive,
                 )
             )
-    return made
+    return importances

@@ -20,12 +20,12 @@ Orders = NDArray[np.int64]
 
 
 @compiled
-def _within(values: Array, place: int, radius: float) -> int:
-    """How many other values of a sorted array are nearer than `radius` to the one at `place`."""
+def _within(values: Array, row: int, radius: float) -> int:
+    """How many other values of a sorted array are nearer than `radius` to the one at `row`."""
     # doubling steps, then halving ones
     n = len(values)
-    centre = values[place]
-    low, step = place, 1
+    centre = values[row]
+    low, step = row, 1
     while low - step >= 0 and centre - values[low - step] < radius:
         low -= step
         step *= 2
@@ -33,7 +33,7 @@ def _within(values: Array, place: int, radius: float) -> int:
         if low - step >= 0 and centre - values[low - step] < radius:
             low -= step
         step //= 2
-    high, step = place, 1
+    high, step = row, 1
     while high + step < n and values[high + step] - centre < radius:
         high += step
         step *= 2
@@ -55,19 +55,19 @@ def _closer(distance: float, nearest: Array) -> None:
 
 
 @compiled
-def _radius(x: Array, y: Array, place: int, nearest: Array) -> tuple[float, int]:
-    """Distance to the k-th neighbour of point `place`, and how many points are nearer in x alone.
+def _radius(x: Array, y: Array, row: int, nearest: Array) -> tuple[float, int]:
+    """Distance to the k-th neighbour of point `row`, and how many points are nearer in x alone.
 
     Points are sorted by x; `nearest` is room for k values. First a few points to either side, then one side after the
     other for as long as x alone does not rule them out.
     """
     n, last = len(x), len(nearest) - 1
-    x_here, y_here = x[place], y[place]
+    x_here, y_here = x[row], y[row]
     nearest[:] = np.inf
-    left, right = max(place - 12, 0), min(place + 12, n - 1)
+    left, right = max(row - 12, 0), min(row + 12, n - 1)
     for other in range(left, right + 1):
         distance = max(abs(x_here - x[other]), abs(y[other] - y_here))
-        if distance < nearest[last] and other != place:
+        if distance < nearest[last] and other != row:
             _closer(distance, nearest)
     left -= 1
     while left >= 0 and x_here - x[left] < nearest[last]:
@@ -142,15 +142,17 @@ class Information:
         )
         return max(0.0, float(value))
 
-    def pairs(self, wanted: Iterable[tuple[int, int]], on_share: Callable[[float], None] | None = None) -> list[float]:
+    def pairs(
+        self, column_pairs: Iterable[tuple[int, int]], on_share: Callable[[float], None] | None = None
+    ) -> list[float]:
         """Of several pairs of columns."""
-        return spread(lambda pair: self.of(*pair), wanted, on_share)
+        return spread(lambda pair: self.of(*pair), column_pairs, on_share)
 
     def matrix(self, on_share: Callable[[float], None] | None = None) -> Array:
         """Of all pairs, ``(channel, channel)``; NaN on the diagonal, where it has no finite value."""
         count = len(self._values)
-        found = np.full((count, count), np.nan)
+        information = np.full((count, count), np.nan)
         rows = spread(lambda i: [self.of(i, j) for j in range(i)], range(1, count), on_share)
         for i, row in enumerate(rows, start=1):
-            found[i, :i] = found[:i, i] = row
-        return found
+            information[i, :i] = information[:i, i] = row
+        return information

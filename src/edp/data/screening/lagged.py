@@ -75,17 +75,17 @@ class _Spectra:
             self.size *= 2
         self.block = self.size - 2 * reach
 
-    def scaled(self, place: int) -> Iterator[FloatArray]:
+    def scaled(self, piece_index: int) -> Iterator[FloatArray]:
         """The stretches of a piece, centred and scaled, ``(time, channel)``."""
-        mean = self.table.sums[0][place, self.live]
+        mean = self.table.sums[0][piece_index, self.live]
         deviation = self.table.within[self.live]
-        for stretch in self.table.pieces[place].stretches:
+        for stretch in self.table.pieces[piece_index].stretches:
             yield ((stretch[:, self.live] - mean) / deviation).astype(np.float32)
 
-    def blocks(self, place: int, columns: NDArray[np.int64] | None, around: bool) -> NDArray[np.complex64]:
+    def blocks(self, piece_index: int, columns: NDArray[np.int64] | None, around: bool) -> NDArray[np.complex64]:
         """Spectra of all blocks of a piece, ``(frequency, block, channel)``."""
         cut = []
-        for values in self.scaled(place):
+        for values in self.scaled(piece_index):
             chosen = values if columns is None else values[:, columns]
             count = -(-len(chosen) // self.block)
             padded = np.zeros((self.reach + count * self.block + self.reach, chosen.shape[1]), dtype=np.float32)
@@ -96,8 +96,8 @@ class _Spectra:
                     part = part.copy()
                     part[: self.reach] = part[-self.reach :] = 0.0
                 cut.append(part)
-        found = scipy.fft.rfft(np.stack(cut), axis=1)
-        return np.ascontiguousarray(found.transpose(1, 0, 2), dtype=np.complex64)
+        spectra = scipy.fft.rfft(np.stack(cut), axis=1)
+        return np.ascontiguousarray(spectra.transpose(1, 0, 2), dtype=np.complex64)
 
     def back(self, product: NDArray[np.complex64]) -> FloatArray:
         """From summed cross spectra ``(frequency, i, j)`` to sums at lags -reach to reach."""
@@ -133,15 +133,17 @@ def lagged_covariances(
         for shift in range(1, shifts + 1):
             other = (p + shift) % count
             shared = min(around.shape[1], answers[other].shape[1])
-            found = spectra.back(_product(around[:, :shared], answers[other][:, :shared]))
+            products = spectra.back(_product(around[:, :shared], answers[other][:, :shared]))
             share = shared / np.sqrt(around.shape[1] * answers[other].shape[1])
             scale = share * np.sqrt(np.outer(strengths[p], strengths[other][places]))
-            pairs.append(np.divide(found, scale, out=np.zeros_like(found), where=scale > 0))
+            pairs.append(np.divide(products, scale, out=np.zeros_like(products), where=scale > 0))
         return sums, np.stack(pairs).astype(np.float32)
 
-    found = spread(of_piece, range(count), on_share)
+    piece_covariances = spread(of_piece, range(count), on_share)
     rows = np.array([piece.samples for piece in table.pieces])
-    return Lagged(live, reach, np.stack([s for s, _ in found]), rows, np.stack([c for _, c in found]))
+    return Lagged(
+        live, reach, np.stack([s for s, _ in piece_covariances]), rows, np.stack([c for _, c in piece_covariances])
+    )
 
 
 def _product(left: NDArray[np.complex64], right: NDArray[np.complex64]) -> NDArray[np.complex64]:
@@ -153,7 +155,7 @@ def _product(left: NDArray[np.complex64], right: NDArray[np.complex64]) -> NDArr
     return total
 
 
-def _squares(table: CandidateTable, place: int, live: NDArray[np.int64]) -> Array:
+def _squares(table: CandidateTable, piece_index: int, live: NDArray[np.int64]) -> Array:
     """Sums of squares of the scaled channels of a piece, ``(channel,)``."""
-    piece: Piece = table.pieces[place]
-    return table.sums[1][place, live] / np.square(table.within[live]) * piece.samples
+    piece: Piece = table.pieces[piece_index]
+    return table.sums[1][piece_index, live] / np.square(table.within[live]) * piece.samples

@@ -34,11 +34,11 @@ def unexplained(
     correlations: Array, channel: int, taps: Sequence[Tap], more: Sequence[Tap] = ()
 ) -> tuple[float, float]:
     """Share of a channel's variance that linear models leave: from `taps`, and from `taps` and `more`."""
-    wanted = gram(correlations, [*taps, *more], [(channel, 0)])[:, 0]
+    target_covariances = gram(correlations, [*taps, *more], [(channel, 0)])[:, 0]
     joint = gram(correlations, [*taps, *more], [*taps, *more])
     joint[np.diag_indices_from(joint)] += RIDGE
     lower = scipy.linalg.cholesky(joint, lower=True, check_finite=False)
-    parts = np.square(scipy.linalg.solve_triangular(lower, wanted, lower=True, check_finite=False))
+    parts = np.square(scipy.linalg.solve_triangular(lower, target_covariances, lower=True, check_finite=False))
     explained = np.cumsum(parts)
     return max(0.0, 1.0 - float(explained[len(taps) - 1])), max(0.0, 1.0 - float(explained[-1]))
 

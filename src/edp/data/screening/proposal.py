@@ -64,58 +64,61 @@ class ScreeningEvidence:
 
     def gain(self, name: str) -> tuple[float, float]:
         """Largest linear value of a channel over the targets, and the lower end of its interval; NaN if not judged."""
-        found = [value for value in self.values if value.channel == name]
-        if not found:
+        channel_values = [value for value in self.values if value.channel == name]
+        if not channel_values:
             return math.nan, math.nan
-        best = max(found, key=lambda value: value.gain)
+        best = max(channel_values, key=lambda value: value.gain)
         return best.gain, best.low
 
     def importance_of(self, name: str) -> GroupImportance | None:
         """The entry over all targets of the group that holds a channel."""
-        found = (entry for entry in self.importance if entry.target == "all" and name in entry.members)
-        return next(found, None)
+        of_channel = (entry for entry in self.importance if entry.target == "all" and name in entry.members)
+        return next(of_channel, None)
 
 
 def noise_flags(evidence: ScreeningEvidence, judged: Sequence[str]) -> list[Flag]:
     """Channels that neither relate to a target nor help a forest or a linear model, held out."""
     flags = []
-    for place, column in enumerate(evidence.live):
+    for live_index, column in enumerate(evidence.live):
         name = evidence.table.names[column]
-        if name not in judged or evidence.relations.related[place].any():
+        if name not in judged or evidence.relations.related[live_index].any():
             continue
         entry = evidence.importance_of(name)
         if _adds(evidence, name) or (entry is not None and entry.low > 0 and entry.increase > NEGLIGIBLE):
             continue
-        flags.append(_noise(evidence, place, name))
+        flags.append(_noise(evidence, live_index, name))
     return flags
 
 
-def _noise(evidence: ScreeningEvidence, place: int, name: str) -> Flag:
+def _noise(evidence: ScreeningEvidence, live_index: int, name: str) -> Flag:
     relations = evidence.relations
-    target = int(np.abs(relations.linear[place]).argmax())
-    value = float(abs(relations.linear[place, target]))
-    chance = float(relations.linear_chance[place, target])
-    only = lonely(evidence.pieces[:, place], chance)
+    target = int(np.abs(relations.linear[live_index]).argmax())
+    value = float(abs(relations.linear[live_index, target]))
+    chance = float(relations.linear_chance[live_index, target])
+    only = lonely(evidence.pieces[:, live_index], chance)
     if only is not None:
         text = (
             f"goes with a target in {evidence.table.pieces[only].name} only "
-            f"(correlation {evidence.pieces[only, place]:.2f}), in no other piece"
+            f"(correlation {evidence.pieces[only, live_index]:.2f}), in no other piece"
         )
-        return Flag(name, FlagKind.ARTEFACT, value=abs(float(evidence.pieces[only, place])), evidence=text)
-    between = float(evidence.table.between[evidence.live[place]])
-    found = f"correlation with a target at most {value:.3f} (between unrelated pieces up to {chance:.3f})"
+        return Flag(name, FlagKind.ARTEFACT, value=abs(float(evidence.pieces[only, live_index])), evidence=text)
+    between = float(evidence.table.between[evidence.live[live_index]])
+    correlation_text = f"correlation with a target at most {value:.3f} (between unrelated pieces up to {chance:.3f})"
     if between > 0.5:
-        text = f"{100 * between:.0f} % of its variance lies between recordings; within them {found}"
+        text = f"{100 * between:.0f} % of its variance lies between recordings; within them {correlation_text}"
         return Flag(name, FlagKind.ARTEFACT, value=between, evidence=text)
-    information = float(np.nan_to_num(relations.information[place]).max())
+    information = float(np.nan_to_num(relations.information[live_index]).max())
     if value > ABOVE_CHANCE * chance or information > LEAST_INFORMATION:
-        spread = float(evidence.pieces[:, place].std(ddof=1))
+        spread = float(evidence.pieces[:, live_index].std(ddof=1))
         text = (
             f"relates to targets in some pieces, not in all alike (correlation {value:.2f} with deviation {spread:.2f} "
             f"among pieces, mutual information above chance {information:.2f} nat); no help to forest or linear model"
         )
         return Flag(name, FlagKind.UNSTEADY, value=value, evidence=text)
-    text = f"{found}; mutual information above chance {information:.3f} nat; no help to a forest or a linear model"
+    text = (
+        f"{correlation_text}; mutual information above chance {information:.3f} nat; no help to a forest or a linear "
+        "model"
+    )
     return Flag(name, FlagKind.NOISE, value=value, evidence=text)
 
 
@@ -185,8 +188,8 @@ def propose(
         ChannelVerdict(name, not dropped, rank, -score, _reason(evidence, name, name in targets, own, barred), own)
         for rank, (dropped, score, name, own, barred) in enumerate(sorted(rows, key=lambda row: row[:3]), start=1)
     )
-    kept = {choice.channel for choice in choices if choice.keep}
-    window, reason = _window(evidence, kept, targets, horizon)
+    proposed = {choice.channel for choice in choices if choice.keep}
+    window, reason = _window(evidence, proposed, targets, horizon)
     return Proposal(choices, window, reason, _notes(evidence, flags, horizon))
 
 
@@ -221,23 +224,23 @@ def _reason(evidence: ScreeningEvidence, name: str, target: bool, flags: tuple[F
     if flags:
         text = "; ".join(f"{flag.kind}: {flag.evidence}" for flag in flags)
         return f"a target, kept for its past, but {text}" if target else text
-    place = int(np.flatnonzero(evidence.live == evidence.table.names.index(name))[0])
+    live_index = int(np.flatnonzero(evidence.live == evidence.table.names.index(name))[0])
     relations = evidence.relations
-    best = int(np.abs(relations.linear[place]).argmax())
+    best = int(np.abs(relations.linear[live_index]).argmax())
     goal = evidence.table.names[evidence.table.targets[best]]
     parts = []
     if target:
         parts.append("a target: its own past")
     else:
-        pieces = evidence.pieces[:, place]
-        same = int((np.sign(pieces) == np.sign(relations.linear[place, best])).sum())
+        pieces = evidence.pieces[:, live_index]
+        same = int((np.sign(pieces) == np.sign(relations.linear[live_index, best])).sum())
         parts.append(
-            f"correlation {relations.linear[place, best]:.2f} with {goal}, of this sign in {same} of "
+            f"correlation {relations.linear[live_index, best]:.2f} with {goal}, of this sign in {same} of "
             f"{len(pieces)} pieces"
         )
-    informed = int(np.nan_to_num(relations.information[place]).argmax())
+    informed = int(np.nan_to_num(relations.information[live_index]).argmax())
     goal = evidence.table.names[evidence.table.targets[informed]]
-    parts.append(f"{max(float(np.nan_to_num(relations.information[place, informed])), 0.0):.2f} nat on {goal}")
+    parts.append(f"{max(float(np.nan_to_num(relations.information[live_index, informed])), 0.0):.2f} nat on {goal}")
     entry, (gain, _) = evidence.importance_of(name), evidence.gain(name)
     if entry is not None:
         group = "" if len(entry.members) == 1 else f" with {len(entry.members) - 1} collinear"
@@ -247,12 +250,12 @@ def _reason(evidence: ScreeningEvidence, name: str, target: bool, flags: tuple[F
     return "; ".join(parts)
 
 
-def _window(evidence: ScreeningEvidence, kept: set[str], targets: Sequence[str], horizon: int) -> tuple[int, str]:
+def _window(evidence: ScreeningEvidence, proposed: set[str], targets: Sequence[str], horizon: int) -> tuple[int, str]:
     """The longer of two: from the present back to the earliest cause, and what a linear prediction makes use of."""
     leads = [
         curve
         for curve in evidence.curves
-        if curve.channel in kept
+        if curve.channel in proposed
         and curve.channel not in targets
         and curve.certain
         and not curve.at_edge
@@ -286,8 +289,8 @@ def _notes(evidence: ScreeningEvidence, flags: Sequence[Flag], horizon: int) -> 
         notes.append(f"the best lag of {', '.join(edge)} is the end of the search; raise max_lag")
     leaks = [flag.channel for flag in flags if flag.kind == FlagKind.LEAK]
     if leaks:
-        known = "a channel knows" if len(leaks) == 1 else f"{len(leaks)} channels know"
-        notes.append(f"{known} the future: a model fed with it does well in tests and fails on the machine")
+        subject = "a channel knows" if len(leaks) == 1 else f"{len(leaks)} channels know"
+        notes.append(f"{subject} the future: a model fed with it does well in tests and fails on the machine")
     if table.left_out:
         notes.append(f"too short to be looked at and left out: {', '.join(table.left_out)}; lower max_lag to see them")
     if horizon == 0:

@@ -24,8 +24,8 @@ def _rank(values: FloatArray, order: Orders, ranks: FloatArray) -> None:
         while stop < n and values[order[stop]] == values[order[start]]:
             stop += 1
         shared = 0.5 * (start + 1 + stop)
-        for place in range(start, stop):
-            ranks[order[place]] = shared
+        for row in range(start, stop):
+            ranks[order[row]] = shared
         start = stop
 
 
@@ -39,8 +39,8 @@ def ranks_of(values: FloatArray) -> FloatArray:
 
 def rank_columns(values: FloatArray) -> FloatArray:
     """Ranks of every column, ``(row, channel)``, stored a channel after another."""
-    found = spread(lambda i: ranks_of(values[:, i]), range(values.shape[1]))
-    return np.stack(found).T
+    ranks = spread(lambda i: ranks_of(values[:, i]), range(values.shape[1]))
+    return np.stack(ranks).T
 
 
 @compiled
@@ -48,14 +48,14 @@ def _dense(values: FloatArray, order: Orders, dense: NDArray[np.int32]) -> float
     """Number the distinct values upwards; returns the pairs of equal values."""
     level, run, tied = 0, 1, 0.0
     dense[order[0]] = 0
-    for place in range(1, len(values)):
-        if values[order[place]] == values[order[place - 1]]:
+    for row in range(1, len(values)):
+        if values[order[row]] == values[order[row - 1]]:
             tied += run
             run += 1
         else:
             level += 1
             run = 1
-        dense[order[place]] = level
+        dense[order[row]] = level
     return tied
 
 
@@ -80,12 +80,12 @@ def _swaps(keys: NDArray[np.int32], spare: NDArray[np.int32]) -> float:
             middle = min(start + width, n)
             stop = min(start + 2 * width, n)
             i, j = start, middle
-            for place in range(start, stop):
+            for row in range(start, stop):
                 if j >= stop or (i < middle and keys[i] <= keys[j]):
-                    spare[place] = keys[i]
+                    spare[row] = keys[i]
                     i += 1
                 else:
-                    spare[place] = keys[j]
+                    spare[row] = keys[j]
                     swaps += middle - i
                     j += 1
         keys, spare = spare, keys
@@ -105,13 +105,13 @@ def _tau(order: Orders, x: NDArray[np.int32], y: NDArray[np.int32], tied_x: floa
         level = x[order[start]]
         while stop < n and x[order[stop]] == level:
             stop += 1
-        for place in range(start, stop):
-            keys[place] = y[order[place]]
+        for row in range(start, stop):
+            keys[row] = y[order[row]]
         if stop - start > 1:  # equal x never count as swaps, so they are put into the order of y
             keys[start:stop] = np.sort(keys[start:stop])
             run = 1
-            for place in range(start + 1, stop):
-                if keys[place] == keys[place - 1]:
+            for row in range(start + 1, stop):
+                if keys[row] == keys[row - 1]:
                     tied_both += run
                     run += 1
                 else:
@@ -142,11 +142,11 @@ class Kendall:
     def matrix(self, on_share: Callable[[float], None] | None = None) -> Array:
         """Of all pairs, ``(channel, channel)``."""
         count = len(self._orders)
-        found = np.eye(count)
+        taus = np.eye(count)
         rows = spread(lambda i: [self.tau(i, j) for j in range(i)], range(1, count), on_share)
         for i, row in enumerate(rows, start=1):
-            found[i, :i] = found[:i, i] = row
-        return found
+            taus[i, :i] = taus[:i, i] = row
+        return taus
 
 
 def correlation(stretches: Sequence[FloatArray], rows: int = 32_768) -> Array:

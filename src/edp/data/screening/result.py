@@ -300,8 +300,8 @@ class ScreeningResult:
         left_out = {*self.targets, *(flag.channel for flag in self.flags)}
         best: dict[str, LagCurve] = {}
         for curve in self.lags:
-            known = best.get(curve.channel)
-            if curve.channel not in left_out and (known is None or abs(curve.value) > abs(known.value)):
+            best_curve = best.get(curve.channel)
+            if curve.channel not in left_out and (best_curve is None or abs(curve.value) > abs(best_curve.value)):
                 best[curve.channel] = curve
         rows = []
         for group in dict.fromkeys(curve.group for curve in best.values()):

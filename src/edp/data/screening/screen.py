@@ -165,8 +165,8 @@ def _structural_flags(table: CandidateTable, lagged: Lagged, spec: ScreeningSpec
     support = np.abs(correlations[:, :, targets]).max(axis=(0, 2))
     flags += artefacts.changing_flags(names, lagged, open_ones(), trusted, support)
     flags += artefacts.broken_flags(table, [int(k) for k in lagged.live], open_ones(), trusted)
-    known = sorted(set(range(len(names))) - set(open_ones()))
-    flags += copies.find_leaks(names, correlations, trusted, targets, known)
+    flagged = sorted(set(range(len(names))) - set(open_ones()))
+    flags += copies.find_leaks(names, correlations, trusted, targets, flagged)
     settled = {names.index(flag.channel) for flag in flags if flag.channel in names}
     pairs = copies.find_copies(correlations, spec.copy)
     return flags + copies.copy_flags(names, pairs, set(trusted), copies.innovations(correlations), settled)
@@ -176,16 +176,16 @@ def _evidence(
     table: CandidateTable,
     lagged: Lagged,
     spec: ScreeningSpec,
-    found: tuple[Array, Metrics, list[LagCurve], list[int]],
+    measured: tuple[Array, Metrics, list[LagCurve], list[int]],
     clock: _Clock,
 ) -> ScreeningEvidence:
     """Multivariate figures of the channels without a flag, and the tests of all live ones."""
-    spearman, metrics, curves, used = found
+    spearman, metrics, curves, used = measured
     columns = np.array(used, dtype=np.int64)
     targets = np.searchsorted(lagged.live, table.targets)
     relations = stability.relations_of(lagged, targets, metrics, spec.level)
     groups = clusters_of(spearman[np.ix_(columns, columns)], spec.collinear)
-    held = values.held_out_pieces(len(table.pieces), spec.forest.held_out, spec.seed)
+    held_out = values.held_out_pieces(len(table.pieces), spec.forest.held_out, spec.seed)
     read = columns if spec.horizon else columns[~np.isin(columns, table.targets)]
     if not len(read):
         raise DataError(
@@ -196,15 +196,21 @@ def _evidence(
         places = {int(c): k for k, c in enumerate(read)}
         grouped = [[places[int(columns[k])] for k in group if int(columns[k]) in places] for group in groups]
         importance: list[GroupImportance] = forest.importances(
-            table, read, [group for group in grouped if group], held, spec, lambda share: tell("forest", share)
+            table, read, [group for group in grouped if group], held_out, spec, lambda share: tell("forest", share)
         )
     with clock.stage("linear value") as tell:
         names = [table.names[i] for i in lagged.live]
         among = np.searchsorted(lagged.live, columns).tolist()
         worth = values.linear_values(
-            names, lagged, among, targets.tolist(), spec.horizon, held, lambda share: tell("linear value", 0.7 * share)
+            names,
+            lagged,
+            among,
+            targets.tolist(),
+            spec.horizon,
+            held_out,
+            lambda share: tell("linear value", 0.7 * share),
         )
-        history = values.window_needed(lagged, among, targets.tolist(), spec.horizon, held)
+        history = values.window_needed(lagged, among, targets.tolist(), spec.horizon, held_out)
     clusters = _clusters(table, spearman, columns, groups, relations.linear[np.searchsorted(lagged.live, columns)])
     pieces = _at_best(lagged, targets, relations)
     correlations = lagged.pooled()
@@ -217,7 +223,7 @@ def _clusters(
     table: CandidateTable, spearman: Array, columns: NDArray[np.int64], groups: list[list[int]], linear: Array
 ) -> list[Cluster]:
     """Clusters of two or more; a target speaks for its cluster, else a name of Table A.1, else the best correlated."""
-    made = []
+    clusters = []
     for group in groups:
         if len(group) < 2:
             continue
@@ -230,10 +236,10 @@ def _clusters(
                 float(np.abs(linear[k]).max()),
             ),
         )
-        made.append(
+        clusters.append(
             Cluster(tuple(table.names[i] for i in members), table.names[columns[first]], least_of(spearman, members))
         )
-    return made
+    return clusters
 
 
 def _at_best(lagged: Lagged, targets: NDArray[np.int64], relations: stability.Relations) -> Array:

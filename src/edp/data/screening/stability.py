@@ -55,23 +55,23 @@ def metrics_by_piece(
         return _metrics(first[0][:shared, live], second[1][:shared], spec)
 
     pairs = [(p, (p + shift) % count) for shift in range(shifts + 1) for p in range(count)]
-    found = np.stack(spread(of_pair, pairs, on_share))
-    found = found.reshape(shifts + 1, count, *found.shape[1:]).transpose(2, 0, 1, 3, 4)
-    return Metrics(found[:, 0], found[:, 1:])
+    metrics = np.stack(spread(of_pair, pairs, on_share))
+    metrics = metrics.reshape(shifts + 1, count, *metrics.shape[1:]).transpose(2, 0, 1, 3, 4)
+    return Metrics(metrics[:, 0], metrics[:, 1:])
 
 
-def piece_rows(table: CandidateTable, place: int, spec: ScreeningSpec) -> tuple[FloatArray, FloatArray]:
+def piece_rows(table: CandidateTable, piece_index: int, spec: ScreeningSpec) -> tuple[FloatArray, FloatArray]:
     """Evenly spread rows of a piece: all channels at t, targets at t + horizon."""
     now, ahead = [], []
-    piece = table.pieces[place]
+    piece = table.pieces[piece_index]
     for stretch in piece.stretches:
         usable = len(stretch) - spec.horizon
         if usable < 1:
             continue
         count = min(usable, max(1, spec.piece_samples * len(stretch) // piece.samples))
-        wanted = np.linspace(0, usable - 1, count).astype(np.int64)
-        now.append(stretch[wanted])
-        ahead.append(stretch[wanted + spec.horizon][:, table.targets])
+        row_indices = np.linspace(0, usable - 1, count).astype(np.int64)
+        now.append(stretch[row_indices])
+        ahead.append(stretch[row_indices + spec.horizon][:, table.targets])
     return np.concatenate(now), np.concatenate(ahead)
 
 
@@ -81,16 +81,16 @@ def _metrics(channels: FloatArray, targets: FloatArray, spec: ScreeningSpec) -> 
     width, count = channels.shape[1], targets.shape[1]
     ranks = np.stack([ranks_of(both[:, i]) for i in range(both.shape[1])], axis=1)
     kendall, information = Kendall(both), Information(both, spec.neighbours, spec.seed)
-    found = np.full((len(METRICS), width, count), np.nan)
+    metrics = np.full((len(METRICS), width, count), np.nan)
     constant = both.max(axis=0) == both.min(axis=0)
-    found[0], found[1] = _pearson(both, width), _pearson(ranks, width)
+    metrics[0], metrics[1] = _pearson(both, width), _pearson(ranks, width)
     for i in np.flatnonzero(~constant[:width]):
         for j in np.flatnonzero(~constant[width:]):
-            found[2, i, j] = kendall.tau(int(i), width + int(j))
-            found[3, i, j] = information.of(int(i), width + int(j))
-    found[:, constant[:width]] = np.nan
-    found[:, :, constant[width:]] = np.nan
-    return found
+            metrics[2, i, j] = kendall.tau(int(i), width + int(j))
+            metrics[3, i, j] = information.of(int(i), width + int(j))
+    metrics[:, constant[:width]] = np.nan
+    metrics[:, :, constant[width:]] = np.nan
+    return metrics
 
 
 def _pearson(values: FloatArray, width: int) -> Array:
@@ -104,14 +104,16 @@ def stability_of(names: Sequence[str], targets: Sequence[str], metrics: Metrics,
     """One entry a metric, channel and target; `lags` are best lags, ``(piece, channel, target)``."""
     own = np.concatenate([metrics.own, lags[None]])
     chance = np.concatenate([_mean(np.abs(metrics.crossed), (1, 2)), np.full((1, *lags.shape[1:]), np.nan)])
-    made = []
+    stabilities = []
     for m, metric in enumerate((*METRICS, "lag")):
         for i, name in enumerate(names):
             for j, target in enumerate(targets):
                 values = own[m, :, i, j]
                 mean, deviation, agreement = _summary(values)
-                made.append(Stability(metric, name, target, values, mean, deviation, agreement, float(chance[m, i, j])))
-    return made
+                stabilities.append(
+                    Stability(metric, name, target, values, mean, deviation, agreement, float(chance[m, i, j]))
+                )
+    return stabilities
 
 
 def _summary(values: Array) -> tuple[float, float, float]:

@@ -107,10 +107,10 @@ class CandidateTable:
         """Evenly spread rows, `count` in all, for each stretch in order; `ahead` rows follow each of them."""
         lengths = [len(stretch) - ahead for piece in self.pieces for stretch in piece.stretches]
         total = sum(max(length, 0) for length in lengths)
-        wanted = np.linspace(0, total - 1, min(count, total)).astype(np.int64)
+        row_indices = np.linspace(0, total - 1, min(count, total)).astype(np.int64)
         rows, start = [], 0
         for length in lengths:
-            inside = wanted[(wanted >= start) & (wanted < start + max(length, 0))]
+            inside = row_indices[(row_indices >= start) & (row_indices < start + max(length, 0))]
             rows.append(inside - start)
             start += max(length, 0)
         return rows
@@ -161,10 +161,10 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
             f"target '{blind[0]}' has {missing[blind[0]]} missing or infinite value(s); mend the log or ask for a "
             'repair (nan = "hold")'
         )
-    kept = [i for i, name in enumerate(names) if name not in missing]
+    present_columns = [i for i, name in enumerate(names) if name not in missing]
     if missing:
-        columns = [values[:, kept] for values in columns]
-    names = tuple(names[i] for i in kept)
+        columns = [values[:, present_columns] for values in columns]
+    names = tuple(names[i] for i in present_columns)
     kinds = {channel.name: channel.kind for channel in first.channels}
     table = CandidateTable(
         names,
@@ -191,14 +191,16 @@ def group_of(name: str, kind: Kind) -> str:
 
 
 def _usual_targets(recording: Recording) -> tuple[str, ...]:
-    known = tuple(name for name in TABLE_A1 if name.startswith("CylVels") and name in recording.channel_names)
-    found = known or tuple(c.name for c in recording.channels if c.kind in (Kind.VELOCITY, Kind.ANGULAR_VELOCITY))
-    if not found:
+    thesis_targets = tuple(name for name in TABLE_A1 if name.startswith("CylVels") and name in recording.channel_names)
+    targets = thesis_targets or tuple(
+        c.name for c in recording.channels if c.kind in (Kind.VELOCITY, Kind.ANGULAR_VELOCITY)
+    )
+    if not targets:
         raise DataError(
             f"recording '{recording.name}' has no velocity, so that screening does not know what is to be predicted; "
             "name the targets, or map a channel with kind velocity"
         )
-    return found
+    return targets
 
 
 def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequence[Recording], tuple[str, ...]]:
@@ -228,14 +230,14 @@ def _missing(names: Sequence[str], columns: Sequence[FloatArray]) -> dict[str, i
 def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: ScreeningSpec) -> tuple[Piece, ...]:
     """A piece a recording; long ones cut where there are too few, neighbours joined where there are too many."""
     total = sum(len(values) for values in columns)
-    made: list[Piece] = []
+    pieces: list[Piece] = []
     if len(columns) >= spec.pieces:
         # lagged covariances of all pairs are held for every piece: a gigabyte at most
         each = 4 * (2 * spec.max_lag + 1) * columns[0].shape[1] ** 2
         per = -(-len(columns) // max(spec.pieces, min(MOST_PIECES, int(1e9 / each))))
         for start in range(0, len(columns), per):
             label = names[start] if per == 1 else f"{names[start]} to {names[min(start + per, len(names)) - 1]}"
-            made.append(Piece(label, tuple(columns[start : start + per])))
+            pieces.append(Piece(label, tuple(columns[start : start + per])))
     else:
         for name, values in zip(names, columns, strict=True):
             # a part is as long as the lags need, if that leaves fewer parts than asked for
@@ -243,5 +245,5 @@ def _pieces(names: Sequence[str], columns: Sequence[FloatArray], spec: Screening
             edges = np.linspace(0, len(values), parts + 1).astype(int)
             for i in range(parts):
                 label = name if parts == 1 else f"{name} part {i + 1}"
-                made.append(Piece(label, (values[edges[i] : edges[i + 1]],)))
-    return tuple(made)
+                pieces.append(Piece(label, (values[edges[i] : edges[i + 1]],)))
+    return tuple(pieces)

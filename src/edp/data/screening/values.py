@@ -28,8 +28,8 @@ ENOUGH = 0.02
 
 def held_out_pieces(count: int, share: float, seed: int) -> NDArray[np.int64]:
     """Which pieces are held out: at least two, at most all but two."""
-    wanted = min(max(2, round(count * share)), count - 2)
-    return np.sort(np.random.default_rng(seed).permutation(count)[:wanted])
+    piece_count = min(max(2, round(count * share)), count - 2)
+    return np.sort(np.random.default_rng(seed).permutation(count)[:piece_count])
 
 
 def _correlations(lagged: Lagged, pieces: NDArray[np.int64]) -> Array:
@@ -80,7 +80,7 @@ def linear_values(
     used: Sequence[int],
     targets: Sequence[int],
     horizon: int,
-    held: NDArray[np.int64],
+    held_out: NDArray[np.int64],
     on_share: Callable[[float], None] | None = None,
 ) -> list[Value]:
     """The value of each used channel for each target.
@@ -91,34 +91,37 @@ def linear_values(
         used: columns that a model may read; targets too, unless the horizon is 0.
         targets: columns of the targets.
         horizon: samples ahead.
-        held: pieces that judge; the others train.
+        held_out: pieces that judge; the others train.
         on_share: hears the share that is done.
     """
-    train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held))
+    train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held_out))
     read = [k for k in used if horizon > 0 or k not in targets]
     delays = [a for a in HISTORY if a + horizon <= lagged.reach]
     taps = [(k, a) for k in read for a in delays]
-    judged = [_correlations(lagged, np.array([p])) for p in held]
+    judged = [_correlations(lagged, np.array([p])) for p in held_out]
     moments = [gram(sums, taps, taps) for sums in judged]
-    made: list[Value] = []
+    values: list[Value] = []
     for done, target in enumerate(targets):
         model = _Model(train, taps, target, horizon)
-        known = [(m, model.answers_of(s), model.power(s)) for m, s in zip(moments, judged, strict=True)]
-        whole = np.array([model.error(model.weights, *k) for k in known])
+        judge_moments = [(m, model.answers_of(s), model.power(s)) for m, s in zip(moments, judged, strict=True)]
+        whole = np.array([model.error(model.weights, *k) for k in judge_moments])
 
         def of_channel(
-            place: int, model: _Model = model, known: list[tuple[Array, Array, float]] = known, whole: Array = whole
+            read_index: int,
+            model: _Model = model,
+            channel_moments: list[tuple[Array, Array, float]] = judge_moments,
+            whole: Array = whole,
         ) -> tuple[float, float, float]:
-            columns = np.arange(place * len(delays), (place + 1) * len(delays))
+            columns = np.arange(read_index * len(delays), (read_index + 1) * len(delays))
             weights = model.without(columns)
-            less = np.array([model.error(weights, *k) for k in known])
+            less = np.array([model.error(weights, *k) for k in channel_moments])
             return _interval(1.0 - whole / less, float(1.0 - whole.sum() / less.sum()))
 
-        for place, (gain, low, high) in enumerate(spread(of_channel, range(len(read)))):
-            made.append(Value(names[read[place]], names[target], gain, low, high))
+        for channel_index, (gain, low, high) in enumerate(spread(of_channel, range(len(read)))):
+            values.append(Value(names[read[channel_index]], names[target], gain, low, high))
         if on_share is not None:
             on_share((done + 1) / len(targets))
-    return made
+    return values
 
 
 def _interval(values: Array, middle: float) -> tuple[float, float, float]:
@@ -129,7 +132,7 @@ def _interval(values: Array, middle: float) -> tuple[float, float, float]:
 
 
 def window_needed(
-    lagged: Lagged, used: Sequence[int], targets: Sequence[int], horizon: int, held: NDArray[np.int64]
+    lagged: Lagged, used: Sequence[int], targets: Sequence[int], horizon: int, held_out: NDArray[np.int64]
 ) -> tuple[int, dict[int, float]]:
     """The shortest history from which a linear prediction is about as good as from the longest that was looked at.
 
@@ -138,13 +141,13 @@ def window_needed(
         used: columns that a model may read.
         targets: columns of the targets.
         horizon: samples ahead.
-        held: pieces that judge.
+        held_out: pieces that judge.
 
     Returns:
         The window in samples, and for each window tried the held-out error as a share of the change's variance.
     """
-    train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held))
-    judge = _correlations(lagged, held)
+    train = _correlations(lagged, np.setdiff1d(np.arange(len(lagged.samples)), held_out))
+    judge = _correlations(lagged, held_out)
     read = [k for k in used if horizon > 0 or k not in targets]
     longest = lagged.reach - horizon + 1
     windows = [w for w in WINDOWS if w <= longest] or [longest]

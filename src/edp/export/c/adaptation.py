@@ -68,16 +68,16 @@ def values(law: Adaptation, upper: str, intervals: int) -> dict[str, object]:
 
 def constants(law: Adaptation) -> list[CConstant]:
     """All constants, those with a text in the order of the C code."""
-    made = []
+    lines = []
     for name in POINTERS:
-        held = np.atleast_1d(getattr(law, name)).ravel()
+        values = np.atleast_1d(getattr(law, name)).ravel()
         # C has no array of nothing: without directions one number stands there that is never read.
-        numbers = held if held.size else np.zeros(1)
-        made.append(CConstant("float", name, len(numbers), array("float", name, map(number, numbers))))
+        numbers = values if values.size else np.zeros(1)
+        lines.append(CConstant("float", name, len(numbers), array("float", name, map(number, numbers))))
     columns = array("uint16_t", "columns", (f"{column}u" for column in law.columns))
-    made.append(CConstant("uint16_t", "columns", len(law.columns), columns))
+    lines.append(CConstant("uint16_t", "columns", len(law.columns), columns))
     shared = [CConstant("edp_adapt_law", "law", 1), CConstant("float", "adapt_most", law.unit.size)]
-    return [*made, *shared, CConstant("uint32_t", "ahead", len(law.horizons))]
+    return [*lines, *shared, CConstant("uint32_t", "ahead", len(law.horizons))]
 
 
 def _intervals(upper: str) -> Code:

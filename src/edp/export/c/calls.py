@@ -98,8 +98,8 @@ def needs_columns(calls: Calls, layer: Layer) -> bool:
 
 def _gather(calls: Calls, layer: layers.Gather) -> list[str]:
     if needs_columns(calls, layer):
-        given, columns = calls.value(layer.inputs[0]), constant(layer, "columns")
-        return [call("edp_gather", given, columns, layer.width, calls.value(layer.name))]
+        source, columns = calls.value(layer.inputs[0]), constant(layer, "columns")
+        return [call("edp_gather", source, columns, layer.width, calls.value(layer.name))]
     lines, at = [], 0
     for name, first, length in runs(calls, layer):
         lines.append(call("edp_copy", calls.value(name, first), length, calls.value(layer.name, at)))
@@ -131,30 +131,30 @@ def _lstm(calls: Calls, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
 
 
 def _gru(calls: Calls, layer: memory.Gru) -> list[str]:
-    given, into = calls.value(layer.inputs[0]), layer.weight_x.shape[1]
+    source, into = calls.value(layer.inputs[0]), layer.weight_x.shape[1]
     rest = (slot(layer, "h"), calls.scratch(layer), calls.value(layer.name))
-    return [call("edp_gru", given, f"&{identifier(layer.name)}_weights", into, layer.width, *rest)]
+    return [call("edp_gru", source, f"&{identifier(layer.name)}_weights", into, layer.width, *rest)]
 
 
 def _pool(calls: Calls, layer: memory.AttentionPool) -> list[str]:
     score, bias = constant(layer, "score"), f"{constant(layer, 'bias')}[0]"
-    held = (slot(layer, "ring"), slot(layer, "scores"), ring(layer), calls.scratch(layer))
+    state = (slot(layer, "ring"), slot(layer, "scores"), ring(layer), calls.scratch(layer))
     sizes = (layer.width, layer.window)
-    given = calls.value(layer.inputs[0])
-    return [call("edp_attention_pool", given, score, bias, *sizes, *held, calls.value(layer.name))]
+    source = calls.value(layer.inputs[0])
+    return [call("edp_attention_pool", source, score, bias, *sizes, *state, calls.value(layer.name))]
 
 
 def _window(calls: Calls, layer: memory.WindowAttention) -> list[str]:
-    held = (slot(layer, "keys"), slot(layer, "values"), ring(layer), calls.scratch(layer))
-    return calls.simple(layer, "edp_window_attention", layer.size, layer.heads, layer.window, *held)
+    state = (slot(layer, "keys"), slot(layer, "values"), ring(layer), calls.scratch(layer))
+    return calls.simple(layer, "edp_window_attention", layer.size, layer.heads, layer.window, *state)
 
 
 def _prefix(calls: Calls, layer: memory.PrefixCorrection) -> list[str]:
     hidden, seen = layer.first_weight.shape
     correction = calls.scratch(layer, seen + hidden)
-    held = (slot(layer, "total"), ring(layer), calls.scratch(layer), correction)
+    state = (slot(layer, "total"), ring(layer), calls.scratch(layer), correction)
     weights = f"&{identifier(layer.name)}_weights"
-    asked = call("edp_prefix", calls.value(layer.inputs[0]), weights, seen // 2, *held).removesuffix(";")
+    asked = call("edp_prefix", calls.value(layer.inputs[0]), weights, seen // 2, *state).removesuffix(";")
     sizes = {(name, part.name): part.size for name, part in calls.graph.slots()}
     lines, at = [f"if ({asked}) {{"], seen + hidden
     for name, part in layer.corrects:
@@ -214,15 +214,15 @@ def structs(layer: Layer) -> list[str]:
     name = identifier(layer.name)
     at = {key: constant(layer, key) for key in layer.tensors()}
     if isinstance(layer, memory.Lstm | memory.LayerNormLstm):
-        held = f"{at['weight_x']}, {at['weight_h']}, {at['bias']}, {number(layer.share)}"
-        made = [f"static const edp_lstm_weights {name}_weights = {{{held}}};"]
+        members = f"{at['weight_x']}, {at['weight_h']}, {at['bias']}, {number(layer.share)}"
+        declarations = [f"static const edp_lstm_weights {name}_weights = {{{members}}};"]
         if isinstance(layer, memory.LayerNormLstm):
             norms = [at[key] for key in ("gain_x", "gain_h", "gain_c", "shift_c")] + [number(layer.epsilon)]
-            made.append(f"static const edp_lstm_norms {name}_norms = {{{', '.join(norms)}}};")
-        return made
+            declarations.append(f"static const edp_lstm_norms {name}_norms = {{{', '.join(norms)}}};")
+        return declarations
     if isinstance(layer, memory.Gru):
-        held = ", ".join(at[key] for key in ("weight_x", "weight_h", "bias_x", "bias_h"))
-        return [f"static const edp_gru_weights {name}_weights = {{{held}}};"]
+        members = ", ".join(at[key] for key in ("weight_x", "weight_h", "bias_x", "bias_h"))
+        return [f"static const edp_gru_weights {name}_weights = {{{members}}};"]
     if isinstance(layer, memory.PrefixCorrection):
         parts = [at[key] for key in ("first_weight", "first_bias", "second_weight", "second_bias")]
         sizes = [f"{len(layer.first_bias)}u", f"{len(layer.second_bias)}u", f"{layer.ticks}u"]

@@ -19,15 +19,15 @@ FILES = ("edp_integer.h", "edp_integer.c", "edp_integer_memory.c")
 
 
 def _quantise(calls: Calls, x: made.Quantise) -> list[str]:
-    given, scale = calls.value(x.inputs[0]), number(2.0**x.frac)
-    made_call = call("edp_q_from_float", given, x.size, scale, calls.value(x.name))
+    source, scale = calls.value(x.inputs[0]), number(2.0**x.frac)
+    made_call = call("edp_q_from_float", source, x.size, scale, calls.value(x.name))
     return [f"s->clipped += {made_call}"]
 
 
 def _gather(calls: Calls, x: made.WGather) -> list[str]:
     if needs_columns(calls, x):
-        given = calls.value(x.inputs[0])
-        return [call("edp_q_gather", given, constant(x, "columns"), x.width, x.shifts[0], calls.value(x.name))]
+        source = calls.value(x.inputs[0])
+        return [call("edp_q_gather", source, constant(x, "columns"), x.width, x.shifts[0], calls.value(x.name))]
     right = dict(zip(x.inputs, x.shifts, strict=True))
     lines, at = [], 0
     for name, first, length in runs(calls, x):
@@ -45,25 +45,25 @@ def _sum(calls: Calls, x: made.WSum) -> list[str]:
 def _activate(calls: Calls, x: made.WActivate) -> list[str]:
     sizes: list[object] = [x.size]
     if x.function is not Function.RELU:
-        sizes.append(str(x.given))
+        sizes.append(str(x.input_frac))
     if x.function is Function.SOFTPLUS:
         sizes.append(str(x.frac))
     return [call(f"edp_q_map_{x.function}", calls.value(x.inputs[0]), *sizes, calls.value(x.name))]
 
 
 def _linear(calls: Calls, x: Any, function: str, *sizes: int) -> list[str]:
-    given, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
+    source, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
     rest = (calls.scratch(x), calls.value(x.name))
-    return [call(function, given, matrix, constant(x, "bias"), *sizes, *rest)]
+    return [call(function, source, matrix, constant(x, "bias"), *sizes, *rest)]
 
 
 def _convolution(calls: Calls, x: made.WConvolution) -> list[str]:
     out, taps, into = x.weight.shape
     if taps == 1:
         return _linear(calls, x, "edp_q_dense", 1, out, into)
-    given, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
-    held = (slot(x, "ring"), ring(x), calls.scratch(x), calls.value(x.name))
-    return [call("edp_q_convolution", given, matrix, constant(x, "bias"), out, taps, into, x.dilation, *held)]
+    source, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
+    state = (slot(x, "ring"), ring(x), calls.scratch(x), calls.value(x.name))
+    return [call("edp_q_convolution", source, matrix, constant(x, "bias"), out, taps, into, x.dilation, *state)]
 
 
 def _recurrent(calls: Calls, x: made.WLstm | made.WGru) -> list[str]:
@@ -82,9 +82,9 @@ def _difference(calls: Calls, x: made.WDifference) -> list[str]:
 
 
 def _pool(calls: Calls, x: made.WAttentionPool) -> list[str]:
-    given, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
-    held = (slot(x, "ring"), slot(x, "scores"), ring(x), calls.scratch(x), calls.value(x.name))
-    return [call("edp_q_attention_pool", given, matrix, x.width, x.window, *held)]
+    source, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
+    state = (slot(x, "ring"), slot(x, "scores"), ring(x), calls.scratch(x), calls.value(x.name))
+    return [call("edp_q_attention_pool", source, matrix, x.width, x.window, *state)]
 
 
 def _mean(calls: Calls, x: made.WTrailingMean) -> list[str]:
@@ -135,11 +135,11 @@ def structs(layer: Layer) -> list[str]:
     if isinstance(layer, made.WAttentionPool):
         return [f"static const edp_q_matrix {name}_matrix = {matrix('', 'score')};"]
     if isinstance(layer, made.WLstm):
-        held = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias')}, {constant(layer, 'bias')}, {layer.share}"
-        return [f"static const edp_q_recurrent {name}_weights = {{{held}}};"]
+        members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias')}, {constant(layer, 'bias')}, {layer.share}"
+        return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
     if isinstance(layer, made.WGru):
-        held = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias_x')}, {constant(layer, 'bias_h')}, 32768"
-        return [f"static const edp_q_recurrent {name}_weights = {{{held}}};"]
+        members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias_x')}, {constant(layer, 'bias_h')}, 32768"
+        return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
     return []
 
 

@@ -182,8 +182,8 @@ class Model:
         copies = []
         for meaning, value in self.graph.results.items():
             first = "[0][0]" if meaning == "prediction" else "[0][0][0]"
-            place = calls.change(value).replace("t->", "t[k].")
-            copies.append(f"edp_copy({place}, {self.graph.width_of(value)}u, &dout[k].{meaning}{first});")
+            target = calls.change(value).replace("t->", "t[k].")
+            copies.append(f"edp_copy({target}, {self.graph.width_of(value)}u, &dout[k].{meaning}{first});")
         return {
             "tangent_fields": indented(f"float {field.removeprefix('t->')}[{size}];" for field, size in fields),
             "tangent_forget": indented(f"edp_fill(0.0f, {size}u, {field});" for field, size in fields),

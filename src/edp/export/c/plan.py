@@ -74,7 +74,7 @@ def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Memor
     scratch: dict[str, int] = {}
     sizes: dict[Number, int] = {}
     for at, layer in enumerate(graph.layers):
-        busy = [held for held in busy if held[3] >= at]
+        busy = [block for block in busy if block[3] >= at]
         for places, wide, until, number in (
             (values, layer.width, last.get(layer.name, at), layer.number),
             (scratch, scratch_of(layer), at, scratch_number(layer)),
@@ -88,9 +88,9 @@ def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Memor
     return MemoryPlan(values, scratch, sizes)
 
 
-def _gap(taken: list[tuple[int, int]], wide: int) -> int:
+def _gap(busy: list[tuple[int, int]], wide: int) -> int:
     start = 0
-    for first, stop in taken:
+    for first, stop in busy:
         if first - start >= wide:
             break
         start = max(start, stop)

@@ -33,8 +33,10 @@ def features(statements: Iterable[str]) -> tuple[int, int, int]:
     """
     calls = on_stack = wide = 0
     for _, inside in CALL.findall(" ".join(statements)):
-        given = [argument.strip() for argument in inside.split(",")]
-        others = [argument for argument in given if not FLOAT.fullmatch(argument)]  # floats have registers of their own
+        arguments = [argument.strip() for argument in inside.split(",")]
+        others = [
+            argument for argument in arguments if not FLOAT.fullmatch(argument)
+        ]  # floats have registers of their own
         calls += 1
         on_stack += max(0, len(others) - IN_REGISTERS)
         wide += sum(argument.rstrip("u").isdigit() and int(argument.rstrip("u")) > 255 for argument in others)
@@ -62,5 +64,5 @@ def runtime_bytes(functions: Iterable[str]) -> int:
 @cache
 def _measured() -> tuple[dict[str, int], dict[str, list[str]]]:
     text = resources.files("edp.export.c").joinpath("kernels.toml").read_text(encoding="utf-8")
-    held = tomllib.loads(text)
-    return held["bytes"], held["needs"]
+    table = tomllib.loads(text)
+    return table["bytes"], table["needs"]

@@ -90,8 +90,8 @@ def _linear(function: str, *constants: str) -> Write:
     """Of a layer whose result changes with its inputs alone."""
 
     def write(t: Tangents, layer: Layer) -> list[str]:
-        held = [constant(layer, name) for name in constants]
-        return t.before(layer, function, *t.changes(layer), *held, layer.width)
+        constants_of_layer = [constant(layer, name) for name in constants]
+        return t.before(layer, function, *t.changes(layer), *constants_of_layer, layer.width)
 
     return write
 
@@ -134,8 +134,8 @@ def _grouped(t: Tangents, layer: layers.GroupedDense) -> list[str]:
 
 
 def _norm(t: Tangents, layer: layers.LayerNorm) -> list[str]:
-    held = (constant(layer, "gain"), number(layer.epsilon), layer.rows, len(layer.gain))
-    return t.before(layer, "edp_layer_norm_tangent", *t.values(layer), *t.changes(layer), *held)
+    parameters = (constant(layer, "gain"), number(layer.epsilon), layer.rows, len(layer.gain))
+    return t.before(layer, "edp_layer_norm_tangent", *t.values(layer), *t.changes(layer), *parameters)
 
 
 def _rows(t: Tangents, layer: layers.RowAttention) -> list[str]:
@@ -146,22 +146,22 @@ def _rows(t: Tangents, layer: layers.RowAttention) -> list[str]:
 
 def _difference(t: Tangents, layer: memory.Difference) -> list[str]:
     kind = "true" if layer.from_zero else "false"
-    held = (constant(layer, "factor"), layer.width, kind, ring(layer), changed(layer, "before"))
-    return t.before(layer, "edp_difference_tangent", *t.changes(layer), *held)
+    parameters = (constant(layer, "factor"), layer.width, kind, ring(layer), changed(layer, "before"))
+    return t.before(layer, "edp_difference_tangent", *t.changes(layer), *parameters)
 
 
 def _starting(t: Tangents, layer: memory.Starting) -> list[str]:
-    held = (len(layer.mean), layer.ticks, ring(layer))
-    return t.before(layer, "edp_starting_tangent", *t.changes(layer), *held)
+    parameters = (len(layer.mean), layer.ticks, ring(layer))
+    return t.before(layer, "edp_starting_tangent", *t.changes(layer), *parameters)
 
 
 def _convolution(t: Tangents, layer: memory.Convolution) -> list[str]:
     out, taps, into = layer.weight.shape
-    given = (*t.changes(layer), constant(layer, "weight"))
+    inputs = (*t.changes(layer), constant(layer, "weight"))
     if taps == 1:
-        return t.before(layer, "edp_dense_tangent", *given, 1, out, into)
-    held = (out, taps, into, layer.dilation, ring(layer), changed(layer, "ring"))
-    return t.before(layer, "edp_convolution_tangent", *given, *held)
+        return t.before(layer, "edp_dense_tangent", *inputs, 1, out, into)
+    parameters = (out, taps, into, layer.dilation, ring(layer), changed(layer, "ring"))
+    return t.before(layer, "edp_convolution_tangent", *inputs, *parameters)
 
 
 def _lstm(t: Tangents, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
@@ -171,23 +171,32 @@ def _lstm(t: Tangents, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
     gates, dgates, old = t.calls.scratch(layer), t.scratch(layer), t.scratch(layer, scratch_of(layer))
     states = changed(layer, "h"), changed(layer, "c")
     if normed:
-        given = (*t.values(layer), *t.changes(layer), slot(layer, "h"), states[0], weights, norms, into, units, gates)
-        first = call("edp_layer_norm_gates_tangent", *given, "d", dgates)
+        inputs = (*t.values(layer), *t.changes(layer), slot(layer, "h"), states[0], weights, norms, into, units, gates)
+        first = call("edp_layer_norm_gates_tangent", *inputs, "d", dgates)
     else:
-        given = (*t.changes(layer), states[0], weights, into, units)
-        first = call("edp_lstm_gates_tangent", *given, "d", dgates)
-    kept = call("edp_copy", slot(layer, "c"), units, old)
+        inputs = (*t.changes(layer), states[0], weights, into, units)
+        first = call("edp_lstm_gates_tangent", *inputs, "d", dgates)
+    copied_state = call("edp_copy", slot(layer, "c"), units, old)
     rest = (gates, units, number(layer.share), norms, old, dgates, *states)
-    return [first, kept, *t.calls.of(layer), call("edp_lstm_cell_tangent", *rest, "d", t.change(layer.name))]
+    return [first, copied_state, *t.calls.of(layer), call("edp_lstm_cell_tangent", *rest, "d", t.change(layer.name))]
 
 
 def _gru(t: Tangents, layer: memory.Gru) -> list[str]:
     name, units, into = identifier(layer.name), layer.width, layer.weight_x.shape[1]
     old = t.scratch(layer, scratch_of(layer))
-    held = (t.calls.scratch(layer), old, t.scratch(layer), changed(layer, "h"))
-    kept = call("edp_copy", slot(layer, "h"), units, old)
-    own = call("edp_gru_tangent", *t.changes(layer), f"&{name}_weights", into, units, *held, "d", t.change(layer.name))
-    return [kept, *t.calls.of(layer), own]
+    memory_arguments = (t.calls.scratch(layer), old, t.scratch(layer), changed(layer, "h"))
+    copied_state = call("edp_copy", slot(layer, "h"), units, old)
+    own = call(
+        "edp_gru_tangent",
+        *t.changes(layer),
+        f"&{name}_weights",
+        into,
+        units,
+        *memory_arguments,
+        "d",
+        t.change(layer.name),
+    )
+    return [copied_state, *t.calls.of(layer), own]
 
 
 def _min_gru(t: Tangents, layer: memory.MinGru) -> list[str]:
@@ -196,39 +205,39 @@ def _min_gru(t: Tangents, layer: memory.MinGru) -> list[str]:
 
 
 def _rotation(t: Tangents, layer: memory.Rotation) -> list[str]:
-    held = (constant(layer, "factor"), len(layer.factor), changed(layer, "h"))
-    return t.before(layer, "edp_rotation_tangent", *t.changes(layer), *held)
+    parameters = (constant(layer, "factor"), len(layer.factor), changed(layer, "h"))
+    return t.before(layer, "edp_rotation_tangent", *t.changes(layer), *parameters)
 
 
 def _mean(t: Tangents, layer: memory.TrailingMean) -> list[str]:
-    held = (layer.size, layer.window, ring(layer), changed(layer, "ring"))
-    return t.before(layer, "edp_trailing_mean_tangent", *t.changes(layer), *held)
+    parameters = (layer.size, layer.window, ring(layer), changed(layer, "ring"))
+    return t.before(layer, "edp_trailing_mean_tangent", *t.changes(layer), *parameters)
 
 
 def _attended(t: Tangents, layer: memory.AttentionPool | memory.WindowAttention, *slots: str) -> str:
     past, moved = (", ".join(of(layer, name) for name in slots) for of in (slot, changed))
-    held = f"{{{past}}}, {{{moved}}}, {ring(layer)}, {layer.window}u"
-    return f"&(const edp_attended){{{held}, {t.calls.scratch(layer)}, {t.scratch(layer)}}}"
+    struct = f"{{{past}}}, {{{moved}}}, {ring(layer)}, {layer.window}u"
+    return f"&(const edp_attended){{{struct}, {t.calls.scratch(layer)}, {t.scratch(layer)}}}"
 
 
 def _pool(t: Tangents, layer: memory.AttentionPool) -> list[str]:
     score = (constant(layer, "score"), f"{constant(layer, 'bias')}[0]", layer.width)
-    held = _attended(t, layer, "ring", "scores")
-    return t.before(layer, "edp_attention_pool_tangent", *t.values(layer), *t.changes(layer), *score, held)
+    attended = _attended(t, layer, "ring", "scores")
+    return t.before(layer, "edp_attention_pool_tangent", *t.values(layer), *t.changes(layer), *score, attended)
 
 
 def _window(t: Tangents, layer: memory.WindowAttention) -> list[str]:
-    held = _attended(t, layer, "keys", "values")
+    attended = _attended(t, layer, "keys", "values")
     six = (_pointers(t.values(layer)), _pointers(t.changes(layer)))
-    return t.before(layer, "edp_window_attention_tangent", *six, layer.size, layer.heads, held)
+    return t.before(layer, "edp_window_attention_tangent", *six, layer.size, layer.heads, attended)
 
 
 def _prefix(t: Tangents, layer: memory.PrefixCorrection) -> list[str]:
     hidden, seen = layer.first_weight.shape
     states = (slot(layer, "total"), changed(layer, "total"), ring(layer))
     work = (t.calls.scratch(layer), t.scratch(layer), "d")
-    given = (*t.values(layer), *t.changes(layer), f"&{identifier(layer.name)}_weights", seen // 2)
-    asked = call("edp_prefix_tangent", *given, *states, *work).removesuffix(";")
+    inputs = (*t.values(layer), *t.changes(layer), f"&{identifier(layer.name)}_weights", seen // 2)
+    asked = call("edp_prefix_tangent", *inputs, *states, *work).removesuffix(";")
     lines = [f"if ({asked}) {{"]
     sizes, at = {(name, part.name): part.size for name, part in t.graph.slots()}, seen + hidden
     for name, part in layer.corrects:

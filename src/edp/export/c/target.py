@@ -47,33 +47,33 @@ class CTarget:
         """See `edp.export.ExportTarget`."""
         check_name(name)
         model = make_model(name, bundle, self.tangent, adapts=True)
-        made = core_files(model) | {
+        files = core_files(model) | {
             f"{name}_golden.h": golden(model),
             "host_test.c": model.fill("host_test.c.in"),
             "fuzz.c": model.fill("fuzz.c.in"),
             "example_task.c": model.fill("example_task.c.in"),
             "CMakeLists.txt": model.fill("CMakeLists.txt.in"),
         }
-        return write_export(folder, {file: text.encode() for file, text in made.items()})
+        return write_export(folder, {file: text.encode() for file, text in files.items()})
 
 
 def core_files(model: Model) -> dict[str, str]:
     """Model and runtime as text by file name: what every form around the C code holds; the header comes first."""
     name = model.name
-    made = {
+    files = {
         f"{name}.h": model.fill("model.h.in"),
         f"{name}.c": model.fill("model.c.in"),
         f"{name}_weights.h": model.weights(),
     }
     if model.changes is not None:
-        made |= {f"{name}_tangent.{end}": model.fill(f"model_tangent.{end}.in") for end in ("h", "c")}
+        files |= {f"{name}_tangent.{end}": model.fill(f"model_tangent.{end}.in") for end in ("h", "c")}
     if model.adapts:
-        made |= {f"{name}_adaptation.{end}": model.fill(f"model_adaptation.{end}.in") for end in ("h", "c")}
+        files |= {f"{name}_adaptation.{end}": model.fill(f"model_adaptation.{end}.in") for end in ("h", "c")}
     if model.whole:
-        made["edp_tables.h"] = tables_header()
+        files["edp_tables.h"] = tables_header()
     for file in model.runtime:
-        made[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
-    return made
+        files[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()
+    return files
 
 
 def check_name(name: str) -> None:

@@ -39,22 +39,22 @@ def filled(items: Iterable[str], indent: str = "    ") -> Code:
 
 def array(kind: str, name: str, values: Iterable[str], note: str = "") -> Code:
     """The definition of a constant array."""
-    held = list(values)
+    numbers = list(values)
     comment = f" /* {note} */" if note else ""
-    return Code(f"static const {kind} {name}[{len(held)}] = {{{comment}\n{filled(held)}\n}};")
+    return Code(f"static const {kind} {name}[{len(numbers)}] = {{{comment}\n{filled(numbers)}\n}};")
 
 
 def call(function: str, *arguments: object) -> str:
     """A call statement; whole numbers are written as unsigned."""
-    given = [f"{x}u" if isinstance(x, int) else str(x) for x in arguments]
-    return f"{function}({', '.join(given)});"
+    argument_texts = [f"{x}u" if isinstance(x, int) else str(x) for x in arguments]
+    return f"{function}({', '.join(argument_texts)});"
 
 
 def indented(lines: Iterable[str], indent: str = "    ") -> Code:
     """Statements, broken where they are too long."""
-    made = []
+    indented_lines = []
     for line in lines:
         own = indent + line[: len(line) - len(line.lstrip())]
         wrapped = textwrap.wrap(line.strip(), WIDTH, initial_indent=own, subsequent_indent=own + "    ")
-        made += wrapped if line.strip() and not line.lstrip().startswith("/*") else [indent + line]
-    return Code("\n".join(made))
+        indented_lines += wrapped if line.strip() and not line.lstrip().startswith("/*") else [indent + line]
+    return Code("\n".join(indented_lines))

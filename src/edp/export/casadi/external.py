@@ -18,18 +18,18 @@ def blanks(graph: Graph, name: str) -> dict[str, object]:
     store: list[str] = []
     load_change: list[str] = []
     store_change: list[str] = []
-    for layer, group in groupby(places(graph), key=lambda place: place.layer):
-        held = list(group)
-        load += _load_count(graph, graph.layer(layer), held)
-        for place in held:
-            if place.slot.name == "age":
-                store.append(f"x[{place.at}] = (double)s->{identifier(layer)}_ring_at.seen;")
-                store_change.append(f"x[{place.at}] = 0.0;")
+    for layer, group in groupby(places(graph), key=lambda state: state.layer):
+        layer_states = list(group)
+        load += _load_count(graph, graph.layer(layer), layer_states)
+        for state in layer_states:
+            if state.slot.name == "age":
+                store.append(f"x[{state.at}] = (double)s->{identifier(layer)}_ring_at.seen;")
+                store_change.append(f"x[{state.at}] = 0.0;")
                 continue
             for lines, who, fill in ((load, "s", None), (load_change, "t", None)):
-                lines.append(_moved(graph, place, "load", who, fill))
-            store.append(_moved(graph, place, "store", "s", number(UNSEEN if place.slot.name == "scores" else 0.0)))
-            store_change.append(_moved(graph, place, "store", "t", "0.0f"))
+                lines.append(_moved(graph, state, "load", who, fill))
+            store.append(_moved(graph, state, "store", "s", number(UNSEEN if state.slot.name == "scores" else 0.0)))
+            store_change.append(_moved(graph, state, "store", "t", "0.0f"))
     every = ["x_next", *graph.results]
     sizes = [len(start(graph)), *map(graph.width_of, graph.results.values())]
     members = [f"&out->{result}{'[0][0]' if result == 'prediction' else '[0][0][0]'}" for result in graph.results]
@@ -53,14 +53,14 @@ def blanks(graph: Graph, name: str) -> dict[str, object]:
     }
 
 
-def _load_count(graph: Graph, layer: Layer, held: list[Place]) -> list[str]:
+def _load_count(graph: Graph, layer: Layer, layer_states: list[Place]) -> list[str]:
     """Sets the ring or the counter of a layer in the C state."""
     if not has_ring(layer):
         return []
-    rings = [place for place in held if is_ring(graph, place)]
-    rows, where = max((place.rows for place in rings), default=0), f"s->{identifier(layer.name)}_ring_at"
-    ages = [place for place in held if place.slot.name == "age"]
-    scores = [place for place in rings if place.slot.name == "scores"]
+    rings = [state for state in layer_states if is_ring(graph, state)]
+    rows, where = max((state.rows for state in rings), default=0), f"s->{identifier(layer.name)}_ring_at"
+    ages = [state for state in layer_states if state.slot.name == "age"]
+    scores = [state for state in rings if state.slot.name == "scores"]
     lines = []
     if ages:
         most = rows if rings else layer.ticks if not isinstance(layer, memory.Difference) else 1  # type: ignore[attr-defined]
@@ -72,11 +72,11 @@ def _load_count(graph: Graph, layer: Layer, held: list[Place]) -> list[str]:
     return lines
 
 
-def _moved(graph: Graph, place: Place, way: str, who: str, fill: str | None) -> str:
-    field, column = f"{who}->{place.field}", f"x + {place.at}"
-    if not is_ring(graph, place):
-        return call(f"{way}_numbers", column, place.slot.size, field)
-    ring = f"s->{identifier(place.layer)}_ring_at"
-    seen = f"{ring}.seen" if counts(graph, place) else f"{place.rows}u"
+def _moved(graph: Graph, state: Place, way: str, who: str, fill: str | None) -> str:
+    field, column = f"{who}->{state.field}", f"x + {state.at}"
+    if not is_ring(graph, state):
+        return call(f"{way}_numbers", column, state.slot.size, field)
+    ring = f"s->{identifier(state.layer)}_ring_at"
+    seen = f"{ring}.seen" if counts(graph, state) else f"{state.rows}u"
     rest = [fill] if fill is not None else []
-    return call(f"{way}_ring", column, place.rows, place.columns, f"{ring}.at", seen, *rest, field)
+    return call(f"{way}_ring", column, state.rows, state.columns, f"{ring}.at", seen, *rest, field)

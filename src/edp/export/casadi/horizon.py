@@ -21,8 +21,8 @@ class Horizon:
     """
 
     def __init__(self, network: Any, library: str | Path, steps: int, commands: int, carry: Any, feed: Any) -> None:
-        held, name = ctypes.CDLL(str(Path(library).resolve())), network.about["name"]
-        self._run, size = held[f"{name}_horizon"], held[f"{name}_horizon_work"]
+        loaded, name = ctypes.CDLL(str(Path(library).resolve())), network.about["name"]
+        self._run, size = loaded[f"{name}_horizon"], loaded[f"{name}_horizon_work"]
         self._run.restype, size.restype = ctypes.c_uint32, ctypes.c_longlong
         self.steps, self.width = steps, network.step.numel_out(1)
         self._sizes = len(network.start), len(network.inputs)
@@ -46,12 +46,12 @@ class Horizon:
         """
         states, inputs = self._sizes
         table = self.steps * inputs
-        given = [np.ascontiguousarray(value, dtype=float) for value in (x, first, base, by)]
-        for value, size in zip(given, (states, inputs, table, table * int(self._shape[1])), strict=True):
+        arguments = [np.ascontiguousarray(value, dtype=float) for value in (x, first, base, by)]
+        for value, size in zip(arguments, (states, inputs, table, table * int(self._shape[1])), strict=True):
             if value.size != size:
                 raise ValueError(f"an argument of a horizon has {value.size} numbers; {size} are needed")
         y, jacobian = np.empty((self.steps, self.width)), np.empty((self.steps, self.width, *self._shape))
-        arrays = (given[0], self._shape, given[3], given[1], given[2])
+        arrays = (arguments[0], self._shape, arguments[3], arguments[1], arguments[2])
         places = [ctypes.c_void_p(array.ctypes.data) for array in arrays]
         ends = [ctypes.c_void_p(array.ctypes.data) for array in (y, jacobian, self._work)]
         refused = self._run(*places, self._fed, *ends)

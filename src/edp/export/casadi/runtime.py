@@ -46,8 +46,8 @@ class Network:
         self.about = json.loads(self.path.read_text())
         if self.about["schema"] != 1:
             raise ValueError(f"{path} has schema {self.about['schema']}, this file reads 1; export the network again")
-        with np.load(self.path.with_suffix(".npz")) as held:
-            self._arrays = {name: np.asarray(held[name], dtype=float) for name in held.files}
+        with np.load(self.path.with_suffix(".npz")) as archive:
+            self._arrays = {name: np.asarray(archive[name], dtype=float) for name in archive.files}
         self.inputs = [channel["name"] for channel in self.about["inputs"]]
         self.targets = [target["name"] for target in self.about["targets"]]
         self.rate_hz = float(self.about["rate_hz"])
@@ -71,17 +71,17 @@ class Network:
         Raises:
             RuntimeError: the compiler is missing or says no.
         """
-        folder, made = self.path.parent, self.path.with_name(f"{self.about['name']}_external.so")
+        folder, compiled = self.path.parent, self.path.with_name(f"{self.about['name']}_external.so")
         options = flags or ("-O2", "-ffp-contract=off", "-fvisibility=hidden")
         sources = sorted(str(path) for path in folder.glob("*.c"))
-        command = [compiler, "-std=c99", *options, "-shared", "-fPIC", *sources, "-lm", "-o", str(made)]
+        command = [compiler, "-std=c99", *options, "-shared", "-fPIC", *sources, "-lm", "-o", str(compiled)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, check=False)
         except OSError as error:
             raise RuntimeError(f"compiler '{compiler}' does not start ({error}); name another one") from error
         if done.returncode:
             raise RuntimeError(f"'{compiler}' cannot compile {folder}:\n{done.stderr[-2000:]}")
-        return made
+        return compiled
 
     def external(self, library: str | Path) -> ca.Function:
         """The same step from the C code, with its Jacobian: faster, in single precision."""
@@ -106,32 +106,32 @@ class Network:
         x, u = ca.MX.sym("x", len(self.start)), ca.MX.sym("first", len(self.inputs))
         base = ca.MX.sym("base", len(self.inputs), steps)
         state, now = x, u
-        made: list[ca.MX] = []
+        predictions: list[ca.MX] = []
         for tick in range(steps):
             if tick:
-                now = ca.DM(np.asarray(carry)) * now + ca.DM(np.asarray(feed)) @ made[-1] + base[:, tick]
+                now = ca.DM(np.asarray(carry)) * now + ca.DM(np.asarray(feed)) @ predictions[-1] + base[:, tick]
             state, y = self.step(state, now)[:2]
-            made.append(y)
-        return ca.Function("horizon", [x, u, base], [ca.horzcat(*made)], ["x", "first", "base"], ["y"])
+            predictions.append(y)
+        return ca.Function("horizon", [x, u, base], [ca.horzcat(*predictions)], ["x", "first", "base"], ["y"])
 
     def _build(self) -> ca.Function:
         x, u = ca.MX.sym("x", len(self.start)), ca.MX.sym("u", len(self.inputs))
         values = {"input": ca.if_else(ca.fabs(u) <= LARGEST, u, math.nan)}
-        held: dict[str, Held] = {layer["name"]: {} for layer in self.about["layers"]}
+        states: dict[str, Held] = {layer["name"]: {} for layer in self.about["layers"]}
         at = 0
         for state in self.about["states"]:
             size = state["rows"] * state["columns"]
             # The layout of a matrix is that of its ticks, one behind the other.
-            held[state["layer"]][state["slot"]] = ca.reshape(x[at : at + size], state["columns"], state["rows"])
+            states[state["layer"]][state["slot"]] = ca.reshape(x[at : at + size], state["columns"], state["rows"])
             at += size
         for layer in self.about["layers"]:
             write = LAYERS.get(layer["kind"])
             if write is None:
                 raise ValueError(f"layer '{layer['name']}' is a {layer['kind']}, which is not known here")
             constants = {name: self._arrays[f"{layer['name']}/{name}"] for name in layer["constants"]}
-            part = _Part(layer, constants, held, held[layer["name"]])
+            part = _Part(layer, constants, states, states[layer["name"]])
             values[layer["name"]] = write(part, *(values[name] for name in layer["inputs"]))
-        after = [ca.vec(held[state["layer"]][state["slot"]]) for state in self.about["states"]]
+        after = [ca.vec(states[state["layer"]][state["slot"]]) for state in self.about["states"]]
         results = {meaning: values[name] for meaning, name in self.about["values"].items()}
         return ca.Function("step", [x, u], [_stack(after), *results.values()], ["x", "u"], ["x_next", *results])
 
@@ -334,8 +334,8 @@ def _window_attention(p: _Part, q: Any, k: Any, v: Any) -> Any:
     unseen = seen < ca.DM(np.arange(p.window - 1, -1, -1)).T
     heads = [_split(part, p.heads) for part in (q, keys, values)]
     root = math.sqrt(p.size / p.heads)
-    made = [vs @ _softmax(qs.T @ ks / root - 1e30 * unseen).T for qs, ks, vs in zip(*heads, strict=True)]
-    return ca.vertcat(*made)
+    attended = [vs @ _softmax(qs.T @ ks / root - 1e30 * unseen).T for qs, ks, vs in zip(*heads, strict=True)]
+    return ca.vertcat(*attended)
 
 
 def _prefix(p: _Part, x: Any) -> Any:

@@ -43,14 +43,14 @@ class Place:
 
 def places(graph: Graph) -> list[Place]:
     """Every slot with numbers. Ages are whole numbers: ticks seen before the present one, as far as they matter."""
-    made, at = [], 0
+    states, at = [], 0
     for layer, slot in graph.slots():
         if slot.size:
             # Scores are a ring of one number a tick.
             shape = (slot.size, 1) if slot.name == "scores" else slot.shape
-            made.append(Place(layer, Slot(slot.name, shape, slot.fill), at))
+            states.append(Place(layer, Slot(slot.name, shape, slot.fill), at))
             at += slot.size
-    return made
+    return states
 
 
 def start(graph: Graph) -> Array:
@@ -59,11 +59,11 @@ def start(graph: Graph) -> Array:
     return np.concatenate(parts) if parts else np.zeros(0, np.float32)
 
 
-def is_ring(graph: Graph, place: Place) -> bool:
+def is_ring(graph: Graph, state: Place) -> bool:
     """Whether the rows are ticks that the C code keeps as a ring."""
-    return place.slot.name in ("ring", "keys", "values", "scores")
+    return state.slot.name in ("ring", "keys", "values", "scores")
 
 
-def counts(graph: Graph, place: Place) -> bool:
+def counts(graph: Graph, state: Place) -> bool:
     """Whether the ring of the C code knows how many ticks it has seen; a convolution takes all of them as seen."""
-    return not isinstance(graph.layer(place.layer), memory.Convolution)
+    return not isinstance(graph.layer(state.layer), memory.Convolution)

@@ -58,7 +58,7 @@ class CasadiTarget:
         golden_run = golden(bundle.predictor, graph.window)
         model = make_model(name, bundle, tangent=True)
         here = resources.files("edp.export.casadi")
-        made: dict[str, bytes] = {
+        files: dict[str, bytes] = {
             "edp_casadi.py": here.joinpath("runtime.py").read_bytes(),
             "edp_horizon.py": here.joinpath("horizon.py").read_bytes(),
             f"{name}.json": as_json(described),
@@ -68,8 +68,8 @@ class CasadiTarget:
             ),
             f"{name}_casadi.c": external(graph, name).encode(),
         }
-        made |= {file: text.encode() for file, text in core_files(model).items()}
-        return write_export(folder, made)
+        files |= {file: text.encode() for file, text in core_files(model).items()}
+        return write_export(folder, files)
 
 
 def content(described: Description) -> dict[str, Any]:
@@ -80,16 +80,16 @@ def content(described: Description) -> dict[str, Any]:
         "layers": [_layer(layer) for layer in graph.layers],
         "values": dict(graph.results),
         "states": [
-            {"layer": place.layer, "slot": place.slot.name, "rows": place.rows, "columns": place.columns}
-            for place in places(graph)
+            {"layer": state.layer, "slot": state.slot.name, "rows": state.rows, "columns": state.columns}
+            for state in places(graph)
         ],
     }
 
 
 def arrays(graph: Graph) -> dict[str, np.ndarray]:
     """Constants by layer and name, and the state after a reset."""
-    made = {f"{layer}/{name}": values for layer, name, values in graph.tensors()}
-    return made | {"start": start(graph)}
+    tensors = {f"{layer}/{name}": values for layer, name, values in graph.tensors()}
+    return tensors | {"start": start(graph)}
 
 
 def _layer(layer: Layer) -> dict[str, Any]:
@@ -105,9 +105,9 @@ def _layer(layer: Layer) -> dict[str, Any]:
 
 def packed(data: dict[str, np.ndarray]) -> bytes:
     """Arrays as a file of NumPy; it holds no objects."""
-    made = io.BytesIO()
-    np.savez(made, allow_pickle=False, **data)  # type: ignore[arg-type]
-    return made.getvalue()
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **data)  # type: ignore[arg-type]
+    return buffer.getvalue()
 
 
 def external(graph: Graph, name: str) -> str:

@@ -71,18 +71,18 @@ def libraries(sources: Sources, platforms: Sequence[str]) -> dict[int, dict[str,
             "the libraries of an FMU need the package ziglang: pip install 'excavator-dynamics-predictor[fmu]', or "
             "write one with sources only: --set binaries=none"
         )
-    made: dict[int, dict[str, bytes]] = {version: {} for version in sources.own}
+    binaries: dict[int, dict[str, bytes]] = {version: {} for version in sources.own}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for file, text in sources.files.items():
             (folder / file).write_text(text, encoding="utf-8", newline="\n")
         for platform in map(PLATFORMS.__getitem__, platforms):
-            given = ("-target", platform.target, *FLAGS, *platform.flags, "-shared", "-s")
+            flags = ("-target", platform.target, *FLAGS, *platform.flags, "-shared", "-s")
             library = f"{sources.name}{platform.ending}"
             for version, listed in sources.own.items():
-                _zig(folder, *given, *sources.common, *listed, *platform.last, "-o", library)
-                made[version][f"binaries/{platform.folders[version]}/{library}"] = (folder / library).read_bytes()
-    return made
+                _zig(folder, *flags, *sources.common, *listed, *platform.last, "-o", library)
+                binaries[version][f"binaries/{platform.folders[version]}/{library}"] = (folder / library).read_bytes()
+    return binaries
 
 
 def _zig(folder: Path, *arguments: str) -> None:

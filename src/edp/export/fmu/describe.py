@@ -65,8 +65,8 @@ def fmi2(about: About, sources: Sequence[str]) -> bytes:
     ET.SubElement(tool, "edp", about.facts)
     listed = ET.SubElement(root, "ModelVariables")
     for reference, entry in enumerate(about.listed):
-        made = ET.SubElement(listed, "ScalarVariable", _common(reference, entry))
-        ET.SubElement(made, FORMS2[entry.form], _numbers(entry))
+        element = ET.SubElement(listed, "ScalarVariable", _common(reference, entry))
+        ET.SubElement(element, FORMS2[entry.form], _numbers(entry))
     structure = ET.SubElement(root, "ModelStructure")
     for kind in ("Outputs", "InitialUnknowns"):
         group = ET.SubElement(structure, kind)
@@ -154,26 +154,26 @@ def _experiment(root: ET.Element, about: About) -> None:
 
 
 def _common(reference: int, entry: Variable) -> dict[str, str]:
-    made = {"name": entry.name, "valueReference": str(reference)}
+    attributes = {"name": entry.name, "valueReference": str(reference)}
     if entry.description:
-        made["description"] = entry.description
-    made |= {"causality": entry.causality, "variability": "continuous" if entry.form == "real" else "discrete"}
-    return made if entry.causality == "input" else made | {"initial": "calculated"}
+        attributes["description"] = entry.description
+    attributes |= {"causality": entry.causality, "variability": "continuous" if entry.form == "real" else "discrete"}
+    return attributes if entry.causality == "input" else attributes | {"initial": "calculated"}
 
 
 def _numbers(entry: Variable) -> dict[str, str]:
     if entry.form != "real":
         return {}
-    made = {"unit": entry.unit}
+    attributes = {"unit": entry.unit}
     also = shown(entry.kind)
-    made |= {"displayUnit": also.name} if also is not None else {}
-    made["nominal"] = repr(entry.nominal)
-    return made | ({"start": "0.0"} if entry.causality == "input" else {})
+    attributes |= {"displayUnit": also.name} if also is not None else {}
+    attributes["nominal"] = repr(entry.nominal)
+    return attributes | ({"start": "0.0"} if entry.causality == "input" else {})
 
 
 def _time(about: About) -> str:
-    taken = {entry.name for entry in about.listed}
-    return next(name for k in range(len(taken) + 1) if (name := f"time_{k}" if k else "time") not in taken)
+    names = {entry.name for entry in about.listed}
+    return next(name for k in range(len(names) + 1) if (name := f"time_{k}" if k else "time") not in names)
 
 
 def _outputs(about: About) -> list[int]:

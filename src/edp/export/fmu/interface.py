@@ -53,11 +53,11 @@ OWN = (
 def variables(model: Model) -> list[Variable]:
     """Inputs, predictions and bounds in the order of the model's C structures, then those of the FMU itself."""
     _, spread = usual_range(model.bundle.predictor)
-    made = [
+    entries = [
         Variable(entry.name, "input", entry.description, kind=entry.kind, nominal=_nominal(width))
         for entry, width in zip(model.bundle.inputs, spread, strict=True)
     ]
-    return _unique(made + _predictions(model) + list(OWN))
+    return _unique(entries + _predictions(model) + list(OWN))
 
 
 def _predictions(model: Model) -> list[Variable]:
@@ -69,7 +69,7 @@ def _predictions(model: Model) -> list[Variable]:
             percent = f"{100 * covered:g}"
             text = f", {side} bound of an interval meant to hold {percent} % of the true values"
             ends_of.append((f"_{side}_{percent.replace('.', '_')}", text))
-    made = []
+    entries = []
     for ending, text in ends_of:
         for row, ticks in zip(widths, task.horizons, strict=True):
             when = f"{ticks} ticks ({1000 * ticks / task.rate_hz:g} ms) after the inputs of the last step"
@@ -77,8 +77,10 @@ def _predictions(model: Model) -> list[Variable]:
                 what = f"[{visible(name, LONGEST_NAME)}] {when}{text}"
                 about = " ".join(part for part in (visible(bundle.descriptions[at]), what) if part)
                 kind = bundle.target_kinds[at]
-                made.append(Variable(f"{name}_ahead_{ticks}{ending}", "output", about, "real", kind, _nominal(row[at])))
-    return made
+                entries.append(
+                    Variable(f"{name}_ahead_{ticks}{ending}", "output", about, "real", kind, _nominal(row[at]))
+                )
+    return entries
 
 
 def _nominal(width: float) -> float:

@@ -76,24 +76,24 @@ class FmuTarget:
         common = _c_files((*core, *COMMON))
         own = {version: _c_files(OWN[version]) for version in versions}
         built = libraries(Sources(name, core | plumbing, common, own), BINARIES[self.binaries])
-        made = {}
+        files = {}
         for version in versions:
             sources = core | {file: plumbing[file] for file in (*COMMON, *OWN[version])}
             content = _files(version, about, sources, Description(name, bundle, model.graph))
-            made[f"{name}_fmi{version}.fmu"] = _packed(content | built[version])
-        return write_export(folder, made)
+            files[f"{name}_fmi{version}.fmu"] = _packed(content | built[version])
+        return write_export(folder, files)
 
 
 def _files(version: int, about: About, sources: Mapping[str, str], described: Description) -> dict[str, bytes]:
     """Content of an FMU without libraries, by path."""
     compiled = _c_files(sources)
-    made = {"modelDescription.xml": fmi2(about, compiled) if version == 2 else fmi3(about)}
-    made["documentation/index.html"] = page(about)
-    made[f"resources/{about.name}.json"] = as_json(described.content())
-    made |= {f"sources/{file}": text.encode() for file, text in sources.items()}
+    files = {"modelDescription.xml": fmi2(about, compiled) if version == 2 else fmi3(about)}
+    files["documentation/index.html"] = page(about)
+    files[f"resources/{about.name}.json"] = as_json(described.content())
+    files |= {f"sources/{file}": text.encode() for file, text in sources.items()}
     if version == 3:
-        made["sources/buildDescription.xml"] = build_description(about, compiled)
-    return made
+        files["sources/buildDescription.xml"] = build_description(about, compiled)
+    return files
 
 
 def _about(model: Model, listed: list[Variable], core: Mapping[str, str]) -> About:
@@ -115,10 +115,10 @@ def _header(model: Model, about: About) -> str:
     """What binds the plumbing to the model."""
     text = resources.files("edp.export.fmu").joinpath("templates/fmu_model.h.in").read_text()
     names = Code(", ".join(c_string(entry.name) for entry in about.listed if entry.causality == "input"))
-    given: dict[str, object] = {"name": model.name, "NAME": model.name.upper(), "token": Code(about.token)}
-    given |= {"rate": repr(about.rate_hz), "step": repr(about.step_s), "names": names}
-    given["tangent"] = Code(TANGENT.format(model.name)) if about.derivatives else ""
-    return fill(text, given)
+    values: dict[str, object] = {"name": model.name, "NAME": model.name.upper(), "token": Code(about.token)}
+    values |= {"rate": repr(about.rate_hz), "step": repr(about.step_s), "names": names}
+    values["tangent"] = Code(TANGENT.format(model.name)) if about.derivatives else ""
+    return fill(text, values)
 
 
 def _plumbing(*names: str) -> dict[str, str]:
@@ -130,11 +130,11 @@ def _c_files(names: Mapping[str, str] | tuple[str, ...]) -> list[str]:
 
 
 def _packed(content: Mapping[str, bytes]) -> bytes:
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for path, data in content.items():
             entry = zipfile.ZipInfo(path, DATE)
             entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o755 << 16
             entry.create_system = 3
             archive.writestr(entry, data)
-    return made.getvalue()
+    return buffer.getvalue()

@@ -47,10 +47,10 @@ def shown(kind: Kind) -> Shown | None:
 
 def units_of(kinds: Sequence[Kind]) -> dict[str, list[Shown]]:
     """Units that variables of these kinds have, with those in which they may be shown, and the second."""
-    found: dict[str, list[Shown]] = {}
+    shown_units: dict[str, list[Shown]] = {}
     for kind in kinds:
-        other = found.setdefault(KINDS[kind].si_unit, [])
+        other = shown_units.setdefault(KINDS[kind].si_unit, [])
         also = shown(kind)
         if also is not None and also not in other:
             other.append(also)
-    return found | {"s": []}
+    return shown_units | {"s": []}

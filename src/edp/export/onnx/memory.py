@@ -32,35 +32,35 @@ def push(nodes: Nodes, ring: str, rows: int, x: str, axis: int = 0) -> tuple[str
     if rows == 1:
         return nodes.join([ring, x], axis), x
     oldest, rest = nodes.split(ring, [1, rows - 1], axis)
-    kept = nodes.join([rest, x], axis)
-    return nodes.join([oldest, kept], axis), kept
+    newest = nodes.join([rest, x], axis)
+    return nodes.join([oldest, newest], axis), newest
 
 
-def _difference(nodes: Nodes, layer: memory.Difference, held: Held, x: str) -> tuple[str, dict[str, str]]:
-    change = nodes.times(nodes.less(x, held["before"]), layer.factor)
+def _difference(nodes: Nodes, layer: memory.Difference, state: Held, x: str) -> tuple[str, dict[str, str]]:
+    change = nodes.times(nodes.less(x, state["before"]), layer.factor)
     if not layer.from_zero:
-        change = nodes.add("Mul", change, held["age"])
-    return change, {"before": x, "age": nodes.clip(nodes.plus(held["age"], np.float32(1)), 0, 1)}
+        change = nodes.add("Mul", change, state["age"])
+    return change, {"before": x, "age": nodes.clip(nodes.plus(state["age"], np.float32(1)), 0, 1)}
 
 
-def _starting(nodes: Nodes, layer: memory.Starting, held: Held, x: str) -> tuple[str, dict[str, str]]:
-    left = nodes.plus(nodes.times(held["age"], np.float32(-1)), np.float32(layer.ticks))
+def _starting(nodes: Nodes, layer: memory.Starting, state: Held, x: str) -> tuple[str, dict[str, str]]:
+    left = nodes.plus(nodes.times(state["age"], np.float32(-1)), np.float32(layer.ticks))
     read = nodes.clip(left, 0, 1)
     # mean + read (x - mean) would lose the digits of a large x.
     later = nodes.times(nodes.plus(nodes.times(read, np.float32(-1)), np.float32(1)), layer.mean)
     value = nodes.add("Add", nodes.add("Mul", x, read), later)
-    age = nodes.clip(nodes.plus(held["age"], np.float32(1)), 0, layer.ticks)
+    age = nodes.clip(nodes.plus(state["age"], np.float32(1)), 0, layer.ticks)
     return nodes.join([value, read], 1), {"age": age}
 
 
-def _convolution(nodes: Nodes, layer: memory.Convolution, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def _convolution(nodes: Nodes, layer: memory.Convolution, state: Held, x: str) -> tuple[str, dict[str, str]]:
     out, taps, into = layer.weight.shape
     weight = layer.weight.reshape(out, taps * into)
     if taps == 1:
         return nodes.linear(x, weight, layer.bias), {}
     # A tap, and the ticks up to the next one, which only wait.
     sizes = [1, layer.dilation - 1] * (taps - 1) if layer.dilation > 1 else [1] * (taps - 1)
-    pieces = nodes.split(held["ring"], sizes, 0)
+    pieces = nodes.split(state["ring"], sizes, 0)
     read = pieces[:: 2 if layer.dilation > 1 else 1]
     value = nodes.linear(nodes.join([*read, x], 1), weight, layer.bias)
     return value, {"ring": nodes.join([*pieces[1:], x], 0)}
@@ -72,49 +72,49 @@ def _mixed(nodes: Nodes, old: str, new: str, share: float) -> str:
     return nodes.add("Add", nodes.times(old, np.float32(1 - share)), nodes.times(new, np.float32(share)))
 
 
-def _gated(nodes: Nodes, layer: Any, held: Held, gates: str) -> tuple[str, dict[str, str]]:
+def _gated(nodes: Nodes, layer: Any, state: Held, gates: str) -> tuple[str, dict[str, str]]:
     i, f, g, o = nodes.split(gates, [layer.width] * 4, 1)
-    kept = nodes.add("Mul", nodes.add("Sigmoid", f), held["c"])
-    cell = nodes.add("Add", kept, nodes.add("Mul", nodes.add("Sigmoid", i), nodes.add("Tanh", g)))
+    decayed = nodes.add("Mul", nodes.add("Sigmoid", f), state["c"])
+    cell = nodes.add("Add", decayed, nodes.add("Mul", nodes.add("Sigmoid", i), nodes.add("Tanh", g)))
     squashed = cell
     if isinstance(layer, memory.LayerNormLstm):
         squashed = nodes.plus(nodes.times(normed(nodes, cell, layer.epsilon), layer.gain_c), layer.shift_c)
     out = nodes.add("Mul", nodes.add("Sigmoid", o), nodes.add("Tanh", squashed))
-    new = {name: _mixed(nodes, held[name], fresh, layer.share) for name, fresh in (("h", out), ("c", cell))}
+    new = {name: _mixed(nodes, state[name], fresh, layer.share) for name, fresh in (("h", out), ("c", cell))}
     return new["h"], new
 
 
-def _lstm(nodes: Nodes, layer: memory.Lstm, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def _lstm(nodes: Nodes, layer: memory.Lstm, state: Held, x: str) -> tuple[str, dict[str, str]]:
     driven = nodes.linear(x, layer.weight_x, layer.bias)
-    return _gated(nodes, layer, held, nodes.linear(held["h"], layer.weight_h, driven))
+    return _gated(nodes, layer, state, nodes.linear(state["h"], layer.weight_h, driven))
 
 
-def _layer_norm_lstm(nodes: Nodes, layer: memory.LayerNormLstm, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def _layer_norm_lstm(nodes: Nodes, layer: memory.LayerNormLstm, state: Held, x: str) -> tuple[str, dict[str, str]]:
     none = np.zeros(1, np.float32)
     driven = normed(nodes, nodes.linear(x, layer.weight_x, none), layer.epsilon)
-    back = normed(nodes, nodes.linear(held["h"], layer.weight_h, none), layer.epsilon)
+    back = normed(nodes, nodes.linear(state["h"], layer.weight_h, none), layer.epsilon)
     both = nodes.add("Add", nodes.times(driven, layer.gain_x), nodes.times(back, layer.gain_h))
-    return _gated(nodes, layer, held, nodes.plus(both, layer.bias))
+    return _gated(nodes, layer, state, nodes.plus(both, layer.bias))
 
 
-def _gru(nodes: Nodes, layer: memory.Gru, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def _gru(nodes: Nodes, layer: memory.Gru, state: Held, x: str) -> tuple[str, dict[str, str]]:
     into = nodes.split(nodes.linear(x, layer.weight_x, layer.bias_x), [layer.width] * 3, 1)
-    back = nodes.split(nodes.linear(held["h"], layer.weight_h, layer.bias_h), [layer.width] * 3, 1)
+    back = nodes.split(nodes.linear(state["h"], layer.weight_h, layer.bias_h), [layer.width] * 3, 1)
     r, z = (nodes.add("Sigmoid", nodes.add("Add", a, b)) for a, b in zip(into[:2], back[:2], strict=True))
     n = nodes.add("Tanh", nodes.add("Add", into[2], nodes.add("Mul", r, back[2])))
-    h = nodes.add("Add", n, nodes.add("Mul", z, nodes.less(held["h"], n)))
+    h = nodes.add("Add", n, nodes.add("Mul", z, nodes.less(state["h"], n)))
     return h, {"h": h}
 
 
-def _min_gru(nodes: Nodes, layer: memory.MinGru, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def _min_gru(nodes: Nodes, layer: memory.MinGru, state: Held, x: str) -> tuple[str, dict[str, str]]:
     z, c = nodes.split(x, [layer.units] * 2, 1)
-    h = nodes.add("Add", held["h"], nodes.add("Mul", nodes.add("Sigmoid", z), nodes.less(c, held["h"])))
+    h = nodes.add("Add", state["h"], nodes.add("Mul", nodes.add("Sigmoid", z), nodes.less(c, state["h"])))
     return h, {"h": h}
 
 
-def _rotation(nodes: Nodes, layer: memory.Rotation, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def _rotation(nodes: Nodes, layer: memory.Rotation, state: Held, x: str) -> tuple[str, dict[str, str]]:
     states = len(layer.factor)
-    real, imaginary = nodes.split(held["h"], [1, 1], 1)
+    real, imaginary = nodes.split(state["h"], [1, 1], 1)
     a, b = layer.factor[:, :1], layer.factor[:, 1:]
     turned = [
         nodes.add("Add", nodes.times(real, a), nodes.times(imaginary, -b)),
@@ -124,22 +124,22 @@ def _rotation(nodes: Nodes, layer: memory.Rotation, held: Held, x: str) -> tuple
     return nodes.shaped(h, 1, 2 * states), {"h": h}
 
 
-def _trailing_mean(nodes: Nodes, layer: memory.TrailingMean, held: Held, x: str) -> tuple[str, dict[str, str]]:
-    age = nodes.clip(nodes.plus(held["age"], np.float32(1)), 0, layer.window)
+def _trailing_mean(nodes: Nodes, layer: memory.TrailingMean, state: Held, x: str) -> tuple[str, dict[str, str]]:
+    age = nodes.clip(nodes.plus(state["age"], np.float32(1)), 0, layer.window)
     if layer.window == 1:
         return x, {"age": age}
-    full, ring = push(nodes, held["ring"], layer.window - 1, x)
+    full, ring = push(nodes, state["ring"], layer.window - 1, x)
     total = nodes.times(nodes.mean(full, 0), np.float32(layer.window))
     return nodes.add("Div", total, age), {"ring": ring, "age": age}
 
 
-def _attention_pool(nodes: Nodes, layer: memory.AttentionPool, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def _attention_pool(nodes: Nodes, layer: memory.AttentionPool, state: Held, x: str) -> tuple[str, dict[str, str]]:
     if layer.window == 1:
         return x, {}
     score = nodes.linear(x, layer.score[None], layer.bias)
-    scores, kept = push(nodes, held["scores"], layer.window - 1, score, axis=1)
-    full, ring = push(nodes, held["ring"], layer.window - 1, x)
-    return nodes.product(nodes.softmax(scores), full), {"ring": ring, "scores": kept}
+    scores, new_scores = push(nodes, state["scores"], layer.window - 1, score, axis=1)
+    full, ring = push(nodes, state["ring"], layer.window - 1, x)
+    return nodes.product(nodes.softmax(scores), full), {"ring": ring, "scores": new_scores}
 
 
 def attend(nodes: Nodes, layer: memory.WindowAttention, qkv: tuple[str, str, str], hidden: str | None) -> str:
@@ -154,18 +154,18 @@ def attend(nodes: Nodes, layer: memory.WindowAttention, qkv: tuple[str, str, str
 
 
 def _window_attention(
-    nodes: Nodes, layer: memory.WindowAttention, held: Held, q: str, k: str, v: str
+    nodes: Nodes, layer: memory.WindowAttention, state: Held, q: str, k: str, v: str
 ) -> tuple[str, dict[str, str]]:
-    age = nodes.clip(nodes.plus(held["age"], np.float32(1)), 0, layer.window)
+    age = nodes.clip(nodes.plus(state["age"], np.float32(1)), 0, layer.window)
     if layer.window == 1:
         return v, {"age": age}
-    keys, kept = push(nodes, held["keys"], layer.window - 1, k)
-    values, also = push(nodes, held["values"], layer.window - 1, v)
+    keys, new_keys = push(nodes, state["keys"], layer.window - 1, k)
+    values, also = push(nodes, state["values"], layer.window - 1, v)
     # Row j of the window was seen if at most window - 1 - j ticks are missing.
     places = np.arange(layer.window, 0, -1, dtype=np.float32)[None]
     unseen = nodes.clip(nodes.plus(nodes.times(age, np.float32(-1)), places), 0, 1)
     value = attend(nodes, layer, (q, keys, values), nodes.times(unseen, np.float32(UNSEEN)))
-    return value, {"keys": kept, "values": also, "age": age}
+    return value, {"keys": new_keys, "values": also, "age": age}
 
 
 def correct(nodes: Nodes, layer: memory.PrefixCorrection, seen: str) -> str:
@@ -174,11 +174,11 @@ def correct(nodes: Nodes, layer: memory.PrefixCorrection, seen: str) -> str:
     return nodes.linear(hidden, layer.second_weight, layer.second_bias)
 
 
-def step_correction(nodes: Nodes, layer: memory.PrefixCorrection, held: Held, x: str) -> tuple[str, dict[str, str]]:
+def step_correction(nodes: Nodes, layer: memory.PrefixCorrection, state: Held, x: str) -> tuple[str, dict[str, str]]:
     """The correction, zero but at the tick `ticks`, and the layer's own next states."""
-    ticks, age = layer.ticks, held["age"]
+    ticks, age = layer.ticks, state["age"]
     counting = nodes.clip(nodes.plus(nodes.times(age, np.float32(-1)), np.float32(ticks)), 0, 1)
-    total = nodes.add("Add", held["total"], nodes.add("Mul", x, counting))
+    total = nodes.add("Add", state["total"], nodes.add("Mul", x, counting))
     numbers = correct(nodes, layer, nodes.join([nodes.times(total, np.float32(1 / ticks)), x], 1))
     reached = nodes.clip(nodes.plus(age, np.float32(2 - ticks)), 0, 1)
     now = nodes.add("Mul", reached, counting)

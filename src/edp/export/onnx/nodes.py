@@ -78,9 +78,11 @@ class Nodes:
     def name(self, what: str) -> str:
         """A name of this scope that is not in use."""
         first = f"{self._scope}_{what}"
-        made = next(c for n in range(len(self._taken) + 1) if (c := f"{first}_{n}" if n else first) not in self._taken)
-        self._taken.add(made)
-        return made
+        free_name = next(
+            c for n in range(len(self._taken) + 1) if (c := f"{first}_{n}" if n else first) not in self._taken
+        )
+        self._taken.add(free_name)
+        return free_name
 
     def constant(self, values: ArrayLike, what: str = "constant") -> str:
         """A float32 array, or an int64 one if that is what comes; equal ones are written once."""
@@ -94,7 +96,7 @@ class Nodes:
 
     def is_zero(self, name: str) -> bool:
         """Whether a value is a constant of zeros."""
-        return any(made == name and not any(data) for (_, _, data), made in self._constants.items())
+        return any(constant_name == name and not any(data) for (_, _, data), constant_name in self._constants.items())
 
     def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
         """A node with one output."""
@@ -104,12 +106,14 @@ class Nodes:
         """A node with several outputs."""
         if operator not in ALLOWED:
             raise ExportError(f"operator {operator} is not one that importers can be counted on to have")
-        made = [self.name(operator.lower()) for _ in range(outputs)]
-        given = list(inputs)
-        while not given[-1]:  # optional ones at the end that are left out
-            given.pop()
-        self._nodes.append(self._onnx.helper.make_node(operator, given, made, made[0], **attributes))
-        return made
+        output_names = [self.name(operator.lower()) for _ in range(outputs)]
+        input_names = list(inputs)
+        while not input_names[-1]:  # optional ones at the end that are left out
+            input_names.pop()
+        self._nodes.append(
+            self._onnx.helper.make_node(operator, input_names, output_names, output_names[0], **attributes)
+        )
+        return output_names
 
     def split(self, x: str, sizes: Sequence[int], axis: int) -> list[str]:
         """Neighbouring pieces; the value itself where there is one piece."""
@@ -193,26 +197,26 @@ class Nodes:
             [helper.make_tensor_value_info(key, proto, shape) for key, (_, shape) in outputs.items()],
             self._tensors,
         )
-        made = helper.make_model(
+        model_proto = helper.make_model(
             graph,
             opset_imports=[helper.make_opsetid("", self.opset)],
             ir_version=OPSETS[self.opset],
             producer_name="excavator-dynamics-predictor",
             producer_version=__version__,
         )
-        helper.set_model_props(made, dict(notes))
+        helper.set_model_props(model_proto, dict(notes))
         try:
-            self._onnx.checker.check_model(made, full_check=True)
+            self._onnx.checker.check_model(model_proto, full_check=True)
         except Exception as error:
             raise ExportError(f"the ONNX checker refuses graph '{name}' at opset {self.opset}: {error}") from error
-        return bytes(made.SerializeToString(deterministic=True))
+        return bytes(model_proto.SerializeToString(deterministic=True))
 
     def _name_outputs(self, inputs: set[str], outputs: Mapping[str, str]) -> None:
         """Let the nodes that make the outputs give them their names."""
-        made = {name for node in self._nodes for name in node.output}
+        produced = {name for node in self._nodes for name in node.output}
         names: dict[str, str] = {}
         for out, value in outputs.items():
-            if value in names or value in inputs or value not in made:
+            if value in names or value in inputs or value not in produced:
                 self._nodes.append(self._onnx.helper.make_node("Identity", [names.get(value, value)], [out], out))
             else:
                 names[value] = out
@@ -222,29 +226,29 @@ class Nodes:
 
     def unread(self, ends: Iterable[str]) -> list[str]:
         """Values that nothing reads, of nodes with another one that some of `ends` rest on."""
-        wanted = set(ends)
+        read_values = set(ends)
         for node in reversed(self._nodes):
-            if wanted & set(node.output):
-                wanted |= set(node.input)
-        split = [node for node in self._nodes if wanted & set(node.output) and node.op_type not in OPTIONAL]
-        return [name for node in split for name in node.output if name not in wanted]
+            if read_values & set(node.output):
+                read_values |= set(node.input)
+        split = [node for node in self._nodes if read_values & set(node.output) and node.op_type not in OPTIONAL]
+        return [name for node in split for name in node.output if name not in read_values]
 
     def _drop_unread(self, outputs: Mapping[str, object]) -> None:
         """Remove nodes and constants that no output rests on."""
-        wanted, kept = set(outputs), []
+        read_values, read_nodes = set(outputs), []
         for node in reversed(self._nodes):
-            if wanted & set(node.output):
-                kept.append(node)
-                wanted |= set(node.input)
+            if read_values & set(node.output):
+                read_nodes.append(node)
+                read_values |= set(node.input)
                 if node.op_type in OPTIONAL:
-                    _leave_out(node, wanted)
-        self._nodes = kept[::-1]
-        self._tensors = [tensor for tensor in self._tensors if tensor.name in wanted]
+                    _leave_out(node, read_values)
+        self._nodes = read_nodes[::-1]
+        self._tensors = [tensor for tensor in self._tensors if tensor.name in read_values]
 
 
-def _leave_out(node: Any, wanted: set[str]) -> None:
+def _leave_out(node: Any, read_values: set[str]) -> None:
     """Drop the outputs of a node that nothing reads."""
-    names = [name if name in wanted else "" for name in node.output]
+    names = [name if name in read_values else "" for name in node.output]
     while not names[-1]:
         names.pop()
     node.output[:] = names

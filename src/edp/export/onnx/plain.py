@@ -58,20 +58,20 @@ def _flat(nodes: Nodes, x: str, ticks: int, rows: int, width: int) -> str:
 
 
 def _gather(nodes: Nodes, layer: layers.Gather, ticks: int, values: Sequence[str], widths: Sequence[int]) -> str:
-    found = runs(layer.columns, widths)
-    if len(found) > MOST_PIECES:
+    column_runs = runs(layer.columns, widths)
+    if len(column_runs) > MOST_PIECES:
         matrix = np.zeros((len(layer.columns), sum(widths)), np.float32)
         matrix[np.arange(len(layer.columns)), list(layer.columns)] = 1.0
         return nodes.linear(nodes.join(list(values), 1), matrix, np.zeros(1, np.float32))
     pieces: dict[int, dict[int, tuple[int, str]]] = {}
     for number, width in enumerate(widths):
-        ends = {end for value, first, length in found if value == number for end in (first, first + length)}
+        ends = {end for value, first, length in column_runs if value == number for end in (first, first + length)}
         if ends:
             cuts = sorted({0, width} | ends)
             names = nodes.split(values[number], [b - a for a, b in pairwise(cuts)], 1)
             pieces[number] = {a: (b, name) for (a, b), name in zip(pairwise(cuts), names, strict=True)}
     parts = []
-    for value, at, length in found:
+    for value, at, length in column_runs:
         stop = at + length
         while at < stop:
             at, name = pieces[value][at]

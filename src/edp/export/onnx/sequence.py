@@ -39,24 +39,24 @@ class Sequences:
 
     def in_columns(self, name: str, ticks: int) -> bool:
         """Whether these last ticks are there as columns."""
-        held = self._values[name]
-        return bool(held.columns) and held.ticks == ticks
+        form = self._values[name]
+        return bool(form.columns) and form.ticks == ticks
 
     def rows(self, name: str, ticks: int) -> str:
         """The last `ticks` ticks as rows."""
-        held = self._values[name]
-        if not held.rows:
-            turned = self._nodes.add("Transpose", held.columns, perm=[0, 2, 1])
-            held.rows = self._nodes.shaped(turned, held.ticks, held.width)
-        return self._last(held.rows, held.ticks, ticks, 0)
+        form = self._values[name]
+        if not form.rows:
+            turned = self._nodes.add("Transpose", form.columns, perm=[0, 2, 1])
+            form.rows = self._nodes.shaped(turned, form.ticks, form.width)
+        return self._last(form.rows, form.ticks, ticks, 0)
 
     def columns(self, name: str, ticks: int) -> str:
         """The last `ticks` ticks as columns."""
-        held = self._values[name]
-        if not held.columns:
-            three = self._nodes.shaped(held.rows, 1, held.ticks, held.width)
-            held.columns = self._nodes.add("Transpose", three, perm=[0, 2, 1])
-        return self._last(held.columns, held.ticks, ticks, 2)
+        form = self._values[name]
+        if not form.columns:
+            three = self._nodes.shaped(form.rows, 1, form.ticks, form.width)
+            form.columns = self._nodes.add("Transpose", three, perm=[0, 2, 1])
+        return self._last(form.columns, form.ticks, ticks, 2)
 
     def _last(self, value: str, had: int, ticks: int, axis: int) -> str:
         if had == ticks:

@@ -50,23 +50,24 @@ def plain_name(name: str) -> str:
 
 def states_of(graph: Graph) -> list[State]:
     """The states of the step graph, in the order of its inputs."""
-    kept: list[State] = []
-    taken = {INPUTS, SPOILT, *graph.results}
+    states: list[State] = []
+    used_names = {INPUTS, SPOILT, *graph.results}
     for layer, slot in graph.slots():
         if slot.size:
             first = f"{plain_name(layer)}_{slot.name}"
-            name = next(c for n in range(len(kept) + 9) if (c := f"{first}_{n}" if n else first) not in taken)
-            taken |= {name, name + LAST}
-            kept.append(State(name, (layer, slot.name), graph.start(layer, slot).reshape(shape_of(slot))))
-    return [*kept, State(SPOILT, ("", ""), np.zeros((1, 1), np.float32))]
+            name = next(c for n in range(len(states) + 9) if (c := f"{first}_{n}" if n else first) not in used_names)
+            used_names |= {name, name + LAST}
+            states.append(State(name, (layer, slot.name), graph.start(layer, slot).reshape(shape_of(slot))))
+    return [*states, State(SPOILT, ("", ""), np.zeros((1, 1), np.float32))]
 
 
 def refuse(layer: Layer) -> ExportError:
     """The error for a kind of layer that is not written."""
     kinds: set[type[Layer]] = {*PLAIN, *STEPS, memory.PrefixCorrection}
-    known = sorted(kind.__name__ for kind in kinds)
+    supported_kinds = sorted(kind.__name__ for kind in kinds)
     return ExportError(
-        f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in ONNX; these have: {', '.join(known)}"
+        f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in ONNX; these have: "
+        f"{', '.join(supported_kinds)}"
     )
 
 
@@ -98,18 +99,18 @@ def step_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], 
     """
     nodes, states = Nodes(opset), states_of(graph)
     nodes.reserve(INPUTS, *graph.results, *(name for s in states for name in (s.name, s.next)))
-    held: dict[str, dict[str, str]] = {layer.name: {} for layer in graph.layers}
+    layer_states: dict[str, dict[str, str]] = {layer.name: {} for layer in graph.layers}
     for state in states[:-1]:
-        held[state.layer[0]][state.layer[1]] = state.name
+        layer_states[state.layer[0]][state.layer[1]] = state.name
     values = {INPUT: INPUTS}
     fresh: dict[str, Held] = {}
     for layer in graph.layers:
         with nodes.inside(plain_name(layer.name)):
-            _add_layer(nodes, graph, layer, values, held, fresh)
+            _add_layer(nodes, graph, layer, values, layer_states, fresh)
     with nodes.inside("end"):
         ends = [
             *(values[name] for name in graph.results.values()),
-            *(v for kept in fresh.values() for v in kept.values()),
+            *(v for new_states in fresh.values() for v in new_states.values()),
         ]
         spoilt = nodes.add("Add", SPOILT, spoil(nodes, INPUTS, ends))
         outputs = add_results(nodes, graph, values, spoilt, targets)
@@ -125,19 +126,19 @@ def _add_layer(
     graph: Graph,
     layer: Layer,
     values: dict[str, str],
-    held: Mapping[str, Held],
+    layer_states: Mapping[str, Held],
     fresh: dict[str, Held],
 ) -> None:
-    given = [values[name] for name in layer.inputs]
+    input_names = [values[name] for name in layer.inputs]
     if isinstance(layer, memory.PrefixCorrection):
-        numbers, fresh[layer.name] = step_correction(nodes, layer, held[layer.name], given[0])
+        numbers, fresh[layer.name] = step_correction(nodes, layer, layer_states[layer.name], input_names[0])
         for (owner, slot), part in corrections(nodes, graph, layer, numbers).items():
             fresh[owner] = dict(fresh[owner]) | {slot: nodes.add("Add", fresh[owner][slot], part)}
     elif type(layer) in STEPS:
-        values[layer.name], fresh[layer.name] = STEPS[type(layer)](nodes, layer, held[layer.name], *given)
+        values[layer.name], fresh[layer.name] = STEPS[type(layer)](nodes, layer, layer_states[layer.name], *input_names)
     elif type(layer) in PLAIN:
         widths = [graph.width_of(name) for name in layer.inputs]
-        values[layer.name] = PLAIN[type(layer)](nodes, layer, 1, given, widths)
+        values[layer.name] = PLAIN[type(layer)](nodes, layer, 1, input_names, widths)
     else:
         raise refuse(layer)
 

@@ -51,6 +51,6 @@ class OnnxTarget:
         }
         about = content(described, files, states, self.opset)
         tables = {"edp": with_full_starts(about, states), "golden": golden(bundle.predictor, graph.window)}
-        made = {f"{name}.json": as_json(about), f"{name}.mat": as_mat(tables)}
-        made |= {f"{name}_{kind}.onnx": data for kind, data in files.items()}
-        return write_export(folder, made)
+        contents = {f"{name}.json": as_json(about), f"{name}.mat": as_mat(tables)}
+        contents |= {f"{name}_{kind}.onnx": data for kind, data in files.items()}
+        return write_export(folder, contents)

@@ -80,14 +80,18 @@ class Window:
         if write is not None:
             write(layer, rows)
         elif isinstance(layer, ELEMENTWISE) and any(self.values.in_columns(name, rows) for name in layer.inputs):
-            given = [self.values.columns(name, rows) for name in layer.inputs]
+            input_names = [self.values.columns(name, rows) for name in layer.inputs]
             operator = "Add" if isinstance(layer, layers.Add) else "Mul"
-            made = activate(self.nodes, layer.function, given[0]) if isinstance(layer, layers.Activate) else ""
-            self.values.give_columns(layer.name, made or self.nodes.add(operator, *given), rows, layer.width)
+            activated = (
+                activate(self.nodes, layer.function, input_names[0]) if isinstance(layer, layers.Activate) else ""
+            )
+            self.values.give_columns(layer.name, activated or self.nodes.add(operator, *input_names), rows, layer.width)
         elif type(layer) in PLAIN:
             widths = [self.graph.width_of(name) for name in layer.inputs]
-            given = [self.values.rows(name, rows) for name in layer.inputs]
-            self.values.give(layer.name, PLAIN[type(layer)](self.nodes, layer, rows, given, widths), rows, layer.width)
+            input_names = [self.values.rows(name, rows) for name in layer.inputs]
+            self.values.give(
+                layer.name, PLAIN[type(layer)](self.nodes, layer, rows, input_names, widths), rows, layer.width
+            )
         elif type(layer) in STEPS:
             self._recurrence(layer)
         else:
@@ -98,29 +102,29 @@ class Window:
 
     def _difference(self, layer: memory.Difference, rows: int) -> None:
         nodes, reach = self.nodes, min(self.ticks, rows + 1)
-        given = self.values.rows(layer.inputs[0], reach)
-        before = nodes.split(given, [reach - 1, 1], 0)[:1] if reach > 1 else []
+        source = self.values.rows(layer.inputs[0], reach)
+        before = nodes.split(source, [reach - 1, 1], 0)[:1] if reach > 1 else []
         if rows < reach:
-            now = nodes.split(given, [1, rows], 0)[1]
+            now = nodes.split(source, [1, rows], 0)[1]
         else:
-            now, zero = given, nodes.constant(np.zeros((1, layer.width), np.float32), "zero")
+            now, zero = source, nodes.constant(np.zeros((1, layer.width), np.float32), "zero")
             before.insert(
-                0, zero if layer.from_zero else nodes.split(given, [1, rows - 1], 0)[0] if rows > 1 else given
+                0, zero if layer.from_zero else nodes.split(source, [1, rows - 1], 0)[0] if rows > 1 else source
             )
         self._give(layer, nodes.times(nodes.less(now, nodes.join(before, 0)), layer.factor), rows)
 
     def _starting(self, layer: memory.Starting, rows: int) -> None:
         nodes, first = self.nodes, self.ticks - rows
         read = (np.arange(first, self.ticks)[:, None] < layer.ticks).astype(np.float32)
-        kept = nodes.times(self.values.rows(layer.inputs[0], rows), read)
-        value = nodes.plus(kept, layer.mean * (1 - read))
+        read_rows = nodes.times(self.values.rows(layer.inputs[0], rows), read)
+        value = nodes.plus(read_rows, layer.mean * (1 - read))
         self._give(layer, nodes.join([value, nodes.constant(read, "read")], 1), rows)
 
     def _convolution(self, layer: memory.Convolution, rows: int) -> None:
         nodes, (out, taps, _) = self.nodes, layer.weight.shape
         past = (taps - 1) * layer.dilation
         reach = min(self.ticks, rows + past)
-        made = nodes.add(
+        convolved = nodes.add(
             "Conv",
             self.values.columns(layer.inputs[0], reach),
             nodes.constant(layer.weight.transpose(0, 2, 1), "weight"),
@@ -129,17 +133,17 @@ class Window:
             dilations=[layer.dilation],
             pads=[rows + past - reach, 0],
         )
-        self.values.give_columns(layer.name, made, rows, out)
+        self.values.give_columns(layer.name, convolved, rows, out)
 
     def _trailing_mean(self, layer: memory.TrailingMean, rows: int) -> None:
         nodes, reach = self.nodes, rows_before(layer, rows, self.ticks)
-        given = self.values.rows(layer.inputs[0], reach)
+        source = self.values.rows(layer.inputs[0], reach)
         if rows == 1:
-            self._give(layer, nodes.mean(given, 0), rows)
+            self._give(layer, nodes.mean(source, 0), rows)
             return
         seen = self._seen(layer.window, rows, reach)
         weights = (seen / seen.sum(axis=1, keepdims=True)).astype(np.float32)
-        self._give(layer, nodes.product(nodes.constant(weights, "weights"), given), rows)
+        self._give(layer, nodes.product(nodes.constant(weights, "weights"), source), rows)
 
     def _seen(self, window: int, rows: int, reach: int) -> np.ndarray:
         """Which of the last `reach` ticks each of the last `rows` ticks sees, ``(rows, reach)``."""
@@ -153,11 +157,11 @@ class Window:
 
     def _attention_pool(self, layer: memory.AttentionPool, rows: int) -> None:
         nodes, reach = self.nodes, rows_before(layer, rows, self.ticks)
-        given = self.values.rows(layer.inputs[0], reach)
-        scores = nodes.shaped(nodes.linear(given, layer.score[None], layer.bias), 1, reach)
+        source = self.values.rows(layer.inputs[0], reach)
+        scores = nodes.shaped(nodes.linear(source, layer.score[None], layer.bias), 1, reach)
         hidden = self._hidden(layer.window, rows, reach)
         weights = nodes.softmax(scores if hidden is None else nodes.add("Add", scores, hidden))
-        self._give(layer, nodes.product(weights, given), rows)
+        self._give(layer, nodes.product(weights, source), rows)
 
     def _window_attention(self, layer: memory.WindowAttention, rows: int) -> None:
         reach = rows_before(layer, rows, self.ticks)
@@ -169,24 +173,24 @@ class Window:
     def _recurrence(self, layer: Layer) -> None:
         """A layer that carries its state over the window, corrected after the first ticks where that is learned."""
         nodes, ticks = self.nodes, self.ticks
-        given = self.values.rows(layer.inputs[0], ticks)
-        held = {
+        source = self.values.rows(layer.inputs[0], ticks)
+        state = {
             slot.name: nodes.constant(self.graph.start(layer.name, slot).reshape(shape_of(slot)), "start")
             for slot in layer.slots
         }
         prefix = self.corrected.get(layer.name)
         if prefix is None:
-            found, _ = self._run(layer, given, ticks, held)
+            outputs, _ = self._run(layer, source, ticks, state)
         else:
             sizes = [prefix.ticks, ticks - prefix.ticks]
-            early, late = nodes.split(given, sizes, 0)
-            first, held = self._run(layer, early, sizes[0], held)
+            early, late = nodes.split(source, sizes, 0)
+            first, state = self._run(layer, early, sizes[0], state)
             for (owner, slot), part in self._correction(prefix).items():
                 if owner == layer.name:
-                    held[slot] = nodes.add("Add", held[slot], part)
-            second, _ = self._run(layer, late, sizes[1], held)
-            found = nodes.join([first, second], 0)
-        self._give(layer, found, ticks)
+                    state[slot] = nodes.add("Add", state[slot], part)
+            second, _ = self._run(layer, late, sizes[1], state)
+            outputs = nodes.join([first, second], 0)
+        self._give(layer, outputs, ticks)
 
     def _correction(self, layer: memory.PrefixCorrection) -> dict[tuple[str, str], str]:
         if layer.name not in self._parts:
@@ -203,17 +207,17 @@ class Window:
             self._parts[layer.name] = corrections(nodes, self.graph, layer, numbers)
         return self._parts[layer.name]
 
-    def _run(self, layer: Layer, given: str, ticks: int, held: dict[str, str]) -> tuple[str, dict[str, str]]:
+    def _run(self, layer: Layer, source: str, ticks: int, state: dict[str, str]) -> tuple[str, dict[str, str]]:
         """Values ``(ticks, width)`` and the states after them."""
         if isinstance(layer, memory.Lstm) and layer.share == 1.0:
-            return lstm(self.nodes, layer, given, ticks, held)
+            return lstm(self.nodes, layer, source, ticks, state)
         if isinstance(layer, memory.Gru):
-            return gru(self.nodes, layer, given, ticks, held)
-        made = []
-        for x in self.nodes.split(given, [1] * ticks, 0):
-            value, held = STEPS[type(layer)](self.nodes, layer, held, x)
-            made.append(value)
-        return self.nodes.join(made, 0), held
+            return gru(self.nodes, layer, source, ticks, state)
+        tick_outputs = []
+        for x in self.nodes.split(source, [1] * ticks, 0):
+            value, state = STEPS[type(layer)](self.nodes, layer, state, x)
+            tick_outputs.append(value)
+        return self.nodes.join(tick_outputs, 0), state
 
 
 WINDOWS = {
@@ -238,7 +242,7 @@ def _first(nodes: Nodes, state: str, units: int) -> str:
 
 
 def lstm(
-    nodes: Nodes, layer: memory.Lstm, given: str, ticks: int, held: Mapping[str, str]
+    nodes: Nodes, layer: memory.Lstm, source: str, ticks: int, state: Mapping[str, str]
 ) -> tuple[str, dict[str, str]]:
     """The operator's gates are in the order i, o, f, c."""
     order, units = (0, 3, 1, 2), layer.width
@@ -246,13 +250,13 @@ def lstm(
     y, h, c = nodes.several(
         "LSTM",
         [
-            nodes.shaped(given, ticks, 1, layer.weight_x.shape[1]),
+            nodes.shaped(source, ticks, 1, layer.weight_x.shape[1]),
             nodes.constant(_reordered(layer.weight_x, order), "w"),
             nodes.constant(_reordered(layer.weight_h, order), "r"),
             nodes.constant(bias, "b"),
             "",
-            _first(nodes, held["h"], units),
-            _first(nodes, held["c"], units),
+            _first(nodes, state["h"], units),
+            _first(nodes, state["c"], units),
         ],
         3,
         hidden_size=units,
@@ -260,19 +264,21 @@ def lstm(
     return nodes.shaped(y, ticks, units), {"h": nodes.shaped(h, 1, units), "c": nodes.shaped(c, 1, units)}
 
 
-def gru(nodes: Nodes, layer: memory.Gru, given: str, ticks: int, held: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+def gru(
+    nodes: Nodes, layer: memory.Gru, source: str, ticks: int, state: Mapping[str, str]
+) -> tuple[str, dict[str, str]]:
     """The operator's gates are in the order z, r, h; the reset gate acts behind the product, as in the network."""
     order, units = (1, 0, 2), layer.width
     bias = np.concatenate([_reordered(layer.bias_x, order), _reordered(layer.bias_h, order)], axis=1)
     y, h = nodes.several(
         "GRU",
         [
-            nodes.shaped(given, ticks, 1, layer.weight_x.shape[1]),
+            nodes.shaped(source, ticks, 1, layer.weight_x.shape[1]),
             nodes.constant(_reordered(layer.weight_x, order), "w"),
             nodes.constant(_reordered(layer.weight_h, order), "r"),
             nodes.constant(bias, "b"),
             "",
-            _first(nodes, held["h"], units),
+            _first(nodes, state["h"], units),
         ],
         2,
         hidden_size=units,

@@ -49,7 +49,7 @@ class Ros2Target:
             escaped = {"title": (markdown_text if template.endswith(".md") else xml_text)(title)}
             return fill(here.joinpath(f"templates/{template}.in").read_text(), blanks | escaped)
 
-        made = {
+        files = {
             "README.md": filled("README.md"),
             "package.xml": filled("package.xml"),
             "setup.py": filled("setup.py"),
@@ -61,9 +61,9 @@ class Ros2Target:
             f"{package}/model.json": as_json(about).decode(),
             f"{package}/csrc/{name}_ros.c": filled("shim.c"),
         }
-        made |= {f"{package}/{file}": here.joinpath(f"package/{file}").read_text() for file in MODULES}
-        made |= {f"{package}/csrc/{file}": text for file, text in core_files(model).items()}
-        return write_export(folder, {file: text.encode() for file, text in made.items()})
+        files |= {f"{package}/{file}": here.joinpath(f"package/{file}").read_text() for file in MODULES}
+        files |= {f"{package}/csrc/{file}": text for file, text in core_files(model).items()}
+        return write_export(folder, {file: text.encode() for file, text in files.items()})
 
 
 def _content(described: Description) -> dict[str, Any]:
@@ -74,11 +74,11 @@ def _content(described: Description) -> dict[str, Any]:
     """
     about = described.content()
     for side in ("inputs", "targets"):
-        given = [entry["name"] for entry in about[side]]
-        names = shown_names(_plain(name) for name in given)
+        channel_names = [entry["name"] for entry in about[side]]
+        names = shown_names(_plain(name) for name in channel_names)
         about[side] = [
             entry | {"name": name} | ({} if name == old else {"original": old})
-            for entry, name, old in zip(about[side], names, given, strict=True)
+            for entry, name, old in zip(about[side], names, channel_names, strict=True)
         ]
     return about
 

@@ -93,21 +93,21 @@ class Folder:
     def tables(self) -> dict[str, Any]:
         """What the MAT file holds besides the golden recording."""
         low, high = input_limits(self.model.bundle.predictor)
-        made: dict[str, Any] = {"edp": self.content()}
+        tables: dict[str, Any] = {"edp": self.content()}
         if self.native is not None:
             ends = {"low": low, "high": high}
-            made |= {side: values.astype(np.float32).reshape(-1, 1) for side, values in ends.items()}
-            made |= {"weights": self.native.weights(), "start": self.native.start()}
-        return made
+            tables |= {side: values.astype(np.float32).reshape(-1, 1) for side, values in ends.items()}
+            tables |= {"weights": self.native.weights(), "start": self.native.start()}
+        return tables
 
     def texts(self) -> dict[str, str]:
         """All text files but the C code of the core; the README first."""
         name = self.model.name
-        wanted = [*(f"{part}.m" for part in MATLAB_FILES), *C_FILES]
-        wanted += [f"{part}.m" for part in NATIVE_FILES] if self.native is not None else []
-        wanted += ["onnx.m"] if self.window else []
+        file_names = [*(f"{part}.m" for part in MATLAB_FILES), *C_FILES]
+        file_names += [f"{part}.m" for part in NATIVE_FILES] if self.native is not None else []
+        file_names += ["onnx.m"] if self.window else []
         files = {"README.md": self._fill("README.md"), "rtwmakecfg.m": self._fill("rtwmakecfg.m")}
-        return files | {f"{name}_{part}": self._fill(part) for part in wanted}
+        return files | {f"{name}_{part}": self._fill(part) for part in file_names}
 
     def _fill(self, part: str) -> str:
         text = resources.files("edp.export.simulink").joinpath(f"templates/{part}.in").read_text()

@@ -59,16 +59,18 @@ class Native:
 
     def laid(self, layer: Layer) -> dict[str, Any]:
         """A layer's constants in the order in which MATLAB reads them."""
-        held = {part: values.reshape(-1, 1) if values.ndim == 1 else values for part, values in layer.tensors().items()}
+        tensors = {
+            part: values.reshape(-1, 1) if values.ndim == 1 else values for part, values in layer.tensors().items()
+        }
         if isinstance(layer, memory.Convolution):
-            held["weight"] = layer.weight.reshape(len(layer.weight), -1)
+            tensors["weight"] = layer.weight.reshape(len(layer.weight), -1)
         elif isinstance(layer, layers.GroupedDense):
-            held |= {"weight": layer.weight.transpose(1, 2, 0), "bias": layer.bias.T}
+            tensors |= {"weight": layer.weight.transpose(1, 2, 0), "bias": layer.bias.T}
         elif isinstance(layer, memory.Rotation):
-            held["factor"] = layer.factor.T
+            tensors["factor"] = layer.factor.T
         elif isinstance(layer, layers.Gather) and len(self.runs(layer)) > MOST_PIECES:
-            held["columns"] = np.array([[column + 1] for column in layer.columns], dtype=float)
-        return held
+            tensors["columns"] = np.array([[column + 1] for column in layer.columns], dtype=float)
+        return tensors
 
     def runs(self, layer: layers.Gather) -> list[tuple[int, int, int]]:
         """Runs of neighbouring columns: which input, its first column, how many."""
@@ -88,8 +90,10 @@ class Native:
 
     def weights(self) -> dict[str, Any]:
         """All constants by field."""
-        held = {(layer.name, part): values for layer in self.graph.layers for part, values in self.laid(layer).items()}
-        return {self._fields[key]: values for key, values in held.items()}
+        tensors = {
+            (layer.name, part): values for layer in self.graph.layers for part, values in self.laid(layer).items()
+        }
+        return {self._fields[key]: values for key, values in tensors.items()}
 
     def start(self) -> dict[str, Array]:
         """States after a reset by field: columns; rings have a column a tick, the oldest first."""
@@ -124,18 +128,18 @@ class Native:
 def functions_for(code: str) -> Code:
     """The functions that code calls, and those that they call."""
     text = resources.files("edp.export.simulink").joinpath("templates/layers.m.in").read_text()
-    known = {}
+    bodies = {}
     for part in re.split(r"^(?=function )", text, flags=re.MULTILINE):
-        found = re.match(r"function (?:.*?= )?(\w+)\(", part)
-        if found:
-            known[found[1]] = part.strip() + "\n"
-    wanted: set[str] = set()
+        signature = re.match(r"function (?:.*?= )?(\w+)\(", part)
+        if signature:
+            bodies[signature[1]] = part.strip() + "\n"
+    needed: set[str] = set()
     search = [code]
     while search:
-        for name in set(re.findall(r"\b(\w+)\(", search.pop())) & set(known) - wanted:
-            wanted.add(name)
-            search.append(known[name])
-    return Code("\n".join(part for name, part in known.items() if name in wanted).rstrip())
+        for name in set(re.findall(r"\b(\w+)\(", search.pop())) & set(bodies) - needed:
+            needed.add(name)
+            search.append(bodies[name])
+    return Code("\n".join(part for name, part in bodies.items() if name in needed).rstrip())
 
 
 Write = Callable[[Native, Any, Sequence[str]], list[str]]
@@ -166,13 +170,13 @@ def _plain(value: float) -> str:
 
 
 def _gather(native: Native, layer: layers.Gather, x: Sequence[str]) -> list[str]:
-    found = native.runs(layer)
-    if len(found) > MOST_PIECES:
+    column_runs = native.runs(layer)
+    if len(column_runs) > MOST_PIECES:
         joined = x[0] if len(x) == 1 else f"[{'; '.join(x)}]"
         lines = [f"given = {joined};"]
         return [*lines, f"{native.value(layer.name)} = given({native.constant(layer, 'columns')});"]
     parts = []
-    for value, first, length in found:
+    for value, first, length in column_runs:
         whole = (first, length) == (0, native.graph.width_of(layer.inputs[value]))
         ends = str(first + 1) if length == 1 else f"{first + 1}:{first + length}"
         parts.append(x[value] if whole else f"{x[value]}({ends})")
@@ -200,8 +204,8 @@ def _prefix(native: Native, layer: memory.PrefixCorrection, x: Sequence[str]) ->
     ]
     sizes, at = {(name, slot.name): slot.size for name, slot in native.graph.slots()}, 0
     for owner in layer.corrects:
-        held, size = native.slot(*owner), sizes[owner]
-        lines.append(f"{held} = {held} + reshape(change({at + 1}:{at + size}), size({held}));")
+        state, size = native.slot(*owner), sizes[owner]
+        lines.append(f"{state} = {state} + reshape(change({at + 1}:{at + size}), size({state}));")
         at += size
     return lines
 

@@ -50,13 +50,13 @@ class SimulinkTarget:
             )
         model = make_model(name, bundle)
         window = self.window and not model.whole
-        made = Folder(model, window)
-        files: dict[str, bytes] = {file: text.encode() for file, text in made.texts().items()}
-        files[f"{name}.json"] = as_json(made.content())
-        files[f"{name}.mat"] = as_mat({**made.tables(), "golden": golden(bundle.predictor, model.graph.window)})
+        written = Folder(model, window)
+        files: dict[str, bytes] = {file: text.encode() for file, text in written.texts().items()}
+        files[f"{name}.json"] = as_json(written.content())
+        files[f"{name}.mat"] = as_mat({**written.tables(), "golden": golden(bundle.predictor, model.graph.window)})
         if window:
             graph = float_graph(bundle.predictor, "ONNX")
-            targets, carried = len(bundle.task.targets), notes(made.described)
+            targets, carried = len(bundle.task.targets), notes(written.described)
             files[f"{name}_window.onnx"] = window_model(graph, targets, f"{name}_window", carried, self.opset)
         files |= {f"core/{file}": text.encode() for file, text in core_files(model).items()}
         stubs = resources.files("edp.export.simulink").joinpath("stub")

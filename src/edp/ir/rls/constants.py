@@ -100,7 +100,7 @@ class Adaptation:
 
     def __post_init__(self) -> None:
         inputs, targets, ahead = len(self.offset), len(self.columns), len(self.horizons)
-        wanted = {
+        shapes = {
             "scale": (inputs,),
             "directions": (self.spec.rank, inputs),
             "middle": (targets,),
@@ -109,8 +109,8 @@ class Adaptation:
             "unit": (ahead, targets),
         }
         for name, values in self.arrays().items():
-            if values.shape != wanted.get(name, values.shape):
-                raise ConfigError(f"adaptation: {name} has the shape {values.shape}, {wanted[name]} must hold")
+            if values.shape != shapes.get(name, values.shape):
+                raise ConfigError(f"adaptation: {name} has the shape {values.shape}, {shapes[name]} must hold")
             if values.dtype != np.float32 or not np.isfinite(values).all():
                 raise ConfigError(f"adaptation: {name} must hold finite float32 numbers")
         for name in ("scale", "spread", "change", "unit"):
@@ -136,12 +136,12 @@ class Adaptation:
         Coefficients follow ``theta' = a theta + w`` with ``a = exp(-1 / (forgetting rate))`` and a variance of w that
         keeps their spread at `prior`: so their covariance never exceeds ``prior^2`` in any direction.
         """
-        kept = math.exp(-1.0 / (self.spec.forgetting_s * self.rate_hz))
+        forgetting = math.exp(-1.0 / (self.spec.forgetting_s * self.rate_hz))
         variance = self.spec.prior**2
-        made = {
-            "keep": kept,
-            "keep_squared": kept * kept,
-            "refresh": (1.0 - kept * kept) * variance,
+        numbers = {
+            "keep": forgetting,
+            "keep_squared": forgetting * forgetting,
+            "refresh": (1.0 - forgetting * forgetting) * variance,
             "prior": variance,
             "noise": self.spec.noise,
             "limit": self.spec.limit,
@@ -150,7 +150,7 @@ class Adaptation:
             "worse": 1.0 + self.spec.margin,
             "better": 1.0 - BETTER,
         }
-        return {name: np.float32(value) for name, value in made.items()}
+        return {name: np.float32(value) for name, value in numbers.items()}
 
     @property
     def rest(self) -> Array:
@@ -159,8 +159,8 @@ class Adaptation:
 
     def arrays(self) -> dict[str, Array]:
         """Its arrays by name."""
-        held = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return {name: value for name, value in held.items() if isinstance(value, np.ndarray)}
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
     def to_plain(self) -> dict[str, Any]:
         """Everything but the arrays, as JSON gives it back."""

@@ -172,12 +172,12 @@ class RlsCorrector:
 
     def _correction(self, h: int, phi: Array) -> Array:
         """In units ``(J,)``; coefficients that are not finite, which nothing but damaged memory makes, are cleared."""
-        found = total(self.theta[h] * phi)
-        damaged = ~np.isfinite(found)
+        correction = total(self.theta[h] * phi)
+        damaged = ~np.isfinite(correction)
         if damaged.any():
-            self.theta[h][damaged], found[damaged] = 0.0, 0.0
+            self.theta[h][damaged], correction[damaged] = 0.0, 0.0
             self.repairs += 1
-        return _within(found, self._numbers["limit"])
+        return _within(correction, self._numbers["limit"])
 
     def _due(self, h: int, error: Array, learn: bool) -> bool:
         """Judge, and learn from, the prediction that has come due; returns whether something was learned."""
@@ -189,11 +189,11 @@ class RlsCorrector:
 
     def _judge(self, h: int, error: Array, correction: Array, learn: bool) -> None:
         """Compare the running errors without and with the correction; take it back, or let it out again."""
-        held, most = self._numbers, np.float32(MOST_ERROR)
+        constants, most = self._numbers, np.float32(MOST_ERROR)
         for running, of in ((self._plain[h], error), (self._corrected[h], error - correction)):
-            running += held["rate"] * (np.minimum(np.abs(of), most) - running)
-        worse = ~self.fallback[h] & (self._corrected[h] > held["worse"] * self._plain[h])
-        better = self.fallback[h] & (self._corrected[h] < held["better"] * self._plain[h])
+            running += constants["rate"] * (np.minimum(np.abs(of), most) - running)
+        worse = ~self.fallback[h] & (self._corrected[h] > constants["worse"] * self._plain[h])
+        better = self.fallback[h] & (self._corrected[h] < constants["better"] * self._plain[h])
         self.fallback[h] = (self.fallback[h] | worse) & ~better
         if learn and worse.any():
             self.theta[h][worse] = 0.0
@@ -201,21 +201,21 @@ class RlsCorrector:
             self.covariance[h] = self._start()
 
     def _learn(self, h: int, phi: Array, error: Array) -> bool:
-        held, p = self._numbers, self.covariance[h]
+        constants, p = self._numbers, self.covariance[h]
         g = total(p * phi)
-        d = held["noise"] + total(phi * g)
-        if not d >= held["noise"]:
+        d = constants["noise"] + total(phi * g)
+        if not d >= constants["noise"]:
             self._repair(h)
             return False
         inverse = np.float32(1.0) / d
         innovation = _within(error - total(self.theta[h] * phi), CLIP)
         step = (innovation * inverse)[:, None]
-        self.theta[h] = _within(held["keep"] * (self.theta[h] + g * step), held["bound"])
-        p = held["keep_squared"] * (p - (g[:, None] * g) * inverse)
+        self.theta[h] = _within(constants["keep"] * (self.theta[h] + g * step), constants["bound"])
+        p = constants["keep_squared"] * (p - (g[:, None] * g) * inverse)
         diagonal = np.einsum("ii->i", p)
-        diagonal += held["refresh"]
+        diagonal += constants["refresh"]
         self.covariance[h] = p
-        if not ((diagonal > 0) & (diagonal <= np.float32(2.0) * held["prior"])).all():
+        if not ((diagonal > 0) & (diagonal <= np.float32(2.0) * constants["prior"])).all():
             self._repair(h)
         return True
 

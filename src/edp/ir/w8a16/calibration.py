@@ -44,14 +44,14 @@ def calibrate(
     Raises:
         ExportError: a part of the network has no whole-number form.
     """
-    found: dict[str, float] = {}
+    ranges: dict[str, float] = {}
     moments = InputMoments(graph)
     for rows in recordings:
         for name, values in _before_weights(graph, rows).items():
-            _raise(found, name, values)
+            _raise(ranges, name, values)
     for rows in pieces(recordings, ticks):
-        moments.add(_follow(graph, rows, found))
-    chosen = formats(found)
+        moments.add(_follow(graph, rows, ranges))
+    chosen = formats(ranges)
     if error_of is not None:
         names = [layer.name for layer in graph.layers if isinstance(layer, Standardise) and layer.name in chosen.fracs]
         fracs = {name: finer(chosen.fracs[name], error_of) for name in names}
@@ -61,11 +61,11 @@ def calibrate(
 
 def finer(frac: int, error_of: Callable[[int], float]) -> int:
     """The format of least error from `frac` on, until `PATIENCE` finer ones in a row bring nothing."""
-    best, error, place = frac, error_of(frac), frac
-    while place - best < PATIENCE:
-        place += 1
-        if (found := error_of(place)) < error:
-            best, error = place, found
+    best, error, candidate = frac, error_of(frac), frac
+    while candidate - best < PATIENCE:
+        candidate += 1
+        if (candidate_error := error_of(candidate)) < error:
+            best, error = candidate, candidate_error
     return best
 
 
@@ -85,14 +85,14 @@ def _before_weights(graph: Graph, rows: NDArray[np.floating]) -> dict[str, Any]:
     inside = integer_part(graph)
     values: dict[str, Any] = {INPUT: np.asarray(rows, dtype=np.float32)[:, None]}
     for layer in graph.layers:
-        known = layer.inputs and set(layer.inputs) <= set(values)
-        if known and layer.name not in inside and type(layer) in OVER_TIME:
+        inputs_computed = layer.inputs and set(layer.inputs) <= set(values)
+        if inputs_computed and layer.name not in inside and type(layer) in OVER_TIME:
             memory = {slot.name: graph.start(layer.name, slot).astype(np.float32) for slot in layer.slots}
             values[layer.name] = OVER_TIME[type(layer)](layer, memory, *(values[name] for name in layer.inputs))
     return values
 
 
-def _follow(graph: Graph, rows: NDArray[np.floating], found: dict[str, float]) -> dict[str, Any]:
+def _follow(graph: Graph, rows: NDArray[np.floating], ranges: dict[str, float]) -> dict[str, Any]:
     """Values of every layer at every tick, ``(time, number)``."""
     run = Reference(graph)
     turning = [layer.name for layer in graph.layers if isinstance(layer, Rotation)]
@@ -101,13 +101,13 @@ def _follow(graph: Graph, rows: NDArray[np.floating], found: dict[str, float]) -
         for name, values in run.step(row).items():
             seen.setdefault(name, []).append(values)
         for name in turning:
-            _raise(found, f"{name}/h", run.memory[name]["h"])
+            _raise(ranges, f"{name}/h", run.memory[name]["h"])
     stacked = {name: np.stack(values) for name, values in seen.items()}
     for name, values in stacked.items():
-        _raise(found, name, values)
+        _raise(ranges, name, values)
     return stacked
 
 
-def _raise(found: dict[str, float], name: str, values: Any) -> None:
+def _raise(ranges: dict[str, float], name: str, values: Any) -> None:
     if np.size(values):
-        found[name] = max(found.get(name, 0.0), float(np.abs(values).max()))
+        ranges[name] = max(ranges.get(name, 0.0), float(np.abs(values).max()))

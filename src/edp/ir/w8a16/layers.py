@@ -121,10 +121,10 @@ class WScaleShift(Whole):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WActivate(_Sized):
-    """A function of each number, which has `given` fractional bits."""
+    """A function of each number, which has `input_frac` fractional bits."""
 
     function: Function
-    given: int
+    input_frac: int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

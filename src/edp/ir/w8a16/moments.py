@@ -37,8 +37,8 @@ class InputMoments:
     def means(self) -> dict[str, Array]:
         """By matrix ``(terms, terms)``; for a `GroupedDense` ``(row, terms, terms)``."""
         apart = {layer.name for layer in self.graph.layers if isinstance(layer, layers.GroupedDense)}
-        held = {name: total / max(1, self._ticks) for name, total in self._sums.items()}
-        return {name: mean if name in apart else mean.mean(axis=0) for name, mean in held.items()}
+        means = {name: total / max(1, self._ticks) for name, total in self._sums.items()}
+        return {name: mean if name in apart else mean.mean(axis=0) for name, mean in means.items()}
 
 
 def _multiplied(layer: Layer, values: Mapping[str, Array]) -> dict[str, Any]:

@@ -60,42 +60,42 @@ class _Work:
     graph: Graph
     fracs: Mapping[str, int]
     rounding: WeightRounding
-    kept: dict[str, int]
+    integer_fracs: dict[str, int]
     """Fractional bits of values that are whole numbers by now."""
     out: list[Layer]
     slots: dict[tuple[str, str], int]
     """Fractional bits of slots."""
 
-    def rows(self, layer: Any, given: int) -> dict[str, Any]:
+    def rows(self, layer: Any, input_frac: int) -> dict[str, Any]:
         """Whole-number weights and biases of a layer."""
-        return rows(layer.name, layer.weight, layer.bias, (given, self.frac(layer.name)), self.rounding)
+        return rows(layer.name, layer.weight, layer.bias, (input_frac, self.frac(layer.name)), self.rounding)
 
-    def gates(self, layer: Any, given: int) -> dict[str, Any]:
+    def gates(self, layer: Any, input_frac: int) -> dict[str, Any]:
         """Whole-number matrices of a recurrent layer."""
-        found: dict[str, Any] = {}
-        for side, frac in (("x", given), ("h", whole.UNIT_FRAC)):
+        gate_constants: dict[str, Any] = {}
+        for side, frac in (("x", input_frac), ("h", whole.UNIT_FRAC)):
             made_of = to_gates(f"{layer.name}/{side}", getattr(layer, f"weight_{side}"), frac, self.rounding)
-            found |= {f"{key}_{side}": values for key, values in made_of.items()}
-        return found
+            gate_constants |= {f"{key}_{side}": values for key, values in made_of.items()}
+        return gate_constants
 
     def whole(self, value: str) -> str:
         """The name of a value as whole numbers."""
-        if value in self.kept:
+        if value in self.integer_fracs:
             return value
         name = f"{value}.whole"
-        if name not in self.kept:
+        if name not in self.integer_fracs:
             size = self.graph.width_of(value)
             self.out.append(made.Quantise(name=name, inputs=(value,), frac=self.frac(value), size=size))
-            self.kept[name] = self.frac(value)
+            self.integer_fracs[name] = self.frac(value)
         return name
 
     def real(self, value: str) -> str:
         """The name of a value as real numbers."""
-        if value not in self.kept:
+        if value not in self.integer_fracs:
             return value
         name = f"{value}.real"
         if not any(layer.name == name for layer in self.out):
-            size, frac = self.graph.width_of(value), self.kept[value]
+            size, frac = self.graph.width_of(value), self.integer_fracs[value]
             self.out.append(made.Dequantise(name=name, inputs=(value,), frac=frac, size=size))
         return name
 
@@ -130,9 +130,9 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
             work.out.append(replace(layer, inputs=tuple(work.real(name) for name in layer.inputs)))
             continue
         inputs = tuple(work.whole(name) for name in layer.inputs)
-        done = LOWER[kind](work, layer, [work.kept[name] for name in inputs])
+        done = LOWER[kind](work, layer, [work.integer_fracs[name] for name in inputs])
         work.out.append(replace(done, inputs=inputs))
-        work.kept[layer.name] = done.frac
+        work.integer_fracs[layer.name] = done.frac
     results = {meaning: work.real(value) for meaning, value in graph.results.items()}
     finished = Graph(graph.inputs, tuple(work.out), results, {}, graph.window)
     return replace(finished, initial=_initial(graph, finished, work))
@@ -165,8 +165,8 @@ def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str]
         else:
             small = numbers[key] is Number.INT16
             largest = whole.LARGEST if small else whole.CELL_LIMIT
-            held = whole.to_fixed(values, work.slots[key], largest)
-            start[key] = held.astype(np.int16 if small else np.int32)
+            fixed_values = whole.to_fixed(values, work.slots[key], largest)
+            start[key] = fixed_values.astype(np.int16 if small else np.int32)
     return start
 
 
@@ -202,113 +202,117 @@ def _within(frac: int, finest: int) -> int:
 Lower = Callable[[_Work, Any, list[int]], made.Whole]
 
 
-def _gather(work: _Work, x: layers.Gather, given: list[int]) -> made.Whole:
-    frac = min(given)
-    shifts = tuple(own - frac for own in given)
+def _gather(work: _Work, x: layers.Gather, input_fracs: list[int]) -> made.Whole:
+    frac = min(input_fracs)
+    shifts = tuple(own - frac for own in input_fracs)
     return made.WGather(name=x.name, inputs=(), frac=frac, columns=x.columns, shifts=shifts)
 
 
-def _sum(work: _Work, x: layers.Add | layers.Subtract, given: list[int]) -> made.Whole:
+def _sum(work: _Work, x: layers.Add | layers.Subtract, input_fracs: list[int]) -> made.Whole:
     """The finer of two formats is the common one, as far as 32 bits reach."""
-    frac, (a, b) = work.frac(x.name), given
+    frac, (a, b) = work.frac(x.name), input_fracs
     common = min(max(a, b), min(a, b) + 14)
     lefts, minus = (common - a, common - b), isinstance(x, layers.Subtract)
     frac = _within(frac, common)
     return made.WSum(name=x.name, inputs=(), frac=frac, size=x.size, lefts=lefts, right=common - frac, minus=minus)
 
 
-def _multiply(work: _Work, x: layers.Multiply, given: list[int]) -> made.Whole:
-    frac = _within(work.frac(x.name), sum(given))
-    return made.WMultiply(name=x.name, inputs=(), frac=frac, size=x.size, right=sum(given) - frac)
+def _multiply(work: _Work, x: layers.Multiply, input_fracs: list[int]) -> made.Whole:
+    frac = _within(work.frac(x.name), sum(input_fracs))
+    return made.WMultiply(name=x.name, inputs=(), frac=frac, size=x.size, right=sum(input_fracs) - frac)
 
 
-def _scale_shift(work: _Work, x: layers.ScaleShift, given: list[int]) -> made.Whole:
+def _scale_shift(work: _Work, x: layers.ScaleShift, input_fracs: list[int]) -> made.Whole:
     # The offset is in the format of the product, 32-bit.
-    most = whole.frac_for(float(np.abs(x.shift).max()), 30) - given[0]
+    most = whole.frac_for(float(np.abs(x.shift).max()), 30) - input_fracs[0]
     gain, bits = halves(x.gain, most)
-    frac = _within(work.frac(x.name), given[0] + bits)
-    offset = whole.to_fixed(x.shift, given[0] + bits, 2**30 - 1).astype(np.int32)
-    right = given[0] + bits - frac
+    frac = _within(work.frac(x.name), input_fracs[0] + bits)
+    offset = whole.to_fixed(x.shift, input_fracs[0] + bits, 2**30 - 1).astype(np.int32)
+    right = input_fracs[0] + bits - frac
     return made.WScaleShift(name=x.name, inputs=(), frac=frac, gain=gain, offset=offset, right=right)
 
 
-def _activate(work: _Work, x: layers.Activate, given: list[int]) -> made.Whole:
-    frac = given[0]
+def _activate(work: _Work, x: layers.Activate, input_fracs: list[int]) -> made.Whole:
+    frac = input_fracs[0]
     if x.function in (Function.SIGMOID, Function.TANH):
         frac = whole.UNIT_FRAC
     elif x.function is Function.SOFTPLUS:
         frac = min(work.frac(x.name), whole.GATE_FRAC)
-    return made.WActivate(name=x.name, inputs=(), frac=frac, function=x.function, size=x.size, given=given[0])
+    return made.WActivate(
+        name=x.name, inputs=(), frac=frac, function=x.function, size=x.size, input_frac=input_fracs[0]
+    )
 
 
-def _glu(work: _Work, x: layers.Glu, given: list[int]) -> made.Whole:
-    return made.WGlu(name=x.name, inputs=(), frac=given[0], rows=x.rows, size=x.size)
+def _glu(work: _Work, x: layers.Glu, input_fracs: list[int]) -> made.Whole:
+    return made.WGlu(name=x.name, inputs=(), frac=input_fracs[0], rows=x.rows, size=x.size)
 
 
-def _dense(work: _Work, x: layers.Dense, given: list[int]) -> made.Whole:
-    return made.WDense(name=x.name, inputs=(), frac=work.frac(x.name), rows=x.rows, **work.rows(x, given[0]))
+def _dense(work: _Work, x: layers.Dense, input_fracs: list[int]) -> made.Whole:
+    return made.WDense(name=x.name, inputs=(), frac=work.frac(x.name), rows=x.rows, **work.rows(x, input_fracs[0]))
 
 
-def _grouped(work: _Work, x: layers.GroupedDense, given: list[int]) -> made.Whole:
-    return made.WGroupedDense(name=x.name, inputs=(), frac=work.frac(x.name), **work.rows(x, given[0]))
+def _grouped(work: _Work, x: layers.GroupedDense, input_fracs: list[int]) -> made.Whole:
+    return made.WGroupedDense(name=x.name, inputs=(), frac=work.frac(x.name), **work.rows(x, input_fracs[0]))
 
 
-def _convolution(work: _Work, x: memory.Convolution, given: list[int]) -> made.Whole:
+def _convolution(work: _Work, x: memory.Convolution, input_fracs: list[int]) -> made.Whole:
     frac = work.frac(x.name)
-    work.slots[x.name, "ring"] = given[0]
-    return made.WConvolution(name=x.name, inputs=(), frac=frac, dilation=x.dilation, **work.rows(x, given[0]))
+    work.slots[x.name, "ring"] = input_fracs[0]
+    return made.WConvolution(name=x.name, inputs=(), frac=frac, dilation=x.dilation, **work.rows(x, input_fracs[0]))
 
 
-def _lstm(work: _Work, x: memory.Lstm, given: list[int]) -> made.Whole:
+def _lstm(work: _Work, x: memory.Lstm, input_fracs: list[int]) -> made.Whole:
     work.slots |= {(x.name, "h"): whole.UNIT_FRAC, (x.name, "c"): whole.CELL_FRAC}
     share = round(x.share * 2**whole.UNIT_FRAC)
     bias = whole.to_fixed(x.bias, whole.GATE_FRAC, whole.GATE_LIMIT).astype(np.int32)
-    matrices = work.gates(x, given[0])
+    matrices = work.gates(x, input_fracs[0])
     return made.WLstm(name=x.name, inputs=(), frac=whole.UNIT_FRAC, bias=bias, share=share, **matrices)
 
 
-def _gru(work: _Work, x: memory.Gru, given: list[int]) -> made.Whole:
+def _gru(work: _Work, x: memory.Gru, input_fracs: list[int]) -> made.Whole:
     work.slots[x.name, "h"] = whole.UNIT_FRAC
     biases: dict[str, Any] = {
         name: whole.to_fixed(values, whole.GATE_FRAC, whole.GATE_LIMIT).astype(np.int32)
         for name, values in (("bias_x", x.bias_x), ("bias_h", x.bias_h))
     }
-    return made.WGru(name=x.name, inputs=(), frac=whole.UNIT_FRAC, **work.gates(x, given[0]), **biases)
+    return made.WGru(name=x.name, inputs=(), frac=whole.UNIT_FRAC, **work.gates(x, input_fracs[0]), **biases)
 
 
-def _min_gru(work: _Work, x: memory.MinGru, given: list[int]) -> made.Whole:
-    work.slots[x.name, "h"] = given[0] + made.WMinGru.EXTRA
-    return made.WMinGru(name=x.name, inputs=(), frac=given[0], units=x.units)
+def _min_gru(work: _Work, x: memory.MinGru, input_fracs: list[int]) -> made.Whole:
+    work.slots[x.name, "h"] = input_fracs[0] + made.WMinGru.EXTRA
+    return made.WMinGru(name=x.name, inputs=(), frac=input_fracs[0], units=x.units)
 
 
-def _rotation(work: _Work, x: memory.Rotation, given: list[int]) -> made.Whole:
-    held = max(work.frac(f"{x.name}/h"), given[0])
-    frac = _within(work.frac(x.name), held)
-    work.slots[x.name, "h"] = held
+def _rotation(work: _Work, x: memory.Rotation, input_fracs: list[int]) -> made.Whole:
+    state_frac = max(work.frac(f"{x.name}/h"), input_fracs[0])
+    frac = _within(work.frac(x.name), state_frac)
+    work.slots[x.name, "h"] = state_frac
     factor = whole.to_fixed(x.factor, 30, 2**30).astype(np.int32)
-    return made.WRotation(name=x.name, inputs=(), frac=frac, factor=factor, left=held - given[0], right=held - frac)
+    return made.WRotation(
+        name=x.name, inputs=(), frac=frac, factor=factor, left=state_frac - input_fracs[0], right=state_frac - frac
+    )
 
 
-def _difference(work: _Work, x: memory.Difference, given: list[int]) -> made.Whole:
+def _difference(work: _Work, x: memory.Difference, input_fracs: list[int]) -> made.Whole:
     factor, bits = halves(x.factor)
-    frac = _within(work.frac(x.name), given[0] + bits)
-    work.slots[x.name, "before"] = given[0]
-    right = given[0] + bits - frac
+    frac = _within(work.frac(x.name), input_fracs[0] + bits)
+    work.slots[x.name, "before"] = input_fracs[0]
+    right = input_fracs[0] + bits - frac
     return made.WDifference(name=x.name, inputs=(), frac=frac, factor=factor, from_zero=x.from_zero, right=right)
 
 
-def _mean(work: _Work, x: memory.TrailingMean, given: list[int]) -> made.Whole:
-    work.slots[x.name, "ring"] = given[0]
-    return made.WTrailingMean(name=x.name, inputs=(), frac=given[0], size=x.size, window=x.window)
+def _mean(work: _Work, x: memory.TrailingMean, input_fracs: list[int]) -> made.Whole:
+    work.slots[x.name, "ring"] = input_fracs[0]
+    return made.WTrailingMean(name=x.name, inputs=(), frac=input_fracs[0], size=x.size, window=x.window)
 
 
-def _pool(work: _Work, x: memory.AttentionPool, given: list[int]) -> made.Whole:
-    work.slots |= {(x.name, "ring"): given[0], (x.name, "scores"): whole.GATE_FRAC}
-    numbers = to_gates(x.name, x.score[None], given[0], work.rounding)
+def _pool(work: _Work, x: memory.AttentionPool, input_fracs: list[int]) -> made.Whole:
+    work.slots |= {(x.name, "ring"): input_fracs[0], (x.name, "scores"): whole.GATE_FRAC}
+    numbers = to_gates(x.name, x.score[None], input_fracs[0], work.rounding)
     return made.WAttentionPool(
         name=x.name,
         inputs=(),
-        frac=given[0],
+        frac=input_fracs[0],
         window=x.window,
         score=numbers["weight"][0],
         multiplier=numbers["multiplier"],
@@ -318,11 +322,11 @@ def _pool(work: _Work, x: memory.AttentionPool, given: list[int]) -> made.Whole:
 
 def weights_of(graph: Graph) -> dict[str, NDArray[np.int8]]:
     """8-bit weights of a whole-number graph, by matrix."""
-    found: dict[str, NDArray[np.int8]] = {}
+    weights: dict[str, NDArray[np.int8]] = {}
     for layer, name, values in graph.tensors():
         if values.dtype == np.int8:
-            found[layer + ("/" + name[-1] if name in ("weight_x", "weight_h") else "")] = values
-    return found
+            weights[layer + ("/" + name[-1] if name in ("weight_x", "weight_h") else "")] = values
+    return weights
 
 
 LOWER: dict[type[Layer], Lower] = {

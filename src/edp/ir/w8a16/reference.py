@@ -56,21 +56,21 @@ class Integers:
         """Feed ticks; returns the value of every layer and the input."""
         values: dict[str, Any] = {INPUT: np.asarray(inputs, dtype=np.float32)}
         for layer in self.graph.layers:
-            given = [values[name] for name in layer.inputs]
+            layer_inputs = [values[name] for name in layer.inputs]
             if isinstance(layer, made.Quantise):
-                values[layer.name] = self._quantised(layer, given[0])
+                values[layer.name] = self._quantised(layer, layer_inputs[0])
                 continue
             kind = type(layer)
             run = WHOLE[kind] if kind in WHOLE else OVER_TIME[kind]
-            values[layer.name] = run(layer, self.memory[layer.name], *given)
+            values[layer.name] = run(layer, self.memory[layer.name], *layer_inputs)
         return values
 
     def _quantised(self, layer: made.Quantise, x: NDArray[np.float32]) -> Whole:
         wide = x * np.float32(2.0**layer.frac)
         top = np.float32(LARGEST)
         self.clipped += int((~((wide >= -top) & (wide <= top))).sum())
-        held = np.where(wide >= -top, np.minimum(wide, top), -top)
-        return np.trunc(np.where(held >= 0, held + np.float32(0.5), held - np.float32(0.5))).astype(np.int64)
+        limited = np.where(wide >= -top, np.minimum(wide, top), -top)
+        return np.trunc(np.where(limited >= 0, limited + np.float32(0.5), limited - np.float32(0.5))).astype(np.int64)
 
 
 def matrix(x: Whole, weight: NDArray[np.int8]) -> Whole:
@@ -100,7 +100,7 @@ def _sum(layer: made.WSum, m: Memory, a: Whole, b: Whole) -> Whole:
 
 
 def _activate(layer: made.WActivate, m: Memory, x: Whole) -> Whole:
-    gate = _to_gate(x, layer.given)
+    gate = _to_gate(x, layer.input_frac)
     if layer.function is Function.RELU:
         return np.maximum(x, 0)
     if layer.function is Function.SIGMOID:

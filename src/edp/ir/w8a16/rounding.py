@@ -48,10 +48,10 @@ class WeightRounding:
         flat = weight.reshape(*scale.shape, -1).astype(np.float64)
         moments = self.moments[matrix]
         if scale.ndim == 1:
-            found = least_error(flat, scale, moments)
+            rounded = least_error(flat, scale, moments)
         else:
-            found = np.stack([least_error(*row) for row in zip(flat, scale, moments, strict=True)])
-        return found.reshape(weight.shape)
+            rounded = np.stack([least_error(*row) for row in zip(flat, scale, moments, strict=True)])
+        return rounded.reshape(weight.shape)
 
 
 def nearest(weight: Array, scale: Array) -> NDArray[np.int8]:
@@ -74,9 +74,9 @@ def least_error(weight: Array, scale: Array, moments: Array) -> NDArray[np.int8]
     # Row i of the upper factor of the inverse says how the columns after i make up for an error in column i.
     upper = np.linalg.cholesky(np.linalg.inv(damped[np.ix_(order, order)])).T
     left = weight[:, order].copy()
-    found = np.empty(left.shape, dtype=np.int8)
+    rounded = np.empty(left.shape, dtype=np.int8)
     for column in range(terms):
-        found[:, column] = nearest(left[:, column], scale)
-        error = (left[:, column] - found[:, column] * scale) / upper[column, column]
+        rounded[:, column] = nearest(left[:, column], scale)
+        error = (left[:, column] - rounded[:, column] * scale) / upper[column, column]
         left[:, column:] -= error[:, None] * upper[column, column:]
-    return found[:, np.argsort(order, kind="stable")]
+    return rounded[:, np.argsort(order, kind="stable")]

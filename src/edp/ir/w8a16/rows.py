@@ -27,22 +27,22 @@ def rows(matrix: str, weight: Array, bias: Array, formats: tuple[int, int], roun
     Raises:
         ExportError: a sum that might not fit in 32 bits.
     """
-    given, frac = formats
+    input_frac, frac = formats
     terms = tuple(range(bias.ndim, weight.ndim))
     # A bias far larger than its weights takes part in the choice of the scale, else it would not fit.
-    scale = np.maximum(np.abs(weight).max(axis=terms) / whole.WEIGHT, np.abs(bias) * 2.0 ** (given - 30))
+    scale = np.maximum(np.abs(weight).max(axis=terms) / whole.WEIGHT, np.abs(bias) * 2.0 ** (input_frac - 30))
     scale = np.maximum(scale.astype(np.float64), 1e-30)
-    held = rounding.of(matrix, weight, scale)
-    offset = np.floor(bias / scale * 2.0**given + 0.5)
-    _check(matrix, held, offset)
-    multiplier, shift = whole.factor(scale * 2.0 ** (frac - given))
-    return {"weight": held, "bias": offset.astype(np.int32), "multiplier": multiplier, "shift": shift}
+    rounded = rounding.of(matrix, weight, scale)
+    offset = np.floor(bias / scale * 2.0**input_frac + 0.5)
+    _check(matrix, rounded, offset)
+    multiplier, shift = whole.factor(scale * 2.0 ** (frac - input_frac))
+    return {"weight": rounded, "bias": offset.astype(np.int32), "multiplier": multiplier, "shift": shift}
 
 
-def to_gates(matrix: str, weight: Array, given: int, rounding: WeightRounding) -> dict[str, Any]:
+def to_gates(matrix: str, weight: Array, input_frac: int, rounding: WeightRounding) -> dict[str, Any]:
     """A matrix ``(out, in)`` into gates or scores; see `rows`."""
-    found = rows(matrix, weight, np.zeros(len(weight)), (given, whole.GATE_FRAC), rounding)
-    return {key: found[key] for key in ("weight", "multiplier", "shift")}
+    constants = rows(matrix, weight, np.zeros(len(weight)), (input_frac, whole.GATE_FRAC), rounding)
+    return {key: constants[key] for key in ("weight", "multiplier", "shift")}
 
 
 def halves(gain: Array, most: int = 30) -> tuple[NDArray[np.int16], int]:

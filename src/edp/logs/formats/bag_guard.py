@@ -122,10 +122,10 @@ def _to_size(kind: str, data: bytes, size: int) -> bytes:
 def _by_ratio(kind: str, data: bytes) -> bytes:
     """For packed parts whose size unpacked is announced nowhere that the library looks."""
     limit = RATIO * len(data) + SPARE
-    found = unpack_to(kind, data, limit)
-    if len(found) > limit:
+    unpacked_bytes = unpack_to(kind, data, limit)
+    if len(unpacked_bytes) > limit:
         raise DataError(f"{len(data)} bytes packed by {kind} that unpack to more than {limit}")
-    return found
+    return unpacked_bytes
 
 
 class _Zstd:
@@ -183,16 +183,16 @@ def _check_database(path: Path | MemoryFile) -> None:
         # A value cannot be longer than the file, whatever its header says.
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(size, 4096), (1 << 31) - 1))
         base.execute("PRAGMA trusted_schema = OFF")
-        found = base.execute("SELECT type, name, sql FROM sqlite_master LIMIT 1000").fetchall()
-        odd = [name for kind, name, sql in found if not _plain(kind, name, sql)]
+        schema_rows = base.execute("SELECT type, name, sql FROM sqlite_master LIMIT 1000").fetchall()
+        odd = [name for kind, name, sql in schema_rows if not _plain(kind, name, sql)]
         if odd:
             raise DataError(
                 f"'{path}': {odd[0]!r} is not one of the plain tables and indices of a bag; record it again"
             )
-        for table in {name for kind, name, _ in found if kind == "table" and name in _PLAIN_TABLES}:
+        for table in {name for kind, name, _ in schema_rows if kind == "table" and name in _PLAIN_TABLES}:
             if any(row[6] for row in base.execute(f"PRAGMA table_xinfo({table})")):
                 raise DataError(f"'{path}': table '{table}' has computed columns; record the bag again")
-        names = {name for _, name, _ in found}
+        names = {name for _, name, _ in schema_rows}
         if "topics" in names:
             count, different = base.execute("SELECT count(*), count(DISTINCT id) FROM topics").fetchone()
             if count != different:

@@ -133,8 +133,8 @@ class RawLog:
         )
 
     def _told_apart(self, name: str) -> str:
-        found = [self.signals[full] for full in self.repeated[name]]
-        return ", ".join(signal.name + (f" [{signal.unit}]" if signal.unit else "") for signal in found[:8])
+        same_named = [self.signals[full] for full in self.repeated[name]]
+        return ", ".join(signal.name + (f" [{signal.unit}]" if signal.unit else "") for signal in same_named[:8])
 
 
 LONGEST_NAME = 256
@@ -199,8 +199,8 @@ def parted(recording: Recording) -> tuple[Recording | None, Recording | None]:
     """The measured channels and the truth of a recording; None for a part without channels."""
     of_truth = [is_truth(name) for name in recording.channel_names]
 
-    def part(wanted: bool) -> Recording | None:
-        places = [i for i, found in enumerate(of_truth) if found == wanted]
+    def part(truth_part: bool) -> Recording | None:
+        places = [i for i, is_truth_channel in enumerate(of_truth) if is_truth_channel == truth_part]
         channels = tuple(recording.channels[i] for i in places)
         return replace(recording, channels=channels, values=recording.values[:, places]) if places else None
 
@@ -255,9 +255,9 @@ def find_time(names: Sequence[str], signal_map: SignalMap, path: Path) -> str | 
                 "set 'time' in the signal map to an existing column, or set 'sample_time_s'"
             )
         return signal_map.time
-    for wanted in _TIME_NAMES:
+    for time_name in _TIME_NAMES:
         for name in names:
-            if name.lower() == wanted:
+            if name.lower() == time_name:
                 return name
     return "t" if "t" in names else None
 

@@ -64,15 +64,17 @@ class CsvFormat:
         time_name = find_time(names, signal_map, path)
         time = None if time_name is None else _stamps(table, layout.names.index(time_name), signal_map)
         signals: dict[str, RawSignal] = {}
-        for place, name in enumerate(layout.names):
+        for column_index, name in enumerate(layout.names):
             if not name or name == time_name:
                 continue
             if name in signals:
                 signals[name] = _ambiguous(path, name, table.rows, time)
                 continue
-            key = str(place)
+            key = str(column_index)
             load = partial(load_column, table, key, table.rows)
-            signals[name] = RawSignal(name, load, table.rows, time, unit=layout.units[place], table=table, key=key)
+            signals[name] = RawSignal(
+                name, load, table.rows, time, unit=layout.units[column_index], table=table, key=key
+            )
         return RawLog(path, signals)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
@@ -234,8 +236,8 @@ def _is_unit_row(row: list[str], decimal: str) -> bool:
     cells = [cell.strip().strip("[]()") for cell in row]
     filled = [cell for cell in cells if cell]
     words = [cell for cell in filled if cell != "1"]
-    known = [normalise_unit(cell) in UNITS or normalise_unit(cell) in TIME_UNITS for cell in words]
-    return any(known) and not any(is_number(cell, decimal) for cell in words)
+    is_unit = [normalise_unit(cell) in UNITS or normalise_unit(cell) in TIME_UNITS for cell in words]
+    return any(is_unit) and not any(is_number(cell, decimal) for cell in words)
 
 
 def _stated_columns(
@@ -257,16 +259,16 @@ def _ambiguous(path: Path, name: str, samples: int, time: Column | None) -> RawS
     return RawSignal(name, load, samples, time)
 
 
-def _stamps(table: CsvTable, place: int, signal_map: SignalMap) -> Column:
+def _stamps(table: CsvTable, column_index: int, signal_map: SignalMap) -> Column:
     layout = table.layout
-    name, unit = layout.names[place], layout.units[place]
-    if table.types[table.keys[place]] != pa.string():
-        return load_column(table, str(place), table.rows) * time_factor(name, unit, signal_map)
-    cells = [(cell or "NaT").strip().removesuffix("Z") for cell in table.texts(place)]
+    name, unit = layout.names[column_index], layout.units[column_index]
+    if table.types[table.keys[column_index]] != pa.string():
+        return load_column(table, str(column_index), table.rows) * time_factor(name, unit, signal_map)
+    cells = [(cell or "NaT").strip().removesuffix("Z") for cell in table.texts(column_index)]
     try:
         dates = np.array(cells, dtype="datetime64[ns]")
     except ValueError:
-        table.refuse_text(place)
+        table.refuse_text(column_index)
         raise
     if not len(dates):
         return np.empty(0)

@@ -150,10 +150,10 @@ class CsvTable:
     def pieces(self, names: Sequence[str], start: int, stop: int) -> Iterator[list[NDArray[Any]]]:
         """See `edp.logs.formats.base.ColumnTable`."""
         places = [int(name) for name in names]
-        keys = [self.keys[place] for place in places]
-        for place in places:
-            if self.types[self.keys[place]] == pa.string():
-                self.refuse_text(place)
+        keys = [self.keys[column_index] for column_index in places]
+        for column_index in places:
+            if self.types[self.keys[column_index]] == pa.string():
+                self.refuse_text(column_index)
         first = 0
         for batch in self.stream(list(dict.fromkeys(keys))):
             low, high = max(start - first, 0), min(stop - first, batch.num_rows)
@@ -164,9 +164,9 @@ class CsvTable:
             if first >= stop:
                 return
 
-    def texts(self, place: int) -> list[str | None]:
+    def texts(self, column_index: int) -> list[str | None]:
         """The cells of a column of text."""
-        key = self.keys[place]
+        key = self.keys[column_index]
         return [cell for batch in self.stream([key]) for cell in batch.column(key).to_pylist()]
 
     def refuse_ragged(self) -> None:
@@ -178,9 +178,9 @@ class CsvTable:
                 "the line"
             )
 
-    def refuse_text(self, place: int) -> None:
+    def refuse_text(self, column_index: int) -> None:
         """Say where a column that should hold numbers holds text."""
-        name, row, key = self.layout.names[place], self.layout.skip_rows + 1, self.keys[place]
+        name, row, key = self.layout.names[column_index], self.layout.skip_rows + 1, self.keys[column_index]
         for batch in self.stream([key]):
             for cell in batch.column(key).to_pylist():
                 if not is_number(cell or "", self.layout.decimal):

@@ -53,28 +53,31 @@ class MatFormat:
         """Read all variables, or the one that the map names."""
         from edp.logs.formats.matlab.unpacking import unpack  # pandas takes seconds to import
 
-        found = unpack(path, signal_map.variable)
-        own = OwnFacts() if found.info is None else own_facts(found.info, f"'{path}', variable '{INFO}'")
+        mat_variables = unpack(path, signal_map.variable)
+        own = (
+            OwnFacts() if mat_variables.info is None else own_facts(mat_variables.info, f"'{path}', variable '{INFO}'")
+        )
         if signal_map.variable is not None:
-            if signal_map.variable not in found.names:
+            if signal_map.variable not in mat_variables.names:
                 raise DataError(
-                    f"'{path}' has no variable '{signal_map.variable}'{closest(signal_map.variable, found.names)}; "
+                    f"'{path}' has no variable '{signal_map.variable}'"
+                    f"{closest(signal_map.variable, mat_variables.names)}; "
                     "set 'variable' in the signal map to an existing one"
                 )
             if signal_map.variable == TRUTH and own.truth:
                 own = replace(own, channels=own.truth, digest=own.truth_digest)
-        if not found.signals:
+        if not mat_variables.signals:
             raise DataError(
-                f"'{path}' holds no signals (variables: {', '.join(found.names[:12]) or 'none'}); expected "
+                f"'{path}' holds no signals (variables: {', '.join(mat_variables.names[:12]) or 'none'}); expected "
                 "numeric vectors, structs of them, timeseries, a Dataset or a timetable"
             )
-        return _raw_log(path, found, own, signal_map)
+        return _raw_log(path, mat_variables, own, signal_map)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write the variables of the wanted layout, and ``edp_info``, a JSON text with units and facts."""
         if options.mat_version not in _VERSIONS:
-            known = closest(options.mat_version, _VERSIONS)
-            raise DataError(f"MAT version '{options.mat_version}' cannot be written{known}")
+            closest_version = closest(options.mat_version, _VERSIONS)
+            raise DataError(f"MAT version '{options.mat_version}' cannot be written{closest_version}")
         long = [name for name in recording.channel_names if not name.isidentifier() or len(name) > 63]
         if long:
             raise DataError(
@@ -121,17 +124,17 @@ class _Table:
         yield [self.columns[name][start:stop] for name in names]
 
 
-def _raw_log(path: Path, found: MatVariables, own: OwnFacts, signal_map: SignalMap) -> RawLog:
-    names = [part.name for part in found.signals]
-    timeless = [part.name for part in found.signals if part.time is None]
+def _raw_log(path: Path, mat_variables: MatVariables, own: OwnFacts, signal_map: SignalMap) -> RawLog:
+    names = [part.name for part in mat_variables.signals]
+    timeless = [part.name for part in mat_variables.signals if part.time is None]
     time_name = None if own.rate_hz else find_time(timeless, signal_map, path)
     time: Column | None = None
     if time_name is not None:
-        part = found.signals[names.index(time_name)]
+        part = mat_variables.signals[names.index(time_name)]
         time = np.asarray(part.values, dtype=np.float64) * time_factor(time_name, None, signal_map)
     signals: dict[str, RawSignal] = {}
-    table = _Table({part.name: part.values for part in found.signals})
-    for part in found.signals:
+    table = _Table({part.name: part.values for part in mat_variables.signals})
+    for part in mat_variables.signals:
         if part.name == time_name:
             continue
         channel = own.channels.get(part.name)
@@ -151,5 +154,7 @@ def _raw_log(path: Path, found: MatVariables, own: OwnFacts, signal_map: SignalM
         )
     if own.channels:
         signals = {name: signals[name] for name in own.channels if name in signals}
-    repeated = {name: full for name, full in found.repeated.items() if name != time_name and set(full) <= set(signals)}
-    return RawLog(path, signals, found.scalars, repeated=repeated, **own.for_log())
+    repeated = {
+        name: full for name, full in mat_variables.repeated.items() if name != time_name and set(full) <= set(signals)
+    }
+    return RawLog(path, signals, mat_variables.scalars, repeated=repeated, **own.for_log())

@@ -37,8 +37,8 @@ class MatLayout:
 
     def variables(self, recording: Recording) -> dict[str, Any]:
         """The variables of a file."""
-        made = {self.variable: self.build(recording)}
-        return made | {self.stamps: _time(recording)} if self.stamps else made
+        mat_values = {self.variable: self.build(recording)}
+        return mat_values | {self.stamps: _time(recording)} if self.stamps else mat_values
 
 
 LAYOUTS: Registry[MatLayout] = Registry("MAT layout")
@@ -118,21 +118,21 @@ def _vectors(recording: Recording) -> list[tuple[str, str, Any]]:
     groups: dict[tuple[str, str], dict[int, int]] = {}
     for i, channel in enumerate(recording.channels):
         match = re.fullmatch(r"(.+)_([1-9]\d*)", channel.name)
-        key, place = (channel.name, 0) if match is None else (match[1], int(match[2]))
-        groups.setdefault((key, channel.unit), {})[place] = i
+        key, row_index = (channel.name, 0) if match is None else (match[1], int(match[2]))
+        groups.setdefault((key, channel.unit), {})[row_index] = i
     keys = [key for key, _ in groups]
-    made: list[tuple[str, str, Any]] = []
+    columns: list[tuple[str, str, Any]] = []
     for (key, unit), places in groups.items():
         width = max(places)
         if 1 in places and len(places) > 1 and 0 not in places and keys.count(key) == 1 and width <= 2 * len(places):
             values = np.full((recording.samples, width), np.nan, dtype=np.float32)
-            for place, i in places.items():
-                values[:, place - 1] = recording.values[:, i]
-            made.append((key, unit, values))
+            for row_index, i in places.items():
+                values[:, row_index - 1] = recording.values[:, i]
+            columns.append((key, unit, values))
         else:
             chosen = sorted(places.values())
-            made += [column for i, column in enumerate(_columns(recording)) if i in chosen]
-    return made
+            columns += [column for i, column in enumerate(_columns(recording)) if i in chosen]
+    return columns
 
 
 def _dataset_of(recording: Recording, signals: list[tuple[str, str, Any]]) -> Any:

@@ -103,11 +103,11 @@ class _Walk:
         """Times (16 bytes), place and length of the chunk (16), then lists, and at the end both sizes (16)."""
         if length < 64:
             raise _broken(self.path, f"has at byte {at} an index of {length} bytes")
-        start, stop, place, _ = struct.unpack_from("<QQQQ", self.view, at)
+        start, stop, chunk_offset, _ = struct.unpack_from("<QQQQ", self.view, at)
         packed, unpacked = struct.unpack_from("<QQ", self.view, at + length - 16)
-        if place in self.indexed:
-            raise _broken(self.path, f"has at byte {at} a second index of the chunk at byte {place}")
-        self.indexed.add(place)
+        if chunk_offset in self.indexed:
+            raise _broken(self.path, f"has at byte {at} a second index of the chunk at byte {chunk_offset}")
+        self.indexed.add(chunk_offset)
         if packed > len(self.view):
             raise _broken(self.path, f"has at byte {at} an index of {packed} packed bytes, more than the file holds")
         self.weigh(at, start, stop, packed, unpacked)

@@ -70,10 +70,12 @@ class MdfFormat:
             file = _File(path, log)
             weakref.finalize(file, _close, log, stream)
             own = file.facts()
-            found = [signal for number in range(len(log.groups)) for signal in file.group(number, own, signal_map)]
-        if not found:
+            named_signals = [
+                signal for number in range(len(log.groups)) for signal in file.group(number, own, signal_map)
+            ]
+        if not named_signals:
             raise DataError(f"'{path}' holds no channels of numbers; {_advice(log)}")
-        signals, aliases, repeated = told_apart(found)
+        signals, aliases, repeated = told_apart(named_signals)
         if own.channels:
             signals, repeated = only(own.channels, signals, repeated)
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
@@ -84,13 +86,13 @@ class MdfFormat:
         time = np.arange(recording.samples) / recording.rate_hz
         signals = [
             asammdf.Signal(
-                samples=np.ascontiguousarray(recording.values[:, place]),
+                samples=np.ascontiguousarray(recording.values[:, channel_index]),
                 timestamps=time,
                 name=channel.name,
                 unit=channel.unit,
                 comment=channel.description,
             )
-            for place, channel in enumerate(recording.channels)
+            for channel_index, channel in enumerate(recording.channels)
         ]
         with asammdf.MDF(version="4.10") as log, path.open("wb+") as stream:
             log.append(signals, acq_name=recording.name, comment="EDP", common_timebase=True)
@@ -113,17 +115,17 @@ class _File:
     def _take_conversions(self) -> None:
         """Take the conversions out of the library's hands before it reads a value: it runs formulas as code."""
         for number, group in enumerate(self.log.groups):
-            for place, channel in enumerate(group.channels):
+            for channel_index, channel in enumerate(group.channels):
                 if channel.conversion is not None:
-                    self.conversions[number, place] = channel.conversion
+                    self.conversions[number, channel_index] = channel.conversion
                     channel.conversion = None
 
-    def convert(self, number: int, place: int, raw: NDArray[Any]) -> NDArray[Any]:
+    def convert(self, number: int, channel_index: int, raw: NDArray[Any]) -> NDArray[Any]:
         """Physical values of a channel."""
-        block = self.conversions.get((number, place))
+        block = self.conversions.get((number, channel_index))
         if block is None:
             return raw
-        name = self.log.groups[number].channels[place].name
+        name = self.log.groups[number].channels[channel_index].name
         return Conversion(block, f"'{self.path}', channel {shown_name(name)}")(raw)
 
     def facts(self) -> OwnFacts:
@@ -143,28 +145,28 @@ class _File:
         if timed and own.rate_hz is None and signal_map.sample_time_s is None:
             stamps = cache(partial(self.stamps, number))
         table = _Table(self, number)
-        found = []
-        for place, channel in enumerate(group.channels):
+        named_signals = []
+        for channel_index, channel in enumerate(group.channels):
             usable = channel.data_type in _NUMBERS and channel.channel_type in _PLAIN_TYPES
-            if place == master or not usable or group.channel_dependencies[place] or not samples:
+            if channel_index == master or not usable or group.channel_dependencies[channel_index] or not samples:
                 continue
-            known = own.channels.get(channel.name)
-            conversion = self.conversions.get((number, place))
+            channel_facts = own.channels.get(channel.name)
+            conversion = self.conversions.get((number, channel_index))
             unit = channel.unit or (conversion.unit if conversion else "")
-            key = str(place)
+            key = str(channel_index)
             signal = RawSignal(
                 channel.name,
                 partial(load_column, table, key, samples),
                 samples,
                 stamps,
-                unit=normalise_unit(unit) or (known.unit if known else None),
-                kind=known.kind if known else None,
-                description=known.description if known else "",
+                unit=normalise_unit(unit) or (channel_facts.unit if channel_facts else None),
+                kind=channel_facts.kind if channel_facts else None,
+                description=channel_facts.description if channel_facts else "",
                 table=table,
                 key=key,
             )
-            found.append((f"{self.name_of(number)}.{channel.name}", signal))
-        return found
+            named_signals.append((f"{self.name_of(number)}.{channel.name}", signal))
+        return named_signals
 
     def name_of(self, number: int) -> str:
         head = self.log.groups[number].channel_group

@@ -106,15 +106,15 @@ class _Walk:
             block = todo.pop()
             tree = _TREE.get(block.id, ())
             chosen = range(len(block.links)) if tree is None else tree
-            for place, target in enumerate(block.links):
-                if not target or (target in self.blocks and place not in chosen):
+            for link_index, target in enumerate(block.links):
+                if not target or (target in self.blocks and link_index not in chosen):
                     continue
-                found = self.block(target)
-                if place in chosen:
+                linked_block = self.block(target)
+                if link_index in chosen:
                     if target in owned:
-                        raise self.broken(target, f"a {_name(found)} block that two others own")
+                        raise self.broken(target, f"a {_name(linked_block)} block that two others own")
                     owned.add(target)
-                todo.append(found)
+                todo.append(linked_block)
             self.numbers(block)
         self.conversions()
 
@@ -213,11 +213,12 @@ class _Walk:
         data = self.block(group.links[2]) if group.links[2] else None
         columns = data is not None and data.id in (b"##LD", b"##DV")
         needed = cycles * (values + (0 if columns else invalid))
-        held = 0 if data is None else self.held(data)
-        if held != needed:
+        memory_bytes = 0 if data is None else self.held(data)
+        if memory_bytes != needed:
             raise _broken(
                 self.path,
-                f"announces {cycles} records of {values + invalid} bytes and holds {held} bytes of them (truncated?)",
+                f"announces {cycles} records of {values + invalid} bytes and holds {memory_bytes} bytes of them "
+                "(truncated?)",
             )
         self.channels(head.links[1], values)
 

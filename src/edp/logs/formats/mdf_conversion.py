@@ -108,8 +108,8 @@ class Conversion:
         starts = np.flatnonzero(np.r_[True, sorted_entry[1:] != sorted_entry[:-1]])
         out = raw.astype(np.float64)
         for first, stop in zip(starts, np.r_[starts[1:], len(order)]):
-            place = int(sorted_entry[first])
-            conversion = self.default if place < 0 else self.inner[place]
+            entry_index = int(sorted_entry[first])
+            conversion = self.default if entry_index < 0 else self.inner[entry_index]
             if conversion is not None:
                 out[order[first:stop]] = conversion(raw[order[first:stop]])
         return out
@@ -139,9 +139,9 @@ def _in_ranges(
     closed = raw.dtype.kind in "uib" if closed is None else closed
     x = raw.astype(np.float64)
     order = np.argsort(lower, kind="stable")
-    place = order[np.maximum(np.searchsorted(lower[order], x, side="right") - 1, 0)]
-    inside = (x >= lower[place]) & ((x <= upper[place]) if closed else (x < upper[place]))
-    return np.where(inside, place, -1)
+    range_index = order[np.maximum(np.searchsorted(lower[order], x, side="right") - 1, 0)]
+    inside = (x >= lower[range_index]) & ((x <= upper[range_index]) if closed else (x < upper[range_index]))
+    return np.where(inside, range_index, -1)
 
 
 def _linear(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
@@ -183,9 +183,9 @@ def _nearest(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
 def _ranges(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
     count = (int(block.val_param_nr) - 1) // 3
     lower, upper = (np.array([block[f"{end}_{i}"] for i in range(count)]) for end in _ENDS)
-    place = _in_ranges(lower, upper, raw)
+    range_index = _in_ranges(lower, upper, raw)
     physical = np.array([block[f"phys_{i}"] for i in range(count)] + [block.default])
-    return np.asarray(physical[place])
+    return np.asarray(physical[range_index])
 
 
 _NUMERIC = {

@@ -113,20 +113,20 @@ _ONE_SIDED: Mapping[str, Callable[[Any], Any]] = {
 
 def _tokens(text: str) -> list[tuple[str, str]]:
     """Kind (number, name, sign) and text of each token."""
-    found: list[tuple[str, str]] = []
+    tokens: list[tuple[str, str]] = []
     at = 0
     text = text.rstrip()
     while at < len(text):
         match = _TOKEN.match(text, at)
         if match is None or match.lastgroup is None:
             raise FormulaError(f"character {at + 1} begins neither a number, a name nor one of + - * / ^ ( )")
-        found.append((match.lastgroup, match[match.lastgroup].lower()))
-        if len(found) > MOST_TOKENS:
+        tokens.append((match.lastgroup, match[match.lastgroup].lower()))
+        if len(tokens) > MOST_TOKENS:
             raise FormulaError(f"it has more than {MOST_TOKENS} numbers, names and signs")
         at = match.end()
-    if not found:
+    if not tokens:
         raise FormulaError("it is empty")
-    return found
+    return tokens
 
 
 class _Parser:

@@ -12,24 +12,24 @@ from edp.logs.formats.base import RawSignal
 Named = tuple[dict[str, RawSignal], dict[str, str], dict[str, list[str]]]
 
 
-def told_apart(found: Sequence[tuple[str, RawSignal]]) -> Named:
+def told_apart(named_signals: Sequence[tuple[str, RawSignal]]) -> Named:
     """Columns by name.
 
     Args:
-        found: the full name of each column (with group or topic), and the column under its short name.
+        named_signals: the full name of each column (with group or topic), and the column under its short name.
 
     Returns:
         columns under their short names where those occur once, else under the full ones, numbered where even those
         occur twice; the full names of the former; and the short names of the latter with their full ones.
     """
-    counts = Counter(signal.name for _, signal in found)
+    counts = Counter(signal.name for _, signal in named_signals)
     often = {name for name, count in counts.items() if count > 1}
     once = counts.keys() - often
     signals: dict[str, RawSignal] = {}
     aliases: dict[str, str] = {}
     repeated: dict[str, list[str]] = {}
     numbers: Counter[str] = Counter()
-    for name, signal in found:
+    for name, signal in named_signals:
         full = name
         if signal.name not in often:
             signals[signal.name] = signal
@@ -49,12 +49,12 @@ def name_of_file(path: Path) -> str:
 
 
 def only(
-    wanted: Iterable[str], signals: Mapping[str, RawSignal], repeated: Mapping[str, Sequence[str]]
+    chosen_names: Iterable[str], signals: Mapping[str, RawSignal], repeated: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, RawSignal], dict[str, list[str]]]:
     """The wanted columns of a log, in that order, and the names that several of them have."""
-    kept = {name: signals[name] for name in wanted if name in signals}
-    among = {name: [full for full in several if full in kept] for name, several in repeated.items()}
-    return kept, {name: several for name, several in among.items() if len(several) > 1}
+    chosen_signals = {name: signals[name] for name in chosen_names if name in signals}
+    among = {name: [full for full in several if full in chosen_signals] for name, several in repeated.items()}
+    return chosen_signals, {name: several for name, several in among.items() if len(several) > 1}
 
 
 SHOWN = 80

@@ -78,12 +78,12 @@ class ParquetFormat:
             raise DataError(f"'{path}' is a damaged or encrypted Parquet file: {brief(error)}; {advice}") from error
         own = _own(table.schema.metadata or {}, path)
         clocks = {} if own.rate_hz else _clocks(table, signal_map)
-        times = {clock.place for clock in clocks.values()}
-        found = []
-        for place, field in enumerate(table.schema):
-            if place not in times:
-                found += _signals(table, place, field, clocks.get(place))
-        signals, aliases, repeated = told_apart(found)
+        times = {clock.field_index for clock in clocks.values()}
+        named_signals = []
+        for field_index, field in enumerate(table.schema):
+            if field_index not in times:
+                named_signals += _signals(table, field_index, field, clocks.get(field_index))
+        signals, aliases, repeated = told_apart(named_signals)
         if own.channels:
             signals, repeated = only(own.channels, signals, repeated)
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
@@ -146,8 +146,8 @@ class _Table:
         self.rows = int(self.file.metadata.num_rows)
         self.which = [0] * len(self.schema.names)
         for places in _by_name(self.schema.names).values():
-            for which, place in enumerate(places):
-                self.which[place] = which
+            for which, field_index in enumerate(places):
+                self.which[field_index] = which
         self.weigh()
 
     def weigh(self) -> None:
@@ -158,12 +158,12 @@ class _Table:
         """
         about = self.file.metadata
         check_names(self.path, self.schema.names)
-        held = [0] * about.num_columns
+        column_bytes = [0] * about.num_columns
         for number in range(about.num_row_groups):
             group = about.row_group(number)
             for column in range(about.num_columns):
-                held[column] += max(int(group.column(column).num_values), int(group.num_rows))
-        largest, size = 8 * max([self.rows, *held]), self.path.stat().st_size
+                column_bytes[column] += max(int(group.column(column).num_values), int(group.num_rows))
+        largest, size = 8 * max([self.rows, *column_bytes]), self.path.stat().st_size
         if self.rows < 0 or largest > RATIO * size + SPARE:
             raise DataError(
                 f"'{self.path}': a column claims {largest // 8} values in a file of {size} bytes; it may be damaged, "
@@ -196,29 +196,35 @@ class _Table:
             elif first + rows <= start:
                 skipped = first + rows
             first += rows
-        wanted = list(dict.fromkeys(names[place] for place in places))
+        column_names = list(dict.fromkeys(names[field_index] for field_index in places))
         try:
-            for batch in self.file.iter_batches(PIECE_ROWS, row_groups=groups, columns=wanted):
-                found = _by_name(batch.schema.names)
-                yield skipped, [batch.column(found[names[place]][self.which[place]]) for place in places]
+            for batch in self.file.iter_batches(PIECE_ROWS, row_groups=groups, columns=column_names):
+                columns_by_name = _by_name(batch.schema.names)
+                yield (
+                    skipped,
+                    [
+                        batch.column(columns_by_name[names[field_index]][self.which[field_index]])
+                        for field_index in places
+                    ],
+                )
                 skipped += batch.num_rows
         except (pa.ArrowException, OSError, ValueError, IndexError) as error:
-            shown = ", ".join(wanted[:4])
+            shown = ", ".join(column_names[:4])
             raise DataError(
                 f"'{self.path}': column(s) {shown} cannot be read ({brief(error)}); copy or export it"
             ) from error
 
-    def whole(self, place: int) -> pa.Array:
+    def whole(self, field_index: int) -> pa.Array:
         """One column."""
-        parts = [columns[0] for _, columns in self.batches([place], 0, self.rows)]
-        return pa.concat_arrays(parts) if parts else pa.array([], self.schema.field(place).type)
+        parts = [columns[0] for _, columns in self.batches([field_index], 0, self.rows)]
+        return pa.concat_arrays(parts) if parts else pa.array([], self.schema.field(field_index).type)
 
 
 def _by_name(names: Sequence[str]) -> dict[str, list[int]]:
     """Where the columns of each name lie: names that occur twice keep their order."""
     places: dict[str, list[int]] = {}
-    for place, name in enumerate(names):
-        places.setdefault(name, []).append(place)
+    for field_index, name in enumerate(names):
+        places.setdefault(name, []).append(field_index)
     return places
 
 
@@ -237,17 +243,17 @@ def _numbers(column: pa.Array, element: int | None = None) -> NDArray[Any]:
 class _Clock:
     """A time column: its place, stamps in seconds, and the rows that have one."""
 
-    place: int
+    field_index: int
     stamps: Column
 
     @staticmethod
-    def read(table: _Table, place: int, signal_map: SignalMap, shared: bool) -> _Clock:
-        stamps = _stamps(table, place, signal_map)
+    def read(table: _Table, field_index: int, signal_map: SignalMap, shared: bool) -> _Clock:
+        stamps = _stamps(table, field_index, signal_map)
         if not shared and len(stamps):
             # Signals of other rates fill the rest of the rows with nothing.
             filled = np.flatnonzero(np.isfinite(stamps))
             stamps = stamps[: int(filled[-1]) + 1 if len(filled) else 0]
-        return _Clock(place, stamps)
+        return _Clock(field_index, stamps)
 
 
 def _clocks(table: _Table, signal_map: SignalMap) -> dict[int, _Clock]:
@@ -255,8 +261,10 @@ def _clocks(table: _Table, signal_map: SignalMap) -> dict[int, _Clock]:
     names = table.schema.names
     own = {} if signal_map.time or signal_map.sample_time_s else _own_times(table.schema)
     if len(set(own.values())) > 1:
-        read = {place: _Clock.read(table, place, signal_map, shared=False) for place in set(own.values())}
-        return {place: read[time] for place, time in own.items()}
+        read = {
+            field_index: _Clock.read(table, field_index, signal_map, shared=False) for field_index in set(own.values())
+        }
+        return {field_index: read[time] for field_index, time in own.items()}
     name = find_time(names, signal_map, table.path)
     if name is None:
         return {}
@@ -287,20 +295,20 @@ def _own_times(schema: pa.Schema) -> dict[int, int]:
     return {i: plain[bisect_left(plain, i) - 1] for i in range(plain[0] + 1, len(names)) if i not in times}
 
 
-def _signals(table: _Table, place: int, field: pa.Field, clock: _Clock | None) -> list[tuple[str, RawSignal]]:
+def _signals(table: _Table, field_index: int, field: pa.Field, clock: _Clock | None) -> list[tuple[str, RawSignal]]:
     """The columns of one field: itself, or the elements of its lists."""
     if _is_number(field.type):
-        parts = [(field.name, str(place))]
+        parts = [(field.name, str(field_index))]
     elif _is_list(field.type):
-        width = _width(table, place)
-        parts = [(f"{field.name}_{i + 1}", f"{place}.{i}") for i in range(width)]
+        width = _width(table, field_index)
+        parts = [(f"{field.name}_{i + 1}", f"{field_index}.{i}") for i in range(width)]
     else:
         return []
-    known = (field.metadata or {}).items()
-    facts = {key.decode(errors="replace"): value.decode(errors="replace") for key, value in known}
+    metadata = (field.metadata or {}).items()
+    facts = {key.decode(errors="replace"): value.decode(errors="replace") for key, value in metadata}
     kind = facts.get("kind")
     samples = table.rows if clock is None else len(clock.stamps)
-    made = []
+    named_signals = []
     for name, key in parts:
         signal = RawSignal(
             name,
@@ -313,17 +321,17 @@ def _signals(table: _Table, place: int, field: pa.Field, clock: _Clock | None) -
             table=table,
             key=key,
         )
-        made.append((f"column_{place + 1}.{name}", signal))
-    return made
+        named_signals.append((f"column_{field_index + 1}.{name}", signal))
+    return named_signals
 
 
-def _width(table: _Table, place: int) -> int:
+def _width(table: _Table, field_index: int) -> int:
     """Elements of the lists of a column; 0 where they differ, such as signals of variable size, or are many."""
-    kind = table.schema.field(place).type
+    kind = table.schema.field(field_index).type
     if pa.types.is_fixed_size_list(kind):
         return int(kind.list_size) if kind.list_size <= _LARGEST_LIST else 0
     widths: set[int] = set()
-    for _, columns in table.batches([place], 0, table.rows):
+    for _, columns in table.batches([field_index], 0, table.rows):
         widths |= set(pc.unique(pc.list_value_length(columns[0])).to_pylist()) - {None}
         if len(widths) > 1:
             return 0
@@ -331,11 +339,11 @@ def _width(table: _Table, place: int) -> int:
     return int(width) if width <= _LARGEST_LIST else 0
 
 
-def _stamps(table: _Table, place: int, signal_map: SignalMap) -> Column:
+def _stamps(table: _Table, field_index: int, signal_map: SignalMap) -> Column:
     """Time in seconds from a column of numbers, time stamps or durations; NaN where there is none."""
-    field = table.schema.field(place)
+    field = table.schema.field(field_index)
     if _is_time(field.type):
-        numbers = table.whole(place).to_numpy(zero_copy_only=False)
+        numbers = table.whole(field_index).to_numpy(zero_copy_only=False)
         first = numbers[:1] if pa.types.is_timestamp(field.type) else np.zeros(1, dtype=numbers.dtype)
         return np.asarray((numbers - first) / np.timedelta64(1, "s"), dtype=np.float64)
     if not _is_number(field.type):
@@ -344,5 +352,5 @@ def _stamps(table: _Table, place: int, signal_map: SignalMap) -> Column:
         )
     facts = field.metadata or {}
     unit = (facts.get(b"unit") or facts.get(b"units") or b"").decode(errors="replace")
-    stamps = _numbers(table.whole(place)).astype(np.float64)
+    stamps = _numbers(table.whole(field_index)).astype(np.float64)
     return stamps * time_factor(field.name, normalise_unit(unit), signal_map)

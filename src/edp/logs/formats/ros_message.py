@@ -168,11 +168,11 @@ class _Walk:
         size = count * (2 if kind == "wstring" and self.cdr else 1)
         if self.at + size > len(self.raw):
             raise DataError(f"a text of {size} bytes in a message of {len(self.raw)}")
-        found = self.raw[self.at : self.at + size]
+        text_bytes = self.raw[self.at : self.at + size]
         # The names of a list decide what its numbers are called, so they must be the same in every message.
-        self.layout.fixed.append((self.at, found))
+        self.layout.fixed.append((self.at, text_bytes))
         self.at += size
-        return found.decode("utf-8", errors="replace").rstrip("\0")
+        return text_bytes.decode("utf-8", errors="replace").rstrip("\0")
 
     def base(self, kind: str, path: str) -> None:
         if kind in ("string", "wstring"):
@@ -204,7 +204,7 @@ def columns_of(
     Raises:
         DataError: a message does not fit its type.
     """
-    found: list[NDArray[Any] | None] = [None] * len(names)
+    columns: list[NDArray[Any] | None] = [None] * len(names)
     sizes = np.fromiter((len(raw) for raw in raws), dtype=np.int64, count=len(raws))
     for size in np.unique(sizes):
         rest = np.flatnonzero(sizes == size)
@@ -217,17 +217,17 @@ def columns_of(
                 part = block[rows, at : at + len(expected)]
                 same &= (part == np.frombuffer(expected, dtype=np.uint8)).all(axis=1)
             chosen = block if len(rows) == len(block) and same.all() else block[rows[same]]
-            for place, name in enumerate(names):
+            for name_index, name in enumerate(names):
                 if name not in layout.fields:
                     continue
                 at, dtype = layout.fields[name]
                 wide = int(dtype[2])
                 column = np.ascontiguousarray(chosen[:, at : at + wide]).view(dtype).ravel()
-                kept = np.dtype(np.float32 if dtype[1:] == "f4" else np.float64)
-                target = found[place]
+                column_dtype = np.dtype(np.float32 if dtype[1:] == "f4" else np.float64)
+                target = columns[name_index]
                 if target is None:
-                    target = found[place] = np.full(len(raws), np.nan, dtype=kept)
+                    target = columns[name_index] = np.full(len(raws), np.nan, dtype=column_dtype)
                 target[rest[rows[same]]] = column
             # Only the numbers of the rows left are kept: messages may all differ.
             rows = rows[~same]
-    return [np.full(len(raws), np.nan) if column is None else column for column in found]
+    return [np.full(len(raws), np.nan) if column is None else column for column in columns]

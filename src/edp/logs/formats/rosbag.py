@@ -51,15 +51,17 @@ class BagFormat:
 
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read topics, types and each topic's first message; the others when their values are asked for."""
-        wanted = {entry.column for entry in signal_map.channels} or set(VOCABULARY)
-        bag = _Bag(path, wanted, signal_map)
+        column_names = {entry.column for entry in signal_map.channels} or set(VOCABULARY)
+        bag = _Bag(path, column_names, signal_map)
         own = bag.facts()
-        found = [signal for topic in bag.topics for signal in topic.signals(own)]
-        if not found:
-            known = ", ".join(sorted(bag.about)) or "none"
-            raise DataError(f"'{path}' holds no numbers in messages (topics: {known}); record topics that hold some")
-        signals, aliases, repeated = told_apart(found)
-        bag.wanted = {aliases.get(name, name) for name in wanted}
+        named_signals = [signal for topic in bag.topics for signal in topic.signals(own)]
+        if not named_signals:
+            topic_names = ", ".join(sorted(bag.about)) or "none"
+            raise DataError(
+                f"'{path}' holds no numbers in messages (topics: {topic_names}); record topics that hold some"
+            )
+        signals, aliases, repeated = told_apart(named_signals)
+        bag.column_names = {aliases.get(name, name) for name in column_names}
         if own.channels:
             signals, repeated = only(own.channels, signals, repeated)
         return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
@@ -77,14 +79,14 @@ FORMATS.register("rosbag1")(BagFormat("rosbag1", ".bag", "a ROS 1 bag", b"#ROSBA
 class _Bag:
     """An open file or folder."""
 
-    def __init__(self, path: Path, wanted: set[str], signal_map: SignalMap) -> None:
+    def __init__(self, path: Path, column_names: set[str], signal_map: SignalMap) -> None:
         if signal_map.time not in (None, _LOG_TIME, _HEADER_TIME):
             raise DataError(
                 f"'{path}' has no time column '{signal_map.time}'; in a bag 'time' of the signal map is "
                 f"'{_HEADER_TIME}' or '{_LOG_TIME}'"
             )
         self.path = path
-        self.wanted = wanted
+        self.column_names = column_names
         self.time = signal_map.time
         with damage(path):
             self.reader = open_reader(path)
@@ -189,26 +191,28 @@ class _Topic:
             self.paths[path] = name.rpartition("/")[2] + last.removeprefix("data") if plain else path
 
     def signals(self, own: OwnFacts) -> list[tuple[str, RawSignal]]:
-        found = []
+        named_signals = []
         for path, short in self.paths.items():
-            known = own.channels.get(short)
+            channel_facts = own.channels.get(short)
             signal = RawSignal(
                 short,
                 partial(load_column, self, path, self.samples),
                 self.samples,
                 None if own.rate_hz else self.stamps,
-                unit=known.unit if known else None,
-                kind=known.kind if known else None,
-                description=known.description if known else "",
+                unit=channel_facts.unit if channel_facts else None,
+                kind=channel_facts.kind if channel_facts else None,
+                description=channel_facts.description if channel_facts else "",
                 table=self,
                 key=path,
             )
-            found.append((f"{self.name}.{path}", signal))
-        return found
+            named_signals.append((f"{self.name}.{path}", signal))
+        return named_signals
 
     def wanted_paths(self) -> list[str]:
-        wanted = self.bag.wanted
-        return [path for path, short in self.paths.items() if short in wanted or f"{self.name}.{path}" in wanted]
+        column_names = self.bag.column_names
+        return [
+            path for path, short in self.paths.items() if short in column_names or f"{self.name}.{path}" in column_names
+        ]
 
     def columns(self, raws: list[bytes], paths: Sequence[str]) -> list[NDArray[Any]]:
         return columns_of(raws, paths, self.kind, self.types, self.bag.cdr)
@@ -298,11 +302,11 @@ def damage(path: Path) -> Iterator[None]:
 
 
 def _advice(text: str) -> str:
-    known = {
+    advice_by_symptom = {
         "Profile is not": " (only ROS 2 messages in MCAP are read); convert the wanted topics to CSV or Parquet",
         "encryption": "; decrypt the bag first",
         "not indexed": " (its recorder was killed): run 'rosbag reindex' or record it again",
         "encrypted": "; it may be password-protected",
     }
-    found = [advice for part, advice in known.items() if part in text]
-    return found[0] if found else "; it may be truncated or damaged: copy or record it again"
+    matching_advice = [advice for part, advice in advice_by_symptom.items() if part in text]
+    return matching_advice[0] if matching_advice else "; it may be truncated or damaged: copy or record it again"

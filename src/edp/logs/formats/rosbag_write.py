@@ -43,9 +43,9 @@ def write_bag(recording: Recording, path: Path, container: str) -> None:
         ) from error
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".bag") as name:
         folder = Path(name)
-        made = _write1(recording, folder) if container == "rosbag1" else _write2(recording, folder, container)
+        unfinished_bag = _write1(recording, folder) if container == "rosbag1" else _write2(recording, folder, container)
         # The target exists already and keeps its name; a move within a folder copies nothing.
-        shutil.move(made, path)
+        shutil.move(unfinished_bag, path)
 
 
 def _write2(recording: Recording, folder: Path, container: str) -> Path:

@@ -33,12 +33,12 @@ def unpacked_size(packing: str, data: bytes | memoryview, limit: int) -> int:
 
 def unpack_to(packing: str, data: bytes | memoryview, limit: int) -> bytes:
     """Packed data unpacked to at most ``limit + 1`` bytes; see `unpacked_size`."""
-    kept = bytearray()
+    unpacked = bytearray()
     for part in _parts(packing, data):
-        kept += part
-        if len(kept) > limit:
+        unpacked += part
+        if len(unpacked) > limit:
             break
-    return bytes(kept[: limit + 1])
+    return bytes(unpacked[: limit + 1])
 
 
 def _parts(packing: str, data: bytes | memoryview) -> Iterator[bytes]:

@@ -134,16 +134,16 @@ def shown(value: float, channel: Channel) -> str:
 def copies(recording: Recording) -> list[Finding]:
     """Channels that equal an earlier one of the recording in every sample; constant ones do not count."""
     seen: dict[bytes, str] = {}
-    found = []
-    for place, channel in enumerate(recording.channels):
-        values = np.ascontiguousarray(recording.values[:, place])
+    findings = []
+    for channel_index, channel in enumerate(recording.channels):
+        values = np.ascontiguousarray(recording.values[:, channel_index])
         if len(values) < 2 or not np.nanmin(values, initial=np.inf) < np.nanmax(values, initial=-np.inf):
             continue
         first = seen.setdefault(hashlib.blake2b(values.tobytes(), digest_size=16).digest(), channel.name)
         if first != channel.name:
             advice = "one of them tells nothing new: leave it out"
-            found.append(Finding("note", channel.name, f"equals '{first}' in every sample", len(values), "", advice))
-    return found
+            findings.append(Finding("note", channel.name, f"equals '{first}' in every sample", len(values), "", advice))
+    return findings
 
 
 def _check_missing(at: Looked) -> list[Finding]:
@@ -224,15 +224,15 @@ def _check_stuck(at: Looked) -> list[Finding]:
         return []
     longest = long[np.argmax(at.stuck_lengths[long])]
     where = place_of(int(at.stuck[longest]), at.rate_hz)
-    held = f"longest {at.stuck_lengths[longest] / at.rate_hz:g} s"
+    duration_text = f"longest {at.stuck_lengths[longest] / at.rate_hz:g} s"
     if busy:
         what, advice = (
-            f"frozen: elsewhere each sample is new, {held}",
+            f"frozen: elsewhere each sample is new, {duration_text}",
             "leave these rows out (rows), or drop the channel",
         )
         return [Finding("warning", at.channel.name, what, len(long), where, advice)]
     advice = "a frozen sensor or a held command? check it"
-    return [Finding("note", at.channel.name, f"stuck at one value, {held}", len(long), where, advice)]
+    return [Finding("note", at.channel.name, f"stuck at one value, {duration_text}", len(long), where, advice)]
 
 
 def _check_clipped(at: Looked) -> list[Finding]:
@@ -240,11 +240,11 @@ def _check_clipped(at: Looked) -> list[Finding]:
 
     Zero is passed over: a pilot pressure or a flow rests there.
     """
-    found = at.measures
-    if not found.busy or found.end_run < _CLIPPED_SAMPLES:
+    measures = at.measures
+    if not measures.busy or measures.end_run < _CLIPPED_SAMPLES:
         return []
-    made = []
-    ends = (("lower", found.at_low, at.good.min()), ("upper", found.at_high, at.good.max()))
+    findings = []
+    ends = (("lower", measures.at_low, at.good.min()), ("upper", measures.at_high, at.good.max()))
     for end, share, value in ends:
         if share < _CLIPPED_SHARE or value == 0:
             continue
@@ -253,8 +253,8 @@ def _check_clipped(at: Looked) -> list[Finding]:
         advice = "the range of the sensor or the data type ends here: what lies beyond was not recorded"
         row = int(np.flatnonzero(at.values == value)[0])
         count = round(share * len(at.good))
-        made.append(Finding("warning", at.channel.name, what, count, place_of(row, at.rate_hz), advice))
-    return made
+        findings.append(Finding("warning", at.channel.name, what, count, place_of(row, at.rate_hz), advice))
+    return findings
 
 
 def _check_coarse(at: Looked) -> list[Finding]:

@@ -65,8 +65,8 @@ def compare(reports: Sequence[QualityReport], sketches: Sequence[Sketch]) -> Dat
     advice = (
         "keep one of them, or put both on one side of the split: a test that repeats training says nothing of new data"
     )
-    found = [Finding("warning", None, repeat.what, 1, "", advice) for repeat in repeats]
-    return DataQuality(tuple(reports), repeats, (*found, *_two_units(reports)))
+    findings = [Finding("warning", None, repeat.what, 1, "", advice) for repeat in repeats]
+    return DataQuality(tuple(reports), repeats, (*findings, *_two_units(reports)))
 
 
 def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
@@ -80,7 +80,7 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
             largest = max(abs(channel.min), abs(channel.max))
             if channel.noise > 0 and math.isfinite(largest) and largest > 0:
                 sizes.setdefault((channel.name, channel.kind), []).append((report.name, largest, channel.noise))
-    found = []
+    findings = []
     for (name, kind), entries in sizes.items():
         if len(entries) < 2:
             continue
@@ -91,18 +91,18 @@ def _two_units(reports: Sequence[QualityReport]) -> list[Finding]:
             if unit:
                 what = f"in '{recording}' {ratios[0]:.2g} times its usual size, its noise {ratios[1]:.2g} times: {unit}"
                 advice = "give that log a map of its own with the right unit"
-                found.append(Finding("warning", name, what, 1, recording, advice))
-    return found
+                findings.append(Finding("warning", name, what, 1, recording, advice))
+    return findings
 
 
 def _unit_ratio(kind: Kind, ratios: tuple[float, float]) -> str:
     """Which two units explain both ratios, empty where none do."""
-    known = [(name, unit.factor) for name, unit in UNITS.items() if kind in unit.kinds and not unit.offset]
-    for name, factor in known:
-        for other, base in known:
+    unit_factors = [(name, unit.factor) for name, unit in UNITS.items() if kind in unit.kinds and not unit.offset]
+    for name, factor in unit_factors:
+        for other, base in unit_factors:
             ratio = base / factor
             if max(ratio, 1 / ratio) < _LEAST_RATIO:
                 continue
-            if all(abs(math.log10(found / ratio)) < _NEAR_DECADES for found in ratios):
+            if all(abs(math.log10(observed_ratio / ratio)) < _NEAR_DECADES for observed_ratio in ratios):
                 return f"{name} read as {other}?"
     return ""

@@ -59,12 +59,12 @@ def look_into(
     """
     signal_map = signal_map or SignalMap()
     raw = open_log(path, signal_map)
-    wanted, problems = resolve(raw, signal_map)
+    sources, problems = resolve(raw, signal_map)
     findings = [Finding("error", None, str(problem)) for problem in problems]
     if not signal_map.channels and not signal_map.others:
         findings += _near_misses(raw)
     findings += _unit_clashes(raw, signal_map)
-    usable, more = _readable(wanted)
+    usable, more = _readable(sources)
     findings += more
     try:
         clocks = _clocks(raw, usable, signal_map)
@@ -92,12 +92,12 @@ def _changed(
     return [Finding("error", None, what, 1, "", advice)]
 
 
-def _clocks(raw: RawLog, wanted: list[ChannelSource], signal_map: SignalMap) -> list[tuple[str, Clock]]:
+def _clocks(raw: RawLog, sources: list[ChannelSource], signal_map: SignalMap) -> list[tuple[str, Clock]]:
     """Each distinct time column judged as it is in the file, under the name of its first channel."""
     if signal_map.sample_time_s is not None or raw.rate_hz is not None:
         return []
     seen: dict[int, tuple[str, Clock]] = {}
-    for entry in wanted:
+    for entry in sources:
         signal = entry.signal
         if signal is not None and signal.time_s is not None and id(signal.time_s) not in seen:
             seen[id(signal.time_s)] = (signal.name, judge(signal.time_s, f"'{raw.path}', time of '{signal.name}'"))
@@ -111,10 +111,10 @@ def _clock_facts(name: str, clock: Clock) -> ClockFacts:
     return ClockFacts(name, clock.rate_hz, clock.jitter, len(clock.gaps), longest, *counts)
 
 
-def _readable(wanted: list[ChannelSource]) -> tuple[list[ChannelSource], list[Finding]]:
+def _readable(sources: list[ChannelSource]) -> tuple[list[ChannelSource], list[Finding]]:
     """The channels whose columns can be read as numbers; a finding for each that cannot."""
     usable, findings = [], []
-    for entry in wanted:
+    for entry in sources:
         try:
             if entry.signal is not None:
                 entry.signal.load()
@@ -126,48 +126,48 @@ def _readable(wanted: list[ChannelSource]) -> tuple[list[ChannelSource], list[Fi
 
 def _near_misses(raw: RawLog) -> list[Finding]:
     """Columns that are not taken although their names nearly are in the vocabulary."""
-    found = []
+    findings = []
     for name in islice(raw.signals, _MOST_NAMES):
         if len(name) <= _LONGEST_MISS and name not in VOCABULARY and raw.signals[name].kind is None:
             hint = closest(name, VOCABULARY)
             if hint.startswith("; did you mean"):
                 what = f"column '{name}' is not taken{hint}"
-                found.append(Finding("warning", None, what, 1, "", "map it or rename it"))
-    return found
+                findings.append(Finding("warning", None, what, 1, "", "map it or rename it"))
+    return findings
 
 
 def _unit_clashes(raw: RawLog, signal_map: SignalMap) -> list[Finding]:
     """Units of the map that differ from the file's."""
-    found = []
+    findings = []
     for entry in signal_map.channels:
         stated = raw.signal(entry.column).unit if entry.column in raw else None
         if stated and entry.unit and stated != entry.unit:
             what = f"the map says {entry.unit}, the file says {stated}; the map's unit is used"
-            found.append(Finding("warning", entry.name, what, 1, "", "check which is right"))
-    return found
+            findings.append(Finding("warning", entry.name, what, 1, "", "check which is right"))
+    return findings
 
 
 def _time_findings(name: str, clock: Clock) -> list[Finding]:
     at = clock.stamps
-    found = []
+    findings = []
     if len(clock.falling):
         row = int(clock.falling[0])
         what = f"time goes back ('{name}')"
         where = f"row {row} (t = {at[row]:g} s)"
-        found.append(Finding("error", None, what, len(clock.falling), where, 'repair falling = "sort"'))
+        findings.append(Finding("error", None, what, len(clock.falling), where, 'repair falling = "sort"'))
     if len(clock.duplicates):
         row = int(clock.duplicates[0])
         what = f"duplicate time stamps ('{name}')"
         where = f"row {row} (t = {at[row]:g} s)"
-        found.append(Finding("error", None, what, len(clock.duplicates), where, 'repair duplicates = "last"'))
+        findings.append(Finding("error", None, what, len(clock.duplicates), where, 'repair duplicates = "last"'))
     if len(clock.gaps):
         row = int(clock.gaps[0])
         longest = float((at[clock.gaps + 1] - at[clock.gaps]).max())
         what = f"gaps in time ('{name}'), longest {longest:g} s"
         where = f"after row {row} (t = {at[row]:g} s)"
-        found.append(Finding("error", None, what, len(clock.gaps), where, 'repair gaps = "hold" or "cut"'))
+        findings.append(Finding("error", None, what, len(clock.gaps), where, 'repair gaps = "hold" or "cut"'))
     if not clock.uniform:
         what = f"time steps are not uniform ('{name}'): rms {clock.jitter:.3g} of a step, median {clock.step_s:g} s"
         advice = f"rows are resampled causally to {clock.rate_hz:g} Hz; set rate_hz for another rate"
-        found.append(Finding("note", None, what, len(at), "", advice))
-    return found
+        findings.append(Finding("note", None, what, len(at), "", advice))
+    return findings

@@ -87,9 +87,9 @@ def _is_busy(same: NDArray[np.bool_], at_end: NDArray[np.bool_]) -> bool:
     """Few equal neighbours away from the ends of the range, runs of ten and more left out, and few of those."""
     starts, stops = runs(same & ~at_end)
     lengths = stops - starts
-    held = int(lengths[lengths >= _HELD].sum())
-    moving = len(same) - int(at_end.sum()) - held
-    return held <= _BUSY_HELD * len(same) and int(lengths.sum()) - held < _BUSY_REPEATS * moving
+    constant_samples = int(lengths[lengths >= _HELD].sum())
+    moving = len(same) - int(at_end.sum()) - constant_samples
+    return constant_samples <= _BUSY_HELD * len(same) and int(lengths.sum()) - constant_samples < _BUSY_REPEATS * moving
 
 
 def quantum(values: Values) -> tuple[float | None, int]:

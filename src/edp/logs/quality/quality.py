@@ -129,12 +129,12 @@ def inspect(
     """
     findings = list(extra)
     facts = []
-    for place, channel in enumerate(recording.channels):
-        looked = look_at(channel, recording.values[:, place], recording.rate_hz)
-        found = [finding for check in CHECKS for finding in check(looked)]
+    for channel_index, channel in enumerate(recording.channels):
+        looked = look_at(channel, recording.values[:, channel_index], recording.rate_hz)
+        of_channel = [finding for check in CHECKS for finding in check(looked)]
         own = [finding for finding in extra if finding.channel == channel.name]
-        facts.append(_facts(looked, verdict_of([*found, *own])))
-        findings += found
+        facts.append(_facts(looked, verdict_of([*of_channel, *own])))
+        findings += of_channel
     findings += copies(recording)
     return QualityReport(
         recording.name,
@@ -161,7 +161,7 @@ def plain(value: Any) -> Any:
 
 
 def _facts(looked: Looked, verdict: str) -> ChannelFacts:
-    channel, good, found = looked.channel, looked.good, looked.measures
+    channel, good, measures = looked.channel, looked.good, looked.measures
     unit = KINDS[channel.kind].report_unit
     nan = float("nan")
     low, high, mean, std = nan, nan, nan, nan
@@ -169,7 +169,7 @@ def _facts(looked: Looked, verdict: str) -> ChannelFacts:
         sums = good.astype(np.float64)
         low, high, mean = (in_report_unit(channel, float(x)) for x in (good.min(), good.max(), sums.mean()))
         std = 0.0 if looked.constant else size_in_report_unit(channel, float(sums.std()))
-    noise = size_in_report_unit(channel, found.noise)
+    noise = size_in_report_unit(channel, measures.noise)
     return ChannelFacts(
         channel.name,
         str(channel.kind),
@@ -180,12 +180,12 @@ def _facts(looked: Looked, verdict: str) -> ChannelFacts:
         std,
         looked.samples - len(good),
         looked.constant,
-        None if found.quantum is None else size_in_report_unit(channel, found.quantum),
-        found.levels,
+        None if measures.quantum is None else size_in_report_unit(channel, measures.quantum),
+        measures.levels,
         noise,
         20.0 * math.log10(std / noise) if noise > 0 and std > 0 else None,
-        looked.rate_hz / found.every,
+        looked.rate_hz / measures.every,
         looked.stuck_samples / looked.rate_hz,
-        found.at_low + found.at_high,
+        measures.at_low + measures.at_high,
         verdict,
     )

@@ -109,18 +109,18 @@ def sketch(recording: Recording, name: str | None = None) -> Sketch:
     hz = min(SKETCH_HZ, rate)
     blocks = max(int(recording.samples * hz / rate), 1)
     starts = np.minimum(np.ceil(np.arange(blocks) * rate / hz - 1e-9).astype(np.intp), recording.samples - 1)
-    made = np.empty((blocks, len(recording.channels)), dtype=np.float32)
+    block_means = np.empty((blocks, len(recording.channels)), dtype=np.float32)
     counts = np.diff(np.append(starts, recording.samples))
-    for place in range(len(recording.channels)):
-        values = recording.values[:, place].astype(np.float64)
+    for channel_index in range(len(recording.channels)):
+        values = recording.values[:, channel_index].astype(np.float64)
         good = np.isfinite(values)
         mean = float(values[good].mean()) if good.any() else 0.0
         values = np.where(good, values - mean, 0.0)
         coarse = np.add.reduceat(values, starts) / np.maximum(counts, 1)
         std = float(coarse.std())
-        made[:, place] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
+        block_means[:, channel_index] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
     digest = hashlib.blake2b(np.ascontiguousarray(recording.values).tobytes(), digest_size=16).hexdigest()
-    return Sketch(name or recording.name, recording.channel_names, made, hz, digest)
+    return Sketch(name or recording.name, recording.channel_names, block_means, hz, digest)
 
 
 def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
@@ -129,13 +129,13 @@ def find_repeats(sketches: Sequence[Sketch]) -> tuple[Repeat, ...]:
     Recordings shorter than 12.8 s are compared by their samples alone. A pair counts where at least two windows agree
     (correlation above 0.98 in at least half of the channels that move), at one lag.
     """
-    found = {pair: _identical(*(sketches[i] for i in pair)) for pair in _equal_pairs(sketches)}
+    repeats_by_pair = {pair: _identical(*(sketches[i] for i in pair)) for pair in _equal_pairs(sketches)}
     for pair, lag in _candidates(sketches).items():
-        if pair not in found:
+        if pair not in repeats_by_pair:
             repeat = _checked(sketches[pair[0]], sketches[pair[1]], lag)
             if repeat is not None:
-                found[pair] = repeat
-    return tuple(sorted(found.values(), key=lambda repeat: -repeat.seconds))
+                repeats_by_pair[pair] = repeat
+    return tuple(sorted(repeats_by_pair.values(), key=lambda repeat: -repeat.seconds))
 
 
 def _equal_pairs(sketches: Sequence[Sketch]) -> list[tuple[int, int]]:
@@ -160,8 +160,8 @@ def _candidates(sketches: Sequence[Sketch]) -> dict[tuple[int, int], int]:
     labels: list[NDArray[np.int64]] = []
     chosen = _telling(sketches)
     for i in long:
-        for place in chosen[i]:
-            marks, places = _fingerprints(sketches[i].values[:, place])
+        for window_index in chosen[i]:
+            marks, places = _fingerprints(sketches[i].values[:, window_index])
             prints.append(marks)
             labels.append(np.stack([np.full(len(places), i), places], axis=1))
     marks, owners = np.concatenate(prints), np.concatenate(labels)
@@ -187,9 +187,9 @@ def _voted(mine: NDArray[np.int64], theirs: NDArray[np.int64]) -> dict[tuple[int
     best: dict[tuple[int, int], tuple[int, int, int]] = {}
     for k in np.flatnonzero(both >= _LEAST_VOTES).tolist():
         i, j, lag = (int(value) for value in votes[k])
-        found = (int(both[k]), int(counts[k]), lag)
-        if found[:2] > best.get((i, j), (0, 0, 0))[:2]:
-            best[i, j] = found
+        vote = (int(both[k]), int(counts[k]), lag)
+        if vote[:2] > best.get((i, j), (0, 0, 0))[:2]:
+            best[i, j] = vote
     return {pair: lag for pair, (_, _, lag) in best.items()}
 
 
@@ -206,13 +206,13 @@ def _telling(sketches: Sequence[Sketch]) -> list[list[int]]:
     for entry, shares in zip(sketches, lively):
         for name, share in zip(entry.channels, shares):
             total[name] = total.get(name, 0.0) + share
-    made = []
+    telling = []
     for entry, shares in zip(sketches, lively):
         places = range(len(entry.channels))
-        common = sorted(places, key=lambda place: (-total[entry.channels[place]], entry.channels[place]))
-        own = sorted(places, key=lambda place: -shares[place])
-        made.append(list(dict.fromkeys([*common[:_CHANNELS], *own[:own_count]])))
-    return made
+        common = sorted(places, key=lambda i: (-total[entry.channels[i]], entry.channels[i]))
+        own = sorted(places, key=lambda i: -shares[i])
+        telling.append(list(dict.fromkeys([*common[:_CHANNELS], *own[:own_count]])))
+    return telling
 
 
 def _lively(entry: Sketch) -> list[float]:
@@ -229,10 +229,10 @@ def _fingerprints(values: Floats) -> tuple[Floats, NDArray[np.int64]]:
     basis = np.cos(np.outer(phase, order)) * np.sqrt(2.0 / WINDOW)
     marks = windows @ basis.astype(np.float32)
     # The channel's own deviation is one.
-    kept = np.flatnonzero(np.linalg.norm(marks, axis=1) > _MOVES * WINDOW**0.5)
+    moving_windows = np.flatnonzero(np.linalg.norm(marks, axis=1) > _MOVES * WINDOW**0.5)
     # Slow parts are large in every motion: as in a derivative, faster ones count for more.
-    marks = marks[kept] * order.astype(np.float32)
-    return marks / np.linalg.norm(marks, axis=1, keepdims=True), kept
+    marks = marks[moving_windows] * order.astype(np.float32)
+    return marks / np.linalg.norm(marks, axis=1, keepdims=True), moving_windows
 
 
 def _checked(a: Sketch, b: Sketch, lag: int) -> Repeat | None:
@@ -276,8 +276,8 @@ def _judged(
         return None
     hit = np.flatnonzero(same)
     compared = moves[hit].any(axis=0)
-    kept = agree[hit].sum(axis=0) >= 0.5 * np.maximum(moves[hit].sum(axis=0), 1)
-    if kept.sum() < max(_LEAST_SHARE * compared.sum(), 1):
+    agreeing_pairs = agree[hit].sum(axis=0) >= 0.5 * np.maximum(moves[hit].sum(axis=0), 1)
+    if agreeing_pairs.sum() < max(_LEAST_SHARE * compared.sum(), 1):
         return None
     begins = start + int(hit[0]) * WINDOW
     ends = start + (int(hit[-1]) + 1) * WINDOW
@@ -289,7 +289,9 @@ def _judged(
     apart = int((moving[hit[0] : hit[-1] + 1] > 0).sum()) - len(hit)
     shared = ends - begins - apart * WINDOW
     renamed = tuple(
-        (a.channels[i], b.channels[j]) for (i, j), held in zip(pairs, kept) if held and a.channels[i] != b.channels[j]
+        (a.channels[i], b.channels[j])
+        for (i, j), agrees in zip(pairs, agreeing_pairs)
+        if agrees and a.channels[i] != b.channels[j]
     )
     return Repeat(
         a.name,
@@ -298,7 +300,7 @@ def _judged(
         min(1.0, shared / min(len(a.values), len(b.values))),
         begins / a.hz,
         (begins + lag) / b.hz,
-        int((kept & compared).sum()),
+        int((agreeing_pairs & compared).sum()),
         int(compared.sum()),
         float(np.median(alike[hit][agree[hit]])),
         renamed,
@@ -327,8 +329,8 @@ def _pairs(a: Sketch, b: Sketch, rows: slice, lag: int) -> list[tuple[int, int]]
 
 def _windows(values: Floats) -> NDArray[np.float64]:
     """Shape ``(window, sample, channel)``, each window about its mean."""
-    made = values.reshape(-1, WINDOW, values.shape[1]).astype(np.float64)
-    return made - made.mean(axis=1, keepdims=True)
+    windows = values.reshape(-1, WINDOW, values.shape[1]).astype(np.float64)
+    return windows - windows.mean(axis=1, keepdims=True)
 
 
 def _alike(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -84,12 +84,12 @@ class _Bridge(Streaming):
         query, key, value = self.project(self.norm_attention(x)).chunk(3, dim=-1)
         keys, values = torch.cat([state[0], key], dim=1), torch.cat([state[1], value], dim=1)
         hidden = torch.cat([state[2], x.new_zeros(len(x), ticks)], dim=1)
-        found = []
+        attended = []
         for start in range(0, ticks, BLOCK):
             stop = min(start + BLOCK, ticks)
             seen = slice(start, stop + self.window - 1)
-            found.append(self._attend(query[:, start:stop], keys[:, seen], values[:, seen], hidden[:, seen]))
-        y = x + self.gather(torch.cat(found, dim=1))
+            attended.append(self._attend(query[:, start:stop], keys[:, seen], values[:, seen], hidden[:, seen]))
+        y = x + self.gather(torch.cat(attended, dim=1))
         y = y + self.narrow(functional.gelu(self.widen(self.norm_feed(y))))
         return y, (keys[:, ticks:], values[:, ticks:], hidden[:, ticks:])
 

@@ -63,11 +63,11 @@ class _Parallel(Streaming):
         return torch.cat([y for y, _ in results], dim=-1), tuple(new for _, new in results)
 
     def lower(self, build: Builder, x: str) -> str:
-        made = []
+        branch_values = []
         for number, branch in enumerate(self._streams(), start=1):
             with build.inside(f"scale{number}"):
-                made.append(branch.lower(build, x))
-        return build.join("scales", *made)
+                branch_values.append(branch.lower(build, x))
+        return build.join("scales", *branch_values)
 
     def costs(self) -> list[Cost]:
         return [cost for branch in self._streams() for cost in branch.costs()]

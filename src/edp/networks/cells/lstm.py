@@ -107,8 +107,8 @@ def zoneout_share(projected: Tensor, units: int, rate: float, training: bool) ->
         return 1.0 - rate
     ticks, batch = projected.shape[:2]
     draws = torch.rand(2, ticks, batch, units, dtype=projected.dtype, device=projected.device)
-    taken = (draws >= rate).to(projected.dtype)
-    return taken[0], taken[1]
+    update_mask = (draws >= rate).to(projected.dtype)
+    return update_mask[0], update_mask[1]
 
 
 def lstm_costs(name: str, width: int, units: int, parameters: int) -> list[Cost]:

@@ -97,7 +97,7 @@ class _Steps(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_h: Tensor, grad_c: Tensor) -> tuple[Tensor | None, ...]:
-        recurrent, gain, c_gain, hs, cs, fresh_cs, gates, squashed, *held = ctx.saved_tensors
+        recurrent, gain, c_gain, hs, cs, fresh_cs, gates, squashed, *norm_tensors = ctx.saved_tensors
         ticks, batch, units = squashed.shape
         by_c, by_o, through, f, grad = (
             values.unbind(0) for values in (*_derivatives(gates, squashed, cs), gates.chunk(4, dim=2)[2], grad_h)
@@ -105,7 +105,7 @@ class _Steps(torch.autograd.Function):
         grads = torch.empty_like(gates)
         whole, to_o = grads.unbind(0), grads[..., :units].unbind(0)
         to_c = grads.view(ticks, batch, 4, units)[:, :, 1:].unbind(0)
-        norms = None if gain is None else _NormsBackward(gain, c_gain, held, fresh_cs)
+        norms = None if gain is None else _NormsBackward(gain, c_gain, norm_tensors, fresh_cs)
         keep = _each(ctx.share, ticks)
         dh, dc = grad[-1], grad_c
         for t in range(ticks - 1, -1, -1):
@@ -170,8 +170,8 @@ class _Norms:
 class _NormsBackward:
     """Gradients through the two layer norms, from the last tick to the first."""
 
-    def __init__(self, gain: Tensor, c_gain: Tensor, held: Sequence[Tensor], cs: Tensor) -> None:
-        sums, mean, scale, c_mean, c_scale = held
+    def __init__(self, gain: Tensor, c_gain: Tensor, norm_tensors: Sequence[Tensor], cs: Tensor) -> None:
+        sums, mean, scale, c_mean, c_scale = norm_tensors
         self.gain, self.c_gain = gain, c_gain
         self.normed, self.c_normed = (sums - mean) * scale, (cs - c_mean) * c_scale
         self.of_sums = [values.unbind(0) for values in (sums, mean, scale)]
@@ -201,7 +201,7 @@ class _NormsBackward:
 def _norm_backward(grad: Tensor, seen: Sequence[Sequence[Tensor]], t: int, gain: Tensor) -> Tensor:
     """Gradient by the input of a layer norm at tick t; `seen` are inputs, means and scales of all ticks."""
     x, mean, scale = (values[t] for values in seen)
-    made: tuple[Tensor, ...] = torch.ops.aten.native_layer_norm_backward(
+    gradients: tuple[Tensor, ...] = torch.ops.aten.native_layer_norm_backward(
         grad, x, [x.shape[1]], mean, scale, gain, None, [True, False, False]
     )
-    return made[0]
+    return gradients[0]

@@ -21,8 +21,8 @@ def linear_scan(a: Tensor, b: Tensor, start: Tensor) -> Tensor:
     Returns:
         h, ``(time, batch, unit)``.
     """
-    made: Tensor = _Scan.apply(a, b, start)  # type: ignore[no-untyped-call]
-    return made
+    states: Tensor = _Scan.apply(a, b, start)  # type: ignore[no-untyped-call]
+    return states
 
 
 class _Scan(torch.autograd.Function):

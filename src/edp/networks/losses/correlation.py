@@ -41,8 +41,8 @@ class Correlation:
         count = course.valid.sum().clamp(min=1)
 
         def centred(x: Tensor) -> Tensor:
-            kept = torch.where(mask, x, 0.0)
-            return torch.where(mask, kept - kept.sum(dim=(0, 1)) / count, 0.0)
+            masked = torch.where(mask, x, 0.0)
+            return torch.where(mask, masked - masked.sum(dim=(0, 1)) / count, 0.0)
 
         p, y = centred(course.predicted), centred(course.target)
         spread_p, spread_y = p.square().sum(dim=(0, 1)) / count, y.square().sum(dim=(0, 1)) / count

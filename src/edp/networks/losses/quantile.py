@@ -26,7 +26,7 @@ class Quantile:
         below = target - answer.center
         total = below.abs()
         beyond = below.unsqueeze(-2) - answer.spread
-        for place, level in enumerate(answer.levels):
-            u = beyond[..., place, :]
+        for level_index, level in enumerate(answer.levels):
+            u = beyond[..., level_index, :]
             total = total + 2.0 * torch.maximum(level * u, (level - 1.0) * u)
         return total / (1 + len(answer.levels))

@@ -33,8 +33,8 @@ class Course:
         """``(stream, time - ticks + 1)``: where `ticks` consecutive ones all count."""
         last = self.valid.shape[1] - ticks + 1
         whole = self.valid[:, :last]
-        for place in range(1, ticks):
-            whole = whole & self.valid[:, place : last + place]
+        for tick in range(1, ticks):
+            whole = whole & self.valid[:, tick : last + tick]
         return whole
 
 

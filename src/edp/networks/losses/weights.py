@@ -23,7 +23,7 @@ def output_weights(sigma: Tensor, power: float) -> Tensor:
 
 def horizon_weights(horizons: int, decay: float) -> Tensor:
     """Weights ``(horizon, 1)`` proportional to ``decay^i`` for the i-th horizon, i from 0, with mean one."""
-    weights = torch.tensor([decay**place for place in range(horizons)], dtype=torch.float64)
+    weights = torch.tensor([decay**horizon_index for horizon_index in range(horizons)], dtype=torch.float64)
     return (weights / weights.mean()).float().unsqueeze(-1)
 
 

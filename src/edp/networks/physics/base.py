@@ -102,20 +102,20 @@ class PhysicsSpec(ABC):
 class PhysicsBase(Streaming):
     """Inputs ``(batch, time, input)`` in SI units to velocities ``(batch, time, horizon, target)`` in m/s.
 
-    `known` is 1 for the targets that are cylinder velocities and 0 for others, of which the base says nothing. State:
-    the strokes of the tick before and whether there was one, where strokes tell the pose; else none.
+    `is_velocity` is 1 for the targets that are cylinder velocities and 0 for others, which the base does not predict.
+    State: the strokes of the tick before and whether there was one, where strokes tell the pose; else none.
     """
 
-    known: Tensor
+    is_velocity: Tensor
 
     def __init__(self, spec: PhysicsSpec, task: Task) -> None:
         super().__init__()
         self.spec, self.task, self.rate_hz = spec, task, task.rate_hz
         self.columns = {name: task.inputs.index(name) for name in spec.channels()}
-        # Targets that are no cylinder velocity take any column; `known` takes them out.
+        # Targets that are no cylinder velocity take any column; `is_velocity` takes them out.
         self.order = [SPEEDS.index(target) if target in SPEEDS else 0 for target in task.targets]
-        known = torch.tensor([float(target in SPEEDS) for target in task.targets])
-        self.register_buffer("known", known, persistent=False)
+        is_velocity = torch.tensor([float(target in SPEEDS) for target in task.targets])
+        self.register_buffer("is_velocity", is_velocity, persistent=False)
         self.geometry = Geometry()
         self.operations = frozenset({Operation.SQRT, *((Operation.SINE,) if spec.pose == "angles" else ())})
 
@@ -135,12 +135,12 @@ class PhysicsBase(Streaming):
         pose = self.geometry.at_strokes(0.5 * self.geometry.axis("STROKE"))
         middle = torch.atan2(pose.sine, pose.cosine).tolist()
         stroke = self.geometry.axis("STROKE").tolist()
-        found = dict.fromkeys(SPEEDS, (0.0, SPEED)) | dict.fromkeys((*HEADS, *RODS), PRESSURE)
+        ranges = dict.fromkeys(SPEEDS, (0.0, SPEED)) | dict.fromkeys((*HEADS, *RODS), PRESSURE)
         for i in range(AXES):
-            found[POSES["angles"][i]] = (middle[i], ANGLE)
-            found[POSES["angles"][AXES + i]] = (0.0, RATE)
-            found[POSES["strokes"][i]] = (0.5 * stroke[i], 0.25 * stroke[i])
-        return {name: found[name] for name in self.columns}
+            ranges[POSES["angles"][i]] = (middle[i], ANGLE)
+            ranges[POSES["angles"][AXES + i]] = (0.0, RATE)
+            ranges[POSES["strokes"][i]] = (0.5 * stroke[i], 0.25 * stroke[i])
+        return {name: ranges[name] for name in self.columns}
 
     def take(self, x: Tensor, names: Sequence[str]) -> Tensor:
         """Input columns by name."""
@@ -201,8 +201,8 @@ class PhysicsBase(Streaming):
                 value = build.add(Difference, "speed", strokes.value, factor=factor, from_zero=False)  # type: ignore[attr-defined]
                 speed = Symbol(build, value, (AXES,))  # type: ignore[assignment]
                 rate = speed * inverse(pose.lever)
-            found = self.ahead(inputs, pose, rate, speed)[..., self.order]  # type: ignore[arg-type]
-            return build.join("ahead", found.value)  # type: ignore[attr-defined]
+            velocities = self.ahead(inputs, pose, rate, speed)[..., self.order]  # type: ignore[arg-type]
+            return build.join("ahead", velocities.value)  # type: ignore[attr-defined]
 
     def costs(self) -> list[Cost]:
         count = (52 if self.spec.pose == "angles" else 101) + AXES + self.arithmetic()

@@ -116,8 +116,8 @@ class Dynamic(PhysicsBase):
         if self.spec.load != "all":
             return torque
         most = self.geometry.axis("STATIC") * pose.lever.abs()
-        held = self.standing(speed) * torch.minimum(torch.maximum(torque, -most), most)
-        return (torque - held - self.sliding(pose, speed)) * (1.0 - self.stopped(pose, torque))
+        friction = self.standing(speed) * torch.minimum(torch.maximum(torque, -most), most)
+        return (torque - friction - self.sliding(pose, speed)) * (1.0 - self.stopped(pose, torque))
 
     def torque_arithmetic(self) -> int:
         """Arithmetic of `net_torque`."""

@@ -74,10 +74,10 @@ class Symbol:
         if self._factors is not None and (np.abs(gain) == 1).all():
             # A product to which something is added, or whose sign is turned, is one layer; it rounds alike.
             value, gain = self._factors[0], self._factors[1] * gain
-        made = self.layer(ScaleShift, "scaled", value, shape=self.shape, gain=gain, shift=shift)
+        scaled = self.layer(ScaleShift, "scaled", value, shape=self.shape, gain=gain, shift=shift)
         if not shift.any():
-            made._factors = value, gain
-        return made
+            scaled._factors = value, gain
+        return scaled
 
     def __getitem__(self, key: Any) -> Symbol:
         if not (isinstance(key, tuple) and len(key) == 2 and key[0] is Ellipsis):
@@ -164,9 +164,9 @@ def _both(kind: type, a: Symbol, b: Symbol) -> Symbol:
 
 def _meet(a: Any, b: Any) -> tuple[Symbol, np.ndarray]:
     """The one that is a value and the other one's numbers, in their common shape."""
-    known, value = (_array(b), a) if isinstance(a, Symbol) else (_array(a), b)
-    shape = np.broadcast_shapes(value.shape, known.shape)
-    return value.spread(shape), np.broadcast_to(known, shape)
+    constant, value = (_array(b), a) if isinstance(a, Symbol) else (_array(a), b)
+    shape = np.broadcast_shapes(value.shape, constant.shape)
+    return value.spread(shape), np.broadcast_to(constant, shape)
 
 
 def _constant(like: Symbol, numbers: np.ndarray) -> Symbol:
@@ -178,35 +178,35 @@ def add(a: Any, b: Any) -> Symbol:
     """Sum, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(Add, a, b)
-    value, known = _meet(a, b)
-    return value.affine(1.0, known)
+    value, constant = _meet(a, b)
+    return value.affine(1.0, constant)
 
 
 def subtract(a: Any, b: Any) -> Symbol:
     """Difference, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(Subtract, a, b)
-    value, known = _meet(a, b)
-    return value.affine(1.0, -known) if isinstance(a, Symbol) else value.affine(-1.0, known)
+    value, constant = _meet(a, b)
+    return value.affine(1.0, -constant) if isinstance(a, Symbol) else value.affine(-1.0, constant)
 
 
 def multiply(a: Any, b: Any) -> Symbol:
     """Product, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(Multiply, a, b)
-    value, known = _meet(a, b)
-    return value.affine(known, 0.0)
+    value, constant = _meet(a, b)
+    return value.affine(constant, 0.0)
 
 
 def divide(a: Any, b: Any) -> Symbol:
     """Quotient, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(Divide, a, b)
-    value, known = _meet(a, b)
+    value, constant = _meet(a, b)
     if isinstance(b, Symbol):
-        return _both(Divide, _constant(value, known), value)
-    known, zero = known.ravel(), np.zeros(known.size, np.float32)
-    return value.layer(Standardise, "divided", value.value, shape=value.shape, offset=zero, scale=known)
+        return _both(Divide, _constant(value, constant), value)
+    constant, zero = constant.ravel(), np.zeros(constant.size, np.float32)
+    return value.layer(Standardise, "divided", value.value, shape=value.shape, offset=zero, scale=constant)
 
 
 def maximum(a: Any, b: Any) -> Symbol:
@@ -217,8 +217,8 @@ def maximum(a: Any, b: Any) -> Symbol:
 def _extreme(kind: type, a: Any, b: Any) -> Symbol:
     if isinstance(a, Symbol) and isinstance(b, Symbol):
         return _both(kind, a, b)
-    value, known = _meet(a, b)
-    return _both(kind, value, _constant(value, known))
+    value, constant = _meet(a, b)
+    return _both(kind, value, _constant(value, constant))
 
 
 def positive(a: Symbol) -> Symbol:
@@ -234,8 +234,8 @@ def sign(a: Symbol) -> Symbol:
 def stack(parts: Sequence[Any], dim: int = 0) -> Symbol:
     """Single numbers as the last dimension, some of them known."""
     like = next(part for part in parts if isinstance(part, Symbol))
-    made = [part if isinstance(part, Symbol) else _constant(like, _array(part)) for part in parts]
-    return Symbol(like.build, like.build.join("stacked", *(part.value for part in made)), (len(made),))
+    symbols = [part if isinstance(part, Symbol) else _constant(like, _array(part)) for part in parts]
+    return Symbol(like.build, like.build.join("stacked", *(part.value for part in symbols)), (len(symbols),))
 
 
 FUNCTIONS: dict[str, Callable[..., Any]] = {

@@ -72,8 +72,10 @@ class Aprbs(Excitation):
         if choice == 8:
             return 0.0
         sign = 1.0 if self._rng.random() < extend_probability(stroke, 2.0) else -1.0
-        place = choice % 4
-        return sign * (self.TOP[axis] if place == 3 else self.LEVELS[place] * self._dead[axis, 0 if sign > 0 else 1])
+        level_index = choice % 4
+        return sign * (
+            self.TOP[axis] if level_index == 3 else self.LEVELS[level_index] * self._dead[axis, 0 if sign > 0 else 1]
+        )
 
     def _begin_chirp(self, view: View) -> None:
         rng = self._rng

@@ -169,14 +169,14 @@ def check_machine(machine: Machine, where: str) -> None:
         ConfigError: a value is out of bounds, or the linkage is impossible.
     """
     for section, key, kind, value in _leaves(machine):
-        place = f"machine file {where}{f' [{section}]' if section else ''}: {key}"
+        where_key = f"machine file {where}{f' [{section}]' if section else ''}: {key}"
         if kind in ("Rating", "Ratings"):
-            _check_ratings(value, key, place)
+            _check_ratings(value, key, where_key)
         elif kind == "str":
             if key == "flow_sharing" and value not in FLOW_SHARING:
-                raise ConfigError(f"{place} = {value!r} must be one of {', '.join(FLOW_SHARING)}")
+                raise ConfigError(f"{where_key} = {value!r} must be one of {', '.join(FLOW_SHARING)}")
         else:
-            _check_numbers(value, BOUNDS.get(f"{section}.{key}" if section else key, ANY), place)
+            _check_numbers(value, BOUNDS.get(f"{section}.{key}" if section else key, ANY), where_key)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", machine.name):
         raise ConfigError(
             f"machine file {where}: name = {machine.name!r} must be letters, digits, - and _: recordings carry it"
@@ -198,30 +198,30 @@ def _leaves(machine: Machine) -> Iterator[tuple[str, str, str, Any]]:
             yield "", field.name, str(field.type), value
 
 
-def _check_numbers(value: float | tuple[float, ...], bound: ParameterBound, place: str) -> None:
+def _check_numbers(value: float | tuple[float, ...], bound: ParameterBound, where_key: str) -> None:
     """A number, or every number of a list."""
     if isinstance(value, tuple):
         labels = CYLINDERS if len(value) == len(CYLINDERS) else range(len(value))
         for label, entry in zip(labels, value, strict=True):
-            _check_number(entry, bound, f"{place}[{label}]")
+            _check_number(entry, bound, f"{where_key}[{label}]")
     else:
-        _check_number(value, bound, place)
+        _check_number(value, bound, where_key)
 
 
-def _check_number(value: float, bound: ParameterBound, place: str) -> None:
+def _check_number(value: float, bound: ParameterBound, where_key: str) -> None:
     if not math.isfinite(value) or not bound.holds(value):
-        raise ConfigError(f"{place} = {value!r} must be {bound if bound is not ANY else 'finite'}")
+        raise ConfigError(f"{where_key} = {value!r} must be {bound if bound is not ANY else 'finite'}")
 
 
-def _check_ratings(value: Rating | Ratings, key: str, place: str) -> None:
+def _check_ratings(value: Rating | Ratings, key: str, where_key: str) -> None:
     """A rating, or one of each cylinder."""
     if isinstance(value[0], tuple):
         for name, rating in zip(CYLINDERS, value, strict=True):
-            _check_ratings(rating, key, f"{place}[{name}]")
+            _check_ratings(rating, key, f"{where_key}[{name}]")
         return
     flow, pressure = value
-    _check_number(flow, POSITIVE if key in FLOWING else NOT_NEGATIVE, f"{place}, flow in L/min,")
-    _check_number(pressure, POSITIVE, f"{place}, pressure in bar,")
+    _check_number(flow, POSITIVE if key in FLOWING else NOT_NEGATIVE, f"{where_key}, flow in L/min,")
+    _check_number(pressure, POSITIVE, f"{where_key}, pressure in bar,")
 
 
 def _check_pairs(machine: Machine, where: str) -> None:
@@ -274,18 +274,20 @@ def _check_triangle(axis: int, axes: Any, plant: Any, where: str) -> None:
 
 def _check_bucket(axes: Any, plant: Any, where: str) -> None:
     closed, stroke = float(axes[2, at.CLOSED]), float(axes[2, at.STROKE])
-    place = f"machine file {where} [bucket_linkage]"
+    where_table = f"machine file {where} [bucket_linkage]"
     psi, length = linkage.bucket_branch(closed, closed + stroke, plant)
     if not len(psi):
         raise ConfigError(
-            f"{place}: rocker = {plant[at.ROCKER]:g} m and link = {plant[at.LINK]:g} m cannot close the loop between "
+            f"{where_table}: rocker = {plant[at.ROCKER]:g} m and link = {plant[at.LINK]:g} m cannot close the "
+            "loop between "
             f"rocker pivot and lug = {plant[at.LUG]:g} m at any bucket angle; rocker + link must be longer than the "
             "pins are apart, |rocker - link| shorter"
         )
     if length[0] < closed + stroke or length[-1] > closed:
         low, high = np.degrees((psi[0], psi[-1]))
         raise ConfigError(
-            f"{place}: closed_length = {closed:g} m with stroke[bucket] = {stroke:g} m needs pins from {closed:g} to "
+            f"{where_table}: closed_length = {closed:g} m with stroke[bucket] = {stroke:g} m needs pins from "
+            f"{closed:g} to "
             f"{closed + stroke:.4g} m apart; this linkage gives {length[-1]:.4g} to {length[0]:.4g} m (bucket angles "
             f"{low:.0f} to {high:.0f} deg) before it cannot close or turns over; change closed_length, stroke, rocker "
             "or link"
@@ -305,10 +307,10 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
     worst = int(np.argmin(levers))
     least = LEAST_LEVER * float(axes[axis, at.STROKE])
     if not levers[worst] >= least:
-        found = f"{levers[worst]:.3f} m/rad" if math.isfinite(levers[worst]) else "none, the loop cannot close"
+        lever_text = f"{levers[worst]:.3f} m/rad" if math.isfinite(levers[worst]) else "none, the loop cannot close"
         raise ConfigError(
             f"machine file {where} [{table}]: the lever arm of the {name} cylinder at joint angle "
-            f"{math.degrees(psi[worst]):.0f} deg is {found}; from 4 deg below to 4 deg above the working range "
+            f"{math.degrees(psi[worst]):.0f} deg is {lever_text}; from 4 deg below to 4 deg above the working range "
             f"({math.degrees(low):.0f} to {math.degrees(high):.0f} deg) it must keep its sign and be at least "
             f"{least:.3f} m/rad ({LEAST_LEVER:g} of the stroke); change the pins, closed_length or stroke"
         )

@@ -58,24 +58,24 @@ def _built_in(name: str) -> Machine:
     member = _member(name)
     if member is not None:
         return family_member(*member)
-    known = machine_names()
-    if name not in known:
-        raise ConfigError(f"unknown machine '{name}'{closest(name, known)}; or give the path of a .toml file")
+    names = machine_names()
+    if name not in names:
+        raise ConfigError(f"unknown machine '{name}'{closest(name, names)}; or give the path of a .toml file")
     source = resources.files("edp.sim").joinpath("machines").joinpath(f"{name.lower()}.toml")
     return parse_machine(source.read_text(encoding="utf-8"), source.name)
 
 
 def _member(name: str) -> tuple[int, int, float, float, float] | None:
     """Seed, index, range of masses (t) and scatter of a machine of a family, by its name; None for any other."""
-    found = FAMILY.fullmatch(name.upper())
-    if found is None:
+    match = FAMILY.fullmatch(name.upper())
+    if match is None:
         return None
     usual = (*MASSES_T, 1.0)
     low, high, scatter = (
         middle if text is None else float(text.replace("P", "."))
-        for text, middle in zip(found.group(3, 4, 5), usual, strict=True)
+        for text, middle in zip(match.group(3, 4, 5), usual, strict=True)
     )
-    return int(found[1]), int(found[2]), low, high, scatter
+    return int(match[1]), int(match[2]), low, high, scatter
 
 
 def known_mass(name: str) -> float | None:

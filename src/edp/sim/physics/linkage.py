@@ -76,10 +76,10 @@ def bucket_closes(psi: Array, plant: Array) -> NDArray[np.bool_]:
 
 
 @compiled
-def _tabulate(psi: Array, wanted: NDArray[np.bool_], plant: Array, length: Array, lever: Array) -> None:
+def _tabulate(psi: Array, selected: NDArray[np.bool_], plant: Array, length: Array, lever: Array) -> None:
     """The bucket cylinder's length and lever arm at the wanted angles."""
     for k in range(psi.shape[0]):
-        if wanted[k]:
+        if selected[k]:
             length[k], lever[k] = cylinder(2, psi[k], plant)
 
 

@@ -63,20 +63,20 @@ def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Arr
     part = step_s / PARTS
     for i in range(force.shape[1]):
         half = 0.5 * width[i]
-        place = -half if force[0, i] >= 0.0 else half
+        pin_offset = -half if force[0, i] >= 0.0 else half
         speed = 0.0
         out[0, i] = 0.0
         for k in range(1, force.shape[0]):
-            before = place
+            before = pin_offset
             for n in range(PARTS):
                 share = (n + 0.5) / PARTS
                 pull = force[k - 1, i] + share * (force[k, i] - force[k - 1, i])
                 speed = (speed - pull / mass[k, i] * part) / (1.0 + FILM / mass[k, i] * part)
-                place += speed * part
-                if abs(place) >= half:
-                    place = half if place > 0.0 else -half
+                pin_offset += speed * part
+                if abs(pin_offset) >= half:
+                    pin_offset = half if pin_offset > 0.0 else -half
                     speed = 0.0
-            out[k, i] = (place - before) / step_s
+            out[k, i] = (pin_offset - before) / step_s
 
 
 def lever_arms(angles: Array, plant: Array) -> Array:

@@ -48,13 +48,13 @@ def run_samples(
     times: tuple[Array, tuple[Clock, Clock]],
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     log: Array,
-    held: Array,
+    held_commands: Array,
 ) -> int:
     """Run one sample per row of `log`; returns the number of clamped pressures.
 
     `demands` holds past demands first: its last rows belong to `log`. `times` are delays in samples, and clocks: the
-    number of steps in a sample and the clock of one step, for coarse and for fine steps. `held` is scratch, one
-    value per spool.
+    number of steps in a sample and the clock of one step, for coarse and for fine steps. `held_commands` is scratch,
+    one value per spool.
     """
     first = demands.shape[0] - log.shape[0]
     delays, clocks = times
@@ -75,8 +75,8 @@ def run_samples(
             for j in range(at.SPOOLS):
                 # whole samples of delay, plus the part of a sample that is left, at mid-step
                 when = first + k + (n + 0.5) / steps - delays[j]
-                held[j] = demands[max(int(np.floor(when)), 0), j]
-            clamps += integrator.step(state, valves, held, (step_s, share, filters), setup, near)
+                held_commands[j] = demands[max(int(np.floor(when)), 0), j]
+            clamps += integrator.step(state, valves, held_commands, (step_s, share, filters), setup, near)
     return clamps
 
 
@@ -99,11 +99,12 @@ def shape_commands(
     past: Array,
     setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
     demands: Array,
-    held: Array,
+    held_commands: Array,
 ) -> None:
     """Spool demands of `levers`, shape (samples, 3), behind the `past` ones into `demands`; `past` is then brought up.
 
-    A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held` is scratch.
+    A `step_s` above 0 puts the operator's hand between the levers given and those of the machine. `held_commands` is
+    scratch.
     """
     axes, plant, _, _ = setup
     count = past.shape[0]
@@ -113,7 +114,7 @@ def shape_commands(
     for k in range(levers.shape[0]):
         lever = levers[k]
         if step_s > 0.0:
-            lever = held[: at.AXES]
+            lever = held_commands[: at.AXES]
             smooth_lever(levers[k], hand, step_s, lever)
         valve.shape_demand(lever, axes, plant, demands[count + k])
     for k in range(count):

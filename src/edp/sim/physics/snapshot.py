@@ -137,25 +137,27 @@ def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
     """What `capture` saw: objects, arrays and generators of `current` are set in place, the rest is made anew."""
     if plain is None:
         return current
-    ((kind, held),) = plain.items()
+    ((kind, content),) = plain.items()
     if kind == "value":
-        return held
+        return content
     if kind == "float":
-        return float(held)
+        return float(content)
     if kind == "scalar":
-        return arrays[held][()]
+        return arrays[content][()]
     if kind == "array":
-        return _restored_array(current, arrays[held])
+        return _restored_array(current, arrays[content])
     if kind == "rng":
-        current.bit_generator.state = held
+        current.bit_generator.state = content
         return current
     if kind in ("list", "tuple"):
-        known = current if isinstance(current, list | tuple) and len(current) == len(held) else [None] * len(held)
-        parts = [restored(old, part, arrays) for old, part in zip(known, held, strict=True)]
+        templates = (
+            current if isinstance(current, list | tuple) and len(current) == len(content) else [None] * len(content)
+        )
+        parts = [restored(old, part, arrays) for old, part in zip(templates, content, strict=True)]
         return parts if kind == "list" else tuple(parts)
     if kind == "dict":
-        return {key: restored(current.get(key), part, arrays) for key, part in held}
-    for name, part in held.items():
+        return {key: restored(current.get(key), part, arrays) for key, part in content}
+    for name, part in content.items():
         old = getattr(current, name)
         new = restored(old, part, arrays)
         if new is not old:

@@ -106,9 +106,9 @@ def load_material(name: str) -> Material:
     """
     if name.endswith(".toml"):
         return parse_material(read_text(name, SETTINGS_BYTES, f"material file {name}", ConfigError), name)
-    known = material_names()
-    if name not in known:
-        raise ConfigError(f"unknown material '{name}'{closest(name, known)}; there are {', '.join(known)}")
+    names = material_names()
+    if name not in names:
+        raise ConfigError(f"unknown material '{name}'{closest(name, names)}; there are {', '.join(names)}")
     source = resources.files("edp.sim").joinpath("materials").joinpath(f"{name}.toml")
     return parse_material(source.read_text(encoding="utf-8"), f"{name}.toml")
 

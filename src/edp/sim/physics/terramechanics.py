@@ -163,17 +163,17 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
 @inlined
 def height_at(x: float, heights: Array) -> float:
     """Height (m) of the ground at `x`, linear between its points."""
-    place = min(max(x / SPACING, 0.0), heights.shape[0] - 1.000001)
-    k = int(place)
-    return heights[k] + (place - k) * (heights[k + 1] - heights[k])
+    cell = min(max(x / SPACING, 0.0), heights.shape[0] - 1.000001)
+    k = int(cell)
+    return heights[k] + (cell - k) * (heights[k + 1] - heights[k])
 
 
 @compiled
 def cutting_force(depth: float, rake: float, surcharge: float, numbers: Array, table: Array) -> float:
     """Force (N) of the earthmoving equation at a depth (m), a rake (rad) and a surcharge (Pa)."""
-    place = min(max(rake * 57.29577951308232, LEAST_RAKE), MOST_RAKE - 1e-9)
-    k = int(place)
-    part = place - k
+    rake_deg = min(max(rake * 57.29577951308232, LEAST_RAKE), MOST_RAKE - 1e-9)
+    k = int(rake_deg)
+    part = rake_deg - k
     weight = table[k, 0] + part * (table[k + 1, 0] - table[k, 0])
     cohesion = table[k, 1] + part * (table[k + 1, 1] - table[k, 1])
     adhesion = table[k, 2] + part * (table[k + 1, 2] - table[k, 2])
@@ -185,9 +185,9 @@ def cutting_force(depth: float, rake: float, surcharge: float, numbers: Array, t
 @compiled
 def strength(numbers: Array, course: Array, memory: Array) -> tuple[float, float, float]:
     """Factor on cutting, factor of this dig, and force of stones (N), at the distance travelled in soil."""
-    place = memory[at.DISTANCE] / numbers[COURSE_STEP]
-    k = int(place)
-    part = place - k
+    cell = memory[at.DISTANCE] / numbers[COURSE_STEP]
+    k = int(cell)
+    part = cell - k
     noise = (1.0 - part) * course[k % COURSE, 0] + part * course[(k + 1) % COURSE, 0]
     dig = course[int(memory[at.DIGS]) % COURSE, 2]
     saw = 1.0 - numbers[SAWTOOTH] * (1.0 - memory[at.CHIP])

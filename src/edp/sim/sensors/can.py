@@ -17,9 +17,9 @@ def read_between(values: Array, positions: Array, out: Array) -> None:
     """`values` at `positions` (in samples), linear between samples and constant beyond them, into `out`."""
     last = values.shape[0] - 1
     for k in range(positions.shape[0]):
-        place = min(max(positions[k], 0.0), float(last))
-        low = int(place)
-        part, high = place - low, min(low + 1, last)
+        position = min(max(positions[k], 0.0), float(last))
+        low = int(position)
+        part, high = position - low, min(low + 1, last)
         for channel in range(values.shape[1]):
             out[k, channel] = values[low, channel] + part * (values[high, channel] - values[low, channel])
 
@@ -61,9 +61,9 @@ class Frames:
         What lies before the first sample has its value. A frame taken between samples k and k + 1 is seen at k + 1 at
         the earliest, so that reading between the two looks at no later sample than the one that shows it.
         """
-        taken = np.empty((len(self.positions), values.shape[1]))
-        read_between(np.ascontiguousarray(values), self.positions, taken)
-        return taken
+        frame_values = np.empty((len(self.positions), values.shape[1]))
+        read_between(np.ascontiguousarray(values), self.positions, frame_values)
+        return frame_values
 
     def hold(self, values: Array) -> Array:
         """The newest value that had arrived at each sample, shape ``(sample, channel)``."""
@@ -87,12 +87,12 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
     # A few frames before the start, so that the first sample has one to show.
     before = int(np.ceil(bus.latency[1] / bus.period)) + 2
     count = before + int(np.ceil(samples / rate_hz / bus.period)) + 1
-    taken = np.asarray((np.arange(count) - before + phase) * bus.period, dtype=np.float64)
+    sample_times = np.asarray((np.arange(count) - before + phase) * bus.period, dtype=np.float64)
     latency = np.clip(latency_s + rng.normal(0.0, bus.jitter, count), *bus.latency)
     # Frames of one ECU keep their order: a late one holds up those behind it.
-    arrivals = np.maximum.accumulate(taken + latency) * rate_hz
+    arrivals = np.maximum.accumulate(sample_times + latency) * rate_hz
     lost = rng.random(count) < bus.loss
     lost[0] = False
-    kept = np.flatnonzero(~lost)
-    seen = kept[np.searchsorted(arrivals[kept], ticks, side="right") - 1]
-    return Frames(taken * rate_hz, np.where(lost, np.inf, arrivals), seen)
+    arrived = np.flatnonzero(~lost)
+    seen = arrived[np.searchsorted(arrivals[arrived], ticks, side="right") - 1]
+    return Frames(sample_times * rate_hz, np.where(lost, np.inf, arrivals), seen)

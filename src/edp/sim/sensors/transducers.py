@@ -29,9 +29,9 @@ def lagged(values: Array, time_constant_s: float, step_s: float) -> Array:
     """First-order lag, exact for a signal that is linear between samples; at rest at the first value."""
     if time_constant_s <= 0.0:
         return values
-    kept = np.exp(-step_s / time_constant_s)
-    new = 1.0 - time_constant_s * (1.0 - kept) / step_s
-    return values[:1] + filters.lfilter([new, 1.0 - kept - new], [1.0, -kept], values - values[:1])
+    decay = np.exp(-step_s / time_constant_s)
+    new = 1.0 - time_constant_s * (1.0 - decay) / step_s
+    return values[:1] + filters.lfilter([new, 1.0 - decay - new], [1.0, -decay], values - values[:1])
 
 
 def limited(values: Array, full_scale: float) -> Array:

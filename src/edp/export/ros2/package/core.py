@@ -43,15 +43,26 @@ def build(compiler: str = "cc", folder: Path = HERE) -> Path:
     Raises:
         RuntimeError: the compiler is missing or says no.
     """
-    made, sources = folder / LIBRARY, sorted(str(path) for path in (folder / "csrc").glob("*.c"))
-    command = [compiler, "-std=c99", "-O2", "-ffp-contract=off", "-shared", "-fPIC", *sources, "-lm", "-o", str(made)]
+    library, sources = folder / LIBRARY, sorted(str(path) for path in (folder / "csrc").glob("*.c"))
+    command = [
+        compiler,
+        "-std=c99",
+        "-O2",
+        "-ffp-contract=off",
+        "-shared",
+        "-fPIC",
+        *sources,
+        "-lm",
+        "-o",
+        str(library),
+    ]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
         raise RuntimeError(f"compiler '{compiler}' does not start ({error}); install one or set CC") from error
     if done.returncode:
         raise RuntimeError(f"'{compiler}' cannot compile {folder / 'csrc'}:\n{done.stderr[-2000:]}")
-    return made
+    return library
 
 
 class Core:
@@ -94,8 +105,8 @@ class Core:
         """
         if len(row) != len(self.inputs):
             raise ValueError(f"a tick has {len(row)} numbers; the network reads {len(self.inputs)}")
-        given = (ctypes.c_float * len(row))(*row)
-        return CallStatus(self._step(self._state, given, self._out))
+        c_row = (ctypes.c_float * len(row))(*row)
+        return CallStatus(self._step(self._state, c_row, self._out))
 
     def missed(self, ticks: int) -> CallStatus:
         """Tell that so many ticks went by without inputs."""
@@ -143,22 +154,22 @@ def read_sources(inputs: list[str], texts: list[str]) -> dict[str, InputSource]:
     Raises:
         ValueError: inputs without a source, sources without an input, or a text of another form; all of them are named.
     """
-    found: dict[str, InputSource] = {}
+    input_sources: dict[str, InputSource] = {}
     wrong = []
     for text in filter(None, texts):
         name, _, origin = text.partition("=")
         kind, _, what = origin.partition(":")
-        if kind not in KINDS or not what or name in found:
+        if kind not in KINDS or not what or name in input_sources:
             wrong.append(f"'{text}' (once each: INPUT=KIND:NAME with a kind of {', '.join(KINDS)})")
         elif kind == "constant":
             try:
-                found[name] = InputSource(kind, value=float(what))
+                input_sources[name] = InputSource(kind, value=float(what))
             except ValueError:
                 wrong.append(f"'{text}' ({what} is no number)")
         else:
-            found[name] = InputSource(kind, what)
-    missing = [name for name in inputs if name not in found]
-    unknown = [name for name in found if name not in inputs]
+            input_sources[name] = InputSource(kind, what)
+    missing = [name for name in inputs if name not in input_sources]
+    unknown = [name for name in input_sources if name not in inputs]
     problems = [
         f"{what}: {', '.join(names)}"
         for what, names in (("not read", wrong), ("inputs without a source", missing), ("no input", unknown))
@@ -166,7 +177,7 @@ def read_sources(inputs: list[str], texts: list[str]) -> dict[str, InputSource]:
     ]
     if problems:
         raise ValueError(f"sources: {'; '.join(problems)}; the network reads {', '.join(inputs)}")
-    return found
+    return input_sources
 
 
 @dataclass
@@ -218,8 +229,8 @@ class Assembler:
 
     def pressure(self, name: str, value: float, stamp: float) -> None:
         """A pressure in Pa, measured at `stamp` s; an older one than is held is left out."""
-        held = self._pressures.get(name)
-        if held is None or stamp >= held[1] or held[1] - stamp > LOOPED_S:
+        latest = self._pressures.get(name)
+        if latest is None or stamp >= latest[1] or latest[1] - stamp > LOOPED_S:
             self._pressures[name] = (value, stamp)
 
     def joints(
@@ -280,8 +291,8 @@ class Assembler:
                 value = value if abs(stamp - when) <= LATE_TICKS * self.tick_s else math.nan
             elif source.kind != "constant":
                 values = fields[KINDS.index(source.kind)]
-                place = at.get(source.name, len(values))
-                value = values[place] if place < len(values) else math.nan
+                value_index = at.get(source.name, len(values))
+                value = values[value_index] if value_index < len(values) else math.nan
             row.append(float(value))
             if not math.isfinite(value):
                 absent.append(f"{name} ({source.kind} of {source.name})")

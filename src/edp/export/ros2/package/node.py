@@ -73,16 +73,16 @@ class PredictorNode(Node):
         for meaning in core.results:
             for number, interval in enumerate(core.result(meaning)):
                 for ahead, values in zip(core.about["horizons"], interval):
-                    made = JointState()
-                    made.header.stamp = stamp
-                    made.name = [target["name"] for target in core.about["targets"]]
+                    message = JointState()
+                    message.header.stamp = stamp
+                    message.name = [target["name"] for target in core.about["targets"]]
                     for field in ("position", "velocity", "effort"):
                         kinds = [FIELDS.get(target["kind"], "effort") for target in core.about["targets"]]
                         if field in kinds:
                             # One that goes elsewhere is NaN here: a JointState has all of a field or none.
                             nan = float("nan")
-                            setattr(made, field, [v if k == field else nan for v, k in zip(values, kinds)])
-                    self.results[meaning, number, ahead["ticks"]].publish(made)
+                            setattr(message, field, [v if k == field else nan for v, k in zip(values, kinds)])
+                    self.results[meaning, number, ahead["ticks"]].publish(message)
 
     def report(self) -> None:
         """Once a second; where no joints came since, the prediction is no longer valid."""
@@ -96,10 +96,10 @@ class PredictorNode(Node):
         values += [KeyValue(key="step_us", value=f"{tick.step_us:.1f}" if tick is not None else "")]
         values += [KeyValue(key="model_hash", value=core.about["model_hash"])]
         level = DiagnosticStatus.OK if good else DiagnosticStatus.WARN
-        made = DiagnosticArray()
-        made.header.stamp = self.get_clock().now().to_msg()
-        made.status = [DiagnosticStatus(level=level, name=self.get_name(), message=why, values=values)]
-        self.diagnostics.publish(made)
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.status = [DiagnosticStatus(level=level, name=self.get_name(), message=why, values=values)]
+        self.diagnostics.publish(message)
         self.fresh = False
 
 

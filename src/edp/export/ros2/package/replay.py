@@ -25,9 +25,9 @@ def sources_of(path: Path) -> list[str]:
     import yaml  # comes with ROS and with rosbags
 
     for node in (yaml.safe_load(path.read_text()) or {}).values():
-        found = node.get("ros__parameters", {}).get("sources") if isinstance(node, dict) else None
-        if found:
-            return list(found)
+        sources = node.get("ros__parameters", {}).get("sources") if isinstance(node, dict) else None
+        if sources:
+            return list(sources)
     raise ValueError(f"{path} has no ros__parameters with sources")
 
 
@@ -37,8 +37,8 @@ def replay(bag: Path, ticks: Assembler, joints: str = "/joint_states", pressures
     from rosbags.typesys import Stores, get_typestore
 
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        wanted = [c for c in reader.connections if c.topic in (joints, pressures) and c.msgtype in TYPES]
-        for connection, _, raw in reader.messages(connections=wanted):
+        connections = [c for c in reader.connections if c.topic in (joints, pressures) and c.msgtype in TYPES]
+        for connection, _, raw in reader.messages(connections=connections):
             message: Any = reader.deserialize(raw, connection.msgtype)
             stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
             if TYPES[connection.msgtype] == "pressure":

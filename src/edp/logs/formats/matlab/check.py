@@ -67,10 +67,10 @@ def _announced_v5(path: Path) -> tuple[int, int]:
                     f"'{path}' is a MAT file that is cut off: a variable at byte {at} has {length} bytes, the file "
                     f"ends after {size}; copy or export it again"
                 )
-            held = _unpacked(stream.read(min(length, 256)), order) if kind == _PACKED else length
-            if held > _DEFLATE_RATIO * (length + 64):
-                raise _impossible(path, f"the variable at byte {at}", held, length)
-            total += held
+            array_bytes = _unpacked(stream.read(min(length, 256)), order) if kind == _PACKED else length
+            if array_bytes > _DEFLATE_RATIO * (length + 64):
+                raise _impossible(path, f"the variable at byte {at}", array_bytes, length)
+            total += array_bytes
             objects += 1
             at += 8 + length
     return total, objects
@@ -149,17 +149,17 @@ class _Walk:
             raise self.refused(name, "a virtual data set, whose values lie in other files")
         if plan.get_external_count():
             raise self.refused(name, "an array in external storage, whose values lie in another file")
-        for place in range(plan.get_nfilters()):
-            number = plan.get_filter(place)[0]
+        for filter_index in range(plan.get_nfilters()):
+            number = plan.get_filter(filter_index)[0]
             if number not in _FILTERS:
                 raise self.refused(name, f"an array packed by the filter {number}")
         part = h5py.Dataset(data)
         size, stored = part.size or 0, data.get_storage_size()
         chunk = math.prod(part.chunks or (0,))
-        held = max(size, chunk if stored else 0) * part.dtype.itemsize
-        if held > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
-            raise _impossible(self.path, f"the array {_shown(name)}", held, stored)
-        self.total += held
+        memory_bytes = max(size, chunk if stored else 0) * part.dtype.itemsize
+        if memory_bytes > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
+            raise _impossible(self.path, f"the array {_shown(name)}", memory_bytes, stored)
+        self.total += memory_bytes
         if size and h5py.check_ref_dtype(part.dtype) is not None:
             check_memory(self.path, _COPIES * self.total, "the variables of this MAT file", _ADVICE)
             self.references(name, part)
@@ -184,8 +184,9 @@ def _shown(name: str) -> str:
     return repr(name if len(name) <= _SHOWN else name[: _SHOWN - 3] + "...")
 
 
-def _impossible(path: Path, what: str, held: int, stored: int) -> DataError:
+def _impossible(path: Path, what: str, memory_bytes: int, stored: int) -> DataError:
     return DataError(
-        f"'{path}': {what} claims {held} bytes, packed into {stored}; it may be damaged, or was made to exhaust "
+        f"'{path}': {what} claims {memory_bytes} bytes, packed into {stored}; it may be damaged, or was made to "
+        "exhaust "
         "memory: copy or export it again"
     )

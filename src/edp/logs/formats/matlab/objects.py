@@ -32,50 +32,50 @@ _SECONDS = {
 
 def collect(variables: dict[str, Any]) -> MatVariables:
     """Walk all variables; names that occur twice are told apart by their path (``log.x``)."""
-    found = MatVariables()
+    mat_variables = MatVariables()
     for name, value in variables.items():
-        _walk(value, name, name, None, found)
-    short = [part.name for part in found.signals]
+        _walk(value, name, name, None, mat_variables)
+    short = [part.name for part in mat_variables.signals]
     counts = Counter(short)
-    for part in found.signals:
+    for part in mat_variables.signals:
         if counts[part.name] > 1:
             outer = f"{re.split(r'[.({]', part.path)[0]}.{part.name}"
             part.name = part.path if outer in counts else outer
-    counts_now = Counter(part.name for part in found.signals)
-    for name, part in zip(short, found.signals):
+    counts_now = Counter(part.name for part in mat_variables.signals)
+    for name, part in zip(short, mat_variables.signals):
         part.name = part.path if counts_now[part.name] > 1 else part.name
         if counts[name] > 1:
-            found.repeated.setdefault(name, []).append(part.name)
-    _share_times(found)
-    return found
+            mat_variables.repeated.setdefault(name, []).append(part.name)
+    _share_times(mat_variables)
+    return mat_variables
 
 
-def _share_times(found: MatVariables) -> None:
+def _share_times(mat_variables: MatVariables) -> None:
     """Make equal times one array: a Dataset holds them once a signal, and each would be judged and kept again."""
-    known: list[NDArray[np.float64]] = []
-    for part in found.signals:
+    distinct_times: list[NDArray[np.float64]] = []
+    for part in mat_variables.signals:
         if part.time is None:
             continue
-        same = next((time for time in known if time is part.time or np.array_equal(time, part.time)), None)
+        same = next((time for time in distinct_times if time is part.time or np.array_equal(time, part.time)), None)
         if same is None:
-            known.append(part.time)
+            distinct_times.append(part.time)
         else:
             part.time = same
 
 
-def _walk(value: Any, name: str, path: str, time: NDArray[np.float64] | None, found: MatVariables) -> None:
+def _walk(value: Any, name: str, path: str, time: NDArray[np.float64] | None, mat_variables: MatVariables) -> None:
     if isinstance(value, MatlabOpaque):
-        _walk_object(value, name, path, found)
+        _walk_object(value, name, path, mat_variables)
     elif isinstance(value, pd.DataFrame):
-        _walk_table(value, path, found)
+        _walk_table(value, path, mat_variables)
     elif isinstance(value, np.ndarray) and value.dtype.names:
-        _walk_struct(value, path, found)
+        _walk_struct(value, path, mat_variables)
     elif isinstance(value, np.ndarray) and value.dtype == object:
         for i, item in enumerate(value.ravel(order="F")):
             inner = f"{name}_{i + 1}" if value.size > 1 else name
-            _walk(item, inner, f"{path}{{{i + 1}}}" if value.size > 1 else path, time, found)
+            _walk(item, inner, f"{path}{{{i + 1}}}" if value.size > 1 else path, time, mat_variables)
     elif isinstance(value, np.ndarray | np.generic) and np.asarray(value).dtype.kind in "fiub":
-        _add_array(np.asarray(value), name, path, time, found)
+        _add_array(np.asarray(value), name, path, time, mat_variables)
 
 
 def _add_array(
@@ -83,11 +83,11 @@ def _add_array(
     name: str,
     path: str,
     time: NDArray[np.float64] | None,
-    found: MatVariables,
+    mat_variables: MatVariables,
     unit: str | None = None,
 ) -> None:
     if array.size == 1 and time is None:
-        found.scalars[name] = float(array.ravel()[0])
+        mat_variables.scalars[name] = float(array.ravel()[0])
         return
     columns = _columns(array, None if time is None else len(time))
     if columns is None:
@@ -95,15 +95,15 @@ def _add_array(
     own = time if time is not None and len(time) == columns.shape[0] else None
     for i in range(columns.shape[1]):
         ending = f"_{i + 1}" if columns.shape[1] > 1 else ""
-        found.signals.append(Part(name + ending, columns[:, i], own, unit, path + ending))
+        mat_variables.signals.append(Part(name + ending, columns[:, i], own, unit, path + ending))
 
 
 def _columns(array: NDArray[Any], samples: int | None) -> NDArray[Any] | None:
     """An array as ``(time, column)``: time is the axis of `samples` values, else the longest; None if there is none."""
     if array.size == 0:
         return None
-    kept = [length for length in array.shape if length > 1]
-    if len(kept) <= 1:
+    long_sides = [length for length in array.shape if length > 1]
+    if len(long_sides) <= 1:
         return array.reshape(-1, 1)
     fitting = [axis for axis, length in enumerate(array.shape) if length == samples]
     axis = fitting[0] if fitting else int(np.argmax(array.shape))
@@ -113,18 +113,18 @@ def _columns(array: NDArray[Any], samples: int | None) -> NDArray[Any] | None:
     return moved.reshape(moved.shape[0], -1)
 
 
-def _walk_struct(value: NDArray[Any], path: str, found: MatVariables) -> None:
+def _walk_struct(value: NDArray[Any], path: str, mat_variables: MatVariables) -> None:
     fields = value.dtype.names or ()
     for number, element in enumerate(value.ravel(order="F")):
         here = f"{path}({number + 1})" if value.size > 1 else path
         if "signals" in fields and "time" in fields:
-            _walk_structure_with_time(element, here, found)
+            _walk_structure_with_time(element, here, mat_variables)
             continue
         time = _struct_time(element, fields)
         for name in fields:
             if time is not None and name == time[0]:
                 continue
-            _walk(element[name], name, f"{here}.{name}", time[1] if time else None, found)
+            _walk(element[name], name, f"{here}.{name}", time[1] if time else None, mat_variables)
 
 
 def _struct_time(element: Any, fields: tuple[str, ...]) -> tuple[str, NDArray[np.float64]] | None:
@@ -136,7 +136,7 @@ def _struct_time(element: Any, fields: tuple[str, ...]) -> tuple[str, NDArray[np
     return None
 
 
-def _walk_structure_with_time(element: Any, path: str, found: MatVariables) -> None:
+def _walk_structure_with_time(element: Any, path: str, mat_variables: MatVariables) -> None:
     """Simulink's 'Structure with time': fields time and signals(k).values, signals(k).label."""
     stamps = np.asarray(element["time"], dtype=np.float64).ravel()
     signals = element["signals"]
@@ -146,10 +146,10 @@ def _walk_structure_with_time(element: Any, path: str, found: MatVariables) -> N
         label = _text(signal["label"]) if "label" in signals.dtype.names else ""
         name = label or f"signal_{number + 1}"
         time = stamps if len(stamps) > 1 else None
-        _add_array(np.asarray(signal["values"]), name, f"{path}.{name}", time, found)
+        _add_array(np.asarray(signal["values"]), name, f"{path}.{name}", time, mat_variables)
 
 
-def _walk_table(table: pd.DataFrame, path: str, found: MatVariables) -> None:
+def _walk_table(table: pd.DataFrame, path: str, mat_variables: MatVariables) -> None:
     time = None
     if isinstance(table.index, pd.TimedeltaIndex | pd.DatetimeIndex):
         index = table.index.to_numpy()
@@ -160,42 +160,42 @@ def _walk_table(table: pd.DataFrame, path: str, found: MatVariables) -> None:
         values = table[name].to_numpy()
         if values.dtype.kind in "fiub" and len(values):
             unit = str(units[i]) if i < len(units) else None
-            found.signals.append(Part(str(name), values, time, unit, f"{path}.{name}"))
+            mat_variables.signals.append(Part(str(name), values, time, unit, f"{path}.{name}"))
 
 
-def _walk_object(value: MatlabOpaque, name: str, path: str, found: MatVariables) -> None:
+def _walk_object(value: MatlabOpaque, name: str, path: str, mat_variables: MatVariables) -> None:
     props = value.properties
     if not isinstance(props, dict):
         return
     if value.classname == "timeseries" or {"Data_", "TimeInfo"} <= set(props):
-        _add_timeseries(props, name, path, found)
+        _add_timeseries(props, name, path, mat_variables)
     elif "Values" in props:
-        _walk(props["Values"], _text(props.get("Name")) or name, path, None, found)
+        _walk(props["Values"], _text(props.get("Name")) or name, path, None, mat_variables)
     else:
         for key in ("any", "Storage", "Elements", "Data"):
             if key in props:
-                _walk_contents(props[key], name, path, found)
+                _walk_contents(props[key], name, path, mat_variables)
 
 
-def _walk_contents(value: Any, name: str, path: str, found: MatVariables) -> None:
+def _walk_contents(value: Any, name: str, path: str, mat_variables: MatVariables) -> None:
     """The inside of a Dataset or SimulationOutput: structs with Storage or Elements, cells, or plain fields."""
     if isinstance(value, np.ndarray) and value.dtype.names and {"Storage", "Elements"} & set(value.dtype.names):
         for element in value.ravel():
             for key in ("Storage", "Elements"):
                 if key in value.dtype.names:
-                    _walk(element[key], name, path, None, found)
+                    _walk(element[key], name, path, None, mat_variables)
     else:
-        _walk(value, name, path, None, found)
+        _walk(value, name, path, None, mat_variables)
 
 
-def _add_timeseries(props: dict[str, Any], name: str, path: str, found: MatVariables) -> None:
+def _add_timeseries(props: dict[str, Any], name: str, path: str, mat_variables: MatVariables) -> None:
     data = np.asarray(props.get("Data_", np.empty(0)))
     if data.dtype.kind not in "fiub" or data.size == 0:
         return
     time = _timeseries_time(props)
     unit = _timeseries_unit(props.get("DataInfo"))
     own = _text(props.get("Name"))
-    _add_array(data, own if own and own != "unnamed" else name, path, time, found, unit)
+    _add_array(data, own if own and own != "unnamed" else name, path, time, mat_variables, unit)
 
 
 def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:

@@ -39,12 +39,12 @@ def unpack(path: Path, variable: str | None = None) -> MatVariables:
     names = list(variables)
     if variable is not None:
         variables = {name: value for name, value in variables.items() if name == variable}
-    found = collect(variables)
-    found.names = names
+    mat_variables = collect(variables)
+    mat_variables.names = names
     if info is not None:
         array = np.asarray(info)
-        found.info = str(array.ravel()[0]) if array.size else ""
-    return found
+        mat_variables.info = str(array.ravel()[0]) if array.size else ""
+    return mat_variables
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -52,8 +52,8 @@ def _load(path: Path) -> dict[str, Any]:
         head = stream.read(128)
     if any(magic.startswith(head[: len(magic)]) for magic in MAGIC) and len(head) < 128:
         raise DataError(f"'{path}' is a MAT file that ends inside its header (truncated); copy or export it again")
-    held, objects = (path.stat().st_size, 1) if is_v4(head) else check_size(path)
-    announce(memory=COPIES * held + objects * OBJECT_BYTES, work=held, parts=objects)
+    memory_bytes, objects = (path.stat().st_size, 1) if is_v4(head) else check_size(path)
+    announce(memory=COPIES * memory_bytes + objects * OBJECT_BYTES, work=memory_bytes, parts=objects)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
