@@ -217,7 +217,7 @@ def attacked(bundle: Bundle, bank: NDArray[np.float32], ticks: int) -> list[floa
     if law is None:
         raise RuntimeError("the bundle has no adaptation")
     named = {"COLUMNS": ",".join(map(str, law.columns)), "AHEAD": ",".join(map(str, law.horizons))}
-    named |= {"MOST_AHEAD": f"{law.reach}u", "BOUND": f"{law.numbers['bound']:.9g}f"}
+    named |= {"MOST_AHEAD": f"{law.max_horizon}u", "BOUND": f"{law.numbers['bound']:.9g}f"}
     flags = [f"-D{name}={value}" for name, value in named.items()]
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

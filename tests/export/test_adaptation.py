@@ -134,7 +134,7 @@ def attack(c, driven, ticks):
     first, _ = driven("lstm")
     law = first.adaptation
     named = {"COLUMNS": ",".join(map(str, law.columns)), "AHEAD": ",".join(map(str, law.horizons))}
-    named |= {"MOST_AHEAD": f"{law.reach}u", "BOUND": f"{float(law.numbers['bound']):.9g}f"}
+    named |= {"MOST_AHEAD": f"{law.max_horizon}u", "BOUND": f"{float(law.numbers['bound']):.9g}f"}
     flags = ["-O2", "-Wno-conversion", *(f"-D{name}={value}" for name, value in named.items())]
     bundle, program = driven("lstm", driver="adversary.c", flags=flags)
     bank = random_inputs(bundle.predictor, 5_000, seed=8)

@@ -27,7 +27,7 @@ def unlabelled(task: Task, recording: Recording) -> Series:
         row, column = (int(i) for i in np.argwhere(bad)[0])
         raise DataError(
             f"recording '{recording.name}' ({recording.source}): channel '{task.inputs[column]}' has "
-            f"{int(bad[:, column].sum())} missing or infinite value(s), the first at row {row}; mend the log or ask "
+            f"{int(bad[:, column].sum())} missing or infinite value(s), the first at row {row}; repair the log or ask "
             'for a repair (nan = "hold")'
         )
     return Series(recording.name, inputs, np.zeros((len(inputs), len(task.targets)), dtype=np.float32))

@@ -76,7 +76,7 @@ class Convolution(Layer):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Gated(Layer):
-    """What both kinds of LSTM have; neither is the other, since they are told apart by their class."""
+    """What both kinds of LSTM have; neither is the other, since they are distinguished by their class."""
 
     weight_x: Array
     weight_h: Array

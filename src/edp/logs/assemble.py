@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError
 from edp.logs.formats.base import ColumnTable, RawLog, RawSignal
 from edp.logs.formats.names import name_of_file
-from edp.logs.repair import Mask, Repair, mend_gaps, mend_stamps, mend_values
+from edp.logs.repair import Mask, Repair, repair_gaps, repair_stamps, repair_values
 from edp.logs.resolve import ChannelSource
 from edp.logs.timebase import Clock, Grid, Rows, common_grid, hold_rows, uniform_clock
 from edp.recording import FloatArray, Recording
@@ -41,7 +41,7 @@ class Assembly:
     Attributes:
         raw: the file.
         sources: the channels, in order.
-        repair: what may be mended.
+        repair: what may be repaired.
         lines: how each time column is sampled.
         rate_hz: of the grid.
         ticks: the ticks of the grid that the recording keeps.
@@ -85,7 +85,7 @@ class Assembly:
             before: the last good value of each channel before `start`, shape ``(channel,)``, to hold.
 
         Raises:
-            DataError: a column cannot be read, or holds missing values that may not be mended.
+            DataError: a column cannot be read, or holds missing values that may not be repaired.
         """
         values, repairs = self._mended(start, stop, before)
         meta: dict[str, Any] = dict(self.raw.meta)
@@ -112,7 +112,7 @@ class Assembly:
             values, missing = np.vstack([before[None], values]), np.append(False, missing)
         names = [entry.channel.name for entry in self.sources]
         offset = start if before is None else start - 1
-        repairs = mend_values(values, missing, names, self.rate_hz, self.repair, f"'{self.raw.path}'", offset)
+        repairs = repair_values(values, missing, names, self.rate_hz, self.repair, f"'{self.raw.path}'", offset)
         return (values if before is None else values[1:]), repairs
 
     def _values(self, first: int, last: int) -> FloatArray:
@@ -192,7 +192,7 @@ def prepare(
     """Bring the times of the chosen channels to one grid; no value is read yet.
 
     Raises:
-        DataError: times that cannot be used or may not be mended; rows outside the log.
+        DataError: times that cannot be used or may not be repaired; rows outside the log.
     """
     where = f"'{raw.path}'"
     lines, grid, repairs = _timelines(raw, sources, signal_map, repair)
@@ -200,7 +200,7 @@ def prepare(
     for line in lines.values():
         missing |= line.missing
     part = _rows(rows, grid.count, where)
-    keep, gap_facts = mend_gaps(missing[part], grid.rate_hz, repair, where)
+    keep, gap_facts = repair_gaps(missing[part], grid.rate_hz, repair, where)
     first = part.start + (keep.start or 0)
     last = part.start + (len(missing[part]) if keep.stop is None else keep.stop)
     own_way = not signal_map.channels and signal_map.rate_hz is None and signal_map.sample_time_s is None
@@ -286,9 +286,9 @@ def _timelines(
                 "set 'time' in the signal map to its name, or set 'sample_time_s'"
             )
         where = f"'{raw.path}', time of '{signal.name}'"
-        clock, order, mended = mend_stamps(signal.time_s, repair, where)
+        clock, order, repaired = repair_stamps(signal.time_s, repair, where)
         judged[key] = (clock, order)
-        repairs += mended
+        repairs += repaired
     grid = common_grid([clock for clock, _ in judged.values()], signal_map.rate_hz, f"'{raw.path}'")
     check_memory(
         raw.path,

@@ -38,7 +38,7 @@ def read_recording(
             that the file states (SI where it states none).
         name: the recording's name; default: as the file says, else the file's stem.
         rows: ``(start, stop)`` of the resulting samples, stop exclusive, None for the end.
-        repair: what may be mended; by default nothing is, and defects are errors.
+        repair: what may be repaired; by default nothing is, and defects are errors.
 
     Returns:
         values float32, shape ``(time, channel)``. Time is brought to a uniform grid by the rule stated in

@@ -25,7 +25,7 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class Repair:
-    """What may be mended while reading; by default nothing is.
+    """What may be repaired while reading; by default nothing is.
 
     Attributes:
         nan: missing or infinite values: ``hold`` the last good value, or ``keep`` them as NaN.
@@ -46,14 +46,14 @@ class Repair:
                 raise ConfigError(f"repair: {name} = '{value}' is not one of {', '.join(allowed)}")
 
 
-def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows | None, list[dict[str, Any]]]:
-    """Judge stamps and mend falling and duplicate ones where allowed.
+def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows | None, list[dict[str, Any]]]:
+    """Judge stamps and repair falling and duplicate ones where allowed.
 
     Returns:
         the clock, the rows kept in their new order (None: all, as they are), and the repairs made.
 
     Raises:
-        DataError: a defect that `repair` does not allow to mend.
+        DataError: a defect that `repair` does not allow to repair.
     """
     clock = judge(stamps, where)
     repairs: list[dict[str, Any]] = []
@@ -62,7 +62,7 @@ def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows
         if repair.falling == "refuse":
             raise DataError(
                 f"{where}: time goes back in {len(clock.falling)} row(s), first in row {clock.falling[0]} "
-                f'(t = {stamps[clock.falling[0]]:g} s); mend the file or set repair falling = "sort"'
+                f'(t = {stamps[clock.falling[0]]:g} s); repair the file or set repair falling = "sort"'
             )
         repairs.append({"repair": "falling = sort", "count": len(clock.falling), "row": int(clock.falling[0])})
         order = np.argsort(stamps, kind="stable")
@@ -72,7 +72,7 @@ def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows
         if repair.duplicates == "refuse":
             raise DataError(
                 f"{where}: {len(clock.duplicates)} duplicate time stamp(s), first in row {clock.duplicates[0]} "
-                f'(t = {stamps[clock.duplicates[0]]:g} s); mend the file or set repair duplicates = "last"'
+                f'(t = {stamps[clock.duplicates[0]]:g} s); repair the file or set repair duplicates = "last"'
             )
         repairs.append({"repair": "duplicates = last", "count": len(clock.duplicates), "row": int(clock.duplicates[0])})
         last = np.append(np.diff(stamps) > 0, True)
@@ -81,7 +81,7 @@ def mend_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Rows
     return clock, order, repairs
 
 
-def mend_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, Any]]]:
+def repair_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tuple[slice, list[dict[str, Any]]]:
     """The rows to keep and the repairs made, given the ticks in gaps, shape ``(time,)``.
 
     Raises:
@@ -104,7 +104,7 @@ def mend_gaps(missing: Mask, rate_hz: float, repair: Repair, where: str) -> tupl
     return slice(int(good_starts[best]), int(good_stops[best])), [fact]
 
 
-def mend_values(
+def repair_values(
     values: NDArray[np.float32],
     missing: Mask,
     names: Sequence[str],
@@ -137,7 +137,7 @@ def mend_values(
         if repair.nan == "refuse":
             raise DataError(
                 f"{where}: channel '{name}' has {len(rows)} missing or infinite value(s), first in row {first} "
-                f'(t = {first / rate_hz:g} s); mend the file or set repair nan = "hold"'
+                f'(t = {first / rate_hz:g} s); repair the file or set repair nan = "hold"'
             )
         if bad[0]:
             raise DataError(

@@ -77,7 +77,7 @@ def _read(order: Header, path: Path) -> tuple[Header, _Served]:
 
 
 def _read_oddly_named(chosen: LogFormat, path: Path, signal_map: SignalMap) -> RawLog:
-    """Libraries take names in UTF-8 only; the link of an open file has one, but no suffix, by which bags are told."""
+    """Libraries take names in UTF-8 only; the link of an open file has one, but no suffix, which bags need."""
     if chosen.name in BAGS:
         raise DataError(f"'{path}' cannot be read: the name of a bag must be UTF-8; rename it")
     link = Path(f"/proc/self/fd/{os.open(path, os.O_RDONLY)}")

@@ -53,7 +53,7 @@ class DataSource:
     Attributes:
         path: a log, a folder of logs, or a data-set file (``.toml``).
         signal_map: columns to channels; None takes the vocabulary's names.
-        repair: what may be mended.
+        repair: what may be repaired.
     """
 
     path: Path
@@ -100,7 +100,7 @@ class DataSource:
         return recordings
 
     def inspect(self, on_log: Callable[[Path, int, int], None] | None = None) -> DataQuality:
-        """What is in each log, what is wrong with it, and which repeat each other; nothing is mended or refused.
+        """What is in each log, what is wrong with it, and which repeat each other; nothing is repaired or refused.
 
         Args:
             on_log: called with the path of each log before it is read, its number from 1, and how many there are.

@@ -77,13 +77,13 @@ def judge(stamps: Stamps, where: str) -> Clock:
     if len(broken):
         raise DataError(
             f"{where}: {len(broken)} time stamp(s) are missing or not finite, first in row {broken[0]}; "
-            "mend the file, or set 'sample_time_s' in the signal map if rows are uniform"
+            "repair the file, or set 'sample_time_s' in the signal map if rows are uniform"
         )
     largest = float(np.abs(stamps).max())
     if largest > LATEST_SECONDS:
         raise DataError(
             f"{where}: the time stamp of row {int(np.abs(stamps).argmax())} lies {largest:g} s from zero; where the "
-            'file counts in another unit, set time_unit = "ms", "us" or "ns" in the signal map, else mend the stamp'
+            'file counts in another unit, set time_unit = "ms", "us" or "ns" in the signal map, else repair the stamp'
         )
     none = np.empty(0, dtype=np.intp)
     if (even := _even(stamps)) is not None:
@@ -124,7 +124,7 @@ def judge(stamps: Stamps, where: str) -> Clock:
 def _even(stamps: Stamps) -> tuple[float, float] | None:
     """Step and rms distance in steps of stamps that are a straight line but for rounding; None for others.
 
-    What most logs have, told without the medians that the general rule takes.
+    What most logs have, computed without the medians that the general rule takes.
     """
     step = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
     if step < SHORTEST_STEP_S:

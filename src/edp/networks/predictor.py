@@ -153,7 +153,7 @@ class Predictor(Streaming):
             y, new["gate"] = self.gate(y, state["gate"])
         y, new["heads"] = self.heads(y, state["heads"])
         values = y.unflatten(-2, (len(self.task.horizons), self.spec.output.values))
-        # Activation and by-pass act on the prediction; the spread is counted from where they leave it.
+        # Activation and skip connection act on the prediction; the spread is counted from where they leave it.
         center = self.activation(values[..., 0, :])
         if self.bypass is not None:
             direct, new["bypass"] = self.bypass(scaled, state["bypass"])

@@ -141,7 +141,7 @@ class Stream:
             DataError: `ticks` is below 1.
         """
         if ticks < 1:
-            raise DataError(f"{ticks} missed ticks were told; give at least 1")
+            raise DataError(f"{ticks} missed ticks were reported; give at least 1")
         if ticks > HOLD_TICKS:
             # More than can be held: what came before is given up at once.
             self._holding = HOLD_TICKS

@@ -29,12 +29,12 @@ PIPE_BYTES = 1 << 20
 SMALL_BYTES = 4096
 """A request that any pipe takes at once."""
 SLOW_S = 5.0
-"""After so long the watcher is told what is being read."""
-TOLD_S = 1
+"""After so long the watcher is informed what is being read."""
+REPORT_S = 1
 """At least so long between two words to the watcher."""
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _SMALL_POOL = {"MIMALLOC_ARENA_RESERVE": "65536"}
-"""Arrow's pool takes a gigabyte at once unless told to take less (KiB); every file would have to be allowed that."""
+"""Arrow's pool takes a gigabyte at once unless limited (KiB); every file would have to be allowed that."""
 _FORKS = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _END_S = 5.0
 _TRIES = 2
@@ -240,7 +240,7 @@ class WorkerConnection:
         self.path = path
         self.size = 0
         self.started = time.monotonic()
-        self.told = 0.0
+        self.reported_at = 0.0
         self.answers = answers
         self.requests = requests
         self._ended = ended
@@ -311,10 +311,10 @@ class WorkerConnection:
         poll.register(self.answers, select.POLLIN)
         came: list[tuple[int, int]] = []
         while not came:
-            came = poll.poll(1000 * TOLD_S)
+            came = poll.poll(1000 * REPORT_S)
             now = time.monotonic()
-            if now - self.started > SLOW_S and now - self.told >= TOLD_S:
-                self.told = now
+            if now - self.started > SLOW_S and now - self.reported_at >= REPORT_S:
+                self.reported_at = now
                 watcher(self.path, now - self.started, self.size)
 
     def lost(self) -> DataError:

@@ -134,7 +134,7 @@ def _obey(orders: socket.socket, forks: _Forks, serve: Serve, inherited: list[in
         for module in order["modules"]:
             importlib.import_module(module)
         for library in order["libraries"]:
-            # One that is not installed or damaged is told by the reader that needs it.
+            # One that is not installed or damaged is reported by the reader that needs it.
             with contextlib.suppress(Exception):
                 importlib.import_module(library)
         if len(sys.modules) != forks.imported:

@@ -5,7 +5,7 @@ operator (what is done now goes on, how long it lasts and what follows is drawn 
 of the sensors. Knowing the true state at that moment, and all the laws, the best guess of a later measured velocity is
 its median over these futures, which has the least mean absolute error of all guesses; that error is the limit. With
 the commands of the future given, only soil and sensors differ between the branches: the limit of a predictor that is
-told the commands.
+given the commands.
 """
 
 from __future__ import annotations
@@ -129,15 +129,15 @@ def _futures(
     at_times = len(past) + np.array([0, *spec.horizons])
     futures = np.empty((spec.branches, len(at_times), len(TARGETS)))
     for b, branch in enumerate(seed.spawn(spec.branches)):
-        world, noise = branch.spawn(2)
+        branch_seed, noise = branch.spawn(2)
         # With commands known and no soil there is but one future; sensors alone differ.
         if not commands_known or simulation.plant.ground is not None:
             simulation.restore(snapshot)
             if commands_known:
-                simulation.branch_soil(world)
+                simulation.branch_soil(branch_seed)
                 rows = simulation.follow(commands)
             else:
-                simulation.branch(world)
+                simulation.branch(branch_seed)
                 rows = simulation.run(length)
         futures[b] = _measured(simulation, np.concatenate((past, rows)), noise)[at_times]
     return futures

@@ -59,7 +59,7 @@ def main_effects(
 
     Raises:
         DataError: shapes that do not fit, values that are not finite, a factor that never changes or cannot be
-            told from others, or no run left to estimate the noise from.
+            distinguished from others, or no run left to estimate the noise from.
     """
     y = finite(scores, "list of scores", 1)
     on = np.asarray(levels, dtype=bool)
@@ -80,7 +80,7 @@ def main_effects(
         raise DataError(f"{y.size} runs came for {design.shape[1]} coefficients; repeat the design")
     if np.linalg.cond(design) > 1e8:
         raise DataError(
-            "some factors or covariates cannot be told apart; every factor must change, each in its own way"
+            "some factors or covariates cannot be distinguished; every factor must change, each in its own way"
         )
     inverse = np.linalg.inv(design.T @ design)
     coefficients = inverse @ (design.T @ y)

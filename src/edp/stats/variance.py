@@ -53,7 +53,7 @@ def split_variance(scores: ArrayLike, level: float = 0.95) -> SplitVariance:
 
     The seed variance is pooled over the splits, its interval exact for normal scores. The split variance is the
     variance of the split means less their share of the seeds'; its interval is Graybill and Wang's (1980). With
-    one seed the two cannot be told apart: `split` holds both.
+    one seed the two cannot be distinguished: `split` holds both.
 
     Args:
         scores: ``(split, seed)``.
@@ -143,7 +143,7 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
     Args:
         differences: ``(run, session)``, module minus baseline.
         tested: ``(run, session)``; None: all. Some sessions must be tested by more than one run, and some runs on
-            more than one session; else a session's variance and a cell's cannot be told apart.
+            more than one session; else a session's variance and a cell's cannot be distinguished.
 
     Raises:
         DataError: the cells cannot tell the variances apart, or hold values that are not finite.

@@ -99,7 +99,7 @@ def test_bad_designs_are_refused(call, words):
     ("levels", "scores", "covariates", "words"),
     [
         (np.zeros((3, 2)), np.zeros(4), None, "levels of shape"),
-        (np.zeros((8, 2)), np.arange(8.0), None, "told apart"),
+        (np.zeros((8, 2)), np.arange(8.0), None, "distinguished"),
         ([[0, 1], [1, 0], [0, 0]], np.arange(3.0), None, "repeat the design"),
         ([[0, 1], [1, 0], [0, 0], [1, 1]] * 2, np.arange(8.0), np.ones((8, 1)), "never changes"),
         ([[0, 1], [1, 0], [0, 0], [1, 1]] * 2, np.arange(8.0), np.ones((7, 1)), "7 rows"),

@@ -127,7 +127,7 @@ def broken_flags(
         table: the data.
         live: its columns that change.
         judged: places in `live` of the channels that may be flagged.
-        trusted: places of those that they are held against: of two in question, it cannot be told which one is broken.
+        trusted: places of those that they are held against: of two in question, which one is broken cannot be decided.
     """
     piece_moments = [_moments([stretch[:, live]]) for piece in table.pieces for stretch in piece.stretches]
     relations, slopes, squares = (np.array(values) for values in zip(*piece_moments, strict=True))

@@ -1,7 +1,7 @@
 """Mutual information of two channels by nearest neighbours (Kraskov, Stoegbauer and Grassberger, 2004, eq. 8).
 
 The same estimator as scikit-learn's `mutual_info_regression`: distances are the larger of the two differences, and
-equal values are told apart by noise of 1e-10 deviations.
+equal values are distinguished by noise of 1e-10 deviations.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
     blind = [name for name in targets if name in missing]
     if blind:
         raise DataError(
-            f"target '{blind[0]}' has {missing[blind[0]]} missing or infinite value(s); mend the log or ask for a "
+            f"target '{blind[0]}' has {missing[blind[0]]} missing or infinite value(s); repair the log or ask for a "
             'repair (nan = "hold")'
         )
     present_columns = [i for i, name in enumerate(names) if name not in missing]
@@ -177,7 +177,7 @@ def build_table(recordings: Sequence[Recording], spec: ScreeningSpec) -> Candida
     )
     still = [names[i] for i in table.targets if not table.live[i]]
     if still:
-        raise DataError(f"target '{still[0]}' never changes; nothing can be told about it: choose another target")
+        raise DataError(f"target '{still[0]}' never changes; it cannot be predicted: choose another target")
     return table
 
 

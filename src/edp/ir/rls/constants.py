@@ -125,7 +125,7 @@ class Adaptation:
         return 1 + 3 * len(self.columns) + self.spec.rank
 
     @property
-    def reach(self) -> int:
+    def max_horizon(self) -> int:
         """The largest horizon in ticks."""
         return max(self.horizons)
 

@@ -73,13 +73,13 @@ class RlsCorrector:
 
     def reset(self) -> None:
         """Forget everything."""
-        law = self.adaptation
-        ahead, targets, n = len(law.horizons), len(law.columns), law.features
+        constants = self.adaptation
+        ahead, targets, n = len(constants.horizons), len(constants.columns), constants.features
         self.theta = np.zeros((ahead, targets, n), dtype=np.float32)
         self.covariance = np.stack([self._start()] * ahead)
         self._plain, self._corrected = (np.zeros((ahead, targets), dtype=np.float32) for _ in range(2))
         self.fallback = np.zeros((ahead, targets), dtype=bool)
-        self._rows = [np.zeros((k, n + 2 * targets), dtype=np.float32) for k in law.horizons]
+        self._rows = [np.zeros((k, n + 2 * targets), dtype=np.float32) for k in constants.horizons]
         self._at = [0] * ahead
         self.repairs = self._streak = 0
 
@@ -127,9 +127,9 @@ class RlsCorrector:
             return self._step(x, y, fresh, learn)
 
     def _step(self, x: Array, y: Array, fresh: bool, learn: bool) -> tuple[Array, RlsStatus]:
-        law, out, taught = self.adaptation, y.copy(), False
+        constants, out, taught = self.adaptation, y.copy(), False
         measured, directed = x[self._columns], self._directed(x)
-        for h, k in enumerate(law.horizons):
+        for h, k in enumerate(constants.horizons):
             error = np.zeros(len(measured), dtype=np.float32)
             if fresh and self._streak >= k:
                 error = self._error(h, measured)
@@ -139,26 +139,26 @@ class RlsCorrector:
             if fresh:
                 self._rows[h][self._at[h]] = np.concatenate([phi, y[h], correction])
                 self._at[h] = (self._at[h] + 1) % k
-            out[h] = np.where(self.fallback[h], y[h], y[h] + law.unit[h] * correction)
-        self._streak = min(self._streak + 1, law.reach) if fresh else 0
+            out[h] = np.where(self.fallback[h], y[h], y[h] + constants.unit[h] * correction)
+        self._streak = min(self._streak + 1, constants.max_horizon) if fresh else 0
         if self.fallback.any():
             return out, RlsStatus.FALLBACK
         return out, RlsStatus.LEARNING if taught else RlsStatus.HOLDING
 
     def _directed(self, x: Array) -> Array:
         """The inputs along the directions ``(r,)``."""
-        law = self.adaptation
-        if not law.spec.rank:
+        constants = self.adaptation
+        if not constants.spec.rank:
             return np.zeros(0, dtype=np.float32)
-        scaled = _within((x - law.offset) / law.scale, FEATURE_LIMIT)
-        return _within(total(law.directions * scaled), FEATURE_LIMIT)
+        scaled = _within((x - constants.offset) / constants.scale, FEATURE_LIMIT)
+        return _within(total(constants.directions * scaled), FEATURE_LIMIT)
 
     def _phi(self, h: int, measured: Array, y: Array, error: Array, directed: Array) -> Array:
-        law = self.adaptation
+        constants = self.adaptation
         if not (self._moves(measured) or self._moves(y)):
-            return np.zeros(law.features, dtype=np.float32)
-        present = _within((measured - law.middle) / law.spread, FEATURE_LIMIT)
-        change = _within((y - measured) / law.change[h], FEATURE_LIMIT)
+            return np.zeros(constants.features, dtype=np.float32)
+        present = _within((measured - constants.middle) / constants.spread, FEATURE_LIMIT)
+        change = _within((y - measured) / constants.change[h], FEATURE_LIMIT)
         return np.concatenate([np.ones(1, dtype=np.float32), present, change, _within(error, FEATURE_LIMIT), directed])
 
     def _moves(self, values: Array) -> bool:

@@ -1,6 +1,6 @@
 """What the samples of one channel say of the sensor and logger behind it: step, noise, update rate, clipping, spikes.
 
-All of it is told from the numbers alone; values are one channel, float32, shape ``(time,)``, without missing ones.
+All of it follows from the numbers alone; values are one channel, float32, shape ``(time,)``, without missing ones.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is odd in a recording: found and reported, never mended here."""
+"""What is odd in a recording: found and reported, never repaired here."""
 
 from __future__ import annotations
 

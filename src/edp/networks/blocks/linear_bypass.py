@@ -1,4 +1,4 @@
-"""Linear by-pass: a finite impulse response from the scaled features straight to the output."""
+"""Linear skip connection: a finite impulse response from the scaled features straight to the output."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LinearBypass:
         trained: False keeps the start values, so that the network learns what the linear map leaves.
 
     Raises:
-        ConfigError: taps below 1, unknown start, or a by-pass that is zero and not trained.
+        ConfigError: taps below 1, unknown start, or a skip connection that is zero and not trained.
     """
 
     slot: ClassVar[BlockSlot] = BlockSlot.BYPASS
@@ -49,7 +49,7 @@ class LinearBypass:
             raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
 
     def build(self, space: OutputSpace) -> Streaming:
-        """The by-pass, at zero; training puts the ridge solution in."""
+        """The skip connection, at zero; training puts the ridge solution in."""
         return Bypass(space.features, space.horizons, space.outputs, self)
 
 
@@ -81,7 +81,7 @@ class Bypass(Streaming):
         wide = self.horizons * self.outputs
         return [
             Cost(
-                "linear by-pass",
+                "linear skip connection",
                 parameters_of(self),
                 per_prediction=self.weight.numel(),
                 width_in=self.features,

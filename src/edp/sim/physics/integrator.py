@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
-from edp.sim.physics import dynamics, friction, hydraulics, linkage, pump, terramechanics, valve
-from edp.sim.physics import terrain as earth
+from edp.sim.physics import dynamics, friction, hydraulics, linkage, pump, terrain, terramechanics, valve
 from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
@@ -310,7 +309,7 @@ def step(
         terramechanics.engage(state, work[FROZEN_W][ANGLES:], axes, ground, work[CONTACT])
     rosenbrock(state, h, axes, plant, work)
     if near_soil:
-        earth.settle(state, h, work[CONTACT], ground)
+        terrain.settle(state, h, work[CONTACT], ground)
     for i in range(at.AXES):
         state[at.PSI + i] += 0.5 * h * state[at.RATE + i]
     pump.displacement_step(state, valves, axes, plant, share)

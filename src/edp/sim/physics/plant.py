@@ -12,8 +12,7 @@ from edp.errors import ConfigError
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
-from edp.sim.physics import dynamics, integrator, linkage, soil, terramechanics, thermal, valve
-from edp.sim.physics import terrain as earth
+from edp.sim.physics import dynamics, integrator, linkage, soil, terrain, terramechanics, thermal, valve
 from edp.sim.physics.jit import compiled
 from edp.sim.sensors import logbook
 
@@ -67,7 +66,7 @@ def run_samples(
         thermal.warm(log[k], axes, plant, time_s)
         near, fine = False, near_end(log[k], axes)
         if in_soil:
-            near, touching = earth.look(log[k], time_s, axes, ground)
+            near, touching = terrain.look(log[k], time_s, axes, ground)
             fine = fine or touching
         integrator.begin_sample(state, work)
         steps, step_s, share, filters = clocks[1] if fine else clocks[0]

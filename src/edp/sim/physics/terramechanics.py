@@ -1,4 +1,4 @@
-"""Forces of soil on the bucket: cutting, edge, heel and the chassis that gives way. What soil does in return: `earth`.
+"""Forces of soil on the bucket: cutting, edge, heel and the chassis that gives way. The reaction of soil: `terrain`.
 
 Cutting follows the earthmoving equation of Reece and McKyes, heel contact Bekker's pressure-sinkage law with elastic
 unloading and Janosi's shear. Every force that depends on velocity opposes it or stands across it, so that soil never

@@ -128,9 +128,10 @@ def replay(
         DataError: no recording is longer than start-up and horizon.
     """
     skip = predictor.spec.window
-    if not any(part.samples > skip + adaptation.reach for part in series):
+    if not any(part.samples > skip + adaptation.max_horizon for part in series):
         raise DataError(
-            f"no recording is longer than {skip + adaptation.reach} ticks, which start-up and horizon take; give longer"
+            f"no recording is longer than {skip + adaptation.max_horizon} ticks, which start-up and horizon "
+            "take; give longer"
         )
     adapter, replayed = RlsCorrector(adaptation), []
     for done, (part, base) in enumerate(zip(series, stream_predictions(predictor, series), strict=True)):

@@ -31,7 +31,7 @@ _SECONDS = {
 
 
 def collect(variables: dict[str, Any]) -> MatVariables:
-    """Walk all variables; names that occur twice are told apart by their path (``log.x``)."""
+    """Walk all variables; names that occur twice are distinguished by their path (``log.x``)."""
     mat_variables = MatVariables()
     for name, value in variables.items():
         _walk(value, name, name, None, mat_variables)
