@@ -102,6 +102,7 @@ def measure(package: Path = PACKAGE) -> House:
         comments += sum(
             token.type == tokenize.COMMENT for token in tokenize.generate_tokens(io.StringIO(text).readline)
         )
+        comments += sum(map(_constant_docstrings, ast.walk(tree)))
         where = files[name].relative_to(package.parent)
         if count > LONG_FILE:
             house.long_files.append(f"{where} {count}")

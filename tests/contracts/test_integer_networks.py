@@ -33,7 +33,7 @@ def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, ro
     predictor = predictor_of(structure, dtype=torch.float32)
     graph = predictor.graph()
     if {type(layer) for layer in graph.layers} & set(REFUSED):
-        with pytest.raises(ExportError, match="no form in whole numbers; train with"):
+        with pytest.raises(ExportError, match="no form in integer arithmetic; train with"):
             calibrate(graph, [rows_of(predictor, 50)])
     else:
         calibrate(graph, [rows_of(predictor, 50)])

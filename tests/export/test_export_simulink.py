@@ -73,7 +73,7 @@ def test_without_the_window_and_in_whole_numbers(bundle_of, matlab_folder_of, tm
     there = {file.name for file in folder.iterdir()}
     assert {"arm_sfun.c", "arm_call.c", "arm_golden.m"} <= there
     assert not there & {"arm_step.m", "arm_reset.m", "arm_stream.m", "arm_onnx.m", "arm_window.onnx"}
-    assert "whole numbers: there is C code only" in (folder / "README.md").read_text()
+    assert "integer arithmetic: C code only" in (folder / "README.md").read_text()
 
 
 @pytest.fixture(scope="session")

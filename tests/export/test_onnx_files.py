@@ -135,7 +135,7 @@ def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path, monkeypa
         make_target("c", {"opset": 9})
     with pytest.raises(ConfigError, match=r"no option 'opsett' \(it has opset\)"):
         make_target("onnx", {"opsett": 9})
-    with pytest.raises(ExportError, match=r"whole numbers \(w8a16\), which ONNX does not hold; export the run"):
+    with pytest.raises(ExportError, match=r"integer arithmetic \(w8a16\), which ONNX does not hold; export the run"):
         OnnxTarget().write(bundle_of("lstm", whole=True), "arm", tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(ExportError, match=r"pip install 'excavator-dynamics-predictor\[onnx\]'"):

@@ -15,7 +15,7 @@ from edp.errors import DataError
 from edp.logs import inspect_log, read_recording, write_recording
 from edp.logs.detect import open_log
 from edp.logs.formats.csv_table import CsvTable
-from edp.logs.formats.edp_metadata import own_facts
+from edp.logs.formats.edp_metadata import parse_edp_metadata
 from edp.recording import Recording
 from edp.signals import TABLE_A1, ChannelMap, SignalMap
 
@@ -95,7 +95,7 @@ HOSTILE_FACTS = {
 @pytest.mark.parametrize("what", HOSTILE_FACTS)
 def test_facts_that_edp_never_wrote_are_refused(tmp_path, what):
     with pytest.raises(DataError, match="facts that EDP wrote into it are damaged") as refused:
-        own_facts(HOSTILE_FACTS[what], "'a'")
+        parse_edp_metadata(HOSTILE_FACTS[what], "'a'")
     assert len(str(refused.value)) < 600
     if len(HOSTILE_FACTS[what]) < 1 << 20:
         table = pq.read_table(own_parquet(tmp_path))

@@ -14,7 +14,7 @@ import scipy.io
 
 from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.logs import FORMATS, LAYOUTS, WriteOptions, inspect_log, read_recording, write_recording
-from edp.logs.formats.edp_metadata import facts_text, own_facts
+from edp.logs.formats.edp_metadata import facts_text, parse_edp_metadata
 from edp.logs.formats.matlab.check import check_size
 from edp.recording import Recording
 from edp.signals import TABLE_A1, Channel, ChannelMap, Kind, SignalMap
@@ -361,6 +361,6 @@ def test_one_name_in_two_variables_is_never_chosen_silently(tmp_path):
 @pytest.mark.parametrize("key", ["dig\u0435st", "digess", "more"])
 def test_facts_with_a_key_that_is_not_known_are_damaged(key):
     text = facts_text(Recording("r", (Channel("u", Kind.GENERIC),), np.zeros((3, 1), np.float32), 100.0))
-    assert own_facts(text, "'r.mat'").digest
+    assert parse_edp_metadata(text, "'r.mat'").digest
     with pytest.raises(DataError, match="which this version does not know"):
-        own_facts(text.replace('"digest"', f'"{key}"'), "'r.mat'")
+        parse_edp_metadata(text.replace('"digest"', f'"{key}"'), "'r.mat'")

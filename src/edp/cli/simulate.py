@@ -46,7 +46,8 @@ def simulate(
         ),
     ] = None,
     form: Annotated[
-        str | None, typer.Option("--format", help="Ending of the logs: parquet (default), csv or mat.")
+        str | None,
+        typer.Option("--format", help="Ending of the logs, of any format that EDP writes (default: parquet)."),
     ] = None,
     layout: Annotated[str | None, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, ...")] = None,
     truth: Annotated[

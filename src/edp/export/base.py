@@ -69,7 +69,7 @@ def _read(target: str, option: str, value: object, kind: type) -> object:
     try:
         return _SWITCH[value.lower()] if kind is bool else kind(value)
     except (KeyError, ValueError) as error:
-        rule = "true or false" if kind is bool else "a whole number" if kind is int else "a number"
+        rule = "true or false" if kind is bool else "an integer" if kind is int else "a number"
         raise ConfigError(f"option '{option}' of export target '{target}' is '{value}'; it must be {rule}") from error
 
 

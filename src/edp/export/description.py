@@ -83,11 +83,12 @@ def float_graph(predictor: Predictor, form: str) -> Graph:
     """The layers of a network in single precision, for a form that has no other numbers.
 
     Raises:
-        ExportError: the network computes in whole numbers.
+        ExportError: the network computes in integer arithmetic.
     """
     if isinstance(predictor, IntegerPredictor):
         raise ExportError(
-            f"the network computes in whole numbers ({predictor.number_format}), which {form} does not hold; export "
+            f"the network computes in integer arithmetic ({predictor.number_format}), which {form} does not "
+            "hold; export "
             "the run that it was quantised from, or take a form around the C code"
         )
     return predictor.graph()

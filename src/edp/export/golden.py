@@ -22,7 +22,7 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     """How far another form may be from `outputs`, PyTorch's in single precision, for each number of a tick.
 
     `SHARE` of a standard deviation and of the largest value; where PyTorch in single precision is farther than that
-    from itself in double precision (a layer norm of a cell near zero), twice that distance. Whole numbers: nothing.
+    from itself in double precision (a layer norm of a cell near zero), twice that distance. Integers: nothing.
     """
     if isinstance(predictor, IntegerPredictor):
         return np.zeros(outputs.shape[1], dtype=np.float32)

@@ -129,8 +129,8 @@ def repair_values(
         if sound[column]:
             continue
         bad = ~np.isfinite(values[:, column])
-        own = bad & ~missing if repair.gaps in ("keep", "refuse") else bad
-        rows = np.flatnonzero(own)
+        repairable = bad & ~missing if repair.gaps in ("keep", "refuse") else bad
+        rows = np.flatnonzero(repairable)
         if not len(rows) or repair.nan == "keep":
             continue
         first = first_row + int(rows[0])
@@ -145,7 +145,7 @@ def repair_values(
                 f"start the rows at {first_row + int(np.argmin(bad))} or later"
             )
         source = np.maximum.accumulate(np.where(bad, 0, np.arange(len(bad))))
-        values[own, column] = values[source[own], column]
+        values[repairable, column] = values[source[repairable], column]
         repairs.append({"repair": "nan = hold", "channel": name, "count": len(rows), "row": first})
     return repairs
 

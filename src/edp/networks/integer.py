@@ -25,7 +25,7 @@ JUDGED_TICKS = 200_000
 
 
 class IntegerPredictor(Predictor):
-    """The whole-number form of a trained predictor; it cannot be trained.
+    """The integer form of a trained predictor; it cannot be trained.
 
     Args:
         source: the float network.
@@ -36,7 +36,7 @@ class IntegerPredictor(Predictor):
         integers: its layers.
 
     Raises:
-        ExportError: a part of the network has no whole-number form.
+        ExportError: a part of the network has no integer form.
     """
 
     number_format = "w8a16"
@@ -84,7 +84,7 @@ class IntegerPredictor(Predictor):
         return torch.stack(sides, dim=3)
 
     def forward_features(self, x: Tensor, state: State) -> NoReturn:
-        """Not in whole numbers.
+        """Not in integer arithmetic.
 
         Raises:
             ExportError: always.
@@ -105,7 +105,7 @@ def integer_predictor(predictor: Predictor, series: Sequence[Series], ticks: int
     """Quantise a trained network; formats and weights are chosen on `series`, its training part.
 
     Raises:
-        ExportError: a part of the network has no whole-number form.
+        ExportError: a part of the network has no integer form.
     """
     some = spread(series, JUDGED_TICKS)
     inputs = [part.inputs for part in series]

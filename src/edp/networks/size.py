@@ -13,7 +13,7 @@ MOST_PARAMETERS = 50_000_000
 # Numbers that a stream carries from tick to tick: 0.4 GB as float32, and a training has a stream for each lane.
 MOST_STATE = 100_000_000
 NO_WIDTHS = ("kernel", "layers", "window", "ticks", "taps", "heads", "reduction", "first_dilations", "lags")
-"""Options in whole numbers that are not the width of anything."""
+"""Options that are integers, but not the width of anything."""
 
 
 def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
@@ -23,7 +23,7 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
         spec: a `ModelSpec`.
         task: what it reads and predicts.
     """
-    options = list(_whole_numbers((spec.backbone, spec.head, *spec.blocks)))
+    options = list(_integers((spec.backbone, spec.head, *spec.blocks)))
     features, targets = len(task.features.features), len(task.targets)
 
     def most(name: str) -> int:
@@ -56,12 +56,12 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
     return squares * width**2 + ends + small, 4 * reach * stacks * (levels + layers + 2) * width
 
 
-def _whole_numbers(parts: tuple[Any, ...] | list[Any], name: str = "") -> Iterator[tuple[str, int]]:
+def _integers(parts: tuple[Any, ...] | list[Any], name: str = "") -> Iterator[tuple[str, int]]:
     for part in parts:
         if is_dataclass(part):
             for entry in fields(part):
-                yield from _whole_numbers([getattr(part, entry.name)], entry.name)
+                yield from _integers([getattr(part, entry.name)], entry.name)
         elif isinstance(part, tuple):
-            yield from _whole_numbers(part, name)
+            yield from _integers(part, name)
         elif isinstance(part, int) and not isinstance(part, bool):
             yield name, part

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import false_discovery_control
 
 from edp.errors import DataError, closest
 from edp.stats.checks import Array, finite
@@ -20,10 +21,8 @@ def benjamini_hochberg(p: ArrayLike) -> Array:
     Raises:
         DataError: empty, or values outside 0 to 1.
     """
-    array, order, n = _sorted(p)
-    scaled = np.take_along_axis(array, order, axis=-1) * n / np.arange(1, n + 1)
-    steps = np.minimum.accumulate(scaled[..., ::-1], axis=-1)[..., ::-1]
-    return _unsorted(np.minimum(steps, 1.0), order)
+    array, _, _ = _sorted(p)
+    return np.asarray(false_discovery_control(array, axis=-1, method="bh"), dtype=np.float64)
 
 
 def holm(p: ArrayLike) -> Array:

@@ -148,7 +148,7 @@ def test_unknown_preset_machine_format_and_paths(edp, logs, tmp_path):
     refused(edp("export", tmp_path, "--to", "c", "--set", "opset=9", "--out", run), "'c' has no option 'opset'")
     refused(edp("export", tmp_path, "--to", "onnx", "--set", "opset=10", "--out", run), "opset 10", "9, 11, 13")
     refused(
-        edp("export", tmp_path, "--to", "onnx", "--set", "opset=new", "--out", run), "'opset'", "'new'", "whole number"
+        edp("export", tmp_path, "--to", "onnx", "--set", "opset=new", "--out", run), "'opset'", "'new'", "an integer"
     )
     refused(edp("export", tmp_path, "--to", "onnx", "--set", "opset", "--out", run), "--set opset", "NAME=VALUE")
     assert not run.exists()

@@ -1,4 +1,4 @@
-"""The C calls of whole-number layers, and the runtime's tables."""
+"""The C calls of integer layers, and the runtime's tables."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ INTEGER_CALLS: dict[type[Layer], Write] = {
     made.WTrailingMean: _mean,
     made.WAttentionPool: _pool,
 }
-"""By kind of whole-number layer."""
+"""By kind of integer layer."""
 CALLS |= INTEGER_CALLS
 
 COUNTED = (made.WDifference, made.WConvolution, made.WTrailingMean, made.WAttentionPool)
@@ -123,7 +123,7 @@ COUNTED = (made.WDifference, made.WConvolution, made.WTrailingMean, made.WAttent
 
 
 def structs(layer: Layer) -> list[str]:
-    """Constant structs that a whole-number layer's function reads, one a line."""
+    """Constant structs that an integer layer's function reads, one a line."""
     name = identifier(layer.name)
 
     def matrix(suffix: str, weight: str = "weight") -> str:

@@ -64,7 +64,7 @@ class Model:
 
     @property
     def whole(self) -> bool:
-        """Whether it computes in whole numbers."""
+        """Whether it computes in integer arithmetic."""
         return isinstance(self.bundle.predictor, IntegerPredictor)
 
     @property
@@ -274,13 +274,13 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
         adapts: with the bundle's adaptation, where it has one.
 
     Raises:
-        ExportError: a part of the network has no form as a layer, a tangent of whole numbers is asked for, or a size is
+        ExportError: a part of the network has no form as a layer, a tangent of integers is asked for, or a size is
             beyond the numbers of C.
     """
     predictor = bundle.predictor
     whole = isinstance(predictor, IntegerPredictor)
     if whole and tangent:
-        raise ExportError("a network in whole numbers is a staircase and has no tangent; export the float run")
+        raise ExportError("a network in integer arithmetic is a staircase and has no tangent; export the float run")
     graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
     changes = plan(graph, tangents.tangent_scratch_of) if tangent else None
     model = Model(name, bundle, graph, plan(graph), changes, adapts and bundle.adaptation is not None)

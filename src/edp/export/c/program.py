@@ -29,7 +29,7 @@ def features(statements: Iterable[str]) -> tuple[int, int, int]:
     """What the size of a model's own code depends on.
 
     Returns:
-        Calls, arguments on the stack, whole numbers that are wider than a byte.
+        Calls, arguments on the stack, integers that are wider than a byte.
     """
     calls = on_stack = wide = 0
     for _, inside in CALL.findall(" ".join(statements)):

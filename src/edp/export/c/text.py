@@ -45,7 +45,7 @@ def array(kind: str, name: str, values: Iterable[str], note: str = "") -> Code:
 
 
 def call(function: str, *arguments: object) -> str:
-    """A call statement; whole numbers are written as unsigned."""
+    """A call statement; integers are written as unsigned."""
     argument_texts = [f"{x}u" if isinstance(x, int) else str(x) for x in arguments]
     return f"{function}({', '.join(argument_texts)});"
 

@@ -146,7 +146,7 @@ class _Part:
         return self.options[name]
 
     def count(self) -> Any:
-        """Ticks seen before this one; a whole number, through which nothing is differentiated."""
+        """Ticks seen before this one; an integer, through which nothing is differentiated."""
         return ca.floor(self.m["age"] + 0.5)
 
     def push(self, slot: str, x: Any) -> Any:

@@ -42,7 +42,7 @@ class Place:
 
 
 def places(graph: Graph) -> list[Place]:
-    """Every slot with numbers. Ages are whole numbers: ticks seen before the present one, as far as they matter."""
+    """Every slot with numbers. Ages are integers: ticks seen before the present one, as far as they matter."""
     states, at = [], 0
     for layer, slot in graph.slots():
         if slot.size:

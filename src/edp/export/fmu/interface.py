@@ -21,7 +21,7 @@ class Variable:
         name: unique.
         causality: input, output or local.
         description: for people.
-        form: real number, whole number, or true and false.
+        form: real number, integer, or true and false.
         kind: what a real number measures.
         nominal: usual size of a real number, SI unit.
     """

@@ -1,4 +1,4 @@
-"""Whole-number arithmetic of W8A16 networks, the same bits in NumPy and in C.
+"""Integer arithmetic of W8A16 networks, the same bits in NumPy and in C.
 
 A value is ``q 2^-frac`` with q a 16-bit number in [-32767, 32767]; `frac` may be negative or beyond 15. Accumulators
 are 32-bit, what they are multiplied by afterwards gives 64 bits. Every rounding is half up, every overflow saturates.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edp.errors import ExportError
 
 Whole = NDArray[np.int64]
-"""Whole numbers of any width; NumPy computes with 64 bits, and `saturated` keeps them in theirs."""
+"""Integers of any width; NumPy computes with 64 bits, and `saturated` keeps them in theirs."""
 
 LARGEST = 32767
 """Of an activation."""

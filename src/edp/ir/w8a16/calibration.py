@@ -42,7 +42,7 @@ def calibrate(
             they were; None keeps the format in which nothing is clipped.
 
     Raises:
-        ExportError: a part of the network has no whole-number form.
+        ExportError: a part of the network has no integer form.
     """
     ranges: dict[str, float] = {}
     moments = InputMoments(graph)

@@ -1,4 +1,4 @@
-"""Layers of a W8A16 network: 8-bit weights, 16-bit values, whole numbers only.
+"""Layers of a W8A16 network: 8-bit weights, 16-bit values, integers only.
 
 A value is ``q 2^-frac``. A weight is ``q scale`` with a scale for each output; the scale is in the `multiplier` and
 `shift` that take an accumulator to its output's format (see `edp.ir.w8a16.arithmetic`), biases are in units of the
@@ -23,7 +23,7 @@ Shifts = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Whole(Layer):
-    """A layer whose value is whole numbers.
+    """A layer whose value is integers.
 
     Attributes:
         frac: fractional bits of its value.
@@ -68,7 +68,7 @@ class Quantise(_Sized):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Dequantise(Layer):
-    """Whole numbers of `frac` fractional bits to real ones, exactly."""
+    """Integers of `frac` fractional bits to real ones, exactly."""
 
     frac: int
     size: int

@@ -1,7 +1,7 @@
-"""A list of float layers as one of whole-number layers, given how large each value becomes.
+"""A list of float layers as one of integer layers, given how large each value becomes.
 
-What lies between the standardised inputs and the last weights is computed in whole numbers; scaling of the inputs, the
-way back to SI units and the few kinds in `FLOAT` stay in single precision.
+What lies between the standardised inputs and the last weights is computed in integer arithmetic; scaling of the
+inputs, the way back to SI units and the few kinds in `FLOAT` stay in single precision.
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ class _Work:
     fracs: Mapping[str, int]
     rounding: WeightRounding
     integer_fracs: dict[str, int]
-    """Fractional bits of values that are whole numbers by now."""
+    """Fractional bits of values that are integers by now."""
     out: list[Layer]
     slots: dict[tuple[str, str], int]
     """Fractional bits of slots."""
 
     def rows(self, layer: Any, input_frac: int) -> dict[str, Any]:
-        """Whole-number weights and biases of a layer."""
+        """Integer weights and biases of a layer."""
         return rows(layer.name, layer.weight, layer.bias, (input_frac, self.frac(layer.name)), self.rounding)
 
     def gates(self, layer: Any, input_frac: int) -> dict[str, Any]:
-        """Whole-number matrices of a recurrent layer."""
+        """Integer matrices of a recurrent layer."""
         gate_constants: dict[str, Any] = {}
         for side, frac in (("x", input_frac), ("h", whole.UNIT_FRAC)):
             made_of = to_gates(f"{layer.name}/{side}", getattr(layer, f"weight_{side}"), frac, self.rounding)
@@ -79,7 +79,7 @@ class _Work:
         return gate_constants
 
     def whole(self, value: str) -> str:
-        """The name of a value as whole numbers."""
+        """The name of a value as integers."""
         if value in self.integer_fracs:
             return value
         name = f"{value}.whole"
@@ -115,7 +115,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
         moments: of what each matrix is multiplied by (see `WeightRounding`), for weights that are not known.
 
     Raises:
-        ExportError: a kind of layer that has no whole-number form, sums that would not fit in 32 bits, or formats of
+        ExportError: a kind of layer that has no integer form, sums that would not fit in 32 bits, or formats of
             another graph.
     """
     inside = integer_part(graph)
@@ -124,7 +124,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
         kind = type(layer)
         if kind in REFUSED:
             raise ExportError(
-                f"layer '{layer.name}' is a {kind.__name__}, which has no form in whole numbers; {REFUSED[kind]}"
+                f"layer '{layer.name}' is a {kind.__name__}, which has no form in integer arithmetic; {REFUSED[kind]}"
             )
         if layer.name not in inside:
             work.out.append(replace(layer, inputs=tuple(work.real(name) for name in layer.inputs)))
@@ -144,7 +144,7 @@ def outline(graph: Graph) -> Graph:
     What a network takes of a controller depends on no number, so neither training nor recordings are needed.
 
     Raises:
-        ExportError: a kind of layer that has no whole-number form.
+        ExportError: a kind of layer that has no integer form.
     """
     hollow = []
     for layer in graph.layers:
@@ -171,9 +171,9 @@ def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str]
 
 
 def integer_part(graph: Graph) -> set[str]:
-    """Layers that are computed in whole numbers: after the scaling of the inputs, up to the last weights.
+    """Layers that are computed in integer arithmetic: after the scaling of the inputs, up to the last weights.
 
-    Functions and selections of whole numbers behind the last weights belong to it too.
+    Functions and selections of integers behind the last weights belong to it too.
     """
     scaled: set[str] = set()
     before: set[str] = set()
@@ -321,7 +321,7 @@ def _pool(work: _Work, x: memory.AttentionPool, input_fracs: list[int]) -> made.
 
 
 def weights_of(graph: Graph) -> dict[str, NDArray[np.int8]]:
-    """8-bit weights of a whole-number graph, by matrix."""
+    """8-bit weights of an integer graph, by matrix."""
     weights: dict[str, NDArray[np.int8]] = {}
     for layer, name, values in graph.tensors():
         if values.dtype == np.int8:
@@ -348,4 +348,4 @@ LOWER: dict[type[Layer], Lower] = {
     memory.TrailingMean: _mean,
     memory.AttentionPool: _pool,
 }
-"""By kind of layer that has a whole-number form."""
+"""By kind of layer that has an integer form."""

@@ -74,7 +74,7 @@ class Integers:
 
 
 def matrix(x: Whole, weight: NDArray[np.int8]) -> Whole:
-    """``x W'`` of whole numbers: double precision holds the sums exactly, and is fast."""
+    """``x W'`` of integers: double precision holds the sums exactly, and is fast."""
     return np.asarray(x.astype(np.float64) @ weight.T.astype(np.float64)).astype(np.int64)
 
 
@@ -245,4 +245,4 @@ WHOLE: dict[type[Layer], Callable[..., Any]] = {
     made.WTrailingMean: _mean,
     made.WAttentionPool: _pool,
 }
-"""Many ticks of a kind of whole-number layer."""
+"""Many ticks of a kind of integer layer."""

@@ -1,4 +1,4 @@
-"""Which whole numbers weights become: the nearest, or those that make the least error in what a layer gives.
+"""Which integers weights become: the nearest, or those that make the least error in what a layer gives.
 
 The second way takes the columns of a matrix one after the other, rounds each, and lets the columns that follow make up
 for its error (E. Frantar et al., GPTQ, 2022): with ``H`` the mean of ``x x'`` over data, the error of an output is
@@ -25,7 +25,7 @@ class WeightRounding:
     """How weights are rounded; without data or known numbers to the nearest.
 
     Attributes:
-        weights: whole numbers found before, by matrix.
+        weights: integers found before, by matrix.
         moments: mean ``x x'`` of what a matrix is multiplied by, ``(terms, terms)``, or ``(row, terms, terms)`` where
             each row has its own input.
     """

@@ -1,4 +1,4 @@
-"""Weights as whole numbers, with a scale for each output."""
+"""Weights as integers, with a scale for each output."""
 
 from __future__ import annotations
 

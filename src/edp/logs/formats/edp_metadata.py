@@ -14,7 +14,7 @@ from edp.signals import Channel, Kind
 
 
 @dataclass(frozen=True)
-class OwnFacts:
+class EdpMetadata:
     """What a file that EDP wrote says about itself; without `rate_hz` the file is someone else's."""
 
     rate_hz: float | None = None
@@ -65,7 +65,7 @@ def _listed(channels: Sequence[Channel]) -> list[dict[str, str]]:
     return [{"name": c.name, "unit": c.unit, "kind": str(c.kind), "description": c.description} for c in channels]
 
 
-def own_facts(text: str, where: str) -> OwnFacts:
+def parse_edp_metadata(text: str, where: str) -> EdpMetadata:
     """Read `facts_text` back.
 
     Raises:
@@ -95,7 +95,7 @@ def own_facts(text: str, where: str) -> OwnFacts:
         name, source = (str(facts[key]) for key in ("name", "source"))
         _check_texts([name, source, *(text for c in [*channels.values(), *truth.values()] for text in _texts(c))])
         _check_depth(facts["meta"])
-        return OwnFacts(rate, name, source, dict(facts["meta"]), channels, truth, *digests)
+        return EdpMetadata(rate, name, source, dict(facts["meta"]), channels, truth, *digests)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(
             f"{where}: the facts that EDP wrote into it are damaged ({type(error).__name__}: {str(error)[:200]}); "

@@ -24,7 +24,7 @@ from edp.logs.formats.base import (
     parted,
     time_factor,
 )
-from edp.logs.formats.edp_metadata import OwnFacts, facts_text, own_facts
+from edp.logs.formats.edp_metadata import EdpMetadata, facts_text, parse_edp_metadata
 from edp.logs.formats.mat_layouts import LAYOUTS
 from edp.logs.formats.matlab import INFO, MAGIC, MatVariables, is_v4
 from edp.logs.units import normalise_unit
@@ -54,8 +54,10 @@ class MatFormat:
         from edp.logs.formats.matlab.unpacking import unpack  # pandas takes seconds to import
 
         mat_variables = unpack(path, signal_map.variable)
-        own = (
-            OwnFacts() if mat_variables.info is None else own_facts(mat_variables.info, f"'{path}', variable '{INFO}'")
+        edp_metadata = (
+            EdpMetadata()
+            if mat_variables.info is None
+            else parse_edp_metadata(mat_variables.info, f"'{path}', variable '{INFO}'")
         )
         if signal_map.variable is not None:
             if signal_map.variable not in mat_variables.names:
@@ -64,14 +66,14 @@ class MatFormat:
                     f"{closest(signal_map.variable, mat_variables.names)}; "
                     "set 'variable' in the signal map to an existing one"
                 )
-            if signal_map.variable == TRUTH and own.truth:
-                own = replace(own, channels=own.truth, digest=own.truth_digest)
+            if signal_map.variable == TRUTH and edp_metadata.truth:
+                edp_metadata = replace(edp_metadata, channels=edp_metadata.truth, digest=edp_metadata.truth_digest)
         if not mat_variables.signals:
             raise DataError(
                 f"'{path}' holds no signals (variables: {', '.join(mat_variables.names[:12]) or 'none'}); expected "
                 "numeric vectors, structs of them, timeseries, a Dataset or a timetable"
             )
-        return _raw_log(path, mat_variables, own, signal_map)
+        return _raw_log(path, mat_variables, edp_metadata, signal_map)
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write the variables of the wanted layout, and ``edp_info``, a JSON text with units and facts."""
@@ -124,10 +126,10 @@ class _Table:
         yield [self.columns[name][start:stop] for name in names]
 
 
-def _raw_log(path: Path, mat_variables: MatVariables, own: OwnFacts, signal_map: SignalMap) -> RawLog:
+def _raw_log(path: Path, mat_variables: MatVariables, edp_metadata: EdpMetadata, signal_map: SignalMap) -> RawLog:
     names = [part.name for part in mat_variables.signals]
     timeless = [part.name for part in mat_variables.signals if part.time is None]
-    time_name = None if own.rate_hz else find_time(timeless, signal_map, path)
+    time_name = None if edp_metadata.rate_hz else find_time(timeless, signal_map, path)
     time: Column | None = None
     if time_name is not None:
         part = mat_variables.signals[names.index(time_name)]
@@ -137,7 +139,7 @@ def _raw_log(path: Path, mat_variables: MatVariables, own: OwnFacts, signal_map:
     for part in mat_variables.signals:
         if part.name == time_name:
             continue
-        channel = own.channels.get(part.name)
+        channel = edp_metadata.channels.get(part.name)
         own_time = part.time if signal_map.sample_time_s is None else None
         if own_time is None and time is not None and len(time) == len(part.values):
             own_time = time
@@ -152,9 +154,9 @@ def _raw_log(path: Path, mat_variables: MatVariables, own: OwnFacts, signal_map:
             table=table,
             key=part.name,
         )
-    if own.channels:
-        signals = {name: signals[name] for name in own.channels if name in signals}
+    if edp_metadata.channels:
+        signals = {name: signals[name] for name in edp_metadata.channels if name in signals}
     repeated = {
         name: full for name, full in mat_variables.repeated.items() if name != time_name and set(full) <= set(signals)
     }
-    return RawLog(path, signals, mat_variables.scalars, repeated=repeated, **own.for_log())
+    return RawLog(path, signals, mat_variables.scalars, repeated=repeated, **edp_metadata.for_log())

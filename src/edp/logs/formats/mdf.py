@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, brief
 from edp.logs.formats.base import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
-from edp.logs.formats.edp_metadata import OwnFacts, facts_text, own_facts
+from edp.logs.formats.edp_metadata import EdpMetadata, facts_text, parse_edp_metadata
 from edp.logs.formats.mdf_check import check_blocks
 from edp.logs.formats.mdf_conversion import Conversion, refuse_engines
 from edp.logs.formats.names import only, shown_name, told_apart
@@ -69,16 +69,16 @@ class MdfFormat:
                 raise
             file = _File(path, log)
             weakref.finalize(file, _close, log, stream)
-            own = file.facts()
+            edp_metadata = file.facts()
             named_signals = [
-                signal for number in range(len(log.groups)) for signal in file.group(number, own, signal_map)
+                signal for number in range(len(log.groups)) for signal in file.group(number, edp_metadata, signal_map)
             ]
         if not named_signals:
             raise DataError(f"'{path}' holds no channels of numbers; {_advice(log)}")
         signals, aliases, repeated = told_apart(named_signals)
-        if own.channels:
-            signals, repeated = only(own.channels, signals, repeated)
-        return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
+        if edp_metadata.channels:
+            signals, repeated = only(edp_metadata.channels, signals, repeated)
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write one channel group of float32 with the time in s, packed, and EDP's facts as an attachment."""
@@ -128,21 +128,21 @@ class _File:
         name = self.log.groups[number].channels[channel_index].name
         return Conversion(block, f"'{self.path}', channel {shown_name(name)}")(raw)
 
-    def facts(self) -> OwnFacts:
+    def facts(self) -> EdpMetadata:
         for attachment in self.log.attachments:
             if attachment.file_name == _FACTS:
                 where = f"'{self.path}', attachment '{_FACTS}'"
-                return own_facts(_embedded(attachment, where).decode(errors="replace"), where)
-        return OwnFacts()
+                return parse_edp_metadata(_embedded(attachment, where).decode(errors="replace"), where)
+        return EdpMetadata()
 
-    def group(self, number: int, own: OwnFacts, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
+    def group(self, number: int, edp_metadata: EdpMetadata, signal_map: SignalMap) -> list[tuple[str, RawSignal]]:
         """The channels of one group that hold numbers, each with its full name."""
         group = self.log.groups[number]
         samples = int(group.channel_group.cycles_nr)
         master = self.log.masters_db.get(number)
         timed = master is not None and group.channels[master].sync_type == _TIME
         stamps = None
-        if timed and own.rate_hz is None and signal_map.sample_time_s is None:
+        if timed and edp_metadata.rate_hz is None and signal_map.sample_time_s is None:
             stamps = cache(partial(self.stamps, number))
         table = _Table(self, number)
         named_signals = []
@@ -150,7 +150,7 @@ class _File:
             usable = channel.data_type in _NUMBERS and channel.channel_type in _PLAIN_TYPES
             if channel_index == master or not usable or group.channel_dependencies[channel_index] or not samples:
                 continue
-            channel_facts = own.channels.get(channel.name)
+            channel_facts = edp_metadata.channels.get(channel.name)
             conversion = self.conversions.get((number, channel_index))
             unit = channel.unit or (conversion.unit if conversion else "")
             key = str(channel_index)

@@ -32,7 +32,7 @@ from edp.logs.formats.base import (
     load_column,
     time_factor,
 )
-from edp.logs.formats.edp_metadata import OwnFacts, facts_text, own_facts
+from edp.logs.formats.edp_metadata import EdpMetadata, facts_text, parse_edp_metadata
 from edp.logs.formats.names import only, told_apart
 from edp.logs.units import normalise_unit
 from edp.recording import Recording
@@ -76,17 +76,17 @@ class ParquetFormat:
         except (pa.ArrowException, OSError, ValueError) as error:
             advice = "decrypt it with its keys first" if "crypt" in str(error) else "copy or export it again"
             raise DataError(f"'{path}' is a damaged or encrypted Parquet file: {brief(error)}; {advice}") from error
-        own = _own(table.schema.metadata or {}, path)
-        clocks = {} if own.rate_hz else _clocks(table, signal_map)
+        edp_metadata = _edp_metadata(table.schema.metadata or {}, path)
+        clocks = {} if edp_metadata.rate_hz else _clocks(table, signal_map)
         times = {clock.field_index for clock in clocks.values()}
         named_signals = []
         for field_index, field in enumerate(table.schema):
             if field_index not in times:
                 named_signals += _signals(table, field_index, field, clocks.get(field_index))
         signals, aliases, repeated = told_apart(named_signals)
-        if own.channels:
-            signals, repeated = only(own.channels, signals, repeated)
-        return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
+        if edp_metadata.channels:
+            signals, repeated = only(edp_metadata.channels, signals, repeated)
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write float32 columns in groups of rows; there is no time column: row k is at k / rate_hz."""
@@ -119,8 +119,10 @@ class ParquetFormat:
 FORMATS.register("parquet")(ParquetFormat())
 
 
-def _own(metadata: dict[bytes, bytes], path: Path) -> OwnFacts:
-    return own_facts(metadata[_KEY].decode(errors="replace"), f"'{path}'") if _KEY in metadata else OwnFacts()
+def _edp_metadata(metadata: dict[bytes, bytes], path: Path) -> EdpMetadata:
+    return (
+        parse_edp_metadata(metadata[_KEY].decode(errors="replace"), f"'{path}'") if _KEY in metadata else EdpMetadata()
+    )
 
 
 def _is_number(kind: pa.DataType) -> bool:
@@ -259,12 +261,13 @@ class _Clock:
 def _clocks(table: _Table, signal_map: SignalMap) -> dict[int, _Clock]:
     """The clock of each column: one for all, or, as Simulink may write it, each signal's own column of time."""
     names = table.schema.names
-    own = {} if signal_map.time or signal_map.sample_time_s else _own_times(table.schema)
-    if len(set(own.values())) > 1:
+    time_of_field = {} if signal_map.time or signal_map.sample_time_s else _times_of_fields(table.schema)
+    if len(set(time_of_field.values())) > 1:
         read = {
-            field_index: _Clock.read(table, field_index, signal_map, shared=False) for field_index in set(own.values())
+            field_index: _Clock.read(table, field_index, signal_map, shared=False)
+            for field_index in set(time_of_field.values())
         }
-        return {field_index: read[time] for field_index, time in own.items()}
+        return {field_index: read[time] for field_index, time in time_of_field.items()}
     name = find_time(names, signal_map, table.path)
     if name is None:
         return {}
@@ -274,7 +277,7 @@ def _clocks(table: _Table, signal_map: SignalMap) -> dict[int, _Clock]:
     return dict.fromkeys(range(len(names)), clock)
 
 
-def _own_times(schema: pa.Schema) -> dict[int, int]:
+def _times_of_fields(schema: pa.Schema) -> dict[int, int]:
     """Columns that have a time column of their own: ``X_time`` beside ``X``, or the nearest ``time`` to the left."""
     names = [name.lower() for name in schema.names]
     first: dict[str, int] = {}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from edp.errors import DataError, brief
 from edp.logs.formats.bag_guard import check_counts, definitions_of, open_reader
 from edp.logs.formats.base import FORMATS, PIECE_ROWS, Column, RawLog, RawSignal, WriteOptions, load_column
-from edp.logs.formats.edp_metadata import OwnFacts, own_facts
+from edp.logs.formats.edp_metadata import EdpMetadata, parse_edp_metadata
 from edp.logs.formats.names import only, told_apart
 from edp.logs.formats.ros_message import columns_of, layout_of
 from edp.logs.formats.rosbag_write import FACTS_TOPIC, write_bag
@@ -53,8 +53,8 @@ class BagFormat:
         """Read topics, types and each topic's first message; the others when their values are asked for."""
         column_names = {entry.column for entry in signal_map.channels} or set(VOCABULARY)
         bag = _Bag(path, column_names, signal_map)
-        own = bag.facts()
-        named_signals = [signal for topic in bag.topics for signal in topic.signals(own)]
+        edp_metadata = bag.facts()
+        named_signals = [signal for topic in bag.topics for signal in topic.signals(edp_metadata)]
         if not named_signals:
             topic_names = ", ".join(sorted(bag.about)) or "none"
             raise DataError(
@@ -62,9 +62,9 @@ class BagFormat:
             )
         signals, aliases, repeated = told_apart(named_signals)
         bag.column_names = {aliases.get(name, name) for name in column_names}
-        if own.channels:
-            signals, repeated = only(own.channels, signals, repeated)
-        return RawLog(path, signals, aliases=aliases, repeated=repeated, **own.for_log())
+        if edp_metadata.channels:
+            signals, repeated = only(edp_metadata.channels, signals, repeated)
+        return RawLog(path, signals, aliases=aliases, repeated=repeated, **edp_metadata.for_log())
 
     def write(self, recording: Recording, path: Path, options: WriteOptions) -> None:
         """Write a topic of one message a sample, float32, and EDP's facts as a topic of text."""
@@ -105,15 +105,15 @@ class _Bag:
             self.facts_from = filled.get(FACTS_TOPIC)
             self.origin_ns = int(self.reader.start_time)
 
-    def facts(self) -> OwnFacts:
+    def facts(self) -> EdpMetadata:
         if not self.facts_from:
-            return OwnFacts()
+            return EdpMetadata()
         with damage(self.path):
             raw = next(iter(self.reader.messages(connections=self.facts_from)))[2]
             start = 8 if self.cdr else 4
             (count,) = struct.unpack_from("<I", raw, start - 4)  # a slice ends where the message does
             text = bytes(raw[start : start + count]).rstrip(b"\0").decode()
-        return own_facts(text, f"'{self.path}', topic '{FACTS_TOPIC}'")
+        return parse_edp_metadata(text, f"'{self.path}', topic '{FACTS_TOPIC}'")
 
     @cached_property
     def together(self) -> None:
@@ -190,15 +190,15 @@ class _Topic:
             plain = not parent and (last == "data" or last.startswith("data_"))
             self.paths[path] = name.rpartition("/")[2] + last.removeprefix("data") if plain else path
 
-    def signals(self, own: OwnFacts) -> list[tuple[str, RawSignal]]:
+    def signals(self, edp_metadata: EdpMetadata) -> list[tuple[str, RawSignal]]:
         named_signals = []
         for path, short in self.paths.items():
-            channel_facts = own.channels.get(short)
+            channel_facts = edp_metadata.channels.get(short)
             signal = RawSignal(
                 short,
                 partial(load_column, self, path, self.samples),
                 self.samples,
-                None if own.rate_hz else self.stamps,
+                None if edp_metadata.rate_hz else self.stamps,
                 unit=channel_facts.unit if channel_facts else None,
                 kind=channel_facts.kind if channel_facts else None,
                 description=channel_facts.description if channel_facts else "",

@@ -50,7 +50,7 @@ class DataQuality:
             "errors": self.errors,
             "recordings": [report.to_json() for report in self.reports],
             "repeats": [repeat.to_json() for repeat in self.repeats],
-            "between": [plain(vars(finding)) for finding in self.findings],
+            "cross_recording": [plain(vars(finding)) for finding in self.findings],
         }
 
 

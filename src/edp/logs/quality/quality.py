@@ -132,8 +132,8 @@ def inspect(
     for channel_index, channel in enumerate(recording.channels):
         looked = look_at(channel, recording.values[:, channel_index], recording.rate_hz)
         of_channel = [finding for check in CHECKS for finding in check(looked)]
-        own = [finding for finding in extra if finding.channel == channel.name]
-        facts.append(_facts(looked, verdict_of([*of_channel, *own])))
+        of_file = [finding for finding in extra if finding.channel == channel.name]
+        facts.append(_facts(looked, verdict_of([*of_channel, *of_file])))
         findings += of_channel
     findings += copies(recording)
     return QualityReport(

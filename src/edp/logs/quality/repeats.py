@@ -210,8 +210,8 @@ def _telling(sketches: Sequence[Sketch]) -> list[list[int]]:
     for entry, shares in zip(sketches, lively):
         places = range(len(entry.channels))
         common = sorted(places, key=lambda i: (-total[entry.channels[i]], entry.channels[i]))
-        own = sorted(places, key=lambda i: -shares[i])
-        telling.append(list(dict.fromkeys([*common[:_CHANNELS], *own[:own_count]])))
+        liveliest = sorted(places, key=lambda i: -shares[i])
+        telling.append(list(dict.fromkeys([*common[:_CHANNELS], *liveliest[:own_count]])))
     return telling
 
 

@@ -92,10 +92,10 @@ def _add_array(
     columns = _columns(array, None if time is None else len(time))
     if columns is None:
         return
-    own = time if time is not None and len(time) == columns.shape[0] else None
+    column_time = time if time is not None and len(time) == columns.shape[0] else None
     for i in range(columns.shape[1]):
         ending = f"_{i + 1}" if columns.shape[1] > 1 else ""
-        mat_variables.signals.append(Part(name + ending, columns[:, i], own, unit, path + ending))
+        mat_variables.signals.append(Part(name + ending, columns[:, i], column_time, unit, path + ending))
 
 
 def _columns(array: NDArray[Any], samples: int | None) -> NDArray[Any] | None:
@@ -194,8 +194,8 @@ def _add_timeseries(props: dict[str, Any], name: str, path: str, mat_variables: 
         return
     time = _timeseries_time(props)
     unit = _timeseries_unit(props.get("DataInfo"))
-    own = _text(props.get("Name"))
-    _add_array(data, own if own and own != "unnamed" else name, path, time, mat_variables, unit)
+    series_name = _text(props.get("Name"))
+    _add_array(data, series_name if series_name and series_name != "unnamed" else name, path, time, mat_variables, unit)
 
 
 def _timeseries_time(props: dict[str, Any]) -> NDArray[np.float64] | None:
