@@ -163,7 +163,9 @@ def show_importance(run: Path, truth: Sequence[Cause], quick: bool) -> dict[str,
                      row.exchanged.mean, f"{row.explained:.0%}", said])  # fmt: skip
     print(f"\nGrowth of the error of the network on FG1 (MAE {found.error['10']['mean']:.2f} {found.units['mean']})")
     table(["taken away", "renewed", "95 %", "exchanged", "explained by others", "simulator"], rows)
-    return {"rows": [dict(zip(("channels", "renewed", "interval", "exchanged", "explained", "truth"), r)) for r in rows]}
+    return {
+        "rows": [dict(zip(("channels", "renewed", "interval", "exchanged", "explained", "truth"), r)) for r in rows]
+    }
 
 
 def main() -> None:

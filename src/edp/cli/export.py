@@ -11,9 +11,9 @@ from edp.cli.console import JsonFlag, emit, out
 from edp.errors import ConfigError
 
 
-def _list_forms(wanted: bool) -> None:
+def _list_forms(listing_asked: bool) -> None:
     """Every registered target, with the first line of what is said about it."""
-    if wanted:
+    if listing_asked:
         from edp.export import TARGETS
 
         for name, target in TARGETS.items():
