@@ -49,7 +49,7 @@ def alive(pid):
         return False
 
 
-def until(condition, seconds=60.0):
+def until(condition, seconds=240.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"

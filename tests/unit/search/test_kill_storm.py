@@ -74,7 +74,7 @@ def test_workers_and_coordinators_are_killed_and_nothing_is_lost(tmp_path):
         children = workers_of(study.pid)
         study.kill()
         study.communicate()
-        until = time.monotonic() + 30
+        until = time.monotonic() + 120
         while not gone(children):
             assert time.monotonic() < until, "workers outlive their coordinator"
             time.sleep(0.01)
