@@ -62,7 +62,7 @@ class Recording:
     @property
     def samples(self) -> int:
         """Number of samples (time steps)."""
-        return self.values.shape[0]
+        return int(self.values.shape[0])
 
     @property
     def duration_s(self) -> float:

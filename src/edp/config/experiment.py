@@ -28,6 +28,24 @@ from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
 from edp.training.schedules import SCHEDULES
 
+__all__ = [
+    "PRESETS",
+    "SETTINGS",
+    "Experiment",
+    "FeatureSettings",
+    "Table",
+    "TaskSettings",
+    "build",
+    "experiment_toml",
+    "load_experiment",
+    "merged",
+    "override",
+    "plain_tree",
+    "preset_table",
+    "read_toml",
+    "with_set_file",
+]
+
 SETTINGS = SettingsTree(
     {
         **NETWORK_PARTS,

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from edp.data.splits import PART, SPLITS, ByRecording, Split, SplitSpec, Stretch
+from edp.data.splits import PART, ByRecording, Split, SplitSpec, Stretch
+from edp.data.splits import SPLITS as SPLITS  # those who need the split `frozen` registered import it from here
 from edp.errors import ConfigError, DataError, StorageError
 from edp.recording import Recording
 from edp.settings.bounds import SEED, check_bounds, shown

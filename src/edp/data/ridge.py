@@ -196,7 +196,8 @@ def _squared_error(held_out: RidgeMoments, fitted: RidgeMoments, weights: Double
     x, y, xy = held_out.x[:size] / rows, held_out.y / rows, held_out.xy[:size] / rows
     quadratic = np.einsum("io,io->o", weights, (held_out.xx[:size, :size] / rows) @ weights)
     linear = offset * (2.0 * (x @ weights) - 2.0 * y + offset) - 2.0 * np.einsum("io,io->o", weights, xy)
-    return held_out.yy / rows + linear + quadratic
+    result: DoubleArray = held_out.yy / rows + linear + quadratic
+    return result
 
 
 def _physical(

@@ -28,4 +28,4 @@ class Series:
     @property
     def samples(self) -> int:
         """Number of ticks."""
-        return self.inputs.shape[0]
+        return int(self.inputs.shape[0])

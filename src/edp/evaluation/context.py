@@ -40,7 +40,8 @@ class Contexts:
 
     def mean(self, horizon: int = 0) -> NDArray[np.float64]:
         """Mean over targets and machines, ``(context,)``."""
-        return self.errors[:, :, horizon].mean(axis=(1, 2))
+        errors: NDArray[np.float64] = self.errors[:, :, horizon].mean(axis=(1, 2))
+        return errors
 
     def gain(self, horizon: int = 0) -> NDArray[np.float64]:
         """Change of the error from the shortest context: mean over machines and standard error, ``(context, 2)``."""

@@ -154,7 +154,7 @@ class Trace(TorchDispatchMode):
 
 
 def _storage(value: Tensor) -> int:
-    return value.untyped_storage()._cdata
+    return int(value.untyped_storage()._cdata)
 
 
 def _tensors(tree: Any) -> list[Tensor]:
@@ -164,7 +164,7 @@ def _tensors(tree: Any) -> list[Tensor]:
 def macs_of(name: str, args: Any, result: Tensor) -> int:
     """Multiply-accumulates of a matrix product or convolution."""
     if name == "convolution":
-        return result.numel() * math.prod(args[1].shape[1:])
+        return int(result.numel() * math.prod(args[1].shape[1:]))
     terms = args[MATRIX[name]].shape[0 if name == "addbmm" else -1]
     return int(result.numel() * terms) * (args[1].shape[-1] if name == "addbmm" else 1)
 

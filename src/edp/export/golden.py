@@ -30,7 +30,8 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
     widths = np.tile(sigma, outputs.shape[1] // len(sigma))
     own = np.abs(outputs - exact).max(axis=0)
-    return np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
+    result: Rows = np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
+    return result
 
 
 def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:

@@ -85,7 +85,7 @@ class _Gated(Layer):
 
     @property
     def width(self) -> int:
-        return self.weight_h.shape[1]
+        return int(self.weight_h.shape[1])
 
     @property
     def slots(self) -> tuple[Slot, ...]:
@@ -130,7 +130,7 @@ class Gru(Layer):
 
     @property
     def width(self) -> int:
-        return self.weight_h.shape[1]
+        return int(self.weight_h.shape[1])
 
     @property
     def slots(self) -> tuple[Slot, ...]:

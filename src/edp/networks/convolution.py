@@ -41,7 +41,8 @@ class CausalConv(Streaming):
     def weight(self) -> Tensor:
         """The folded kernel, ``(channels_out, channels_in, kernel)``."""
         norm = self.direction.flatten(1).norm(dim=1)
-        return self.direction * (self.gain / norm)[:, None, None]
+        result: Tensor = self.direction * (self.gain / norm)[:, None, None]
+        return result
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         return like.new_zeros(batch, self.memory, self.direction.shape[1])
@@ -146,4 +147,4 @@ class ConvolutionStack(Streaming):
 
 def receptive_field(levels: int, kernel: int) -> int:
     """Receptive field of a stack with dilations 1, 2, 4, ... in samples (eq. 3.37)."""
-    return 1 + 2 * (kernel - 1) * (2**levels - 1)
+    return int(1 + 2 * (kernel - 1) * (2**levels - 1))

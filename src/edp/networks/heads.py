@@ -188,7 +188,8 @@ class Heads(Streaming):
 
     def _layer(self, layer: int, x: Tensor) -> Tensor:
         """``(batch, time, output, in)`` to ``(batch, time, output, out)``."""
-        return torch.einsum("btci,cio->btco", x, self.weights[layer]) + self.biases[layer]
+        result: Tensor = torch.einsum("btci,cio->btco", x, self.weights[layer]) + self.biases[layer]
+        return result
 
     def lower(self, build: Builder, x: str) -> str:
         weights = [weight.transpose(1, 2) for weight in self.weights]

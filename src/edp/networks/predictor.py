@@ -18,12 +18,11 @@ from edp.networks.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.networks.blocks.base import BLOCKS, OUTPUT_SLOTS, SHARED_SLOTS, BlockSlot, HasConflicts, OutputSpace
 from edp.networks.frontend import FrontEnd, TargetTransform
 from edp.networks.heads import HEADS, HeadSpec, MlpHead
-from edp.networks.initial import state_numbers
 from edp.networks.losses import Prediction
 from edp.networks.outputs import OUTPUTS, OutputSpec, Point
 from edp.networks.physics import PHYSICS, PhysicsBase, PhysicsSpec
 from edp.networks.size import MOST_PARAMETERS, MOST_STATE, size_at_most
-from edp.networks.streaming import Cost, State, Streaming, parameters_of
+from edp.networks.streaming import Cost, State, Streaming, parameters_of, state_numbers
 from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, whole
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,7 +57,7 @@ def inverse_lever(speed: float, speeds: Array, levers: Array, rest: float) -> fl
 
 
 @compiled
-def reference(leg: Array, time: float, ramp: float, setup: tuple, reached: Array) -> None:
+def reference(leg: Array, time: float, ramp: float, setup: tuple[Any, ...], reached: Array) -> None:
     """Stroke shares at a time of a leg into `reached[:3]`; `setup` is that of `control`."""
     q = progress(time, leg[LENGTH], ramp)
     for i in range(at.AXES):
@@ -66,7 +68,7 @@ def reference(leg: Array, time: float, ramp: float, setup: tuple, reached: Array
 
 @compiled
 def control(
-    leg: Array, strokes: Array, queue: Array, memory: Array, gains: Array, setup: tuple, targets: Array
+    leg: Array, strokes: Array, queue: Array, memory: Array, gains: Array, setup: tuple[Any, ...], targets: Array
 ) -> None:
     """Levers of one control step into `targets`, shape (samples, 3), in a straight line from the last ones.
 

@@ -7,8 +7,8 @@ import math
 import torch
 
 from edp.data.prepared import Prepared
-from edp.networks.initial import state_numbers
 from edp.networks.predictor import Predictor
+from edp.networks.streaming import state_numbers
 from edp.storage.memory import check_setting
 from edp.training.spec import TrainingSpec
 

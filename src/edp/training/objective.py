@@ -55,6 +55,7 @@ class Objective:
             return Course(predicted, target, level, valid)
 
         def last(x: Tensor) -> Tensor:
-            return x[:, -1].unflatten(0, (-1, chunks.consecutive))
+            result: Tensor = x[:, -1].unflatten(0, (-1, chunks.consecutive))
+            return result
 
         return Course(last(predicted), last(target), last(level), last(valid))

@@ -99,7 +99,8 @@ def _information(x_sorted: Array, y_along_x: Array, y_sorted: Array, places: Ord
     for i in range(n):
         radius, along_x = _radius(x_sorted, y_along_x, i, nearest)
         total += psi[along_x + 1] + psi[_within(y_sorted, places[i], radius) + 1]
-    return psi[n] + psi[k] - total / n
+    result: float = psi[n] + psi[k] - total / n
+    return result
 
 
 class Information:

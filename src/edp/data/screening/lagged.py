@@ -51,14 +51,16 @@ class Lagged:
         sums = self.sums.sum(axis=0, dtype=np.float64)
         deviation = np.sqrt(np.diagonal(sums[self.reach]))
         sums /= np.outer(deviation, deviation)
-        return sums
+        result: Array = sums
+        return result
 
     def by_piece(self, columns: NDArray[np.int64]) -> FloatArray:
         """Correlation of all channels with some, in each piece, ``(piece, lag, channel, column)``."""
         squares = self.squares()
         scale = np.sqrt(squares[:, None, :, None] * squares[:, None, None, columns])
         shown = self.sums[:, :, :, columns]
-        return np.divide(shown, scale, out=np.zeros_like(shown), where=scale > 0)
+        result: FloatArray = np.divide(shown, scale, out=np.zeros_like(shown), where=scale > 0)
+        return result
 
     def squares(self) -> FloatArray:
         """Sums of squares in each piece, ``(piece, channel)``."""
@@ -158,4 +160,5 @@ def _product(left: NDArray[np.complex64], right: NDArray[np.complex64]) -> NDArr
 def _squares(table: CandidateTable, piece_index: int, live: NDArray[np.int64]) -> Array:
     """Sums of squares of the scaled channels of a piece, ``(channel,)``."""
     piece: Piece = table.pieces[piece_index]
-    return table.sums[1][piece_index, live] / np.square(table.within[live]) * piece.samples
+    squares: Array = table.sums[1][piece_index, live] / np.square(table.within[live]) * piece.samples
+    return squares

@@ -120,7 +120,8 @@ def _tau(order: Orders, x: NDArray[np.int32], y: NDArray[np.int32], tied_x: floa
     swaps = _swaps(keys, np.empty(n, dtype=np.int32))
     pairs = 0.5 * n * (n - 1.0)
     agree = pairs - tied_x - tied_y + tied_both - 2.0 * swaps
-    return agree / (np.sqrt(pairs - tied_x) * np.sqrt(pairs - tied_y))
+    result: float = agree / (np.sqrt(pairs - tied_x) * np.sqrt(pairs - tied_y))
+    return result
 
 
 class Kendall:
@@ -159,4 +160,5 @@ def correlation(stretches: Sequence[FloatArray], rows: int = 32_768) -> Array:
             part = stretch[start : start + rows] - mean
             moments += part.T @ part
     deviation = np.sqrt(np.diag(moments))
-    return np.clip(moments / np.outer(deviation, deviation), -1.0, 1.0)
+    result: Array = np.clip(moments / np.outer(deviation, deviation), -1.0, 1.0)
+    return result

@@ -131,7 +131,8 @@ def _mean(values: Array, axes: tuple[int, ...]) -> Array:
     finite = np.isfinite(values)
     count = finite.sum(axis=axes)
     total = np.where(finite, values, 0.0).sum(axis=axes)
-    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    result: Array = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +207,8 @@ def _t(values: Array) -> Array:
     """Absolute mean over its standard error among pieces, ``(piece, ...)`` to ``(...)``; NaN counts as no relation."""
     values = np.nan_to_num(values)
     error = values.std(axis=0, ddof=1) / math.sqrt(len(values))
-    return np.abs(values.mean(axis=0)) / np.maximum(error, 1e-12)
+    result: Array = np.abs(values.mean(axis=0)) / np.maximum(error, 1e-12)
+    return result
 
 
 def lag_curves(

@@ -96,7 +96,8 @@ class CandidateTable:
         weights = [piece.samples for piece in self.pieces]
         among = np.average(np.square(self.sums[0] - self.mean), axis=0, weights=weights)
         total = among + np.square(self.within)
-        return np.divide(among, total, out=np.zeros_like(total), where=total > 0)
+        result: Array = np.divide(among, total, out=np.zeros_like(total), where=total > 0)
+        return result
 
     @cached_property
     def live(self) -> NDArray[np.bool_]:

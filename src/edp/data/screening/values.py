@@ -34,7 +34,8 @@ def held_out_pieces(count: int, share: float, seed: int) -> NDArray[np.int64]:
 
 def _correlations(lagged: Lagged, pieces: NDArray[np.int64]) -> Array:
     """Sums over some pieces a row, ``(lag, channel, channel)``: about 1 on the diagonal, the same scale for all."""
-    return lagged.sums[pieces].sum(axis=0, dtype=np.float64) / lagged.samples[pieces].sum()
+    result: Array = lagged.sums[pieces].sum(axis=0, dtype=np.float64) / lagged.samples[pieces].sum()
+    return result
 
 
 class _Model:

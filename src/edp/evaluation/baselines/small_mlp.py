@@ -85,7 +85,8 @@ class SmallMlp(Baseline):
 
     def _change(self, features: FloatArray) -> DoubleArray:
         output = self._model.predict(self._standardised(features)).reshape(len(features), self.task.outputs)
-        return output * self._out_scale + self._out_centre
+        changes: DoubleArray = output * self._out_scale + self._out_centre
+        return changes
 
     def _standardised(self, features: FloatArray) -> FloatArray:
         # Beyond ten deviations nothing was learned; the clip keeps a spike from becoming an absurd prediction.

@@ -39,7 +39,7 @@ def scratch_of(layer: Layer) -> int:
         return layer.rows
     if isinstance(layer, memory.PrefixCorrection):
         hidden, seen = layer.first_weight.shape
-        return seen + hidden + len(layer.second_bias)
+        return int(seen + hidden + len(layer.second_bias))
     return _scratch_of_whole(layer)
 
 
@@ -47,7 +47,7 @@ def _scratch_of_whole(layer: Layer) -> int:
     if isinstance(layer, whole.WDense | whole.WConvolution):
         return len(layer.bias)
     if isinstance(layer, whole.WGroupedDense):
-        return layer.bias.shape[1]
+        return int(layer.bias.shape[1])
     if isinstance(layer, whole.WLstm):
         return 8 * layer.width
     if isinstance(layer, whole.WGru):

@@ -106,7 +106,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 def packed(data: dict[str, np.ndarray]) -> bytes:
     """Arrays as a file of NumPy; it holds no objects."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **data)  # type: ignore[arg-type]
+    np.savez(buffer, allow_pickle=False, **data)
     return buffer.getvalue()
 
 

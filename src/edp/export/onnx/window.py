@@ -30,7 +30,7 @@ def rows_before(layer: Layer, rows: int, ticks: int) -> int:
     if isinstance(layer, memory.Difference):
         return min(ticks, rows + 1)
     if isinstance(layer, memory.Convolution):
-        return min(ticks, rows + (layer.weight.shape[1] - 1) * layer.dilation)
+        return int(min(ticks, rows + (layer.weight.shape[1] - 1) * layer.dilation))
     if isinstance(layer, TRAILING):
         return min(ticks, rows + layer.window - 1)
     return ticks if type(layer) in STEPS and not isinstance(layer, memory.Starting) else rows

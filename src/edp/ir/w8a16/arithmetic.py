@@ -110,13 +110,15 @@ def looked_up(table: NDArray[np.uint16], x: Whole, step: int) -> Whole:
     at, rest = x >> step, x & ((1 << step) - 1)
     low = table[at].astype(np.int64)
     high = table[at + 1].astype(np.int64)
-    return low + rounded_shift((high - low) * rest, step)
+    result: Whole = low + rounded_shift((high - low) * rest, step)
+    return result
 
 
 def tanh(x: Whole, frac: int) -> Whole:
     """In 2^-15, of x in ``2^-frac``, `frac` at least 6."""
     size = looked_up(TANH, np.abs(x), frac - 6)
-    return np.where(x < 0, -1, 1) * np.minimum((size + 1) >> 1, LARGEST)
+    result: Whole = np.where(x < 0, -1, 1) * np.minimum((size + 1) >> 1, LARGEST)
+    return result
 
 
 def sigmoid(x: Whole) -> Whole:

@@ -193,7 +193,7 @@ class _WRecurrent(Whole):
 
     @property
     def width(self) -> int:
-        return self.weight_h.shape[1]
+        return int(self.weight_h.shape[1])
 
     @property
     def macs(self) -> int:

@@ -187,7 +187,8 @@ def _accumulate(layer: layers.Accumulate, m: Memory, x: Rows) -> Rows:
 
 def _glu(layer: layers.Glu, m: Memory, x: Rows) -> Rows:
     halves = x.reshape(*x.shape[:-1], layer.rows, 2, -1)
-    return flat(halves[..., 0, :] * sigmoid(halves[..., 1, :]))
+    result: Rows = flat(halves[..., 0, :] * sigmoid(halves[..., 1, :]))
+    return result
 
 
 Run = Callable[..., Any]

@@ -87,16 +87,15 @@ def _readers() -> tuple[Any, Any]:
         rosbag1.decompressors[kind] = partial(_by_ratio, kind)
     for kind in ("lz4", "zstd"):
         storage_mcap.DECOMPRESSORS[kind] = partial(_to_size, kind)
-    rosbag2.zstd = _Zstd  # type: ignore[assignment]
-    rosbag2.TemporaryDirectory = NoFolder  # type: ignore[assignment, misc]
-    rosbag2.Path = place  # type: ignore[assignment, misc]
+    for name, replacement in {"zstd": _Zstd, "TemporaryDirectory": NoFolder, "Path": place}.items():
+        setattr(rosbag2, name, replacement)
 
     class Mcap(storage_mcap.McapReader):
         def open(self) -> None:
             check_records(_source(self.path))
             super().open()
 
-    class Sqlite(rosbag2.Sqlite3Reader):  # type: ignore[name-defined, misc]
+    class Sqlite(rosbag2.Sqlite3Reader):
         def open(self) -> None:
             _check_database(_source(self.path))
             super().open()

@@ -148,7 +148,8 @@ def _linear(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
     if (block.a, block.b) == (1, 0):
         return raw
     values = raw * block.a
-    return values + block.b if block.b else values
+    result: NDArray[Any] = values + block.b if block.b else values
+    return result
 
 
 def _rational(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
@@ -167,7 +168,8 @@ def _pairs(block: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _interpolated(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
-    return np.interp(raw, *_pairs(block))
+    result: NDArray[Any] = np.interp(raw, *_pairs(block))
+    return result
 
 
 def _nearest(block: Any, raw: NDArray[Any]) -> NDArray[Any]:

@@ -108,7 +108,8 @@ class QualityReport:
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values; a number that is not finite becomes None."""
-        return plain({**asdict(self), "verdict": self.verdict})
+        result: dict[str, Any] = plain({**asdict(self), "verdict": self.verdict})
+        return result
 
 
 def verdict_of(findings: Sequence[Finding]) -> str:

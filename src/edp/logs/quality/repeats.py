@@ -330,7 +330,8 @@ def _pairs(a: Sketch, b: Sketch, rows: slice, lag: int) -> list[tuple[int, int]]
 def _windows(values: Floats) -> NDArray[np.float64]:
     """Shape ``(window, sample, channel)``, each window about its mean."""
     windows = values.reshape(-1, WINDOW, values.shape[1]).astype(np.float64)
-    return windows - windows.mean(axis=1, keepdims=True)
+    centred: NDArray[np.float64] = windows - windows.mean(axis=1, keepdims=True)
+    return centred
 
 
 def _alike(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> NDArray[np.float64]:

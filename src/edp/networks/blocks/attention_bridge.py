@@ -102,7 +102,8 @@ class _Bridge(Streaming):
         offset = hidden[:, None] + hidden.new_zeros(ticks, columns).masked_fill(outside, UNSEEN)
         offset = offset[:, None].expand(-1, self.heads, -1, -1).flatten(0, 1)
         scores = torch.baddbmm(offset, q, k.transpose(1, 2), alpha=1.0 / math.sqrt(q.shape[-1]))
-        return (scores.softmax(dim=-1) @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
+        result: Tensor = (scores.softmax(dim=-1) @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
+        return result
 
     def lower(self, build: Builder, x: str) -> str:
         wide = self.width

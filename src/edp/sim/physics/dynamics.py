@@ -105,7 +105,8 @@ def bias_torque(psi: Array, rate: Array, axes: Array, plant: Array) -> Array:
     gravity = np.empty(3)
     gravity_torque(psi, axes, plant[at.GRAVITY], gravity)
     _, s12, _, s13, _, s23 = couplings(*_turn(psi[1]), *_turn(psi[2]), axes)
-    return gravity + np.array(coriolis_terms(s12, s13, s23, *rate))
+    result: Array = gravity + np.array(coriolis_terms(s12, s13, s23, *rate))
+    return result
 
 
 def mechanical_energy(psi: Array, rate: Array, axes: Array, plant: Array) -> float:

@@ -38,7 +38,9 @@ def stiffness(pressure: float, plant: Array) -> float:
     absolute = max(pressure + at.ATMOSPHERE, 1e4)
     air = plant[at.AIR] * at.ATMOSPHERE
     # (1 + a) / (1 / beta + a / p) with a = air / p, in one division
-    return plant[at.BULK_MODULUS] * absolute * (absolute + air) / (absolute * absolute + plant[at.BULK_MODULUS] * air)
+    bulk = plant[at.BULK_MODULUS]
+    stiffness: float = bulk * absolute * (absolute + air) / (absolute * absolute + bulk * air)
+    return stiffness
 
 
 @inlined

@@ -157,7 +157,8 @@ class Ground:
     def mass_kg(self) -> float:
         """All soil: profile (above 0 of the boom-foot frame counts positive), heap before the edge, bucket."""
         profile = self.material.density * self.numbers[terramechanics.WIDTH] * SPACING_M * float(self.heights.sum())
-        return profile + float(self.memory[at.HEAP] + self.memory[at.PAYLOAD])
+        result: float = profile + float(self.memory[at.HEAP] + self.memory[at.PAYLOAD])
+        return result
 
     def height(self, x: float) -> float:
         """Height (m above the boom foot) at a distance (m) in front of it."""

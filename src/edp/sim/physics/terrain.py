@@ -32,7 +32,8 @@ LEFT_M = 0.03
 @compiled
 def cell_of(x: float, heights: Array) -> int:
     """The cell that holds `x`."""
-    return min(max(int(x / tm.SPACING + 0.5), 0), heights.shape[0] - 1)
+    result: int = min(max(int(x / tm.SPACING + 0.5), 0), heights.shape[0] - 1)
+    return result
 
 
 @compiled

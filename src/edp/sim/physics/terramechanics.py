@@ -165,7 +165,8 @@ def height_at(x: float, heights: Array) -> float:
     """Height (m) of the ground at `x`, linear between its points."""
     cell = min(max(x / SPACING, 0.0), heights.shape[0] - 1.000001)
     k = int(cell)
-    return heights[k] + (cell - k) * (heights[k + 1] - heights[k])
+    height: float = heights[k] + (cell - k) * (heights[k + 1] - heights[k])
+    return height
 
 
 @compiled
@@ -179,7 +180,8 @@ def cutting_force(depth: float, rake: float, surcharge: float, numbers: Array, t
     adhesion = table[k, 2] + part * (table[k + 1, 2] - table[k, 2])
     per_metre = (numbers[DENSITY] * GRAVITY * depth + 2.0 * surcharge) * weight
     per_metre += numbers[COHESION] * cohesion + numbers[ADHESION] * adhesion
-    return numbers[WIDTH] * depth * per_metre
+    result: float = numbers[WIDTH] * depth * per_metre
+    return result
 
 
 @compiled

@@ -65,4 +65,5 @@ def hint_error(hidden: Tensor, teacher_components: Tensor, valid: Tensor) -> Ten
         gram = student_features.T @ student_features
         gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
         best = torch.linalg.solve(gram, student_features.T @ goal.double()).to(rows)
-    return (rows @ best - goal).square().mean()
+    error: Tensor = (rows @ best - goal).square().mean()
+    return error

@@ -80,7 +80,8 @@ class Site:
 
     def _rounded(self, x: Tensor, limit: float) -> Tensor:
         step = limit / self.levels
-        return (x / step).round().clamp(-self.levels, self.levels) * step
+        rounded: Tensor = (x / step).round().clamp(-self.levels, self.levels) * step
+        return rounded
 
     def compare(self) -> None:
         """From now on find out which range loses least."""
@@ -140,7 +141,7 @@ class NetworkRounding:
             heads.units = units
         for matrix in self.matrices:
             if isinstance(matrix.part, nn.LSTM):  # it holds what it was last called with
-                matrix.part._init_flat_weights()  # type: ignore[no-untyped-call]
+                matrix.part._init_flat_weights()
         self._handles, self._units, self.sites = [], {}, []
 
     def keep(self) -> None:

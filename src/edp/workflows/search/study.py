@@ -241,7 +241,8 @@ class Study:
         # A Gaussian process does not learn from trials that were refused for their costs.
         if kind == "gp" and (number >= GP_TRIALS or self.bounds):
             kind = "tpe"
-        return SAMPLERS[kind](seed, self.sampler.startup)
+        sampler: optuna.samplers.BaseSampler = SAMPLERS[kind](seed, self.sampler.startup)
+        return sampler
 
 
 def _gp(seed: int, startup: int) -> Any:

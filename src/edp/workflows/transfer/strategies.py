@@ -67,7 +67,7 @@ class LowRank:
             for matrix, change in self._changes:
                 matrix.values.add_(change())
                 if isinstance(matrix.part, nn.LSTM):  # it holds what it was last called with
-                    matrix.part._init_flat_weights()  # type: ignore[no-untyped-call]
+                    matrix.part._init_flat_weights()
         del net.adapters
         for parameter in self._frozen:
             parameter.requires_grad_(True)
@@ -80,7 +80,7 @@ class LowRank:
 
         def enter(*_: object) -> None:
             for parameters, key, weight, change in replaced:
-                parameters[key] = weight + change()  # type: ignore[assignment]
+                parameters[key] = weight + change()
 
         def leave(*_: object) -> None:
             for parameters, key, weight, _change in replaced:

@@ -20,7 +20,7 @@ FIELDS = {"velocity": "velocity", "angular_velocity": "velocity", "position": "p
 
 def seconds(stamp: Any) -> float:
     """A time of ROS in seconds."""
-    return stamp.sec + 1e-9 * stamp.nanosec
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 class PredictorNode(Node):

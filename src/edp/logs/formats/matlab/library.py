@@ -7,7 +7,7 @@ import warnings
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import matio
-    import pandas  # type: ignore[import-untyped]
+    import pandas
     from matio.utils import MatlabOpaque
 
 __all__ = ["MatlabOpaque", "matio", "pandas"]
