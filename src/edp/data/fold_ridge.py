@@ -72,7 +72,7 @@ def fold_ridge(
             if better.any():
                 best[better] = loss[better]
                 weights[:, :, better] = 0.0
-                weights[np.ix_(range(folds.count), chosen, np.flatnonzero(better))] = np.stack(solved)[:, :, better]
+                weights[np.ix_(np.arange(folds.count), chosen, np.flatnonzero(better))] = np.stack(solved)[:, :, better]
                 intercepts[:, better] = np.stack(shifts)[:, better]
     left_out = np.zeros_like(targets)
     for rows, weight, intercept in zip(rows_of, weights, intercepts, strict=True):

@@ -27,6 +27,7 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
 from edp.networks.committee import Committee, Members
+from edp.networks.losses.base import Penalty
 from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.signals import KINDS
 from edp.storage.memory import check_setting
@@ -147,6 +148,17 @@ def bagging_of(spec: TrainingSpec) -> BaggingSpec:
     return spec.bagging or BaggingSpec()
 
 
+def penalty_of(spec: TrainingSpec) -> Penalty:
+    """The loss of a training on folds; `check_training` refuses any other.
+
+    Raises:
+        TypeError: it reads more than an error.
+    """
+    if not isinstance(spec.loss, Penalty):
+        raise TypeError("bagging trains with a loss that reads an error alone; check_training refuses any other")
+    return spec.loss
+
+
 def _committee(net: Predictor) -> Committee:
     if not isinstance(net.backbone, Committee):
         raise TypeError("bagging trains a committee; check_training refuses any other backbone")
@@ -234,7 +246,7 @@ class _Training:
         self.residuals = torch.from_numpy(np.stack(residuals) / self.spread).float()
         draw = torch.Generator().manual_seed(spec.seed)
         self.groups = [MemberGroup(group, outputs, table.folds, spec, draw) for group in _groups(net)]
-        self.loss = spec.loss
+        self.loss = penalty_of(spec)
 
     def run(self) -> DoubleArray:
         """Train, set the network's weights, and give the predictions of left-out rows."""

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -32,13 +32,14 @@ from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
+from edp.recording import Recording
 from edp.report import build_report
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import check_writable, make_folder, read_object, write_bytes, write_json
 from edp.storage.runs import RunFolder, command_line, environment, read_provenance, run_key
-from edp.training import Bundle, Diverged, Fitted, TrainingProgress, fit, load_bundle, make_bundle, save_bundle
+from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import weights_digest
-from edp.training.fit import thread_count
+from edp.training.fit import fit, thread_count
 from edp.training.spec import check_training
 from edp.training.strategy import TrainingStrategy
 
@@ -62,7 +63,15 @@ def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") ->
     return cover(recordings, inputs, None if chosen is None else chosen.split(recordings, LAGS))
 
 
-def prepare_data(source: DataSource, experiment: Experiment, frozen: Mapping[str, str] | None = None) -> Prepared:
+class RecordingSource(Protocol):
+    """What gives recordings."""
+
+    def read(self) -> list[Recording]:
+        """All of them."""
+        ...
+
+
+def prepare_data(source: RecordingSource, experiment: Experiment, frozen: Mapping[str, str] | None = None) -> Prepared:
     """Read and cut a data set for an experiment.
 
     Args:

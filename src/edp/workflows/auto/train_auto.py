@@ -19,8 +19,9 @@ from edp.networks.predictor import Predictor
 from edp.recording import Recording
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.runs import RunFolder, run_key
-from edp.training import Bundle, Diverged, Fitted, TrainingProgress, fit, load_bundle
+from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
 from edp.training.bagging import fit_bagged
+from edp.training.fit import fit
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
 from edp.workflows.auto.promise import (
     PortfolioChoice,
