@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError
+from edp.evaluation.guard import beaten_by
 from edp.report.common.wording import decimals_for, listed, number, percent
 from edp.report.run.predictability import limit_line, read_limit
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
@@ -262,6 +263,9 @@ def headline(facts: Facts) -> str:
     rows = comparison_rows(facts)
     if samples is None or not any(row["is_network"] for row in rows):
         return f"This run has no scores yet; `edp evaluate {facts.folder}` makes them."
+    beaten = beaten_by(facts.scores) if facts.scores else None
+    if beaten is not None:
+        return beaten.sentence()
     unit, what, key = facts.unit, "", "mean"
     if not unit and facts.targets:
         first = facts.targets[0]

@@ -16,6 +16,7 @@ from edp.report.common.style import Plot
 from edp.report.common.templates import template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
+from edp.report.run.choice import candidates_table, promise_table, read_choice
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.report.run.plots import DOTS_AT_MOST, plots_of
 from edp.storage import write_bytes
@@ -71,6 +72,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "intervals": tables.interval_table(facts),
         "spread": run.spread_text(facts),
         "ranked": len((facts.models.get(run.NETWORK) or {}).get("recordings", ())) > DOTS_AT_MOST,
+        "choice": choice_of(facts),
         "unseen": foundation_tables(facts),
         "worst": tables.worst_recordings_table(facts),
         **shown(plots),
@@ -82,6 +84,17 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "config": facts.config,
         "makers": {name: f"{command} {facts.folder}" for name, command in run.MAKERS.items()},
         "absent": facts.absent,
+    }
+
+
+def choice_of(facts: run.Facts) -> dict[str, Any]:
+    """What the preset auto chose, as sentence and tables; empty for any other run."""
+    content = read_choice(facts.folder)
+    if content is None:
+        return {}
+    return {
+        "sentence": unbroken(content["sentence"]),
+        "tables": [entry for entry in (candidates_table(content), promise_table(facts, content)) if entry is not None],
     }
 
 

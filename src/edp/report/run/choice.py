@@ -1,0 +1,92 @@
+"""What `edp train --preset auto` chose: the error that left-out data promised beside that of the test recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from edp.errors import StorageError
+from edp.report.common.tables import TextTable
+from edp.report.common.wording import MISSING, decimals_for, number, percent
+from edp.report.run.facts import NETWORK, Facts, horizon_text, score
+from edp.storage import read_object
+
+FILE = "auto.json"
+
+
+def read_choice(folder: Path) -> Mapping[str, Any] | None:
+    """The content of ``auto.json``; None where the run is another.
+
+    Raises:
+        StorageError: the file does not hold what the preset auto writes.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    content = read_object(path, ("sentence", "chosen", "candidates", "excess", "persistence"))
+    candidates, excess = content["candidates"], content["excess"]
+    sound = (
+        isinstance(content["sentence"], str)
+        and isinstance(candidates, dict)
+        and isinstance(excess, dict)
+        and content["chosen"] in candidates
+        and all(isinstance(one, dict) and isinstance(one.get("label"), str) for one in candidates.values())
+        and all(isinstance(excess.get(name), int | float) for name in candidates)
+        and all(_is_promise(one.get("promise")) for one in candidates.values())
+        and _is_promise(content["persistence"])
+    )
+    if not sound:
+        raise StorageError(f"'{path}' does not hold what edp train --preset auto writes; train again in another folder")
+    return content
+
+
+def _is_promise(value: Any) -> bool:
+    """Whether a value is errors by horizon and target."""
+    return isinstance(value, dict) and all(
+        isinstance(row, dict) and all(isinstance(error, int | float) for error in row.values())
+        for row in value.values()
+    )
+
+
+def candidates_table(content: Mapping[str, Any]) -> TextTable:
+    """Each candidate's error on left-out data relative to the one that is kept."""
+    chosen = content["chosen"]
+    rows = []
+    for name, one in content["candidates"].items():
+        share = math.expm1(float(content["excess"][name]) - float(content["excess"][chosen]))
+        parameters = one.get("parameters")
+        count = f"{parameters:,}" if isinstance(parameters, int) else MISSING
+        rows.append((one["label"], count, "kept" if name == chosen else percent(share, signed=True)))
+    marked = frozenset(place for place, name in enumerate(content["candidates"]) if name == chosen)
+    columns = (("Model", ""), ("Parameters", ""), ("Error on left-out data", "against the one kept"))
+    return TextTable("The models that were tried", columns, tuple(rows), marked)
+
+
+def promise_table(facts: Facts, content: Mapping[str, Any]) -> TextTable | None:
+    """Root-mean-square errors by output and horizon: promised, on the test recordings, of persistence."""
+    promised = content["candidates"][content["chosen"]]["promise"]
+    rows = []
+    for target in facts.targets:
+        for k in facts.horizons:
+            expected = promised.get(str(k), {}).get(target.name)
+            still = content["persistence"].get(str(k), {}).get(target.name)
+            test = score(facts.models.get(NETWORK, {}), k, "rmse", target.name)
+            if expected is None or test is None:
+                continue
+            places = decimals_for([expected, test])
+            ratio = percent(test / expected - 1, signed=True) if expected > 0 else MISSING
+            row = (f"{target.description}, {horizon_text(facts, k)} ahead", target.unit)
+            rows.append((*row, number(expected, places), number(test, places), ratio, number(still, places)))
+    if not rows:
+        return None
+    columns = (
+        ("Output", ""),
+        ("Unit", ""),
+        ("Promised", "RMSE"),
+        ("On the test recordings", "RMSE"),
+        ("Test against promise", ""),
+        ("Present value kept, left-out data", "RMSE"),
+    )
+    return TextTable("What left-out data promised, and what came of it", columns, tuple(rows))
