@@ -1,9 +1,9 @@
 """Our default on public measured recordings, beside persistence and linear floors, k steps ahead.
 
 Each set is a data-set file and a settings file in ``examples/real``; no code knows any of them. The same commands, with
-the same preset, work on anyone's recordings:
+the same defaults, work on anyone's recordings:
 
-    edp train examples/real/faster.toml --preset small --config examples/real/faster_settings.toml --out runs/faster
+    edp train examples/real/faster.toml --config examples/real/faster_settings.toml --out runs/faster
     edp evaluate runs/faster
 
 The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
@@ -22,17 +22,18 @@ from pathlib import Path
 from typing import Any
 
 from common import Verdict, finish, parser, table, verdict
-from edp.config.experiment import load_experiment, read_toml
+from edp.settings.tree import read_toml
 from edp.storage import read_json
-from edp.workflows.train_evaluate import DataSource, evaluate, train
+from edp.workflows.auto import load_auto, train_auto
+from edp.workflows.train_evaluate import DataSource, evaluate
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples" / "real"
 VARIABLE = "EDP_SHARED_DATA"
-PRESET = "small"
+PRESET = "auto"
 BASELINES = ("persistence", "ridge_arx")
 QUICK_SETS = ("sjoberg.toml", "tanks.toml")
-QUICK = ("training.epochs=2",)
+QUICK = ("auto.minutes=0.05",)
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,7 @@ class Row:
 def scores_of(data: str, settings: str, out: Path, changes: Sequence[str]) -> tuple[dict[str, Any], float]:
     """Train and judge by a data-set file and a settings file; the content of scores.json, and seconds."""
     began = time.perf_counter()
-    experiment = load_experiment(EXAMPLES / settings, PRESET, changes)
-    train(DataSource.of(EXAMPLES / data), experiment, out)
+    train_auto(DataSource.of(EXAMPLES / data), load_auto(EXAMPLES / settings, changes), out)
     folder = evaluate(out, baselines=BASELINES)
     return read_json(folder / "scores.json"), time.perf_counter() - began
 
@@ -99,7 +99,7 @@ def show_floors(rows: Sequence[Row], quick: bool) -> None:
 def run(quick: bool, seed: int) -> tuple[list[Row], dict[str, Any]]:
     """Train and judge every set; rows of the k-step table and what else is kept."""
     listed = read_toml(EXAMPLES / "leagues.toml")
-    changes = [f"training.seed={seed}", *(QUICK if quick else ())]
+    changes = [f"auto.seed={seed}", *(QUICK if quick else ())]
     rows: list[Row] = []
     kept: dict[str, Any] = {"seconds": {}}
     with tempfile.TemporaryDirectory() as folder:

@@ -1,0 +1,148 @@
+"""Is the default at least as good as every simple rival on public measured recordings, and does it keep its promise?
+
+`edp train` with no settings but the task, on each set of ``examples/real``: its root-mean-square error on the test part
+beside the stated linear floor, beside the best of all baselines fitted in the same run, and beside the error that
+left-out data promised. Nothing is chosen per set, and the test part is opened once a seed.
+
+The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import Verdict, finish, parser, table, verdict
+from edp.evaluation.baselines import BASELINES
+from edp.settings.tree import read_toml
+from edp.storage import read_json
+from edp.workflows.auto import load_auto, train_auto
+from edp.workflows.train_evaluate import DataSource, evaluate
+from real_recordings import EXAMPLES, QUICK, QUICK_SETS, rmse, shared_folder
+
+KEPT = 0.1
+"""How far the test error may lie from the promise."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One target at one horizon of one set: medians over seeds, in the units of the floors.
+
+    Attributes:
+        ours: on the test part.
+        floor: the better of the stated linear floor and persistence.
+        rival: the best baseline of the same run, by the test part.
+        rival_name: which one.
+        promise: what left-out data promised.
+    """
+
+    title: str
+    target: str
+    horizon: int
+    ours: float
+    floor: float
+    rival: float
+    rival_name: str
+    promise: float
+
+
+def run_set(entry: dict[str, Any], seeds: Sequence[int], changes: Sequence[str]) -> tuple[list[Task], dict[str, Any]]:
+    """Train and judge one set with every seed; its tasks, and what was chosen in how many seconds."""
+    judged: list[dict[str, Any]] = []
+    promised: list[dict[str, Any]] = []
+    notes: dict[str, Any] = {"chosen": [], "seconds": []}
+    for seed in seeds:
+        with tempfile.TemporaryDirectory() as folder:
+            began = time.perf_counter()
+            settings = load_auto(EXAMPLES / entry["settings"], [f"auto.seed={seed}", *changes])
+            facts = train_auto(DataSource.of(EXAMPLES / entry["data"]), settings, Path(folder) / "run").facts
+            notes["seconds"].append(round(time.perf_counter() - began, 1))
+            notes["chosen"].append(facts["chosen"])
+            promised.append(facts["candidates"][facts["chosen"]]["promise"])
+            judged.append(read_json(evaluate(Path(folder) / "run", baselines=tuple(BASELINES)) / "scores.json"))
+    tasks = []
+    for target, horizon, persistence, linear in entry["rows"]:
+        errors = {
+            model: float(np.median([rmse(scores, model, target, horizon) for scores in judged]))
+            for model in ("network", *BASELINES)
+        }
+        ours = errors.pop("network")
+        best = min(errors, key=lambda model: errors[model])
+        promise = float(np.median([one[str(horizon)][target] for one in promised]))
+        floor = min(persistence, linear)
+        tasks.append(Task(entry["title"], target, horizon, ours, floor, errors[best], best, promise))
+    return tasks, notes
+
+
+def verdicts_of(tasks: Sequence[Task], quick: bool) -> list[Verdict]:
+    """How many tasks meet each goal, of how many; the means."""
+    count = len(tasks)
+    titles = list(dict.fromkeys(task.title for task in tasks))
+    sets = [
+        math.exp(float(np.mean([math.log(task.ours / task.floor) for task in tasks if task.title == title])))
+        for title in titles
+    ]
+    mean = math.exp(float(np.mean(np.log(sets))))
+    met = {
+        "tasks at most 1.00 of the linear floor": sum(task.ours <= task.floor for task in tasks),
+        "tasks at most 1.00 of the best rival": sum(task.ours <= task.rival for task in tasks),
+        "tasks whose promise is within 10 % of the test error": sum(
+            abs(task.promise / task.ours - 1) <= KEPT for task in tasks
+        ),
+    }
+    goals = (count, count - 2, count - 5)
+    rows = [
+        verdict(name, number, goal, ">= 1", "tasks", quick)
+        for (name, number), goal in zip(met.items(), goals, strict=True)
+    ]
+    rows.append(verdict("error relative to the floor, geometric mean over sets", mean, 1.0, "<= 0.8", "ratio", quick))
+    worst = max(task.ours / task.rival for task in tasks)
+    rows.append(verdict("worst error relative to the best rival", worst, 1.0, "<= 1.02", "ratio", quick))
+    return rows
+
+
+def show(tasks: Sequence[Task], notes: dict[str, dict[str, Any]]) -> None:
+    """Print a row a task, and a row a set."""
+    headings = ["set", "target", "k", "ours", "ours/floor", "best rival", "ours/rival", "promise/ours"]
+    lines = []
+    for t in tasks:
+        ratios = (t.ours / t.floor, t.rival_name, t.ours / t.rival, t.promise / t.ours)
+        lines.append([t.title, t.target, t.horizon, t.ours, *ratios])
+    table(headings, lines)
+    print()
+    table(["set", "chosen", "training, s"], [[name, *map(str, note.values())] for name, note in notes.items()])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    options = parser(__doc__ or "")
+    options.add_argument("--shared", type=Path, default=None, help="folder of the recordings (else $EDP_SHARED_DATA)")
+    options.add_argument("--seeds", type=int, default=5, help="how many seeds, from --seed on")
+    chosen = options.parse_args(arguments)
+    if shared_folder(chosen.shared) is None:
+        return
+    seeds = range(chosen.seed, chosen.seed + (1 if chosen.quick else chosen.seeds))
+    tasks: list[Task] = []
+    notes: dict[str, dict[str, Any]] = {}
+    for entry in read_toml(EXAMPLES / "leagues.toml")["floors"]:
+        if chosen.quick and entry["data"] not in QUICK_SETS:
+            continue
+        print(f"{entry['settings']} ...", file=sys.stderr, flush=True)
+        found, notes[entry["title"]] = run_set(entry, seeds, QUICK if chosen.quick else ())
+        tasks += found
+    show(tasks, notes)
+    kept = {"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}
+    finish("auto_preset", verdicts_of(tasks, chosen.quick), chosen.seed, json.loads(json.dumps(kept)))
+
+
+if __name__ == "__main__":
+    main()
