@@ -59,7 +59,7 @@ def candidates_table(content: Mapping[str, Any]) -> TextTable:
         parameters = one.get("parameters")
         count = f"{parameters:,}" if isinstance(parameters, int) else MISSING
         rows.append((one["label"], count, "kept" if name == chosen else percent(share, signed=True)))
-    marked = frozenset(place for place, name in enumerate(content["candidates"]) if name == chosen)
+    marked = frozenset(row for row, name in enumerate(content["candidates"]) if name == chosen)
     columns = (("Model", ""), ("Parameters", ""), ("Error on left-out data", "against the one kept"))
     return TextTable("The models that were tried", columns, tuple(rows), marked)
 
