@@ -90,12 +90,14 @@ class ScaledTanh:
         ConfigError: unless ``0 < low < start < high``.
     """
 
+    # With 1 the targets would be cut at one standard deviation; 2.5 leaves nearly all of them in reach.
     start: float = 2.5
     low: float = 1.01
     high: float = 5.0
 
     def __post_init__(self) -> None:
         check_bounds("stanh", self, start=AMPLITUDE, low=AMPLITUDE, high=AMPLITUDE)
+        # An amplitude at a bound would need an infinite logit; the start must lie strictly inside.
         if not 0 < self.low < self.start < self.high:
             raise ConfigError(
                 f"stanh: low = {self.low}, start = {self.start}, high = {self.high}; 0 < low < start < high must hold"
@@ -129,5 +131,6 @@ class _ScaledTanh(nn.Module):
     def lower(self, build: Builder, x: str) -> str:
         size, amplitude = build.width(x), self.amplitude()
         y = build.add(Activate, "tanh", x, function=Function.TANH, size=size)
+        # Outputs vary fastest within a horizon, so the amplitudes repeat once for each horizon.
         gain = amplitude.repeat(size // len(amplitude))
         return build.add(ScaleShift, "amplitude", y, gain=gain, shift=torch.zeros_like(gain))

@@ -36,6 +36,7 @@ class AdaptedStream(Stream):
     def reset(self) -> None:
         """Forget all ticks; what was learned stays. ``adapter.reset()`` forgets that."""
         super().reset()
+        # The change across a reset is no motion of the machine; learning from it would spoil the correction.
         self.adapter.interrupt()
         self.status = RlsStatus.NONE
         self.correction = np.zeros_like(self.adapter.adaptation.unit)
@@ -58,9 +59,11 @@ class AdaptedStream(Stream):
             self.status = RlsStatus.NONE
             prediction = base if self._corrected is None else self._corrected
             return replace(prediction, status=base.status)
+        # Only a tick with accepted inputs of its own carries new information; held inputs would be learned twice.
         fresh = base.status is StreamStatus.OK
         adapted, self.status = self.adapter.step(self._last, base.prediction, fresh=fresh, learn=self.learn)
         self.correction = adapted - base.prediction
+        # Bounds move with the centre: the correction shifts the prediction and says nothing about its spread.
         lower, upper = base.lower + self.correction, base.upper + self.correction
         self._corrected = replace(base, prediction=adapted, lower=lower, upper=upper)
         return self._corrected

@@ -168,6 +168,7 @@ class TcnSpec:
         """The convolution stack(s); refused where the receptive field is shorter than the window."""
         reach = receptive_field(len(self.channels), self.kernel)
         if reach < window:
+            # 64 levels exceed any window that fits in memory; with kernel 1 the field stays one sample at every depth.
             levels = next((n for n in range(1, 64) if receptive_field(n, self.kernel) >= window), 0)
             change = f"give {levels} channels entries" if levels else "use a kernel of at least 2"
             raise ConfigError(
@@ -241,6 +242,7 @@ class CommitteeSpec:
         dropout: rate after each hidden layer, in training.
     """
 
+    # Spans in powers of two cover 0.01 to 0.32 s at 100 Hz with few columns.
     lags: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
     members: int = 10
     units: int = 64
@@ -276,6 +278,7 @@ class CommitteeSpec:
             for name in self.activations
         ]
         net = Committee(bank, groups)
+        # Attention pooling and the last state each give `units` numbers.
         return net, net.width
 
 
@@ -288,6 +291,7 @@ class RecurrentBackbone(Streaming):
         super().__init__()
         self.encoder = encoder
         self.recurrent = recurrent
+        # Dropout acts behind the recurrence, not inside it: masks within the loop would erase what the state carries.
         self.dropout = nn.Dropout(dropout)
         self.pooling = AttentionPooling(units, window)
         extras = in_slot(blocks, BlockSlot.FEATURES)
@@ -341,5 +345,6 @@ def _convolutions(
         build: BranchMaker = make_branch
         net = branches[0].build(build)  # type: ignore[attr-defined]
         width *= len(net.branches)
+    # Blocks of the channels come behind the joined branches, so that they see the channels of all scales.
     behind = [spec.build(width, window) for spec in in_slot(blocks, BlockSlot.CHANNELS)]  # type: ignore[attr-defined]
     return (Chain([net, *behind]) if behind else net), width

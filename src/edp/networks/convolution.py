@@ -27,6 +27,7 @@ class CausalConv(Streaming):
     def __init__(self, channels_in: int, channels_out: int, kernel: int, dilation: int) -> None:
         super().__init__()
         self.dilation = dilation
+        # Samples that the kernel reaches back; the state holds exactly these.
         self.memory = (kernel - 1) * dilation
         self.direction = nn.Parameter(torch.empty(channels_out, channels_in, kernel))
         self.gain = nn.Parameter(torch.empty(channels_out))
@@ -117,6 +118,7 @@ class ConvolutionStack(Streaming):
     ) -> None:
         super().__init__()
         widths = (width_in, *channels)
+        # Dilations double from level to level, so that the receptive field grows exponentially with depth (eq. 3.37).
         self.levels = nn.ModuleList(
             TemporalBlock(widths[i], widths[i + 1], kernel, first_dilation * 2**i, dropout)
             for i in range(len(channels))
@@ -147,4 +149,5 @@ class ConvolutionStack(Streaming):
 
 def receptive_field(levels: int, kernel: int) -> int:
     """Receptive field of a stack with dilations 1, 2, 4, ... in samples (eq. 3.37)."""
+    # Two convolutions a level give the factor 2 (eq. 3.37).
     return int(1 + 2 * (kernel - 1) * (2**levels - 1))

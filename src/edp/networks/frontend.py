@@ -47,6 +47,8 @@ class FrontEnd(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         previous, age = state
         x = x[..., : self.sources]
+        # At the first tick after a reset the previous sample is the tick itself: derivatives start at zero, not with
+        # a jump.
         first = torch.where(age > 0.5, previous, x[:, :1])
         before = torch.cat([first, x[:, :-1]], dim=1)
         columns = [x[..., : self.logged]]
@@ -54,11 +56,13 @@ class FrontEnd(Streaming):
             columns.append(how(x[..., source], before[..., source], self.rate_hz).unsqueeze(-1))
         if self.starting:
             columns += self._start(x[..., self.starting], age)
+        # Age is counted no further than needed, so that it stays exact in float32 over hours.
         return torch.cat(columns, dim=-1), (x[:, -1:], (age + x.shape[1]).clamp(max=self.starting_ticks))
 
     def _start(self, x: Tensor, age: Tensor) -> list[Tensor]:
         """Channels of the start ``(batch, time, channel)``, and whether they are read at a tick."""
         read = age + torch.arange(x.shape[1], device=x.device).view(1, -1, 1) < self.starting_ticks
+        # Behind its ticks a channel of the start is replaced by its mean, which is zero after scaling.
         mean = self.offset[self.lasting : self.lasting + len(self.starting)]
         return [torch.where(read, x, mean), read.to(x)]
 
@@ -122,6 +126,7 @@ class TargetTransform(nn.Module):
         Shape ``(batch, time, horizon, target)``; in absolute mode ``(batch, time, 1, 1)``.
         """
         base = self._base(features)
+        # Zeros have the shape of a level, so that terms of the loss need no special case.
         return base / self.width if isinstance(base, Tensor) else features.new_zeros(*features.shape[:2], 1, 1)
 
     def encode(self, future: Tensor, features: Tensor) -> Tensor:
@@ -145,6 +150,7 @@ class TargetTransform(nn.Module):
     def lower_decode(self, build: Builder, name: str, code: str, base: str | None) -> str:
         """SI values from one or several sets of standardised ones, ``set * horizon * target``."""
         one = self.width.numel()
+        # Bounds carry several sets of the same numbers; gains repeat once for each set.
         sets = build.width(code) // one
         gain, shift = self.width.flatten().repeat(sets), self.offset.flatten().repeat(sets)
         value = build.add(ScaleShift, f"{name}.decoded", code, gain=gain, shift=shift)

@@ -63,6 +63,7 @@ class MlpHead:
 
 
 @HEADS.register("glu")
+# A layer twice as wide feeds the gated unit, which halves it again.
 @dataclass(frozen=True, kw_only=True)
 class GluHead:
     """A head whose first layer is gated: ``GLU(u) = u_1 sigmoid(u_2)`` with ``u = W_c h + b_c`` (eq. 3.27).
@@ -163,6 +164,8 @@ class Heads(Streaming):
         self.biases = nn.ParameterList(nn.Parameter(torch.empty(outputs, out)) for out in wide)
         with torch.no_grad():
             for weight, bias in zip(self.weights, self.biases, strict=True):
+                # PyTorch's bound for a linear layer with the inputs of a single output.
+                # shrink it too far.
                 bound = 1.0 / math.sqrt(weight.shape[1])
                 weight.uniform_(-bound, bound)
                 bias.uniform_(-bound, bound)
@@ -173,6 +176,7 @@ class Heads(Streaming):
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         if x.ndim == 3:
+            # Without a gate all outputs read the same features: one wide product replaces one for each output.
             shared = self.weights[0].transpose(0, 1).flatten(1)
             y = (x @ shared).unflatten(-1, (self.outputs, -1)) + self.biases[0]
         else:
@@ -193,6 +197,7 @@ class Heads(Streaming):
 
     def lower(self, build: Builder, x: str) -> str:
         weights = [weight.transpose(1, 2) for weight in self.weights]
+        # A representation of the shared width has no gate before it, and the first layer is one dense layer.
         if build.width(x) == self.widths[0]:
             first, bias = weights[0].flatten(0, 1), self.biases[0].flatten()
             x = build.add(Dense, "layer1", x, weight=first, bias=bias)
@@ -208,6 +213,7 @@ class Heads(Streaming):
             last = f"layer{len(self.weights)}"
             x = build.add(GroupedDense, last, x, weight=weights[-1], bias=self.biases[-1])
         values = self.widths[-1]
+        # Values vary slowest in the results, so that the first block of numbers is the prediction of all outputs.
         return build.pick("by_value", x, [c * values + v for v in range(values) for c in range(self.outputs)])
 
     def costs(self) -> list[Cost]:

@@ -114,6 +114,8 @@ class LearnedFromPrefix(Streaming):
         self.recurrent, self.width_in, self.ticks = recurrent, width_in, ticks
         numbers = state_numbers(recurrent.initial_state(1, torch.zeros(())))
         self.first, self.second = nn.Linear(2 * width_in, hidden), nn.Linear(hidden, numbers)
+        # A small second layer leaves the state near that of the plain network; zeros would stop gradients to the
+        # first layer.
         nn.init.normal_(self.second.weight, std=0.01)
         nn.init.zeros_(self.second.bias)
 
@@ -135,10 +137,12 @@ class LearnedFromPrefix(Streaming):
         inner, total, age = state
         y, inner = self.recurrent(x, inner)
         young = age < self.ticks
+        # Only ticks of the prefix enter the mean: a later chunk must leave it unchanged.
         total = total + x.sum(dim=1).masked_fill(~young, 0.0)
         age = (age + x.shape[1]).clamp(max=self.ticks)
         seen = torch.cat([total / self.ticks, x[:, -1]], dim=1)
         correction = self.second(torch.tanh(self.first(seen)))
+        # The correction is used in the one tick that ends the prefix; all other ticks get zeros and cost the same.
         used = correction.masked_fill(~(young & (age >= self.ticks)), 0.0)
         return y, (map_state(torch.add, inner, spread_over(inner, used)), total, age)
 

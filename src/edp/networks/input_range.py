@@ -24,11 +24,13 @@ def usual_range(predictor: Predictor) -> tuple[Array, Array]:
     """
     front, features = predictor.front, predictor.task.features
     offset, width = (part.detach().cpu().double().numpy() for part in (front.offset, front.width))
+    # Inputs without statistics of their own get a width beyond any sensor, so that only wild values are rejected.
     centre, spread = np.zeros(front.inputs), np.full(front.inputs, 1e6)
     logged, hidden = len(features.channels), len(features.hidden)
     centre[:logged], spread[:logged] = offset[:logged], width[:logged]
     for number, entry in enumerate(features.derived):
         source = features.inputs.index(entry.source)
+        # A scaler knows the derivative's width; over one tick it bounds the change of the hidden source.
         change = width[logged + number] / (predictor.task.rate_hz if entry.how == "derivative" else 1.0)
         if source >= logged:
             spread[source] = min(spread[source], change)
@@ -45,5 +47,6 @@ def usual_range(predictor: Predictor) -> tuple[Array, Array]:
 def input_limits(predictor: Predictor) -> tuple[Array, Array]:
     """Least and largest accepted value of each input, SI units, each ``(input,)``."""
     centre, spread = usual_range(predictor)
+    # Clipping keeps the limit representable in float32, in which the exported code compares.
     low, high = (np.clip(centre + side * LIMIT * spread, -LARGEST, LARGEST) for side in (-1.0, 1.0))
     return low, high

@@ -92,6 +92,7 @@ class IntegerPredictor(Predictor):
         raise ExportError("a network in w8a16 gives predictions only; train, teach and look inside with the float run")
 
     def _run(self, x: Tensor, state: State) -> tuple[dict[str, np.ndarray], State]:
+        # A deep copy keeps the caller's state valid, as the float network does.
         new = deepcopy(state)
         return new.run(x.detach().cpu().float().numpy().transpose(1, 0, 2)), new
 
@@ -115,6 +116,7 @@ def integer_predictor(predictor: Predictor, series: Sequence[Series], ticks: int
 
 def spread(series: Sequence[Series], ticks: int) -> list[Series]:
     """Some of the series, at even distances, of about so many ticks in all; at least one."""
+    # A stride over recordings keeps the mix of drives; the first recordings alone could be one kind of work.
     every = max(1, round(sum(part.samples for part in series) / ticks))
     return list(series[::every])
 
@@ -125,6 +127,7 @@ def _error_with(predictor: Predictor, series: Sequence[Series], frac: int) -> fl
     scale, unit = rounded.front.scale, 2.0**-frac
 
     def scaled(features: Tensor) -> Tensor:
+        # Rounding and clamping alone are applied: the judgement concerns the format of the inputs, not of the weights.
         return (scale(features) / unit).round().clamp(-LARGEST, LARGEST) * unit
 
     rounded.front.scale = scaled  # type: ignore[method-assign]

@@ -50,6 +50,7 @@ def model_from_plain(plain: Mapping[str, Any]) -> ModelSpec:
     """
     try:
         return NETWORK.build(ModelSpec, plain, "of the bundle's network")
+    # A bundle is data from outside: its faults are faults of the bundle, not of the user's settings.
     except ConfigError as error:
         raise BundleError(f"the bundle's network is not understood by this version: {error}") from error
 

@@ -48,6 +48,7 @@ class AttentionPooling(Streaming):
         ticks, columns = stop - start, stop - start + self.window - 1
         lag = torch.arange(columns, device=scores.device) - torch.arange(ticks, device=scores.device)[:, None]
         band = (lag >= 0) & (lag < self.window)
+        # Twice the offset of unseen ticks: a column outside the band loses even against ticks before the reset.
         weights = scores[:, None, keys].masked_fill(~band, 2 * UNSEEN).softmax(dim=-1)
         return weights @ states[:, keys]
 
@@ -61,6 +62,7 @@ class AttentionPooling(Streaming):
             Cost(
                 f"attention pooling over {self.window}",
                 parameters_of(self),
+                # Scores cost one multiply-accumulate a unit, the weighted sum `window` of them.
                 pooling=(self.window + 1) * self.units,
                 width_in=self.units,
                 width_out=2 * self.units,

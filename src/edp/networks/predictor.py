@@ -93,6 +93,7 @@ class Predictor(Streaming):
 
     def __init__(self, task: Task, spec: ModelSpec, scaler: Scaler) -> None:
         super().__init__()
+        # Contradictions are refused before the size is computed: the message about the cause comes first.
         check_combination(task, spec)
         _check_size(task, spec, scaler)
         self.task, self.spec = task, spec
@@ -117,6 +118,7 @@ class Predictor(Streaming):
 
     def _present(self) -> tuple[Tensor, Tensor]:
         """Gain and shift, ``(horizon, target)``, from scaled features to present values in target space."""
+        # A target without a feature takes any column; blocks that read present values refuse that case.
         columns = [column or 0 for column in self.task.present]
         gain = self.front.width[columns] / self.code.width
         return gain, (self.front.offset[columns] - self.code.offset) / self.code.width
@@ -200,6 +202,7 @@ class Predictor(Streaming):
         Raises:
             ExportError: a part of it has no such form; it is named. Or it computes with other numbers than float32.
         """
+        # Rounded networks have graphs of their own; a float list of them would compute something else.
         if self.number_format != "float32":
             raise ExportError(f"a network in {self.number_format} has no list of float32 layers; take the float one")
         with torch.no_grad():
@@ -208,6 +211,7 @@ class Predictor(Streaming):
 
     def _lower(self, build: Builder, x: str) -> dict[str, str]:
         with build.inside("front"):
+            # Physical features serve two readers: scaling, and the present values of delta mode.
             features = self.front.lower(build, x)
             base = self.code.lower_base(build, features)
             scaled = self.front.lower_scale(build, features)
@@ -226,6 +230,7 @@ class Predictor(Streaming):
     def _lower_center(self, build: Builder, x: str, scaled: str, base: str | None, y: str) -> str:
         """The standardised prediction, ``horizon * target``."""
         horizons, outputs, values = len(self.task.horizons), len(self.task.targets), self.spec.output.values
+        # Of each horizon only the first value is the prediction; the others state its uncertainty.
         first = [(h * values) * outputs + c for h in range(horizons) for c in range(outputs)]
         act = getattr(self.activation, "lower", None)
         if act is None:
@@ -262,6 +267,7 @@ def _check_size(task: Task, spec: ModelSpec, scaler: Scaler) -> None:
         ConfigError: more parameters or numbers of state than `edp.networks.size` allows.
     """
     parameters, state = size_at_most(spec, task)
+    # On the meta device nothing is allocated, and the check itself builds such a network.
     if (parameters <= MOST_PARAMETERS and state <= MOST_STATE) or torch.get_default_device().type == "meta":
         return
     with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers; takes seconds to load
@@ -278,6 +284,7 @@ def _check_size(task: Task, spec: ModelSpec, scaler: Scaler) -> None:
 
 def build_model(task: Task, spec: ModelSpec, scaler: Scaler, seed: int) -> Predictor:
     """A predictor with freshly drawn weights; the same seed gives the same weights."""
+    # The caller's generator stays as it is: building a network must not change what is drawn after it.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         predictor = Predictor(task, spec, scaler)

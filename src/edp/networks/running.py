@@ -50,6 +50,7 @@ def stream_errors(predictor: Predictor, series: Sequence[Series]) -> Iterator[tu
 
     Series that are no longer than window and horizon are passed over.
     """
+    # A whole window from reset: before that, predictions suffer from the start and not from the network.
     skip = predictor.spec.window
     for predicted, part in zip(stream_predictions(predictor, series), series, strict=True):
         for horizon_index, k in enumerate(predictor.task.horizons):
@@ -102,9 +103,11 @@ def stream_hidden(predictor: Predictor, series: Sequence[Series], batch: int = 4
 
 
 def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int) -> list[NDArray[np.float32]]:
+    # Streams of like length run together, so that little is computed beyond the end of the shorter ones.
     order = sorted(range(len(series)), key=lambda i: series[i].samples)
     results: dict[int, NDArray[np.float32]] = {}
     was_training = predictor.training
+    # Dropout off, and no graph: predictions must not depend on how often they are asked for.
     predictor.eval()
     try:
         with torch.inference_mode():
@@ -113,7 +116,7 @@ def _stream(predictor: Predictor, run: Run, series: Sequence[Series], batch: int
                 group_answers = _run_group(predictor, run, [series[i] for i in group])
                 results.update(zip(group, group_answers, strict=True))
     finally:
-        predictor.train(was_training)
+        predictor.train(was_training)  # back to what the caller had
     return [results[i] for i in range(len(series))]
 
 
@@ -131,6 +134,7 @@ def _windows(predictor: Predictor, run: Run, series: Sequence[Series]) -> list[N
     try:
         with torch.inference_mode():
             for part in series:
+                # Ticks before the first whole window come from one stream from reset, as there is no shorter window.
                 pieces = [answers(part.inputs[None, : window - 1])[0]] if window > 1 else []
                 ends = np.arange(window, part.samples + 1)
                 for at in range(0, len(ends), PIECE):

@@ -23,6 +23,7 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
         spec: a `ModelSpec`.
         task: what it reads and predicts.
     """
+    # Options alone: building a network to count it could exhaust the memory that is to be protected.
     options = list(_integers((spec.backbone, spec.head, *spec.blocks)))
     features, targets = len(task.features.features), len(task.targets)
 
@@ -32,6 +33,7 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
     width = max([features, *(value for key, value in options if key not in NO_WIDTHS)])
     spans = sum(key == "lags" for key, _ in options)
     if spans:  # the representation of a committee: changes over each span, and all members
+        # Two groups of members at most: one for each of the two activations.
         width = features * (1 + spans) + 2 * most("members") * most("units")
     levels = sum(key == "channels" for key, _ in options)
     stacks = max(1, sum(key == "first_dilations" for key, _ in options))

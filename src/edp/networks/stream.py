@@ -95,7 +95,7 @@ class Stream:
     def __init__(self, predictor: Predictor, threads: int = 1) -> None:
         if threads < 1:
             raise ConfigError(f"a stream on {threads} threads was asked for; give at least 1")
-        self.predictor, self._threads = predictor.eval(), threads
+        self.predictor, self._threads = predictor.eval(), threads  # evaluation: no dropout on a machine
         self._like = next(predictor.parameters())
         self._dtype = np.float64 if self._like.dtype is torch.float64 else np.float32
         # In single precision, as the exported code compares.
@@ -108,6 +108,7 @@ class Stream:
         """Forget all ticks and counts."""
         self.ticks = self.rejected = self.held = self.restarts = 0
         self._last: NDArray[np.floating] = np.zeros(len(self.predictor.task.inputs), dtype=self._dtype)
+        # NaN until the first tick: a zero could be taken for a prediction.
         self._numbers = np.full((1 + 2 * len(self._coverages), *self._shape), np.nan, dtype=np.float32)
         self._forget()
 
@@ -147,6 +148,7 @@ class Stream:
             self._holding = HOLD_TICKS
             self.ticks += ticks - 1
             return self._tick(self._hold())
+        # Numbers of a tick that ended in a restart are no prediction; the last good ones stay.
         before = self._numbers
         for _ in range(ticks):
             status = self._hold()
@@ -179,6 +181,7 @@ class Stream:
     def _run(self, holding: bool) -> StreamStatus:
         """One tick of the network from the last accepted inputs."""
         self.ticks += 1
+        # Non-finite results would stay in the recurrent state for ever; clearing it is the only way back.
         numbers = self._computed()
         if not np.isfinite(numbers).all():
             self.restarts += 1
@@ -202,6 +205,7 @@ class Stream:
 
     def _hold(self) -> StreamStatus:
         """A tick without inputs of its own."""
+        # A stream without a tick since its reset has nothing to hold.
         if self._age > 0 and self._holding < HOLD_TICKS:
             self._holding += 1
             self.held += 1
@@ -213,6 +217,7 @@ class Stream:
         return StreamStatus.RESTARTED
 
     def _tick(self, status: StreamStatus) -> StreamTick:
+        # A copy: the caller may keep results while the stream goes on.
         count = len(self._coverages)
         center, lower, upper = np.split(self._numbers.copy(), [1, 1 + count])
         return StreamTick(center[0], lower, upper, self._coverages, status)
@@ -222,6 +227,7 @@ class Stream:
 def _threads(count: int) -> Iterator[None]:
     """PyTorch's threads for what is computed here; those of the caller come back."""
     before = torch.get_num_threads()
+    # Setting the thread count costs a call into the thread pool at every tick; equal counts skip it.
     if before == count:
         yield
         return

@@ -28,8 +28,10 @@ class StreamingTrailingMean(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         ring, seen = state
         history, ticks = torch.cat([ring, x], dim=1), x.shape[1]
+        # Ticks since the reset count, not those in the chunk, so that chunks of any length agree.
         passed = torch.arange(1, ticks + 1, device=x.device, dtype=x.dtype)[:, None]
         count = (seen + passed).clamp(max=self.window)
+        # Sums are formed anew instead of carried: a running sum drifts over hours of float32 additions.
         return _sums(history, self.window) / count, (history[:, ticks:], count[:, -1:])
 
     def lower(self, build: Builder, x: str) -> str:
@@ -49,6 +51,7 @@ def _sums(history: Tensor, window: int) -> Tensor:
     ticks = history.shape[1] - window + 1
     runs, size, start = history, 1, 0
     total = torch.zeros_like(history[:, :ticks])
+    # Binary decomposition of the window: log2(window) additions a tick, of equal rounding at every chunk length.
     while size <= window:
         if window & size:
             total = total + runs[:, start : start + ticks]

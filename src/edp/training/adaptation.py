@@ -68,6 +68,7 @@ def adapt(
     weights = start
     for rate in steps:
         loss = loss_with(net, weights, objective, support)
+        # Parameters that the support does not touch, such as frozen ones, have no gradient and stay.
         gradients = torch.autograd.grad(loss, list(weights.values()), create_graph=second_order, allow_unused=True)
         weights = {
             name: tensor if slope is None else tensor - rate * slope

@@ -59,6 +59,7 @@ class Exponential:
         ConfigError: decay outside ]0, 1[.
     """
 
+    # 0.995: some 200 updates long.
     decay: float = 0.995
 
     def __post_init__(self) -> None:
@@ -67,6 +68,7 @@ class Exponential:
 
     def step(self, update: int, updates: int) -> float:
         """Towards the weights by ``1 - decay``, at first by ``9 / (10 + n)``."""
+        # A young average would otherwise hold on to the random start.
         return 1.0 - min(self.decay, (1 + update) / (10 + update))
 
     def factor(self, factor: float, update: int, updates: int) -> float:
@@ -100,6 +102,7 @@ class Stochastic:
         check_bounds("swa", self, share=above(0.0, 1.0), rate=SHARE)
 
     def _begin(self, updates: int) -> int:
+        # At least one update, so that the mean exists at the end of a short training.
         return updates - max(1, round(self.share * updates))
 
     def step(self, update: int, updates: int) -> float:

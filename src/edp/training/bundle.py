@@ -87,6 +87,7 @@ def make_bundle(
 
 
 def weights_digest(predictor: Predictor) -> str:
+    # Weights and formats together decide what an integer network computes; one without the other is another network.
     """Content address of the weights of a predictor, and of their integer form."""
     state = hashlib.blake2b(_weights_bytes(predictor), digest_size=16)
     if isinstance(predictor, IntegerPredictor):
@@ -112,9 +113,10 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
             f"a network in {form} cannot be saved as a bundle, which would be read as one in float32; save the network "
             "that it was made of, and quantise that after loading"
         )
-    path = make_folder(folder)
+    path = make_folder(folder)  # an old bundle stays valid until the header is renamed
     data = _weights_bytes(bundle.predictor)
     digest = hashlib.blake2b(data, digest_size=16).hexdigest()
+    # Names by content: a reader of the old header never finds new weights under the old name.
     weights = f"weights-{digest[:12]}.safetensors"
     write_bytes(path / weights, data)
     task = bundle.task
@@ -143,7 +145,9 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         entry = _write_arrays(path, "adaptation", save_arrays(bundle.adaptation.arrays()))
         referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
+    # The header comes last: it is what makes the new files count.
     write_json(path / HEADER, header | {HASH: header_digest(header)})
+    # Old files go only after the rename; a kill in between leaves spare files, not a broken bundle.
     for old in (file for what in ("weights", "integers", "adaptation") for file in path.glob(f"{what}-*.safetensors")):
         if old.name not in referenced:
             old.unlink(missing_ok=True)
@@ -165,6 +169,7 @@ def _write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
 
 def header_digest(header: Mapping[str, Any]) -> str:
     """Hash over all of a header but its hash: what is fed and predicted, and in which order, is under it."""
+    # One round through JSON: the hash is over what a reader will see, tuples as lists.
     plain = json.loads(json.dumps({key: value for key, value in header.items() if key != HASH}, allow_nan=False))
     text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -181,6 +186,7 @@ def load_bundle(folder: str | Path) -> Bundle:
     with _as_damage(path):
         header = _read_header(path)
         _check_schema(header, path)
+        # The hash protects against damage and stray edits, not against an attacker: it has no key.
         if header.get(HASH) != header_digest(header):
             raise BundleError(
                 f"'{path / HEADER}' does not match its hash: it was cut off or changed by hand; restore the bundle"
@@ -200,6 +206,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
         if header.get("schema") not in UNHASHED:
             raise BundleError(f"bundle '{path}' has schema {header.get('schema')}; there is nothing to upgrade")
         upgraded = header | {"schema": UNHASHED[header["schema"]]}
+        # The content is assembled once, so that damage is not sealed under a new hash.
         _assembled(upgraded, path)
     write_json(path / HEADER, upgraded | {HASH: header_digest(upgraded)})
     return path
@@ -207,6 +214,7 @@ def upgrade_bundle(folder: str | Path) -> Path:
 
 def _bundle_folder(folder: str | Path) -> Path:
     path = Path(folder)
+    # Both the run folder and the bundle in it are accepted.
     path = path / "bundle" if os.path.lexists(path / "bundle" / HEADER) else path
     if not os.path.lexists(path / HEADER):
         raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
@@ -216,6 +224,7 @@ def _bundle_folder(folder: str | Path) -> Path:
 @contextlib.contextmanager
 def _as_damage(path: Path) -> Iterator[None]:
     """What goes wrong in a file of a bundle, as one message that names the bundle."""
+    # A damaged file can raise any of these deep in a parser; a bug elsewhere keeps its own type.
     kinds = (EdpError, LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError)
     try:
         yield
@@ -243,6 +252,7 @@ def _assembled(header: dict[str, Any], path: Path) -> Bundle:
     texts = tuple(_text(c["description"]) for c in header["outputs"])
     _check_channels(header, task, inputs)
     predictor = Predictor(task, spec, blank_scaler(task))
+    # Weights are loaded on top of placeholders: nothing in the file decides the structure.
     _fill(predictor, load(_weights(path, header["weights"])))
     if header["schema"] == INTEGER_SCHEMA or "number_format" in header:
         integers = {name: x.numpy() for name, x in load(_weights(path, header["integers"])).items()}
@@ -255,6 +265,7 @@ def _assembled(header: dict[str, Any], path: Path) -> Bundle:
 
 def _check_channels(header: Mapping[str, Any], task: Task, inputs: Sequence[Channel]) -> None:
     """The channels that are listed are those of the task, in its order."""
+    # Order is meaning: swapped columns would give plausible and wrong predictions.
     if [channel.name for channel in inputs] != list(task.inputs):
         raise ValueError("its inputs are not those of its task")
     if [entry["name"] for entry in header["outputs"]] != list(task.targets):
@@ -274,6 +285,7 @@ def _text(value: Any) -> str:
 
 def _formats(plain: Any) -> dict[str, int]:
     formats = object_with(plain, (), "its formats")
+    # A bool is an int in Python; JSON's true is no format.
     wrong = [name for name, frac in formats.items() if isinstance(frac, bool) or not isinstance(frac, int)]
     wrong += [name for name, frac in formats.items() if name not in wrong and abs(frac) > MOST_BITS]
     if wrong:
@@ -284,6 +296,7 @@ def _formats(plain: Any) -> dict[str, int]:
 def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
     """Put weights into a network: all of them, of its shapes and types, finite, and widths above 0."""
     expected = predictor.state_dict()
+    # Both directions: a missing weight keeps a random start, a spare one belongs to another network.
     other = sorted({*expected} ^ {*tensors})
     if other:
         raise ValueError(f"its weights are not those of its header: '{other[0][:80]}' is in one of them only")
@@ -294,6 +307,7 @@ def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             raise ValueError(f"its weights are damaged: '{name}' holds a number that is not finite")
     predictor.load_state_dict(dict(tensors))
+    # Widths divide and multiply; zero or negative ones would turn predictions over without an error.
     for what, width in (("inputs", predictor.front.width), ("targets", predictor.code.width)):
         if not (width > 0).all():
             raise ValueError(f"its weights are damaged: the scale of the {what} holds a width that is not positive")
@@ -314,6 +328,7 @@ def _adaptation(entry: Mapping[str, Any], task: Task, path: Path) -> Adaptation:
 
 def _check_schema(header: Mapping[str, Any], path: Path) -> None:
     schema = header["schema"]
+    # 1.0 and true equal 1 in Python; neither is a schema.
     if schema in (SCHEMA, INTEGER_SCHEMA, ADAPTED_SCHEMA) and not isinstance(schema, bool | float):
         return
     whole = isinstance(schema, int) and not isinstance(schema, bool)

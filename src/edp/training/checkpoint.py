@@ -79,6 +79,7 @@ def save_checkpoint(
     tensors = {"running": weights.running.detach().cpu().contiguous()}
     for group, named in (("current", weights.current), ("average", weights.average), ("best", weights.best)):
         tensors |= {f"{group}/{name}": tensor.detach().cpu().contiguous() for name, tensor in named.items()}
+    # Structure goes to JSON and tensors to safetensors: neither executes code when it is read.
     state = optimizer.state_dict()
     structure = _strip(state, "optimizer", tensors)
     header = {"key": key, "progress": asdict(progress), "optimizer": structure}
@@ -101,6 +102,7 @@ def load_checkpoint(path: Path, key: str) -> tuple[Progress, Weights, dict[str, 
             raise StorageError(f"checkpoint '{path}' belongs to another run; choose another folder with --out")
         return _taken_apart(header, tensors)
     except (SafetensorError, LookupError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+        # safetensors, JSON and missing keys each raise their own type; all of them mean damage.
         raise damaged(path, error) from error
 
 
@@ -141,6 +143,7 @@ def unpack(data: bytes) -> Any:
 
 
 def _header(data: bytes) -> Any:
+    # safetensors begin with the length of their header, 8 bytes, little-endian.
     size = int.from_bytes(data[:8], "little")
     outer = parse_json(data[8 : 8 + size].decode(), "its header", ValueError)
     return parse_json(outer["__metadata__"]["edp"], "its header", ValueError, finite=False)
@@ -148,6 +151,7 @@ def _header(data: bytes) -> Any:
 
 def _place_of_digest(data: bytes) -> int:
     end = 8 + int.from_bytes(data[:8], "little")
+    # The search ends with the header: weights could hold the same bytes by chance.
     spot = CHECKSUM.search(data, 8, min(end, len(data)))
     if spot is None:
         raise ValueError("it has no checksum: cut off, or written by an earlier version of EDP")
@@ -155,6 +159,7 @@ def _place_of_digest(data: bytes) -> int:
 
 
 def _digest(data: bytes, position: int) -> bytes:
+    # The checksum's own place counts as zeros, so that it can stand inside of what it covers.
     state = hashlib.blake2b(data[:position], digest_size=16)
     state.update(BLANK.encode())
     state.update(memoryview(data)[position + len(BLANK) :])
@@ -193,6 +198,7 @@ def _restore(value: Any, tensors: dict[str, Tensor]) -> Any:
             if (
                 sum((n - 1) * step for n, step in zip(stored.shape, value["stride"], strict=True)) + 1
                 > stored.numel()
+                # A forged stride could reach beyond the storage.
                 > 0
             ):
                 raise ValueError(f"'{value['tensor']}' asks for more memory than it has numbers")

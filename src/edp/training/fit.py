@@ -224,7 +224,7 @@ class Loop:
         """Exactly `updates` batches; the order depends on the seed and the epoch alone."""
         passes, batches = 0, 0
         while batches < self.updates:
-            for batch in self.sampler.epoch(self.progress.epoch * 1000 + passes):
+            for batch in self.sampler.epoch(self.progress.epoch * 1000 + passes):  # orders of epochs do not meet
                 yield batch
                 batches += 1
                 if batches == self.updates:
@@ -236,7 +236,7 @@ class Loop:
         within = self.within
         if not within.updates:
             # Dropout must not depend on how often the run was stopped: each epoch has its own seed.
-            torch.manual_seed(self.spec.seed * 100_003 + self.progress.epoch)
+            torch.manual_seed(self.spec.seed * 100_003 + self.progress.epoch)  # prime: seeds do not meet
         self.net.train()
         seen, began, shown = 0, time.perf_counter(), time.perf_counter()
         for batch in islice(self._batches(), within.updates, until):
@@ -245,7 +245,7 @@ class Loop:
             within.updates += 1
             seen += batch.targets_seen
             now = time.perf_counter()
-            if now - shown > 0.5:
+            if now - shown > 0.5:  # seconds
                 shown = now
                 on_event(self._event(self.progress.epoch + 1, within.updates, seen / (now - began), now - began, None))
         return seen

@@ -59,6 +59,7 @@ def _weights(net: Predictor, spec: TrainingSpec) -> float:
 
 
 def _batch(net: Predictor, spec: TrainingSpec) -> float:
+    # The meta device tells shapes without memory.
     """Inputs, future targets and state of all streams of an update."""
     chunks, task = spec.chunks, net.task
     like = torch.zeros((), device="meta")
@@ -79,6 +80,7 @@ def _backward(net: Predictor, spec: TrainingSpec) -> float:
     """What the backward pass of an update needs of the forward pass, from two short passes of one stream."""
     chunks = spec.chunks
     first, second = (_saved(net, ticks) for ticks in PROBED)
+    # The difference of two passes removes what does not grow with the ticks.
     tick = max(0.0, (second - first) / (PROBED[1] - PROBED[0]))
     start = max(0.0, first - tick * PROBED[0])
     # The loss takes differences of predictions and targets, some of them kept for the way back.
@@ -95,6 +97,7 @@ def _saved(net: Predictor, ticks: int) -> int:
     def pack(tensor: torch.Tensor) -> torch.Tensor:
         nonlocal total
         storage = tensor.untyped_storage()
+        # Views share a storage, and weights are kept anyway: each storage counts once, weights not at all.
         if storage.data_ptr() not in counted_storages:
             counted_storages.add(storage.data_ptr())
             total += storage.nbytes()
@@ -104,6 +107,7 @@ def _saved(net: Predictor, ticks: int) -> int:
     was_training = net.training
     net.train()
     try:
+        # The trial must not move the random numbers of the training.
         with torch.random.fork_rng(devices=[]), torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
             net.forward_features(x, net.initial_state(1, x))
     finally:

@@ -25,6 +25,7 @@ class Objective:
         self.spec, self.code = spec, code
         self.weights = output_weights(code.width, spec.weight_power)
         self.weights = self.weights * horizon_weights(len(self.weights), spec.horizon_decay).to(self.weights)
+        # Ones stand for errors of one standard deviation, which a network at the mean has.
         self.running = torch.ones_like(self.weights)
 
     def evaluate(self, answer: Prediction, future: Tensor, features: Tensor, valid: Tensor) -> Tensor:
@@ -40,6 +41,7 @@ class Objective:
         weights = self.weights
         if self.spec.adaptive.blend:
             weights = weights * self.spec.adaptive.weights(self.running)
+            # Detached: the weights follow the error and must not be a way to lower the loss.
             self.running = self.spec.adaptive.follow(self.running, (answer.center - target).detach(), valid)
         loss = masked_loss(self.spec.loss, answer, target, valid, weights)
         if self.spec.terms:

@@ -50,6 +50,7 @@ def fit_part(
     """
     if spec.refit != "none":
         raise ConfigError(f"a training with refit = '{spec.refit}' cannot be done in parts; refit = 'none' must hold")
+    # The number of threads changes the order of sums, and with it the last bits of a result.
     torch.set_num_threads(thread_count(spec))
     loop = Loop(data, model, spec, None, windowed=windowed)
     if spec.epochs > 1:
@@ -88,6 +89,7 @@ def _epochs(loop: Loop, until: int | None, start: bytes | None) -> tuple[Fitted,
 
 def _state_of_epochs(loop: Loop) -> dict[str, Any]:
     """What later epochs depend on; every epoch seeds its own chances. No times: equal parts, equal bytes."""
+    # Times differ from run to run; without them equal trainings leave equal bytes.
     progress = asdict(loop.progress) | {"seconds": 0.0}
     progress["history"] = [row | {"seconds": 0.0} for row in progress["history"]]
     return {
@@ -124,6 +126,7 @@ def _state(loop: Loop) -> dict[str, Any]:
         "average": loop.average,
         "optimizer": loop.optimizer.state_dict(),
         "running": loop.objective.running,
+        # Dropout is drawn along the epoch, so the generator's state is part of the place inside it.
         "chance": torch.get_rng_state(),
         "chance on the device": torch.cuda.get_rng_state(loop.device) if cuda else None,
     }

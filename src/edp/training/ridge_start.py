@@ -45,6 +45,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
         [Series(part.name, feature_matrix(task, part)[:, read], part.targets) for part in parts]
         for parts in (train, validation)
     ]
+    # Validation alone cannot fit the regression; it only chooses its penalty.
     if not any(len(origins(part, lags)) for part in series_of_parts[0]):
         raise DataError(
             f"linear_bypass: the longest training stretch has {max(part.samples for part in train)} samples, fewer "
@@ -63,6 +64,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
     maps[:, read] = solution.weights
     if predictor.code.delta:
         for target, column in enumerate(predictor.code.present):
+            # In delta mode the network predicts the change: the present value is taken out of lag 0.
             maps[0, column, :, target] -= 1.0
     level = solution.intercept + np.einsum("hfkc,f->kc", maps, offset) - predictor.code.offset.double().cpu().numpy()
     unit = predictor.code.width.double().cpu().numpy()
@@ -71,6 +73,7 @@ def start_bypass(predictor: Predictor, train: Sequence[Series], validation: Sequ
         # The skip connection filters forward in time: its last tap is lag 0.
         bypass.weight.copy_(torch.from_numpy(weight[::-1].transpose(2, 1, 0).copy()))
         bypass.bias.copy_(torch.from_numpy((level / unit).ravel()))
+        # Silent heads: the first validation measures the regression alone, which training must improve on.
         for parameter in (predictor.heads.weights[-1], predictor.heads.biases[-1]):
             parameter.zero_()
     return True
@@ -80,5 +83,6 @@ def _columns(task: Task) -> list[int]:
     """Features that the regression reads, in order."""
     features = task.features
     new = {entry.name for entry in features.derived if entry.source in features.hidden}
+    # Derived columns of measured channels are sums of lags already; only those of hidden channels add something.
     regression_channels = {*features.channels, *new, *task.targets}
     return [column for column, name in enumerate(features.lasting) if name in regression_channels]

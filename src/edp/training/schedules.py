@@ -35,6 +35,7 @@ SCHEDULES: Registry[type] = Registry("schedule")
 
 
 def _ramp(progress: float, share: float) -> float:
+    # The small constant gives the first update a rate above zero.
     return min(1.0, (progress + 1e-3) / share) if share > 0 else 1.0
 
 
@@ -69,6 +70,7 @@ class Cosine:
         floor: share of the base rate at the end.
     """
 
+    # A short warm-up: moments of the optimiser are unreliable in the first updates.
     warmup: float = 0.03
     floor: float = 0.01
 
@@ -78,6 +80,7 @@ class Cosine:
     def factor(self, progress: float, state: ScheduleState) -> float:
         if progress < self.warmup:
             return _ramp(progress, self.warmup)
+        # The guard serves a warm-up of the whole run, where the cosine has no length.
         done = (progress - self.warmup) / max(1e-9, 1.0 - self.warmup)
         return self.floor + (1.0 - self.floor) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
 
@@ -139,11 +142,12 @@ class Plateau:
 
     def observe(self, validation: float, state: ScheduleState) -> None:
         """Count epochs without improvement."""
+        # A relative threshold, since the unit of the score depends on the targets.
         if validation < state.best * (1.0 - self.threshold):
             state.best, state.waited = validation, 0
             return
         state.waited += 1
-        if state.waited > self.patience:
+        if state.waited > self.patience:  # epochs without gain, then one step down
             state.factor, state.waited = max(self.floor, state.factor * self.shrink), 0
 
 

@@ -83,11 +83,14 @@ class TrainingSpec:
     average: AverageSpec = field(default_factory=Exponential)
     epochs: int = 20
     updates: int = 0
+    # Some epochs of patience: noise of the validation score alone must not end a training.
     patience: int = 8
     refit: str = "none"
     bagging: BaggingSpec | None = None
+    # Recurrent networks have rare steep gradients; the norm of 1 bounds the step that these cause.
     clip_norm: float = 1.0
     seed: int = 0
+    # One thread: two were slower on small steps of a busy machine (docs/findings.md, two threads).
     threads: int = 1
     device: str = "auto"
 
@@ -140,6 +143,7 @@ def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:
             f"the loss '{loss}' trains the output {_either(spec.loss.outputs)}, but model.output is '{output}', which "
             f"is trained by the loss {_either(fitting)}; change one of the two"
         )
+    # A setting without effect is refused, since its user expects one.
     if spec.horizon_decay < 1 and len(task.horizons) == 1:
         reasons.append(
             f"horizon_decay = {spec.horizon_decay} weighs horizons against one another, but the task has one "

@@ -25,6 +25,7 @@ def validation_scores(
 
     The loss is the main one, without weights and terms. With `windowed` every prediction is from reset over its window.
     """
+    # Double precision: sums over hours of ticks in float32 lose the digits in which epochs differ.
     scale = net.code.width.detach().cpu().double()
     factors = torch.tensor([KINDS[kind].report_factor for kind in data.target_kinds], dtype=torch.float64)
     absolute, count, loss = torch.zeros_like(scale), 0, 0.0
@@ -52,6 +53,7 @@ def _answers(
     net: Predictor, series: Sequence[Series], spec: TrainingSpec, windowed: bool = False
 ) -> Iterator[tuple[Prediction, Tensor]]:
     """What the network says of each series after start-up, and the standardised targets; batches of one."""
+    # Ticks of the start judge the reset and not the network; training gives them no loss either.
     skip = spec.chunks.burn_in if spec.chunks.regime == "chunk" else net.spec.window - 1
     for part, answer in zip(series, stream_answers(net, series, windowed=windowed), strict=True):
         target = standard_targets(net, part)[:, skip:]
@@ -64,6 +66,7 @@ def standard_targets(net: Predictor, part: Series) -> Tensor:
 
     Ticks whose targets lie beyond the end are left out.
     """
+    # All horizons share their ticks, so that errors at different horizons compare.
     ticks = part.samples - net.task.max_horizon
     future = np.stack([part.targets[k : k + ticks] for k in net.task.horizons], axis=1)
     like = next(net.parameters())

@@ -70,6 +70,7 @@ class _Bridge(Streaming):
         self.norm_attention, self.norm_feed = nn.LayerNorm(width), nn.LayerNorm(width)
         self.project, self.gather = nn.Linear(width, 3 * width), nn.Linear(width, width)
         self.widen, self.narrow = nn.Linear(width, 2 * width), nn.Linear(2 * width, width)
+        # PyTorch's start of multi-head attention: Xavier over the joined projections, biases at zero.
         nn.init.xavier_uniform_(self.project.weight)
         for bias in (self.project.bias, self.gather.bias):
             nn.init.zeros_(bias)
@@ -77,6 +78,7 @@ class _Bridge(Streaming):
     def initial_state(self, batch: int, like: Tensor) -> State:
         past = self.window - 1
         keys = like.new_zeros(batch, past, self.width)
+        # Ticks before the reset get an offset that hides them: zeros in the ring would take part in the softmax.
         return keys, keys.clone(), like.new_full((batch, past), UNSEEN)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
@@ -85,11 +87,15 @@ class _Bridge(Streaming):
         keys, values = torch.cat([state[0], key], dim=1), torch.cat([state[1], value], dim=1)
         hidden = torch.cat([state[2], x.new_zeros(len(x), ticks)], dim=1)
         attended = []
+        # Blocks bound the memory of the scores, which would grow with the square of the sequence length otherwise.
         for start in range(0, ticks, BLOCK):
             stop = min(start + BLOCK, ticks)
+            # The columns that the first query of the block sees start `window - 1` ticks before it, which are in the
+            # ring.
             seen = slice(start, stop + self.window - 1)
             attended.append(self._attend(query[:, start:stop], keys[:, seen], values[:, seen], hidden[:, seen]))
         y = x + self.gather(torch.cat(attended, dim=1))
+        # The residual is added behind the norm (pre-norm): the path of the gradients past the layer stays free.
         y = y + self.narrow(functional.gelu(self.widen(self.norm_feed(y))))
         return y, (keys[:, ticks:], values[:, ticks:], hidden[:, ticks:])
 
@@ -101,6 +107,7 @@ class _Bridge(Streaming):
         outside = (lag < 0) | (lag >= self.window)
         offset = hidden[:, None] + hidden.new_zeros(ticks, columns).masked_fill(outside, UNSEEN)
         offset = offset[:, None].expand(-1, self.heads, -1, -1).flatten(0, 1)
+        # The scale 1/sqrt(head width) keeps the variance of the scores near one, so that the softmax does not saturate.
         scores = torch.baddbmm(offset, q, k.transpose(1, 2), alpha=1.0 / math.sqrt(q.shape[-1]))
         result: Tensor = (scores.softmax(dim=-1) @ v).unflatten(0, (batch, self.heads)).transpose(1, 2).flatten(2)
         return result
@@ -109,6 +116,7 @@ class _Bridge(Streaming):
         wide = self.width
         with build.inside("bridge"):
             calm = _norm(build, "norm1", x, self.norm_attention)
+            # Three layers instead of one: an export reads each projection by its own name and width.
             parts = zip(self.project.weight.chunk(3), self.project.bias.chunk(3), strict=True)
             names = ("query", "key", "value")
             qkv = [build.add(Dense, names[i], calm, weight=w, bias=b) for i, (w, b) in enumerate(parts)]
@@ -127,6 +135,8 @@ class _Bridge(Streaming):
         feed = nn.ModuleList([self.norm_feed, self.widen, self.narrow])
         return [
             Cost(
+                # Query, key, value and output projection take 4 C^2; the thesis's W^2 becomes W for a single new
+                # column.
                 f"attention bridge, {self.heads} heads over {self.window}",
                 parameters_of(attention),
                 per_column=4 * wide * wide + 2 * self.window * wide,

@@ -57,6 +57,7 @@ class _Across(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         query, key, value = self.project(x).chunk(3, dim=-1)
         weights = (query @ key.transpose(-2, -1) / math.sqrt(self.hidden)).softmax(dim=-1)
+        # The norm stands behind the sum (post-norm), as in eq. 3.23.
         return self.norm(x + self.gather(weights @ value)), state
 
     def lower(self, build: Builder, x: str) -> str:
@@ -81,6 +82,7 @@ class _Across(Streaming):
             Cost(
                 f"attention across {rows} outputs",
                 parameters_of(self),
+                # Scores and weighted sums over the outputs cost `rows^2 C` each; four projections cost `rows C^2` each.
                 per_prediction=4 * rows * wide * wide + 2 * rows * rows * wide,
                 width_in=rows * wide,
                 width_out=3 * rows * wide,

@@ -49,6 +49,7 @@ class _DiagonalGate(Streaming):
         super().__init__()
         self.scale = nn.Parameter(torch.zeros(outputs, width))
         self.bias = nn.Parameter(torch.full((outputs, width), OPEN_BIAS))
+        # Small random slopes break the symmetry between outputs and leave the gate nearly transparent.
         nn.init.normal_(self.scale, std=0.01)
 
     def initial_state(self, batch: int, like: Tensor) -> State:
@@ -62,6 +63,7 @@ class _DiagonalGate(Streaming):
         outputs, width = self.scale.shape
         wide = outputs * width
         with build.inside("gate"):
+            # A copy for each output: layers of a graph have no broadcasting.
             every = build.pick("repeated", x, list(range(width)) * outputs)
             gate = build.add(ScaleShift, "scaled", every, gain=self.scale.flatten(), shift=self.bias.flatten())
             gate = build.add(Activate, "sigmoid", gate, function=Function.SIGMOID, size=wide)

@@ -27,6 +27,7 @@ class GlobalAveragePooling:
 
     def extra(self, width: int) -> int:
         """Features added for recurrent states of `width`."""
+        # At least one feature, so that a single unit does not give an empty layer.
         return max(1, width // 2)
 
     def build(self, width: int, window: int) -> Streaming:

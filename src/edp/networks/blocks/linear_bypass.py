@@ -45,6 +45,7 @@ class LinearBypass:
         check_bounds("linear_bypass", self, taps=whole(1, MOST_KERNEL))
         if self.start not in STARTS:
             raise ConfigError(f"linear_bypass: unknown start '{self.start}'{closest(self.start, STARTS)}")
+        # A map that starts at zero and never changes adds nothing; the combination is refused, not ignored.
         if self.start == "zero" and not self.trained:
             raise ConfigError("linear_bypass: start = 'zero' with trained = false does nothing; change one of them")
 
@@ -62,11 +63,14 @@ class Bypass(Streaming):
     def __init__(self, features: int, horizons: int, outputs: int, spec: LinearBypass) -> None:
         super().__init__()
         self.spec, self.features, self.horizons, self.outputs = spec, features, horizons, outputs
+        # Zero until training sets the regression: a bundle loads its weights over them, and a fresh network is
+        # unchanged.
         self.weight = nn.Parameter(torch.zeros(horizons * outputs, features, spec.taps), requires_grad=spec.trained)
         self.bias = nn.Parameter(torch.zeros(horizons * outputs), requires_grad=spec.trained)
         self.fixed = () if spec.trained else ("weight", "bias")
 
     def initial_state(self, batch: int, like: Tensor) -> State:
+        # Zeros stand for the mean of scaled features, so that a reset starts from the usual operating point.
         return like.new_zeros(batch, self.spec.taps - 1, self.features)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
@@ -75,6 +79,7 @@ class Bypass(Streaming):
         return y.unflatten(-1, (self.horizons, self.outputs)), history[:, x.shape[1] :]
 
     def lower(self, build: Builder, x: str) -> str:
+        # Streaming layers take the tap before the feature, PyTorch the feature before the tap.
         return build.add(Convolution, "bypass", x, weight=self.weight.transpose(1, 2), bias=self.bias)
 
     def costs(self) -> list[Cost]:

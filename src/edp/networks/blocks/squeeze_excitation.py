@@ -40,6 +40,7 @@ class SqueezeExcitation:
 
     def build(self, width: int, window: int) -> Streaming:
         """The block on `width` channels."""
+        # A bottleneck of at least one unit, for networks narrower than the reduction.
         return _SqueezeExcitation(width, window, max(1, width // self.reduction))
 
 
@@ -63,6 +64,7 @@ class _SqueezeExcitation(Streaming):
     def lower(self, build: Builder, x: str) -> str:
         down, up = self.squeeze.weight, self.excite.weight
         with build.inside("squeeze_excitation"):
+            # The exported dense layer always has a bias; zeros give the same numbers.
             s = build.add(Dense, "squeeze", self.mean.lower(build, x), weight=down, bias=down.new_zeros(len(down)))
             s = build.add(Activate, "relu", s, function=Function.RELU, size=len(down))
             s = build.add(Dense, "excite", s, weight=up, bias=up.new_zeros(len(up)))

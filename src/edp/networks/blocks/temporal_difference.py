@@ -40,6 +40,7 @@ class _Difference(Streaming):
         return like.new_zeros(batch, 1, self.width)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        # The state holds the last tick of the previous chunk, so that a chunk boundary leaves no jump.
         before = torch.cat([state, x[:, :-1]], dim=1)
         return x - before, x[:, -1:]
 

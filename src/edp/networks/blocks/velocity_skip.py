@@ -67,6 +67,7 @@ class _Skip(Streaming):
     def __init__(self, columns: list[int], space: OutputSpace) -> None:
         super().__init__()
         self.columns = columns
+        # Buffers, not parameters: the path must stay the present value itself, and bundles carry its scaling.
         self.register_buffer("gain", space.gain)
         self.register_buffer("shift", space.shift)
 

@@ -59,6 +59,8 @@ class DiagonalSsm(Streaming):
         super().__init__()
         self.width_in, self.units, self.states = width_in, units, states
         low, high = (math.log(value) for value in MEMORY)
+        # Time constants are spread evenly in the logarithm; the shuffle keeps them independent of the order of the
+        # angles.
         self.rate = nn.Parameter(-torch.linspace(low, high, states)[torch.randperm(states)])
         self.angle = nn.Parameter(FASTEST * torch.rand(states))
         self.into = nn.Linear(width_in, 2 * states, bias=False)
@@ -69,14 +71,17 @@ class DiagonalSsm(Streaming):
 
     def factor(self) -> tuple[Tensor, Tensor]:
         """Lambda as ``(state, 2)`` and the scale of the input, ``(state, 1)``; both are constants once trained."""
+        # training.
         decay = torch.exp(self.rate)
         size = torch.exp(-decay)
         turn = torch.stack([torch.cos(self.angle), torch.sin(self.angle)], dim=-1)
         # 1 - |lambda|^2 = -expm1(-2 decay): exact where lambda is close to the unit circle.
+        # The scale keeps the variance of the state independent of its time constant (Orvieto et al. 2023).
         return size.unsqueeze(-1) * turn, torch.sqrt(-torch.expm1(-2 * decay)).unsqueeze(-1)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         factor, scale = self.factor()
+        # Time first: the scan walks over contiguous rows.
         driven = self.into(x.transpose(0, 1)).unflatten(-1, (self.states, 2)) * scale
         h = torch.view_as_real(
             linear_scan(torch.view_as_complex(factor), torch.view_as_complex(driven), torch.view_as_complex(state))
@@ -86,6 +91,7 @@ class DiagonalSsm(Streaming):
 
     def lower(self, build: Builder, x: str) -> str:
         factor, scale = self.factor()
+        # The scale folds into the matrix once; a tick of the exported code then costs no extra products.
         weight = (self.into.weight.unflatten(0, (self.states, 2)) * scale.unsqueeze(-1)).flatten(0, 1)
         driven = build.add(Dense, "drive", x, weight=weight, bias=weight.new_zeros(2 * self.states))
         h = build.add(Rotation, "rotation", driven, factor=factor)
@@ -94,6 +100,7 @@ class DiagonalSsm(Streaming):
 
     def costs(self) -> list[Cost]:
         states, units = 2 * self.states, self.units
+        # The two parameters of a state are its rate and its angle.
         rows = parameters_of(self.into) + 2 * self.states
         return [
             Cost(

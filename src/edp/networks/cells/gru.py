@@ -42,6 +42,7 @@ class StreamingGru(Streaming):
     def __init__(self, width_in: int, units: int) -> None:
         super().__init__()
         self.width_in, self.units = width_in, units
+        # The uniform bound 1/sqrt(units) is PyTorch's, so that results compare with its own layer.
         bound = 1.0 / math.sqrt(units)
         self.weight_ih = nn.Parameter(torch.empty(3 * units, width_in).uniform_(-bound, bound))
         self.weight_hh = nn.Parameter(torch.empty(3 * units, units).uniform_(-bound, bound))
@@ -75,6 +76,7 @@ class _Steps(torch.autograd.Function):
         hs = projected.new_empty(ticks + 1, batch, units)
         hs[0] = h
         gates, inner = torch.empty_like(projected), torch.empty_like(projected)
+        # A contiguous transpose: the product of each tick reads it row by row.
         down = recurrent.t().contiguous()
         into_soft, into_new = (part.unbind(0) for part in projected.split([2 * units, units], dim=2))
         up_soft, up_new = (part.unbind(0) for part in inner.split([2 * units, units], dim=2))
@@ -82,6 +84,7 @@ class _Steps(torch.autograd.Function):
         reset, keep = (part.unbind(0) for part in gates[..., : 2 * units].chunk(2, dim=2))
         hidden, up = hs.unbind(0), inner.unbind(0)
         for t in range(ticks):
+            # Views are unbound once before the loop; indexing inside it would cost more than the small products.
             torch.addmm(bias, hidden[t], down, out=up[t])
             torch.add(into_soft[t], up_soft[t], out=soft[t]).sigmoid_()
             torch.addcmul(into_new[t], reset[t], up_new[t], out=new[t]).tanh_()
@@ -102,6 +105,7 @@ class _Steps(torch.autograd.Function):
         factors = torch.stack([by_reset, by_keep, by_new * reset], dim=2)
         grads, totals = torch.empty_like(factors), torch.empty_like(hs[1:])
         flat = grads.view(ticks, batch, 3 * units).unbind(0)
+        # Unbound views again, one list for each operand of the loop.
         grad_of, total_of, keep_of, grads_of, factors_of = (
             values.unbind(0) for values in (grad_h, totals, keep, grads, factors)
         )
@@ -110,8 +114,10 @@ class _Steps(torch.autograd.Function):
             total = torch.add(dh, grad_of[t], out=total_of[t])
             torch.mul(factors_of[t], total.unsqueeze(1), out=grads_of[t])
             dh = torch.addmm(total * keep_of[t], flat[t], recurrent)
+        # Gradients of the weights need all ticks at once: one large product replaces one small product a tick.
         rows = grads.view(ticks * batch, 3 * units)
         by_recurrent, by_bias = rows.t() @ hs[:-1].flatten(0, 1), rows.sum(dim=0)
+        # The gradient by the input of n lacks the reset gate, which acts on U h only.
         grads = grads.clone()
         torch.mul(by_new, totals, out=grads[:, :, 2])
         return grads.flatten(2), by_recurrent, by_bias, dh

@@ -44,6 +44,7 @@ class StreamingLayerNormLstm(Streaming):
     def __init__(self, width_in: int, units: int, zoneout: float) -> None:
         super().__init__()
         self.width_in, self.units, self.rate = width_in, units, zoneout
+        # The uniform bound of PyTorch's LSTM; the norms rescale the sums anyway.
         bound = 1.0 / math.sqrt(units)
         self.weight_ih = nn.Parameter(torch.empty(4 * units, width_in).uniform_(-bound, bound))
         self.weight_hh = nn.Parameter(torch.empty(4 * units, units).uniform_(-bound, bound))
@@ -61,6 +62,7 @@ class StreamingLayerNormLstm(Streaming):
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         # Rows of all ticks are normalised at once; a norm over 4 D does not notice the order of the gates.
         rows = x.transpose(0, 1) @ output_first(self.weight_ih).t()
+        # Both shifts and the bias are added to the same sums: one addition for all ticks outside the loop.
         shift = output_first(self.norm_shift_ih + self.norm_shift_hh + self.bias)
         projected = functional.layer_norm(rows, rows.shape[2:], output_first(self.norm_gain_ih), shift, EPSILON)
         share = zoneout_share(projected, self.units, self.rate, self.training)
@@ -81,6 +83,7 @@ class StreamingLayerNormLstm(Streaming):
             gain_c=self.norm_gain_c,
             shift_c=self.norm_shift_c,
             epsilon=EPSILON,
+            # Evaluation takes the expected share of the new state, as dropout does with its mean.
             share=1.0 - self.rate,
         )
 

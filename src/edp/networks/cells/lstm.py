@@ -51,6 +51,7 @@ class StreamingLstm(Streaming):
 
     def lower(self, build: Builder, x: str) -> str:
         part = self.cell.get_parameter
+        # PyTorch's two biases always act as a sum; an export stores one.
         bias = part("bias_ih_l0") + part("bias_hh_l0")
         weight_x, weight_h = part("weight_ih_l0"), part("weight_hh_l0")
         return build.add(LstmLayer, "lstm", x, weight_x=weight_x, weight_h=weight_h, bias=bias)
@@ -73,6 +74,7 @@ class ZoneoutLstm(Streaming):
     def __init__(self, width_in: int, units: int, rate: float) -> None:
         super().__init__()
         self.width_in, self.units, self.rate = width_in, units, rate
+        # The bound of PyTorch's LSTM, so that zoneout is the only difference from the plain layer.
         bound = 1.0 / math.sqrt(units)
         self.weight_ih_l0 = nn.Parameter(torch.empty(4 * units, width_in).uniform_(-bound, bound))
         self.weight_hh_l0 = nn.Parameter(torch.empty(4 * units, units).uniform_(-bound, bound))
@@ -86,6 +88,7 @@ class ZoneoutLstm(Streaming):
         return zeros, zeros.clone()
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        # The order of registration in `__init__`: input weights, recurrent weights, the two biases.
         weight, recurrent, first, second = (output_first(parameter) for parameter in self.parameters())
         projected = nn.functional.linear(x.transpose(0, 1), weight, first + second)
         share = zoneout_share(projected, self.units, self.rate, self.training)
@@ -107,6 +110,7 @@ def zoneout_share(projected: Tensor, units: int, rate: float, training: bool) ->
         return 1.0 - rate
     ticks, batch = projected.shape[:2]
     draws = torch.rand(2, ticks, batch, units, dtype=projected.dtype, device=projected.device)
+    # Separate draws for h and c, as in the source of zoneout (Krueger et al. 2016, arXiv 1606.01305).
     update_mask = (draws >= rate).to(projected.dtype)
     return update_mask[0], update_mask[1]
 

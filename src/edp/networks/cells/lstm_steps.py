@@ -70,6 +70,7 @@ class _Steps(torch.autograd.Function):
         hs, cs = (projected.new_empty(ticks + 1, batch, units) for _ in range(2))
         hs[0], cs[0] = state
         keep = _each(share, ticks)
+        # Without zoneout the new c is the kept c: the buffer is shared and a copy a tick is saved.
         fresh_cs = cs[1:] if keep is None else projected.new_empty(ticks, batch, units)
         gates, squashed = torch.empty_like(projected), projected.new_empty(ticks, batch, units)
         down = recurrent.t().contiguous()
@@ -114,6 +115,8 @@ class _Steps(torch.autograd.Function):
                 total = torch.addcmul(fresh_c, fresh_h, through[t])
             else:
                 total = fresh_c + norms.cell(fresh_h * through[t], t)
+            # The gradient is written into the slices of one buffer, so that the weights' gradient is one product at
+            # the end.
             torch.mul(by_c[t], total.unsqueeze(1), out=to_c[t])
             torch.mul(by_o[t], fresh_h, out=to_o[t])
             row = whole[t] if norms is None else norms.sums(whole[t], t)
@@ -139,6 +142,7 @@ def _each(share: Shares, ticks: int) -> tuple[Sequence[Tensor | float], Sequence
 def _derivatives(gates: Tensor, squashed: Tensor, cs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Of c~ by the pre-activations of i, f, g ``(time, batch, 3, units)``; of h~ by that of o, and by what tanh saw."""
     o, i, f, g = gates.chunk(4, dim=2)
+    # Derivatives of all ticks at once; only the product with the incoming gradient remains in the loop.
     by_c = torch.stack([g * i * (1 - i), cs[:-1] * f * (1 - f), i * (1 - g.square())], dim=2)
     return by_c, squashed * o * (1 - o), o * (1 - squashed.square())
 
@@ -154,6 +158,7 @@ class _Norms:
     def sums(self, sums: Tensor) -> Tensor:
         y, mean, scale = torch.native_layer_norm(sums, [sums.shape[1]], self.gain, None, EPSILON)
         self.of_sums.append((sums, mean, scale))
+        # Mean and scale are kept from the forward pass; computing them again would double the cost of the norm.
         return y
 
     def cell(self, c: Tensor) -> Tensor:
@@ -189,6 +194,7 @@ class _NormsBackward:
 
     def rows(self) -> Tensor:
         """Gradients by ``U h`` at every tick."""
+        # The loop runs from the last tick to the first, so the list is turned round.
         return torch.stack(self.made[::-1])
 
     def gradients(self, grads: Tensor) -> tuple[Tensor, Tensor, Tensor]:

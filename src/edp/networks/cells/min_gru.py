@@ -45,6 +45,7 @@ class StreamingMinGru(Streaming):
         with torch.no_grad():
             # Memories of 2 to 50 ticks at the start: mean gates of 1/2 to 1/50.
             gate = 1.0 / torch.logspace(0.3, 1.7, units)
+            # The logit of the mean gate: the sigmoid of this bias gives it back.
             self.gate_and_candidate.bias[:units] = (gate / (1 - gate)).log()
 
     def initial_state(self, batch: int, like: Tensor) -> State:

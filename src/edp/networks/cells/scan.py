@@ -33,6 +33,7 @@ class _Scan(torch.autograd.Function):
         return h
 
     @staticmethod
+    # The backward pass works in place and records no graph: a second derivative is refused instead of wrong.
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         a, h, start = ctx.saved_tensors
@@ -56,11 +57,13 @@ def _run(a: Tensor, b: Tensor, start: Tensor, backwards: bool = False) -> Tensor
     each block enters the next. Products only shrink where ``|a| < 1``, so nothing overflows.
     """
     ticks, constant = len(b), a.ndim == 1
+    # Blocks of sqrt(ticks) balance the steps inside a block with the joins between blocks.
     size = max(1, math.isqrt(ticks))
     blocks, left = divmod(ticks, size)
     order = -1 if backwards else 1
     # The blocks lie where the run begins, the ticks left over where it ends.
     whole, over = (slice(left, None), slice(left)) if backwards else (slice(ticks - left), slice(ticks - left, None))
+    # The copy is the result: all steps below work in place on views of it.
     h = b.clone()
     inside = h[whole].view(blocks, size, *b.shape[1:])
     steps = inside.unbind(1)[::order]
@@ -72,6 +75,7 @@ def _run(a: Tensor, b: Tensor, start: Tensor, backwards: bool = False) -> Tensor
         products = [torch.stack(powers[::order]).unsqueeze(1)] * blocks
         rest = [a] * left
     else:
+        # Factors are multiplied up in place, so the caller's tensor must not be the one that changes.
         shrinking = a[whole].clone().view(blocks, size, *b.shape[1:])
         factors = shrinking.unbind(1)[::order]
         for k in range(1, size):

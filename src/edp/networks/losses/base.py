@@ -72,4 +72,5 @@ def masked_loss(spec: LossSpec, answer: Prediction, target: Tensor, valid: Tenso
     """
     each = (spec.evaluate(answer, target) * weights).mean(dim=(-1, -2))
     mask = valid.to(each.dtype)
+    # At least one: a batch without valid ticks gives zero, not NaN, and leaves the weights as they are.
     return (each * mask).sum() / mask.sum().clamp(min=1.0)

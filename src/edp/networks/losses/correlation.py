@@ -41,10 +41,12 @@ class Correlation:
         count = course.valid.sum().clamp(min=1)
 
         def centred(x: Tensor) -> Tensor:
+            # Masked ticks may hold NaN or infinity; selecting before the sum keeps them out of the gradient as well.
             masked = torch.where(mask, x, 0.0)
             return torch.where(mask, masked - masked.sum(dim=(0, 1)) / count, 0.0)
 
         p, y = centred(course.predicted), centred(course.target)
         spread_p, spread_y = p.square().sum(dim=(0, 1)) / count, y.square().sum(dim=(0, 1)) / count
+        # The floor inside the root bounds the gradient where a prediction stands still.
         pearson = (p * y).sum(dim=(0, 1)) / count / torch.sqrt((spread_p + FLOOR) * (spread_y + FLOOR))
         return torch.where(spread_y > FLOOR, 1.0 - pearson, 0.0).mean()

@@ -36,5 +36,6 @@ class Drift:
     def evaluate(self, course: Course) -> Tensor:
         """Mean over the ticks that count."""
         error = torch.where(course.valid[..., None, None], course.predicted - course.target, 0.0)
+        # The sum of independent errors grows with the root of the ticks; the quotient keeps late ticks from dominating.
         ticks = course.valid.to(error.dtype).cumsum(dim=1).clamp(min=1.0)[..., None, None]
         return masked_mean(error.cumsum(dim=1).square() / ticks, course.valid)

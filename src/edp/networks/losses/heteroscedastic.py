@@ -40,7 +40,10 @@ class Heteroscedastic:
         """The likelihood term of each prediction."""
         error, log_variance = answer.center - target, answer.spread[..., 0, :]
         if answer.law == LAPLACE:
+            # sqrt(2) turns the standard deviation into the scale of a Laplace law.
             each = math.sqrt(2.0) * error.abs() * torch.exp(-0.5 * log_variance) + 0.5 * log_variance
         else:
             each = 0.5 * (error.square() * torch.exp(-log_variance) + log_variance)
+        # The detached factor damps the learning of the variance, which otherwise hides large errors (Seitzer et al.
+        # 2022).
         return each * torch.exp(self.beta * log_variance.detach()) if self.beta else each

@@ -36,5 +36,6 @@ class Huber(Penalty):
 def huber(error: Tensor, delta: float) -> Tensor:
     """Huber penalty of each error."""
     size = error.abs()
+    # One expression for both branches: no selection, and a continuous gradient at `delta`.
     inside = torch.clamp(size, max=delta)
     return inside * (size - 0.5 * inside)

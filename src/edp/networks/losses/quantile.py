@@ -24,6 +24,7 @@ class Quantile:
     def evaluate(self, answer: Prediction, target: Tensor) -> Tensor:
         """The mean pinball loss of each prediction's quantiles."""
         below = target - answer.center
+        # The median's pinball loss times two is the absolute error, which keeps the scale of the point losses.
         total = below.abs()
         beyond = below.unsqueeze(-2) - answer.spread
         for level_index, level in enumerate(answer.levels):

@@ -33,6 +33,7 @@ class Smoothness:
 
     def evaluate(self, course: Course) -> Tensor:
         """Mean over triplets of consecutive ticks."""
+        # The level is added back: in delta mode the increments alone would be smoothed, not the predicted velocity.
         value = course.predicted + course.level
         bend = value[:, 2:] - 2.0 * value[:, 1:-1] + value[:, :-2]
         return masked_mean(bend.square(), course.together(3))

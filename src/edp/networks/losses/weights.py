@@ -17,6 +17,7 @@ def output_weights(sigma: Tensor, power: float) -> Tensor:
         sigma: standard deviation of each target in SI units, ``(..., output)``.
         power: p; 0 weighs all outputs alike, right where targets are standardised already.
     """
+    # Double precision: powers of small standard deviations overflow float32 early.
     weights = sigma.double().pow(-power)
     return (weights / weights.mean(dim=-1, keepdim=True)).to(sigma.dtype)
 
@@ -53,6 +54,7 @@ class AdaptiveWeights:
 
     def weights(self, running: Tensor) -> Tensor:
         """Weights ``(horizon, output)`` from the running errors, same shape."""
+        # A running error of zero, before the first batch or on perfect outputs, must not divide.
         inverse = running.clamp(min=1e-9).reciprocal()
         cut = torch.minimum(inverse, self.max_ratio * inverse.amin(dim=-1, keepdim=True))
         return 1.0 - self.blend + self.blend * cut / cut.mean(dim=-1, keepdim=True)
@@ -61,4 +63,5 @@ class AdaptiveWeights:
         """The running errors after a batch with errors ``(batch, time, horizon, output)``."""
         count = valid.sum()
         mean = torch.where(valid[..., None, None], error.abs(), 0.0).sum(dim=(0, 1)) / count.clamp(min=1)
+        # A batch without valid ticks must not pull the running error towards zero.
         return torch.where(count > 0, self.memory * running + (1.0 - self.memory) * mean, running)

@@ -31,6 +31,7 @@ ANGLE, RATE, SPEED = 0.5, 0.5, 0.2
 PRESSURE = (1e7, 5e6)
 """Usual middle and width of a pressure, Pa."""
 POSES = {
+    # own.
     "angles": (*(f"JointAngle_{i + 1}" for i in range(AXES)), *(f"JointVel_{i + 1}" for i in range(AXES))),
     "strokes": tuple(f"CylStroke_{i + 1}" for i in range(AXES)),
 }
@@ -74,6 +75,7 @@ class PhysicsSpec(ABC):
                 f"{name} predicts {', '.join(SPEEDS)}, but the targets are {', '.join(task.targets)}; give the "
                 "velocities these names in the signal map, or remove model.physics"
             )
+        # The regression predicts the whole target; a physics base added to it would count the velocity twice.
         if any(getattr(block, "start", "zero") != "zero" for block in model.blocks):
             return (
                 f"{name} would be added to the regression of the whole target, from which linear_bypass starts; set "
@@ -115,8 +117,10 @@ class PhysicsBase(Streaming):
         # Targets that are no cylinder velocity take any column; `is_velocity` takes them out.
         self.order = [SPEEDS.index(target) if target in SPEEDS else 0 for target in task.targets]
         is_velocity = torch.tensor([float(target in SPEEDS) for target in task.targets])
+        # Not persistent: it follows from the task, so a bundle cannot contradict it.
         self.register_buffer("is_velocity", is_velocity, persistent=False)
         self.geometry = Geometry()
+        # The square root is that of the linkage; strokes need no sine, since circles give the angles directly.
         self.operations = frozenset({Operation.SQRT, *((Operation.SINE,) if spec.pose == "angles" else ())})
 
     def read(self) -> None:
@@ -125,12 +129,14 @@ class PhysicsBase(Streaming):
         Raises:
             ConfigError: no such machine or file, or one that cannot be.
         """
+        # Numbers come into buffers, so that a bundle carries the machine and needs no machine file.
         self.geometry.read(self.spec.machine)
 
     def settle(self, parts: Sequence[Tensor]) -> None:
         """Take averages over training inputs ``(time, input)`` where the base has any; most have none."""
 
     def usual(self) -> dict[str, tuple[float, float]]:
+        # The middle of the strokes, since a middle of angles need not be a pose that the linkage reaches.
         """Middle and width of what each channel that the base reads usually is, SI units."""
         pose = self.geometry.at_strokes(0.5 * self.geometry.axis("STROKE"))
         middle = torch.atan2(pose.sine, pose.cosine).tolist()
@@ -168,6 +174,7 @@ class PhysicsBase(Streaming):
             before = torch.cat([torch.where(seen > 0.5, previous, strokes[:, :1]), strokes[:, :-1]], dim=1)
             speed = (strokes - before) * self.rate_hz
             rate = speed * inverse(pose.lever)
+            # The last stroke is state: the rate at a chunk's first tick needs it.
             state = strokes[:, -1:], torch.ones_like(seen)
         return self.ahead(x, pose, rate, speed)[..., self.order], state
 
@@ -205,6 +212,7 @@ class PhysicsBase(Streaming):
             return build.join("ahead", velocities.value)  # type: ignore[attr-defined]
 
     def costs(self) -> list[Cost]:
+        # Arithmetic of the pose itself, held to a trace of what runs by `edp.evaluation.mac_check`.
         count = (52 if self.spec.pose == "angles" else 101) + AXES + self.arithmetic()
         width = len(self.task.horizons) * len(self.task.targets)
         return [

@@ -42,6 +42,7 @@ class DynamicSpec(PhysicsSpec):
 
     space: ClassVar[dict[str, Any]] = {"load": LOADS, "fade_s": (0.0, 0.2)}
     load: str = "all"
+    # 0.03 s: measured compromise between boom and bucket at k = 10 (docs/findings.md, fading acceleration).
     fade_s: float = 0.03
 
     def __post_init__(self) -> None:
@@ -66,6 +67,7 @@ class Dynamic(PhysicsBase):
         super().__init__(spec, task)
         if spec.load == "all":
             self.operations |= {Operation.EXP}
+        # Horizons and fading settle it; a buffer moves with the device but is not stored.
         self.register_buffer("lasts", torch.tensor(self.lasting()).unsqueeze(-1), persistent=False)
 
     def ahead(self, x: Tensor, pose: Pose, rate: Tensor, speed: Tensor) -> Tensor:
@@ -80,6 +82,7 @@ class Dynamic(PhysicsBase):
         """For each horizon the time in s by which an acceleration counts: k steps, less where it fades."""
         ahead_s = [k / self.rate_hz for k in self.task.horizons]
         fade_s = self.spec.fade_s
+        # The integral of exp(-t / fade); expm1 keeps the digits where the horizon is far below the fading.
         return [fade_s * -math.expm1(-time_s / fade_s) if fade_s else time_s for time_s in ahead_s]
 
     def torque(self, x: Tensor, pose: Pose, rate: Tensor) -> Tensor:
@@ -95,11 +98,13 @@ class Dynamic(PhysicsBase):
 
     def standing(self, speed: Tensor) -> Tensor:
         """How much of an axis stands, by Stribeck's curve: 1 at rest, 0 beyond its velocity, ``(batch, time, 3)``."""
+        # Stribeck's curve is smooth, so that gradients pass through zero velocity.
         return torch.exp(-(speed / self.geometry.axis("STRIBECK")).square())
 
     def sliding(self, pose: Pose, speed: Tensor) -> Tensor:
         """Torque of Coulomb and viscous friction where an axis slides, N m, ``(batch, time, 3)``."""
         own = self.geometry
+        # The part that stands is left to static friction; both together would brake an axis twice.
         coulomb = (1.0 - self.standing(speed)) * torch.sign(speed) * own.axis("COULOMB")
         return (coulomb + own.axis("VISCOUS") * speed) * pose.lever
 
@@ -115,6 +120,7 @@ class Dynamic(PhysicsBase):
         torque = self.torque(x, pose, rate)
         if self.spec.load != "all":
             return torque
+        # Forces become torques by the lever arm, whose sign depends on the linkage.
         most = self.geometry.axis("STATIC") * pose.lever.abs()
         friction = self.standing(speed) * torch.minimum(torch.maximum(torque, -most), most)
         return (torque - friction - self.sliding(pose, speed)) * (1.0 - self.stopped(pose, torque))

@@ -36,6 +36,7 @@ class Force(Dynamic):
 
     def __init__(self, spec: ForceSpec, task: Task) -> None:
         super().__init__(spec, task)
+        # Ones until `read` or a bundle fills them: a division by zeros would give NaN in a blank network.
         self.register_buffer("mass", torch.ones(AXES))
 
     def read(self) -> None:
@@ -46,6 +47,7 @@ class Force(Dynamic):
     def settle(self, parts: Sequence[Tensor]) -> None:
         """Average the equivalent masses over training inputs; before, they are averages over all strokes."""
         with torch.no_grad():
+            # Double precision: sums over hours of ticks lose digits in float32.
             total = torch.zeros(AXES, dtype=torch.float64)
             for part in parts:
                 for block in part.split(BLOCK):

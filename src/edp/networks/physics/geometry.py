@@ -45,6 +45,7 @@ class Pose:
 
 def inverse(lever: Tensor) -> Tensor:
     """1 / J, finite everywhere."""
+    # A clamp of the square keeps the sign of the lever and a finite gradient at a dead centre.
     return lever / torch.clamp(lever.square(), min=LEAST)
 
 
@@ -55,6 +56,7 @@ def _meet(x: Tensor, y: Tensor, first2: Tensor, second2: Tensor, side: Tensor | 
     """
     inverse = 1.0 / (x * x + y * y)
     along = 0.5 * (1.0 + (first2 - second2) * inverse)
+    # Sensor noise can put circles apart by a hair; without the clamp the root would be NaN.
     across = side * torch.sqrt(torch.clamp(first2 * inverse - along * along, min=SMALL))
     return along * x - across * y, along * y + across * x
 
@@ -118,6 +120,7 @@ class Geometry(nn.Module):
         """Cosine and sine of the angle between two pin radii that a cylinder's length spans."""
         b, r = self.number(base), self.number(rod)
         cosine = (b * b + r * r - length * length) / (2.0 * b * r)
+        # Rounding and noise may push a cosine beyond 1 near the end of a stroke.
         return cosine, torch.sqrt(torch.clamp(1.0 - cosine * cosine, min=SMALL))
 
     def _bucket_turn(self, length: Tensor) -> tuple[Tensor, Tensor]:
@@ -147,6 +150,7 @@ class Geometry(nn.Module):
     def _triangle(self, base: str, rod: str, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
         """Length opposite to the angle between two pin radii, and its change by that angle."""
         b, r = self.number(base), self.number(rod)
+        # The clamp only matters where the pin radii fold onto each other, outside any stroke.
         length = torch.sqrt(torch.clamp(b * b + r * r - 2.0 * b * r * cosine, min=SMALL))
         return length, b * r * sine / length
 
@@ -166,6 +170,8 @@ class Geometry(nn.Module):
 
     def lever_change(self, pose: Pose) -> Tensor:
         """dJ/dpsi in m/rad^2, ``(..., 3)``, by a central difference over `TURN` to either side."""
+        # A central difference: the derivative of the four-bar in closed form is long and would be needed in every
+        # export.
         c, s = float(np.cos(TURN)), float(np.sin(TURN))
         _, ahead = self.cylinders(pose.cosine * c - pose.sine * s, pose.sine * c + pose.cosine * s)
         _, behind = self.cylinders(pose.cosine * c + pose.sine * s, pose.sine * c - pose.cosine * s)
@@ -186,6 +192,7 @@ class Geometry(nn.Module):
         """Mass matrix in relative angles, kg m^2: diagonal 11, 22, 33 and coupling 12, 13, 23, each ``(..., 3)``."""
         k12, k13, k23 = by_cosine
         m, length = self.axis("MASS"), self.axis("LENGTH")
+        # Steiner's theorem: inertia about the joint from inertia about the centre of mass.
         about = self.axis("INERTIA") + m * (self.axis("COM_X").square() + self.axis("COM_Y").square())
         h1 = about[0] + (m[1] + m[2]) * length[0].square()
         h2 = about[1] + m[2] * length[1].square()
@@ -220,6 +227,7 @@ class Geometry(nn.Module):
 
     def mean_mass(self) -> Tensor:
         """Equivalent masses M_ii / J_i^2 in kg averaged over a uniform grid of strokes, ``(3,)``."""
+        # A grid over all poses stands for training data that do not exist yet.
         share = torch.linspace(0.0, 1.0, GRID, dtype=self.axes.dtype, device=self.axes.device)
         pose = self.at_strokes(torch.cartesian_prod(share, share, share) * self.axis("STROKE"))
         return self.equivalent_mass(pose).mean(dim=0)
@@ -236,6 +244,7 @@ def _sides(angle: float, number: dict[str, float]) -> list[float]:
     lug = np.array([number["LUG_X"] * c - number["LUG_Y"] * s, number["LUG_X"] * s + number["LUG_Y"] * c])
     pivot, pin = np.array([number["PIVOT_X"], number["PIVOT_Y"]]), np.array([number["PIN_X"], 0.0])
     line = torch.tensor(pin + lug - pivot)
+    # The branch is settled at the middle of the stroke: a linkage crosses no toggle along its stroke.
     rocker2, link2 = (torch.tensor(number[name] ** 2) for name in ("ROCKER", "LINK"))
     rocker = np.array([float(part) for part in _meet(line[0], line[1], rocker2, link2, 1.0)])
 

@@ -57,7 +57,7 @@ class HybridPhysics(Dynamic):
             return speed, self.net_torque(x, pose, rate, speed) * pose.lever / own
         torque = self.torque(x, pose, rate)
         # An axis that stands is held by its friction or stop, which takes what others ask of it: its inertia grows.
-        most = self.geometry.axis("STATIC") * pose.lever.abs()
+        most = self.geometry.axis("STATIC") * pose.lever.abs()  # the most that static friction takes
         stands = self.standing(speed) * (torque.abs() < most)
         own = own * (1.0 + HELD * torch.maximum(stands, self.stopped(pose, torque)))
         turned = solve(own, coupling, torque - self.sliding(pose, speed))
@@ -75,6 +75,7 @@ def solve(own: Tensor, coupling: Tensor, torque: Tensor) -> Tensor:
     l21, l31 = d / a, e / a
     d2 = b - l21 * d
     l32 = (f - l31 * d) / d2
+    # Pivots stay positive for a positive definite matrix, so that no pivoting and no branch is needed.
     d3 = c - l31 * e - l32 * l32 * d2
     y = y - l21 * x
     z = z - l31 * x - l32 * y

@@ -82,6 +82,8 @@ class Symbol:
     def __getitem__(self, key: Any) -> Symbol:
         if not (isinstance(key, tuple) and len(key) == 2 and key[0] is Ellipsis):
             raise ExportError("only the last dimension of a value can be chosen from: x[..., columns]")
+        # Places are chosen by NumPy on an array of indices, so that its indexing rules hold without being written
+        # again.
         places = np.arange(int(np.prod(self.shape))).reshape(self.shape)[..., key[1]]
         picked = self.build.pick("picked", self.value, places.ravel().tolist())
         return Symbol(self.build, picked, places.shape)
@@ -138,6 +140,7 @@ class Symbol:
     def __rtruediv__(self, other: Any) -> Symbol:
         return divide(other, self)
 
+    # Comparisons become numbers 0 and 1: a graph has no other type.
     def __lt__(self, other: Any) -> Symbol:
         return positive(subtract(other, self))
 
@@ -163,6 +166,7 @@ def _both(kind: type, a: Symbol, b: Symbol) -> Symbol:
 
 
 def _meet(a: Any, b: Any) -> tuple[Symbol, np.ndarray]:
+    # Exactly one of the two is a value here; two values are handled by the callers.
     """The one that is a value and the other one's numbers, in their common shape."""
     constant, value = (_array(b), a) if isinstance(a, Symbol) else (_array(a), b)
     shape = np.broadcast_shapes(value.shape, constant.shape)
@@ -171,6 +175,7 @@ def _meet(a: Any, b: Any) -> tuple[Symbol, np.ndarray]:
 
 def _constant(like: Symbol, numbers: np.ndarray) -> Symbol:
     """Known numbers as a value; one that is not finite still spoils them."""
+    # Times zero keeps NaN: an invalid input must not turn into a valid constant.
     return like.affine(0.0, numbers)
 
 
@@ -260,6 +265,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "clamp": lambda a, min: maximum(a, min),
     "maximum": maximum,
     "minimum": lambda a, b: _extreme(Minimum, a, b),
+    # Known zeros need no layer.
     "zeros_like": lambda a: torch.zeros(a.shape),
     "stack": stack,
 }
