@@ -152,6 +152,7 @@ def simulate_data_set(
     with _alone(folder) as check:
         bound = _bound(folder, identity)
         missing = [scenario for scenario, path in zip(plan, paths, strict=True) if not path.exists()]
+        # Before the manifest: a refused order leaves the folder unbound.
         check_room(folder, missing, suffix)
         if not bound:
             write_json(folder / MANIFEST, identity)
@@ -161,6 +162,7 @@ def simulate_data_set(
                 on_done(read_recording(path), True)
         count = workers or os.cpu_count() or 1
         for recording in simulate_many(missing, min(count, max(1, len(missing)))):
+            # Before each log: a lock that was taken over means that another process writes here.
             check()
             write_recording(recording, folder / f"{recording.name}{suffix}", files)
             if on_done is not None:
@@ -249,6 +251,7 @@ def _digest(value: Any) -> str:
 def identity_of(plan: Sequence[Scenario], files: WriteOptions, suffix: str = ".parquet") -> dict[str, Any]:
     """What makes two simulated data sets the same, as JSON gives it back."""
     identity: dict[str, Any] = {"schema": 1, "edp": __version__, "plan": [plain(entry) for entry in plan]}
+    # Only what departs from the usual: folders without these options keep their identity.
     if files != WriteOptions():
         identity["files"] = asdict(files)
     if suffix != ".parquet":

@@ -98,6 +98,7 @@ class DataSetSpec:
             raise ConfigError(f"masses = {list(self.masses)} are those of a family; say how many machines with family")
         if not self.family and self.scatter != 1.0:
             raise ConfigError(f"scatter = {self.scatter} is that of a family; say how many machines with family")
+        # A machine is found again by its name: a rounded one would be another machine.
         if self.scatter != round(self.scatter, 3):
             raise ConfigError(f"scatter = {self.scatter} has more than three decimals; names of machines hold three")
         member_mass(self.seed, 0, *self.masses)
@@ -125,6 +126,7 @@ class DataSetSpec:
             Scenario(
                 machine=self.machine,
                 excitation=excitations[i],
+                # Hundredths of a second, which are whole samples at 100 Hz.
                 duration_s=round(self.minutes * 60.0 / self.recordings, 2),
                 rate_hz=self.rate_hz,
                 step_s=self.step_s,
@@ -271,6 +273,7 @@ def _parallel(function: Callable[[Job], Result], jobs: Sequence[Job], workers: i
         try:
             for job in jobs:
                 running.append((job, pool.submit(function, job)))
+                # At most two a worker: finished recordings must not pile up in memory while an early one is late.
                 if len(running) >= 2 * workers:
                     yield _result(*running.popleft())
             while running:

@@ -30,6 +30,7 @@ TARGETS = tuple(TABLE_A1)[:3]
 PAST = 40
 """Samples of the past that sensors see before a branch: longer than any latency of the bus."""
 RESAMPLES = 2000
+"""Draws of the bootstrap of recordings."""
 CONFIDENCE = 0.95
 MOST_BRANCHES, MOST_MOMENTS = 4096, 100_000
 """Bounds; the usual 32 branches of 240 moments take minutes."""
@@ -106,11 +107,13 @@ def branch_recording(job: LimitJob) -> Array:
     root = np.random.SeedSequence(job.seed)
     errors = np.empty((len(job.moments), len(KINDS), len(spec.horizons), len(TARGETS)))
     for n, (moment, seed) in enumerate(zip(job.moments, root.spawn(len(job.moments)), strict=True)):
+        # Moments rise, so the recording is simulated once, however many moments it has.
         simulation.run(moment - simulation.samples)
         snapshot = simulation.snapshot()
         past = simulation.log[-PAST:]
         known_futures = _futures(simulation, past, spec, seed.spawn(2)[0], commands_known=True)
         simulation.restore(snapshot)
+        # A seed sequence counts on: these two children differ from those of the call above.
         unknown = _futures(simulation, past, spec, seed.spawn(2)[1], commands_known=False)
         simulation.restore(snapshot)
         errors[n, 0], errors[n, 1] = least_mae(unknown[:, 1:]), least_mae(known_futures[:, 1:])
@@ -156,12 +159,14 @@ def plan_limit(scenarios: Sequence[Scenario], spec: LimitSpec) -> list[LimitJob]
     Raises:
         ConfigError: the recordings are too short for the horizons.
     """
+    # Stream 1 chooses moments, stream 2 resamples: neither changes with the other.
     rng = np.random.default_rng([spec.seed, 1])
     count = min(len(scenarios), spec.recordings, spec.moments)
     chosen = sorted(rng.permutation(len(scenarios))[:count].tolist())
     jobs = []
     for job_index, index in enumerate(chosen):
         scenario = scenarios[index]
+        # The farthest horizon must end within the recording.
         last = scenario.samples - spec.horizons[-1] - 1
         share = spec.moments // count + (1 if job_index < spec.moments % count else 0)
         if last < PAST + share:
@@ -195,6 +200,7 @@ def find_limit(
     jobs = plan_limit(scenarios, spec)
     parts = []
     for job, part in zip(jobs, ordered(branch_recording, jobs, workers), strict=True):
+        # mm/s, as results are stated.
         parts.append(1e3 * np.concatenate((part, part.mean(axis=-1, keepdims=True)), axis=-1))
         if on_done is not None:
             on_done(job)
@@ -221,6 +227,7 @@ def find_limit(
 
 def _confidence(parts: Sequence[Array], rng: np.random.Generator) -> tuple[Array, Array]:
     """Percentile bounds of the mean by resampling recordings; moments, where there is one recording."""
+    # Moments of one recording depend on one another, so whole recordings are drawn where there are several.
     units = parts if len(parts) > 1 else [moment[None] for moment in parts[0]]
     sums = np.stack([unit.sum(axis=0) for unit in units])
     counts = np.array([len(unit) for unit in units], dtype=float)

@@ -25,6 +25,7 @@ from edp.sim.view import view_of
 
 Array = NDArray[np.float64]
 START_CLEARANCE_M, START_TRIES = 0.3, 100
+"""Least height of the tip above ground at the start, and how often strokes are drawn for it."""
 
 
 class Simulation:
@@ -89,6 +90,7 @@ class Simulation:
         """
         rows = self.plant.follow(targets) if self.operator.by_hand else self.plant.run(targets)
         self.samples += len(rows)
+        # Asked once a block: what once is not finite stays so.
         if not self.plant.finite:
             scenario = self.scenario
             raise SimulationError(
@@ -139,7 +141,9 @@ class Simulation:
     def branch(self, seed: np.random.SeedSequence) -> None:
         """Give operator and soil fresh randomness from here on; what the operator does now goes on, see `redraw`."""
         hand, course = seed.spawn(2)
+        # In place: all streams of the operator share this generator.
         self._hand.bit_generator.state = np.random.default_rng(hand).bit_generator.state
+        # Targets drawn before the branch and not yet used belong to the old future.
         self.operator.redraw(len(self._waiting))
         self._waiting = self._waiting[:0]
         self.branch_soil(course)
@@ -155,6 +159,7 @@ _CHANGING = ("plant", "operator", "_hand", "_waiting")
 
 def _seeds(scenario: Scenario) -> list[np.random.SeedSequence]:
     """Seeds of start, operator, sensors and soil, in this order."""
+    # The order is fixed: another one would give other recordings for the same seed.
     return np.random.SeedSequence(scenario.seed).spawn(4)
 
 
@@ -169,6 +174,7 @@ def _start_strokes(scenario: Scenario, machine: Machine, ground: soil.Ground | N
         if y > ground.height(x) + START_CLEARANCE_M:
             break
         strokes = rng.uniform(*scenario.start_strokes, 3)
+        # A raised boom clears most grounds.
         strokes[0] = rng.uniform(scenario.start_strokes[1], 0.9)
     return strokes
 

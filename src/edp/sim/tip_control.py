@@ -23,11 +23,13 @@ GAINS = 6
 TIME, BEHIND, SUM, LEVER = 0, 1, 2, 5
 MEMORY = 8
 MOST_SUM = 0.1
+"""Most speed (m/s) that the integral may add: a blocked leg must not wind it up."""
 
 
 @compiled
 def progress(time: float, length: float, ramp: float) -> float:
     """Share of the way done after `time` of `length` seconds, with constant acceleration over the ramps."""
+    # A short leg is ramps only.
     ramp = min(ramp, 0.5 * length)
     time = min(max(time, 0.0), length)
     top = 1.0 / (length - ramp)
@@ -76,6 +78,7 @@ def control(
     for each axis, `axes`, `plant`, `pose.joint_limits` and scratch of `pose.REACHED_VALUES`.
     """
     speeds, levers, axes, reached = setup[0], setup[1], setup[2], setup[5]
+    # Full speed up to half of the error at which the reference stands still.
     lag = 2.0 - 2.0 * memory[BEHIND] / gains[WAITS_BEHIND]
     memory[TIME] += gains[STEP] * min(max(lag, 0.0), 1.0)
     last = queue.shape[0] - 1
@@ -92,6 +95,7 @@ def control(
         speed = (queue[last, i] - queue[last - 1, i]) * full / gains[STEP]
         speed += gains[PROPORTIONAL] * error + memory[SUM + i]
         lever = inverse_lever(speed, speeds[i], levers[i], gains[REST_SPEED])
+        # No integration at a saturated lever, which could not follow.
         if abs(lever) < 1.0:
             total = memory[SUM + i] + gains[INTEGRAL] * gains[STEP] * error
             memory[SUM + i] = min(max(total, -MOST_SUM), MOST_SUM)

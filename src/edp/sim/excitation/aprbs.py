@@ -30,8 +30,11 @@ class Aprbs(Excitation):
     CHIRP_HZ = (0.05, 5.0)
     CHIRP_S = (12.0, 25.0)
     CHIRP_SHARE = 0.35
+    """Share of the time; more of it made the commands no flatter (findings)."""
     PIECE_S = 0.1
+    """A chirp is given in such pieces, since its sign must turn soon after a cylinder nears an end."""
     TURN = (0.22, 0.78)
+    """Shares of the stroke at which a chirp turns."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
@@ -69,6 +72,7 @@ class Aprbs(Excitation):
 
     def _level(self, axis: int, stroke: float) -> float:
         choice = int(self._rng.integers(9))
+        # One level in nine is rest: steps from and to zero cross the dead band.
         if choice == 8:
             return 0.0
         sign = 1.0 if self._rng.random() < extend_probability(stroke, 2.0) else -1.0
@@ -91,6 +95,7 @@ class Aprbs(Excitation):
             self._sign = -self._sign
         time = self._time + np.arange(samples) / self._rate
         growth = math.log(high / low) / self._length
+        # The integral of the frequency; expm1 keeps its digits while growth * time is small.
         phase = 2.0 * np.pi * low * np.expm1(growth * time) / growth
         bias = self._dead[self._chirp, 0 if self._sign > 0 else 1] + self._amplitude + self._extra
         values = self._sign * (bias + self._amplitude * np.sin(phase))

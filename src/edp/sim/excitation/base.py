@@ -50,6 +50,7 @@ EXCITATIONS: Registry[type[Excitation]] = Registry("excitation")
 
 def extend_probability(stroke: float, pull: float = 1.1) -> float:
     """Chance to extend next: more when retracted, so that the mean stroke stays near the middle."""
+    # Never certain: moves into the ends of the stroke stay part of the data.
     return min(max(0.5 + pull * (0.5 - stroke), 0.03), 0.97)
 
 
@@ -89,6 +90,7 @@ class Hold:
         """Take back `unused` samples and draw what is left, given the time held so far."""
         self.spend(-unused)
         if self.left > 0:
+            # What has lasted so long already cannot have been drawn shorter.
             low = max(self._low, self._held / self._rate)
             self.left = max(1, round(self._rng.uniform(low, max(low, self._high)) * self._rate) - self._held)
 

@@ -67,6 +67,7 @@ class Dig(Tracked):
             above = self.kinematics.strokes_at(self._in[0], self._in[1] + self._depth + self.ABOVE_M, self._in[2])
             return self.stroke_leg(np.full(3, 0.5) if above is None else above, rng.uniform(*self.MOVE))
         if self._phase == PENETRATE:
+            # NaN is unlike itself: free air has no surface.
             if view.ground == view.ground:  # the real surface here, now that the bucket is above it
                 shift = view.ground - self._depth - self._in[1]
                 self._in[1] += shift
@@ -123,6 +124,7 @@ class Dig(Tracked):
             return
         if view.payload_kg > self._full_kg:
             self.end_leg()
+        # Before the reference stands still, which would give the leg up.
         elif self.behind > 0.75 * self.WAITS_BEHIND:
             rise = self.RELIEF_RATE * self.step_s
             self._leg[tip_control.START + 1] += rise

@@ -16,8 +16,10 @@ class EndStops(Excitation):
     """Runs one cylinder into its cushion and stop, holds it there, and lets the others move in between."""
 
     STRETCH_S = 0.4
+    """A push is given in stretches, so that the end is noticed soon after it is reached."""
     HOLD_S = (0.5, 1.0)
     MOST_STRETCHES = 13
+    """Pushes (5.2 s) after which a cylinder that does not reach its end is left alone."""
 
     def __init__(self, rng: np.random.Generator, rate_hz: float, machine: Machine) -> None:
         super().__init__(rng, rate_hz, machine)
@@ -36,6 +38,7 @@ class EndStops(Excitation):
     def _next(self, view: View) -> None:
         rng = self._rng
         share = view.strokes[self._runner]
+        # A cylinder creeps the last half per cent behind its cushion.
         reached = (share if self._sign > 0 else 1.0 - share) > 0.995
         self._levels = np.zeros(AXES)
         if self._phase == HOLD:
@@ -43,6 +46,7 @@ class EndStops(Excitation):
             for i in range(AXES):
                 self._stream.next(view.strokes[i])
                 self._levels[i] = self._stream.level
+            # The runner rests meanwhile: the short move is one of the other two.
             self._levels[self._runner] = 0.0
             self._runner = int(rng.integers(AXES))
             self._sign = 1.0 if rng.random() < extend_probability(view.strokes[self._runner], 0.6) else -1.0

@@ -14,7 +14,9 @@ from edp.sim.physics.plant import Plant
 Array = NDArray[np.float64]
 AXES = 3
 LEVERS = (0.25, 0.35, 0.5, 0.7, 1.0)
+"""Levers measured, closer to one another near the dead band, where the speed bends most."""
 RUN_S, SETTLE_S = 0.9, 0.5
+"""A run of each lever, and the part of it in which valve and pump settle and that is left out."""
 
 
 def dead_lever(machine: Machine) -> Array:
@@ -25,6 +27,7 @@ def dead_lever(machine: Machine) -> Array:
     return shaped
 
 
+# Thirty short simulations each; few are kept, since a family may have a thousand machines.
 @lru_cache(maxsize=8)
 def speed_table(machine: Machine) -> tuple[Array, Array]:
     """Lever to cylinder speed, measured on the machine from mid stroke in free air, as an automatic control is set up.
@@ -40,9 +43,11 @@ def speed_table(machine: Machine) -> tuple[Array, Array]:
         for side, sign in enumerate((1.0, -1.0)):
             levers[axis, side, 0] = dead[axis, side]
             for n, lever in enumerate(LEVERS, start=1):
+                # Levers must rise along the table even where the dead band is wide.
                 levers[axis, side, n] = max(lever, dead[axis, side] + 0.02 * n)
                 targets = np.zeros((round(RUN_S * 100), AXES))
                 targets[:, axis] = sign * levers[axis, side, n]
+                # Begun on the far side of mid stroke, so that no run meets an end.
                 plant = Plant(machine, np.full(AXES, 0.5 - 0.15 * sign))
                 log = plant.run(targets)[round(SETTLE_S * 100) :]
                 speed = sign * float(log[:, at.LOG_VELOCITY + axis].mean())

@@ -41,6 +41,7 @@ class Reversals(Excitation):
             return
         if self._flips < 0:
             active = rng.random(AXES) < 0.5
+            # At least one lever: a burst of none would be a second pause.
             active[rng.integers(AXES)] = True
             towards = [1.0 if rng.random() < extend_probability(s, 3.0) else -1.0 for s in view.strokes]
             self._signs = active * np.array(towards)

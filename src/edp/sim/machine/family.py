@@ -32,6 +32,7 @@ from edp.sim.machine.machine import Bodies, BucketLinkage, Cylinders, Machine, P
 BASE_MASS_T = 21.7
 """Operating weight of M22, t."""
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+"""Step of a sequence that fills a range evenly for any number of members (multiples of the golden ratio, modulo 1)."""
 LIGHTEST_T, HEAVIEST_T = 1.0, 200.0
 MASSES_T = (10.0, 50.0)
 """Range of masses of a family, unless another is asked for."""
@@ -87,6 +88,7 @@ def member_mass(seed: int, index: int, low_t: float = MASSES_T[0], high_t: float
             f"family of machines from {low_t} to {high_t} t; the lower must not exceed the upper, "
             f"both within {LIGHTEST_T:g} to {HEAVIEST_T:g} t"
         )
+    # Stream 0 is the masses'; machine i draws from stream 1 + i, so members do not depend on how many there are.
     first = np.random.default_rng([seed, 0]).random()
     share = (first + index * GOLDEN) % 1.0
     return float(low_t * (high_t / low_t) ** share)
@@ -192,6 +194,7 @@ def _bucket_linkage(pins: BucketLinkage, size: float, old_arm: float, new_arm: f
 
 
 def _cylinders(cylinders: Cylinders, s: float, linkage: Any, draws: Draws) -> Cylinders:
+    # Evenly in the logarithm: leakage is a matter of factors.
     wear = np.exp(draws.wear(np.log(0.7), np.log(4.0)))
     width = s * draws.uniform(0.96, 1.04, 3)
     return replace(

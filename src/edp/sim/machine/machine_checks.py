@@ -258,6 +258,7 @@ def _check_triangle(axis: int, axes: Any, plant: Any, where: str) -> None:
     base, rod = ((at.BOOM_BASE, at.BOOM_ROD), (at.ARM_BASE, at.ARM_ROD))[axis]
     closed, stroke = float(axes[axis, at.CLOSED]), float(axes[axis, at.STROKE])
     least, most = abs(plant[base] - plant[rod]), plant[base] + plant[rod]
+    # Pins in one line give no lever arm, so equality is refused.
     if closed <= least:
         raise ConfigError(
             f"machine file {where} [{name}_cylinder]: closed_length = {closed:g} m must be above "
@@ -302,10 +303,13 @@ def _check_levers(axis: int, low: float, high: float, axes: Any, plant: Any, whe
     table = "bucket_linkage" if axis == 2 else f"{name}_cylinder"
     psi = np.linspace(low - BEYOND_STOPS, high + BEYOND_STOPS, 241)
     closes = linkage.bucket_closes(psi, plant) if axis == 2 else np.full(len(psi), True)
+    # By convention extension raises the boom angle and lowers those of arm and bucket.
     sign = 1.0 if axis == 0 else -1.0
+    # Where the loop cannot close there is no lever arm: worse than any that is too short.
     levers = [sign * linkage.cylinder(axis, p, plant)[1] if ok else -math.inf for p, ok in zip(psi, closes)]
     worst = int(np.argmin(levers))
     least = LEAST_LEVER * float(axes[axis, at.STROKE])
+    # Negated, so that NaN is refused as well.
     if not levers[worst] >= least:
         lever_text = f"{levers[worst]:.3f} m/rad" if math.isfinite(levers[worst]) else "none, the loop cannot close"
         raise ConfigError(

@@ -37,12 +37,14 @@ def load_machine(name: str) -> Machine:
     if name.lower().endswith(".toml"):
         path = Path(name)
         try:
+            # Part of the cache's key: an edited file is another machine.
             changed = path.stat().st_mtime_ns
         except OSError as error:
             raise ConfigError(
                 f"machine file {name} cannot be read: {error.strerror}; give the path of a TOML file, "
                 f"or one of the names {', '.join(machine_names())}"
             ) from error
+        # Resolved, since a relative name means another file once the current folder has changed.
         return _from_file(path.resolve(), changed)
     return _built_in(name.upper())
 

@@ -23,6 +23,7 @@ FLOW_SHARING = ("parallel", "compensated")
 def conductance(rating: Rating) -> float:
     """K of Q = k sqrt(dp), m^3/s/sqrt(Pa), from L/min at bar."""
     flow, pressure = rating
+    # 6e4 L/min are 1 m^3/s.
     return flow / 6e4 / math.sqrt(pressure * 1e5)
 
 
@@ -97,6 +98,7 @@ def _pack_valves(machine: Machine, axes: Array) -> None:
     axes[:, at.DEAD_BAND_RETRACT] = valves.dead_band_retract
     axes[:, at.CONFLUX_DEAD_BAND_EXTEND] = valves.conflux_dead_band_extend
     axes[:, at.CONFLUX_DEAD_BAND_RETRACT] = valves.conflux_dead_band_retract
+    # Files count pumps from 1, arrays from 0.
     axes[:, at.PRIMARY_PUMP] = np.array(valves.primary_pump) - 1
     axes[:, at.CONFLUX_PUMP] = np.array(valves.conflux_pump) - 1
     axes[:, at.DEMAND_EXTEND] = valves.pump_demand_extend

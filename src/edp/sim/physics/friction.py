@@ -35,6 +35,7 @@ def lugre(v: float, z: float, axes: Array, i: int, viscous: float) -> tuple[floa
     fade_slope = -2.0 * ratio / axes[i, at.STRIBECK] * fade
     level_slope = (axes[i, at.STATIC] - axes[i, at.COULOMB]) * fade_slope
     stiffness, damping = axes[i, at.SIGMA0], axes[i, at.SIGMA1] * fade
+    # d|v|/dv is one-sided at rest: the Jacobian needs a finite slope, and ROS2 keeps its order for any.
     sign = 1.0 if v >= 0.0 else -1.0
     decay = stiffness * abs(v) / level
     z_rate = v - decay * z
@@ -55,6 +56,7 @@ def end_stop(stroke: float, v: float, axes: Array, i: int) -> tuple[float, float
     else:
         return 0.0, 0.0
     factor = 1.0 + axes[i, at.STOP_DAMPING] * inward
+    # A rebound faster than 1 / damping would make Hunt and Crossley's law pull.
     if factor <= 0.0:
         return 0.0, 0.0
     force = axes[i, at.STOP_STIFFNESS] * depth * factor

@@ -19,6 +19,7 @@ SMOOTH2 = 1e5**2
 def orifice(dp: float) -> tuple[float, float]:
     """Dp / (dp^2 + delta^2)^(1/4), which is sqrt(dp) smoothed over 1 bar, and its derivative."""
     q2 = dp * dp + SMOOTH2
+    # Two square roots replace the slower pow(q2, 0.25).
     root = math.sqrt(math.sqrt(q2))
     inverse = 1.0 / (q2 * root)
     return dp * q2 * inverse, (q2 - 0.5 * dp * dp) * inverse
@@ -35,6 +36,7 @@ def check_orifice(dp: float, leak: float) -> tuple[float, float]:
 @inlined
 def stiffness(pressure: float, plant: Array) -> float:
     """Effective bulk modulus (Pa) of oil with free air at a gauge pressure (Pa), isothermal."""
+    # 0.1 bar absolute, as the clamped pressures: a stage of ROS2 may fall below it, where a / p has no meaning.
     absolute = max(pressure + at.ATMOSPHERE, 1e4)
     air = plant[at.AIR] * at.ATMOSPHERE
     # (1 + a) / (1 / beta + a / p) with a = air / p, in one division
@@ -47,6 +49,7 @@ def stiffness(pressure: float, plant: Array) -> float:
 def port_flows(pressure: float, relief: float, leak: float, plant: Array) -> tuple[float, float]:
     """Inflow (m^3/s) of one chamber through relief, make-up check and spool leakage, and its slope (<= 0)."""
     flow, slope = -leak * (pressure - plant[at.TANK]), -leak
+    # A slope instead of a hard limit: real reliefs let pressure rise while they open, and the Jacobian needs it.
     if pressure > relief:
         flow -= plant[at.PORT_SLOPE] * (pressure - relief)
         slope -= plant[at.PORT_SLOPE]
@@ -65,6 +68,7 @@ def section(area: float, supply: float, load: float, highest: float, leak: float
     """
     if area <= 0.0:
         return 0.0, 0.0, 0.0
+    # Behind a compensator that shows the higher load, the flow does not depend on the section's own load.
     q, d = check_orifice(supply - max(load, highest), leak)
     return area * q, area * d, (area * d if load >= highest else 0.0)
 
@@ -103,6 +107,7 @@ def cylinder_flows(
     head_2, h_2, h_load_2 = section(opened[i, at.HEAD_IN_2], pump_2, head, highest[1], check)
     rod_1, r_1, r_load_1 = section(opened[i, at.ROD_IN_1], pump_1, rod, highest[0], check)
     rod_2, r_2, r_load_2 = section(opened[i, at.ROD_IN_2], pump_2, rod, highest[1], check)
+    # Spools open to tank have no check valve: 1.0 lets a cavitating chamber draw oil back.
     head_out, h_out = drain(opened[i, at.HEAD_OUT], head - tank, 1.0)
     rod_out, r_out = drain(opened[i, at.ROD_OUT], rod - tank, 1.0)
     down, by_down = drain(opened[i, at.HEAD_TO_ROD], head - rod, check)

@@ -20,6 +20,7 @@ from edp.sim.physics.jit import inlined
 
 Array = NDArray[np.float64]
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
+"""One of the two values at which ROS2 is L-stable; the other, 1 + 1/sqrt(2), has the larger error constant."""
 
 # frozen[...]: numbers of one step; three of a kind stand together, one per cylinder
 LEVERS, GRAVITY_T, PER_HEAD, PER_ROD, SINES, MASS, BYPASS, ANGLES = 0, 3, 6, 9, 12, 15, 21, 23
@@ -54,6 +55,7 @@ def turned(i: int, angle: float, s: Array) -> tuple[float, float]:
         anchor(i, angle, s)
     x = angle - s[ANCHOR + i]
     q = x * x
+    # First terms left out at 0.03 rad: x^8 / 8! = 2e-17 and x^9 / 9! = 5e-20.
     c = 1.0 - q * (1.0 / 2.0 - q * (1.0 / 24.0 - q * (1.0 / 720.0)))
     d = x * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q * (1.0 / 5040.0))))
     return s[ANCHOR_COS + i] * c - s[ANCHOR_SIN + i] * d, s[ANCHOR_SIN + i] * c + s[ANCHOR_COS + i] * d
@@ -72,6 +74,7 @@ def freeze_geometry(state: Array, axes: Array, plant: Array, strokes: Array, s: 
     length, s[LEVERS + 2] = linkage.cylinder_at(2, c3, s3, plant)
     strokes[2] = length - axes[2, at.CLOSED]
     for i in range(at.AXES):
+        # Volumes as reciprocals: both stages of a step multiply by them.
         s[PER_HEAD + i] = 1.0 / (axes[i, at.HEAD_DEAD] + axes[i, at.HEAD_AREA] * strokes[i])
         s[PER_ROD + i] = 1.0 / (axes[i, at.ROD_DEAD] + axes[i, at.ROD_AREA] * (axes[i, at.STROKE] - strokes[i]))
     ca, sa = c1 * c2 - s1 * s2, s1 * c2 + c1 * s2
@@ -101,6 +104,7 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
         out[at.RATE] += soil[0]
         out[at.RATE + 1] += soil[1]
         out[at.RATE + 2] += soil[2]
+    # Parallel orifices see their own load only: no section may find a higher pressure here.
     highest = (-1e9, -1e9)
     if plant[at.COMPENSATED] > 0.0:
         highest = (hydraulics.highest_load(0, w, opened), hydraulics.highest_load(1, w, opened))
@@ -124,6 +128,7 @@ def rates(w: Array, axes: Array, plant: Array, work: tuple[Array, ...], jacobian
             e[i, C_HEAD], e[i, C_ROD] = c_head, c_rod
             e[i, HEAD_BY_HEAD], e[i, ROD_BY_ROD], e[i, ACROSS] = by[0], by[1], by[2]
             e[i, HEAD_BY_1], e[i, HEAD_BY_2], e[i, ROD_BY_1], e[i, ROD_BY_2] = by[3], by[4], by[5], by[6]
+            # The force holds -drag + stop, so that the derivative of the stop enters the drag's with the other sign.
             e[i, F_BY_Z], e[i, F_BY_V], e[i, Z_BY_Z], e[i, Z_BY_V] = f_by_z, f_by_v - stop_by_v, z_by_z, z_by_v
     for m in range(2):
         p = w[at.PUMP + m]
@@ -143,6 +148,7 @@ def eliminate(g: float, axes: Array, s: Array, e: Array) -> None:
         ch, cr = g * e[i, C_HEAD], g * e[i, C_ROD]
         hh, hr = 1.0 - ch * e[i, HEAD_BY_HEAD], -ch * e[i, ACROSS]
         rh, rr = -cr * e[i, ACROSS], 1.0 - cr * e[i, ROD_BY_ROD]
+        # Never below 1: all slopes of the flows are <= 0, so Cramer's rule needs no pivot.
         det = 1.0 / (hh * rr - hr * rh)
         t_hh, t_hr, t_rh, t_rr = rr * det, -hr * det, -rh * det, hh * det
         e[i, T_HH], e[i, T_HR], e[i, T_RH], e[i, T_RR] = t_hh, t_hr, t_rh, t_rr
@@ -163,6 +169,7 @@ def factorise(g: float, axes: Array, work: tuple[Array, ...]) -> None:
     """Factor what is left of I - g J, 5x5, into `work[LU]`; no pivoting, its diagonal dominates."""
     s, lu, e, contact = work[FROZEN_W], work[LU], work[SLOPE], work[CONTACT]
     eliminate(g, axes, s, e)
+    # Rows of the joint rates stay multiplied by M: no inverse of the mass matrix is needed.
     lu[0, 0], lu[0, 1], lu[0, 2] = s[MASS], s[MASS + 1], s[MASS + 2]
     lu[1, 0], lu[1, 1], lu[1, 2] = s[MASS + 1], s[MASS + 3], s[MASS + 4]
     lu[2, 0], lu[2, 1], lu[2, 2] = s[MASS + 2], s[MASS + 4], s[MASS + 5]
@@ -190,6 +197,7 @@ def factorise(g: float, axes: Array, work: tuple[Array, ...]) -> None:
     lu[3, 3], lu[3, 4], lu[4, 3], lu[4, 4] = l33, l34, l43, l44
     for k in range(5):
         inverse = 1.0 / lu[k, k]
+        # The reciprocal pivot is kept, since `solve` runs twice for each factorisation.
         lu[k, k] = inverse
         for i in range(k + 1, 5):
             lu[i, k] *= inverse
@@ -242,11 +250,13 @@ def rosenbrock(state: Array, h: float, axes: Array, plant: Array, work: tuple[Ar
     solve(g, axes, work, k1)
     for n in range(at.RATE, at.DISPLACEMENT):
         stage[n] = state[n] + h * k1[n]
+    # Displacements have exact half steps of their own and are constant for ROS2.
     for m in range(2):
         stage[at.DISPLACEMENT + m] = state[at.DISPLACEMENT + m]
     rates(stage, axes, plant, work, False)
     for n in range(at.HEAD, at.DISPLACEMENT):
         rhs[n] = f[n] - 2.0 * k1[n]
+    # The left-hand side of these rows holds M instead of I, so 2 k1 is multiplied by M as well.
     a, b, c = 2.0 * k1[at.RATE], 2.0 * k1[at.RATE + 1], 2.0 * k1[at.RATE + 2]
     rhs[at.RATE] = f[at.RATE] - s[MASS] * a - s[MASS + 1] * b - s[MASS + 2] * c
     rhs[at.RATE + 1] = f[at.RATE + 1] - s[MASS + 1] * a - s[MASS + 3] * b - s[MASS + 4] * c
@@ -295,15 +305,18 @@ def step(
     """
     h, share, filters = clock
     axes, plant, work, ground = setup
+    # Half steps before and after ROS2 in mirrored order: Strang splitting has order 2 only if it is symmetric.
     valve.pilot_half_step(demand, filters, plant[at.HYSTERESIS], valves)
     valve.spool_half_step(filters, valves)
     pump.displacement_step(state, valves, axes, plant, share)
     for i in range(at.AXES):
         state[at.PSI + i] += 0.5 * h * state[at.RATE + i]
+    # Mid-step: geometry frozen at either end would lower the order to one.
     freeze_geometry(state, axes, plant, work[STROKES_W], work[FROZEN_W])
     valve.open_spools(valves, work[STROKES_W], axes, work[OPENED])
     bypass = pump.bypass_conductances(valves, axes, plant)
     work[FROZEN_W][BYPASS], work[FROZEN_W][BYPASS + 1] = bypass
+    # Contact of the step before must not act on a bucket that has left the ground.
     work[CONTACT][terramechanics.ON] = 0.0
     if near_soil:
         terramechanics.engage(state, work[FROZEN_W][ANGLES:], axes, ground, work[CONTACT])
@@ -315,6 +328,7 @@ def step(
     pump.displacement_step(state, valves, axes, plant, share)
     valve.spool_half_step(filters, valves)
     valve.pilot_half_step(demand, filters, plant[at.HYSTERESIS], valves)
+    # Last: within a step the stages may pass below vacuum, and a clamp there would break the order.
     return clamp_pressures(state)
 
 

@@ -44,6 +44,7 @@ def cache_folder() -> Path | None:
     state = hashlib.blake2b(digest_size=8)
     state.update(str(GROUND_POINTS).encode())
     for source in fingerprinted():
+        # The zero byte separates name and content, so that no other split of the same bytes has this hash.
         state.update(source.relative_to(Path(__file__).parents[1]).as_posix().encode() + b"\0" + source.read_bytes())
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     try:
@@ -76,6 +77,7 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
     try:
         fast: Any = numba.njit(cache=True, **options)(function)
     finally:
+        # Restored at once: other users of Numba in this process keep their own cache folder.
         config.CACHE_DIR = before
     return fast  # type: ignore[no-any-return]
 
@@ -105,8 +107,10 @@ class WarmUp:
             return
         with (folder / "lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
+            # Asked again under the lock: another process may have filled the cache meanwhile.
             if not whole.exists():
                 play()
+                # Marked last: a rehearsal that was killed is repeated.
                 whole.touch()
 
 

@@ -34,6 +34,7 @@ def bucket_linkage(cosine: float, sine: float, plant: Array) -> tuple[float, flo
     inverse = 1.0 / (to_lug_x * to_lug_x + to_lug_y * to_lug_y)
     rocker2, link2 = plant[at.ROCKER] * plant[at.ROCKER], plant[at.LINK] * plant[at.LINK]
     along = 0.5 * (1.0 + (rocker2 - link2) * inverse)
+    # Rounding makes the radicand negative where rocker and link align; zero would divide the lever arm by zero.
     across = math.sqrt(max(rocker2 * inverse - along * along, 1e-12))
     arm_x = along * to_lug_x - across * to_lug_y
     arm_y = along * to_lug_y + across * to_lug_x
@@ -72,6 +73,7 @@ def bucket_closes(psi: Array, plant: Array) -> NDArray[np.bool_]:
     across = plant[at.PIN_X] + plant[at.LUG] * np.cos(angle) - plant[at.PIVOT_X]
     apart = np.hypot(across, plant[at.LUG] * np.sin(angle) - plant[at.PIVOT_Y])
     folded, straight = abs(plant[at.ROCKER] - plant[at.LINK]), plant[at.ROCKER] + plant[at.LINK]
+    # A micrometre away from both limits, where rocker and link align and the lever arm is not defined.
     return np.asarray((apart > folded + 1e-6) & (apart < straight - 1e-6))
 
 
@@ -89,9 +91,11 @@ def bucket_branch(closed: float, full: float, plant: Array) -> tuple[Array, Arra
     Of all stretches of angles on which the linkage closes and the cylinder shortens as the angle grows, the one that
     covers most of the lengths from `closed` to `full`; empty when there is none.
     """
+    # One full turn in steps of 0.2 deg.
     psi = np.linspace(-1.3 * np.pi, 0.7 * np.pi, 1801)
     length, lever = np.full(len(psi), np.nan), np.full(len(psi), np.nan)
     _tabulate(psi, bucket_closes(psi, plant), plant, length, lever)
+    # Padded, so that a stretch which touches an end of the range has both its edges.
     falling = np.concatenate(([False], lever < 0.0, [False]))
     edges = np.flatnonzero(np.diff(falling.astype(int))).reshape(-1, 2)
 
@@ -113,10 +117,13 @@ def angle_at_stroke(axis: int, stroke: float, axes: Array, plant: Array) -> floa
             axis
         ]
         cosine = (plant[base] ** 2 + plant[rod] ** 2 - target**2) / (2.0 * plant[base] * plant[rod])
+        # Rounding at the ends of the stroke can take the cosine just beyond 1.
         phi = math.acos(min(max(cosine, -1.0), 1.0))
         return float(phi - plant[offset] if axis == 0 else plant[offset] - phi)
     psi, _ = bucket_branch(axes[axis, at.CLOSED], axes[axis, at.CLOSED] + axes[axis, at.STROKE], plant)
+    # Bisection, since the length falls all along the branch: Newton's method could leave it near a stop.
     low, high = psi[0], psi[-1]
+    # 60 halvings of a turn end below the spacing of float64.
     for _ in range(60):
         middle = 0.5 * (low + high)
         if cylinder(2, middle, plant)[0] > target:

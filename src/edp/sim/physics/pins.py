@@ -69,8 +69,10 @@ def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Arr
         for k in range(1, force.shape[0]):
             before = pin_offset
             for n in range(PARTS):
+                # Midpoint rule: the force is linear between samples.
                 share = (n + 0.5) / PARTS
                 pull = force[k - 1, i] + share * (force[k, i] - force[k - 1, i])
+                # Implicit in the grease: stable for however light a mass behind the pin.
                 speed = (speed - pull / mass[k, i] * part) / (1.0 + FILM / mass[k, i] * part)
                 pin_offset += speed * part
                 if abs(pin_offset) >= half:

@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 FINE = 4
 """A step is cut in this many near the ends of the stroke, where cushions and stops are stiff."""
 RESTING_PRESSURE = 10e5
+"""Pa, of pump lines and of the less loaded chamber at the start: no chamber begins in vacuum."""
 Clock = tuple[int, float, float, Array]
 LEVER_BANDWIDTH_HZ, LEVER_RATE = 2.5, 5.0
 """Hand on the lever: second-order smoothing and the largest rate in full strokes per second."""
@@ -32,7 +33,9 @@ def near_end(row: Array, axes: Array) -> bool:
     for i in range(at.AXES):
         v, stroke = row[at.LOG_VELOCITY + i], row[at.LOG_STROKE + i]
         ahead = axes[i, at.STROKE] - stroke if v > 0.0 else stroke
+        # 20 ms of travel ahead, since the choice of the clock holds for a whole sample.
         braking = abs(v) > 1e-2 and ahead < axes[i, at.CUSHION_LENGTH] + 0.02 * abs(v)
+        # A cylinder that rests at its stop is not stiff: only motion there needs fine steps.
         touching = abs(v) > 1e-3 and min(stroke, axes[i, at.STROKE] - stroke) < 1e-3
         if braking or touching:
             return True
@@ -58,11 +61,14 @@ def run_samples(
     first = demands.shape[0] - log.shape[0]
     delays, clocks = times
     axes, plant, work, ground = setup
+    # Steps in a sample times their length: fine and coarse clocks give the same.
     time_s = clocks[0][0] * clocks[0][1]
     in_soil = ground[0][terramechanics.ACTIVE] > 0.0
     clamps = 0
     for k in range(log.shape[0]):
+        # Logged before the steps: row k is the instant at which lever k is applied.
         logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k])
+        # Once a sample: the oil's temperature changes over minutes.
         thermal.warm(log[k], axes, plant, time_s)
         near, fine = False, near_end(log[k], axes)
         if in_soil:
@@ -84,6 +90,7 @@ def smooth_lever(target: Array, hand: Array, step_s: float, out: Array) -> None:
     """Lever positions of one sample, shape (3,), from targets: 2nd-order low-pass of limited rate; state in `hand`."""
     omega = 2.0 * np.pi * LEVER_BANDWIDTH_HZ
     for i in range(at.AXES):
+        # Critically damped: an operator's hand does not ring.
         pull = omega * omega * (target[i] - hand[i, 0]) - 2.0 * omega * hand[i, 1]
         hand[i, 1] = min(max(hand[i, 1] + step_s * pull, -LEVER_RATE), LEVER_RATE)
         hand[i, 0] += step_s * hand[i, 1]
@@ -128,6 +135,7 @@ def steps_per_sample(rate_hz: float, step_s: float) -> int:
         ConfigError: there is none.
     """
     steps = round(1.0 / (rate_hz * step_s))
+    # 1e-9 allows for the rounding of decimal steps such as 0.0001 only.
     if steps < 1 or abs(steps * step_s * rate_hz - 1.0) > 1e-9:
         raise ConfigError(
             f"step_s = {step_s} s does not divide the sample time {1.0 / rate_hz} s of rate_hz = {rate_hz}; "
@@ -167,10 +175,12 @@ class Plant:
         self.hand = np.zeros((at.AXES, 2))
         self.work = integrator.new_work()
         self._held = np.zeros(at.SPOOLS)
+        # An array of one value, since a snapshot restores arrays in place.
         self._counts = np.zeros(1, dtype=np.int64)
         self.ground = ground
         self._ground = soil.no_ground() if ground is None else ground.arrays()
         self._delays = valve.dead_times(machine) * rate_hz
+        # One sample more than the longest dead time: a delay between samples reads the older one.
         self._past = int(np.ceil(self._delays.max())) + 1
         self._demands = np.zeros((self._past, at.SPOOLS))
         coarse, fine = ((n * steps, *integrator.clock_of(machine, step_s / n)) for n in (1, FINE))
@@ -191,11 +201,13 @@ class Plant:
     def memory(self) -> tuple[NDArray[Any], ...]:
         """Every array that changes as time goes on, live: what to copy, and to write back to, for an exact restart."""
         changing = (self.state, self.valves, self.hand, self._demands, self.axes, self.plant, self._counts)
+        # The first three (numbers, tables, course) are read only while the plant runs.
         return (*changing, *self._ground[3:])
 
     @property
     def finite(self) -> bool:
         """Whether every state is a finite number; what once is not stays so."""
+        # One sum instead of a test of each value: NaN and infinity survive every addition.
         return math.isfinite(sum(self.state.tolist()))
 
     @property
@@ -237,6 +249,7 @@ def resting_state(strokes: Array, axes: Array, plant: Array) -> Array:
     dynamics.gravity_torque(psi, axes, plant[at.GRAVITY], load)
     for i in range(at.AXES):
         force = load[i] / linkage.cylinder(i, psi[i], plant)[1]
+        # Equilibrium fixes only the difference of the pressures; the lower one is set.
         head = (force + axes[i, at.ROD_AREA] * RESTING_PRESSURE) / axes[i, at.HEAD_AREA]
         rod = RESTING_PRESSURE
         if head < RESTING_PRESSURE:

@@ -56,10 +56,12 @@ def reach(x: float, y: float, attitude: float, axes: Array, plant: Array, limits
     elbow = -math.acos(min(max(cosine, -1.0), 1.0))
     first = math.atan2(pin_y, pin_x) - math.atan2(arm * math.sin(elbow), boom + arm * math.cos(elbow))
     middle = 0.5 * (limits[2, 0] + limits[2, 1])
+    # Of all equal attitudes the turn that is nearest to the middle of the bucket's range.
     last = middle + (attitude - first - elbow - middle + math.pi) % (2.0 * math.pi) - math.pi
     reached[REACHED_ANGLE], reached[REACHED_ANGLE + 1], reached[REACHED_ANGLE + 2] = first, elbow, last
     for i in range(at.AXES):
         psi = reached[REACHED_ANGLE + i]
+        # 1e-9 rad: rounding at exactly full stroke is no pose out of reach.
         if psi < limits[i, 0] - 1e-9 or psi > limits[i, 1] + 1e-9:
             fits = False
         psi = min(max(psi, limits[i, 0]), limits[i, 1])
@@ -101,6 +103,7 @@ class Kinematics:
         ]
         low, high = float(self.limits[2, 0]), float(self.limits[2, 1])
         target = float(strokes[2]) * self.axes[2, at.STROKE] + self.axes[2, at.CLOSED]
+        # 50 halvings of at most pi reach 3e-15 rad.
         for _ in range(50):
             middle = 0.5 * (low + high)
             if linkage.cylinder(2, middle, self.plant)[0] > target:

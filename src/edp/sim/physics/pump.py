@@ -21,6 +21,7 @@ def demand(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
         i = j if j < 3 else j - 3
         pilot = valves[j, at.PILOT]
         gain = axes[i, at.DEMAND_EXTEND] if pilot >= 0.0 else axes[i, at.DEMAND_RETRACT]
+        # Demand begins at 10 % of the pilot, below usual dead bands of the spools (12 to 14 %), and is full at 85 %.
         asked = min(gain * max(abs(pilot) - 0.1, 0.0) * (1.0 / 0.75), 1.0)
         pump = axes[i, at.PRIMARY_PUMP] if j < 3 else axes[i, at.CONFLUX_PUMP]
         if pump == 0.0:
@@ -34,7 +35,9 @@ def demand(valves: Array, axes: Array, plant: Array) -> tuple[float, float]:
 def displacement_step(state: Array, valves: Array, axes: Array, plant: Array, share: float) -> None:
     """Move both displacements towards demand under the power limit; `share` = exp(-step / time constant)."""
     first, second = demand(valves, axes, plant)
+    # A line below tank pressure takes no power from the other pump's share.
     power = plant[at.MAX_FLOW] * (first * max(state[at.PUMP], 0.0) + second * max(state[at.PUMP + 1], 0.0))
+    # At least 1 W: idle pumps do not divide by zero.
     limit = min(1.0, plant[at.POWER_LIMIT] / max(power, 1.0))
     d = at.DISPLACEMENT
     state[d] = first * limit + (state[d] - first * limit) * share

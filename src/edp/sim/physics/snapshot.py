@@ -47,6 +47,7 @@ class Snapshot:
             StorageError: the disk is full or the folder read-only.
         """
         facts = {"schema": SCHEMA, "scenario": self.scenario, "samples": self.samples, "state": self.state}
+        # JSON has no NaN; `capture` writes numbers that are not finite as text.
         text = json.dumps(facts, allow_nan=False).encode()
         named: dict[str, Any] = {f"a{i}": array for i, array in enumerate(self.arrays)}
         named[_FACTS] = np.frombuffer(text, np.uint8)
@@ -72,6 +73,7 @@ class Snapshot:
             )
             if facts["schema"] != SCHEMA:
                 raise StorageError(f"{where} has schema {facts['schema']}; this version reads {SCHEMA}")
+            # All members but facts and log.
             arrays, log = tuple(stored[f"a{i}"] for i in range(len(stored) - 2)), stored["log"]
             return Snapshot(
                 facts["scenario"], int(facts["samples"]), facts["state"], arrays, (log,) if len(log) else ()
@@ -96,6 +98,7 @@ def _array(packed: zipfile.ZipFile, name: str) -> NDArray[Any]:
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(data)
     left = len(data.getvalue()) - data.tell()
+    # Arrays of objects would have to be unpickled, which runs what the file says.
     if dtype.hasobject or math.prod(shape) * dtype.itemsize != left:
         raise ValueError(f"array '{name}' announces {shape} of {dtype} and holds {left} bytes")
     data.seek(0)
@@ -105,6 +108,7 @@ def _array(packed: zipfile.ZipFile, name: str) -> NDArray[Any]:
 
 def capture(value: Any, arrays: list[NDArray[Any]]) -> Any:
     """`value` as JSON-able data, its arrays copied into `arrays`; parts that never change become None."""
+    # Before np.generic: these are JSON as they are.
     if value is None or isinstance(value, bool | int | str):
         return {"value": value}
     if isinstance(value, float):
@@ -117,6 +121,7 @@ def capture(value: Any, arrays: list[NDArray[Any]]) -> Any:
     if isinstance(value, list | tuple):
         return {type(value).__name__: [capture(part, arrays) for part in value]}
     if isinstance(value, dict):
+        # A list of pairs keeps the order, which a reader of JSON need not.
         return {"dict": [[str(key), capture(part, arrays)] for key, part in value.items()]}
     if not _changes(value):
         return None

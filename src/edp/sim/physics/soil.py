@@ -20,9 +20,11 @@ from edp.storage import SETTINGS_BYTES, parse_toml, read_text
 
 Array = NDArray[np.float64]
 SPACING_M = 0.05
+"""Cell (m) of the height profile."""
 BEYOND_M = 1.0
 """How far the ground goes on beyond the machine's reach."""
 UNEVENNESS_M = 0.04
+"""Deviation (m) of the surface at its bends, a metre apart."""
 
 
 BOUNDS = {
@@ -140,8 +142,10 @@ class Ground:
     def __init__(self, material: Material, machine: Machine, rng: np.random.Generator) -> None:
         self.material = material
         points = math.ceil((sum(machine.bodies.length) + BEYOND_M) / SPACING_M)
+        # A bend each metre (20 cells) and two more, so that the interpolation has a value beyond either end.
         bends = rng.normal(0.0, UNEVENNESS_M, points // 20 + 2)
         uneven = np.interp(np.arange(points) / 20.0, np.arange(len(bends)), bends)
+        # The origin is the boom foot, which stands above level ground.
         self.heights: Array = uneven - machine.chassis.boom_foot_height
         self.memory: Array = np.zeros(at.MEMORY)
         self.numbers = terramechanics.pack_soil(material, machine, rng.uniform(*material.cone_index))
@@ -175,8 +179,10 @@ class Ground:
         ahead = (here + np.arange(count)) % count
         self.course[ahead, 0] = keep * old[here % count, 0] + np.sqrt(1.0 - keep**2) * fresh[:, 0]
         stone = (int(self.memory[at.DISTANCE] / terramechanics.STONE_STEP) + np.arange(count)) % count
+        # A stone that the edge is in now stays until it has passed.
         inside = np.logical_and.accumulate(old[stone, 1] > 0.0)
         self.course[stone, 1] = np.where(inside, old[stone, 1], fresh[:, 1])
+        # The strength of the present dig was already felt; that of the later ones was not.
         dig = int(self.memory[at.DIGS]) % count
         self.course[:, 2] = fresh[:, 2]
         self.course[dig, 2] = old[dig, 2]

@@ -42,6 +42,7 @@ def drop(mass: float, x: float, cells: int, numbers: Array, heights: Array) -> N
     first = cell_of(x, heights)
     share = mass / (cells * numbers[tm.DENSITY] * numbers[tm.WIDTH] * tm.SPACING)
     for n in range(cells):
+        # Clamped at the first cell, so that no mass is lost at the tracks.
         heights[max(first - n, 0)] += share
 
 
@@ -59,11 +60,13 @@ def sweep(c: Array, moved: float, numbers: Array, heights: Array, memory: Array)
             heights[n] = y
     if heights[k] > y:
         inside = min(moved, tm.SPACING)
+        # Of the edge's own cell only the part passed in this step; 1e-12 avoids 0 / 0 at a cell's border.
         slice_ = (heights[k] - y) * inside / (inside + left + 1e-12)
         heights[k] -= slice_
         cut += slice_
     mass = cut * numbers[tm.DENSITY] * numbers[tm.WIDTH] * tm.SPACING
     full = memory[at.PAYLOAD] / numbers[tm.CAPACITY]
+    # The fuller the bucket, the more soil flows past it onto the heap.
     loaded = min(mass * max(1.0 - full * full, 0.0), max(numbers[tm.CAPACITY] - memory[at.PAYLOAD], 0.0))
     memory[at.PAYLOAD] += loaded
     memory[at.HEAP] += mass - loaded
@@ -90,11 +93,13 @@ def settle(state: Array, h: float, c: Array, ground: tuple[Array, ...]) -> None:
             chip = memory[at.CHIP] + moved / max(0.9 * c[tm.DEPTH], 0.03)
             memory[at.CHIP] = chip - math.floor(chip)
             into = v[0] * c[tm.EDGE_X] + v[1] * c[tm.EDGE_Y]
+            # Only a drag towards the machine, edge first, fills the bucket.
             if v[0] < 0.0 and into > 0.0:
                 sweep(c, -h * v[0], numbers, heights, memory)
         if c[tm.HEEL_DEPTH] > 0.0:
             slid = h * abs(v[2])
             memory[at.SHEAR] += slid
+            # Sliding brings fresh soil below the heel, which has no set yet.
             memory[at.HEEL_SET] *= math.exp(-slid / (2.0 * tm.HEEL_CONTACT))
         else:
             memory[at.SHEAR] = memory[at.HEEL_SET] = 0.0
@@ -102,6 +107,7 @@ def settle(state: Array, h: float, c: Array, ground: tuple[Array, ...]) -> None:
     else:
         damping = 0.0
         memory[at.SHEAR] = memory[at.HEEL_SET] = 0.0
+    # A margin above the ground: an edge that skims the surface would begin a dig at each touch.
     if memory[at.IN_SOIL] > 0.0 and c[tm.DEPTH] < -LEFT_M:
         memory[at.IN_SOIL] = 0.0
         memory[at.DIGS] += 1.0
@@ -114,11 +120,13 @@ def settle(state: Array, h: float, c: Array, ground: tuple[Array, ...]) -> None:
 @compiled
 def spill(angle: float, x: float, time_s: float, numbers: Array, heights: Array, memory: Array) -> None:
     """Let soil slide out of a bucket in the air that is tilted too far; `angle`: its attitude, `x`: its place."""
+    # Distance of the attitude from -pi, where the mouth is level, whatever turn it is counted in.
     turn = (angle + math.pi) / (2.0 * math.pi)
     tilt = 2.0 * math.pi * abs(turn - math.floor(turn + 0.5))
     holds = min(max((EMPTY_RAD - tilt) / (EMPTY_RAD - HOLDS_RAD), 0.0), 1.0) * numbers[tm.CAPACITY]
     over = memory[at.PAYLOAD] - holds
     if over > 0.0:
+        # The last 100 g leave at once: an exponential decay would never end.
         gone = over * min(time_s / SPILL_S, 1.0) if over > 0.1 else over
         memory[at.PAYLOAD] -= gone
         drop(gone, x + 2.0 * tm.SPACING, 5, numbers, heights)
@@ -128,12 +136,14 @@ def spill(angle: float, x: float, time_s: float, numbers: Array, heights: Array,
 def slide(x: float, numbers: Array, heights: Array) -> None:
     """Slopes around `x` that are too steep give way, once forth and once back."""
     middle = cell_of(x, heights)
+    # 1.2 m to either side of the edge: soil is moved nowhere else.
     first, last = max(middle - 24, 0), min(middle + 24, heights.shape[0] - 1)
     limit = numbers[tm.STEEPEST] * tm.SPACING
     for n in range(2 * (last - first)):
         k = first + n if n < last - first else 2 * last - first - 1 - n
         rise = heights[k + 1] - heights[k]
         if abs(rise) > limit:
+            # Half of the excess goes to each side, so that the mass stays.
             move = 0.5 * (rise - limit if rise > 0.0 else rise + limit)
             heights[k] += move
             heights[k + 1] -= move
@@ -191,4 +201,5 @@ def look(row: Array, time_s: float, axes: Array, ground: tuple[Array, ...]) -> t
         memory[at.FORCE_X] = memory[at.FORCE_Y] = memory[at.PITCH] = memory[at.PITCH_RATE] = 0.0
     carry(numbers, memory, axes)
     untouched = row[at.LOG_EVENTS + at.SOIL_CONTACT] == 0.0
+    # 1.5 samples of the present sinking and 2 mm: the landing itself must fall into fine steps.
     return near, near and untouched and down > LANDING and gap < 0.002 + 1.5 * down * time_s

@@ -41,9 +41,13 @@ GRAVITY = 9.81
 CREEP = 0.02
 """Speed (m/s) over which the direction of soil forces is smoothed."""
 SPACING = 0.05
+"""Cell (m) of the profile, as `soil.SPACING_M`, which cannot be imported from here."""
 STONE_STEP = 0.005
+"""Travel (m) a cell of the stones' column."""
 COURSE = 8192
+"""Cells of a course; its stones repeat after 41 m of travel in soil."""
 LEAST_RAKE, MOST_RAKE = 10, 120
+"""Rake (deg) to which the table of cutting factors is limited."""
 LEAST_LEAN, MOST_LEAN = 0.17, 2.1
 """Rake (rad) within which the direction of the cutting force follows it."""
 EDGE_DEPTH = 0.05
@@ -62,11 +66,13 @@ PUSHED_BACK = 0.5
 
 def cutting_factors(rake_deg: float, friction_deg: float, metal_deg: float) -> tuple[float, float, float]:
     """N_gamma, N_c and N_a of the earthmoving equation at the failure angle that minimises N_gamma."""
+    # Steps of 0.1 deg: the minimum over the failure angle is flat.
     failure = np.radians(np.linspace(5.0, 85.0, 801))
     rake, phi, delta = (math.radians(a) for a in (rake_deg, friction_deg, metal_deg))
     cot_out = 1.0 / np.tan(failure + phi)
     below = math.cos(rake + delta) + math.sin(rake + delta) * cot_out
     wedge = 1.0 / math.tan(rake) + 1.0 / np.tan(failure)
+    # Where the denominator is not positive, no wedge can form; such failure angles are left out.
     weight = np.where((below > 1e-2) & (wedge > 0.0), wedge / (2.0 * np.maximum(below, 1e-2)), np.inf)
     n = int(np.argmin(weight))
     cohesion = (1.0 + cot_out[n] / math.tan(failure[n])) / below[n]
@@ -93,8 +99,10 @@ def draw_course(material: Material, rng: np.random.Generator) -> Array:
     and 5-40 kN; strength of each dig, within 30 % of the mean.
     """
     course = np.zeros((COURSE, 3))
+    # Eight cells a correlation length, see COURSE_STEP.
     keep = math.exp(-1.0 / 8.0)
     shocks = rng.normal(0.0, math.sqrt(1.0 - keep * keep), (COURSE, 1))
+    # The first value comes from the stationary distribution, so the process has no transient.
     shocks[0] /= math.sqrt(1.0 - keep * keep)
     course[:, 0] = filters.lfilter([1.0], [1.0, -keep], shocks)[:, 0]
     for _ in range(rng.poisson(material.stones_per_m * STONE_STEP * COURSE)):
@@ -115,6 +123,7 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
     bearing = bekker * bucket.width * HEEL_CONTACT
     # E: unloads five times as stiffly as it loads to 5 cm, and no stiffer than steel plates and pins
     unloading = min(5.0 * bearing * 0.05 ** (material.bekker_exponent - 1.0), PIN_STIFFNESS)
+    # Files give the frequency of rocking, which can be observed, instead of the stiffness.
     stiffness = chassis.pitch_inertia * (2.0 * math.pi * chassis.pitch_frequency) ** 2
     heap_area = 0.5 * 0.4**2 / repose  # E: heaps before the edge stay below 0.4 m
     values = {
@@ -151,6 +160,7 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
         PITCH_DAMPING: 2.0 * chassis.pitch_damping * math.sqrt(stiffness * chassis.pitch_inertia),
         LIFT_MOMENT: chassis.lift_moment,
         UNLOADING: unloading,
+        # 2 zeta sqrt(k m) with a tenth of critical damping, for twice the mass of the bucket.
         HEEL_DAMPING: 0.2 * math.sqrt(unloading * 2.0 * bodies.mass[2]),
         HEAP_LIMIT: heap_area * bucket.width * loose,
         BEARING_LIMIT: 0.25 * cone_index * bucket.width * HEEL_CONTACT,  # E: bearing capacity, a quarter of the cone's
@@ -163,6 +173,7 @@ def pack_soil(material: Material, machine: Machine, cone_index: float) -> Array:
 @inlined
 def height_at(x: float, heights: Array) -> float:
     """Height (m) of the ground at `x`, linear between its points."""
+    # Just below the last point, so that k + 1 exists.
     cell = min(max(x / SPACING, 0.0), heights.shape[0] - 1.000001)
     k = int(cell)
     height: float = heights[k] + (cell - k) * (heights[k + 1] - heights[k])
@@ -212,6 +223,7 @@ def engage_edge(inward: float, ground: Ground, floor: tuple[float, float], c: Ar
     force = inward * factor * cutting_force(depth, rake, 0.5 * loose * GRAVITY * heap, numbers, table)
     back = 0.0
     if inward < 1.0:
+        # The back of the bucket meets the soil at the supplementary rake, and has no heap before it.
         back = (1.0 - inward) * factor * cutting_force(depth, math.pi - rake, 0.0, numbers, table)
     along, rise = floor
     if rake < LEAST_LEAN or rake > MOST_LEAN:
@@ -268,6 +280,7 @@ def engage(state: Array, angles: Array, axes: Array, ground: Ground, c: Array) -
     vx = c[TIP_JX] * w1 + c[TIP_JX + 1] * w2 + c[TIP_JX + 2] * w3 + c[PITCHED]
     # depth below the ground that the edge has not reached yet
     inward = min(max(0.5 - 0.5 * vx / TURNING, 0.0), 1.0)
+    # 1.5 cells ahead: the cell of the edge itself is cut down to it already.
     uncut = inward * height_at(c[POINTS] - 1.5 * SPACING, heights)
     uncut += (1.0 - inward) * height_at(c[POINTS] + 1.5 * SPACING, heights)
     c[DEPTH] = min(uncut - c[POINTS + 1], DEEPEST)

@@ -32,9 +32,11 @@ def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
 def _oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:
     """Exact transition of (error, rate) of a low-pass of damping <= 1 over one step, row by row, 4 values."""
     omega = 2.0 * math.pi * frequency_hz
+    # The exact solution instead of an integration step: stable and of the same result for any step.
     ringing = omega * math.sqrt(1.0 - damping * damping)
     decay, fall = damping * omega, math.exp(-damping * omega * step_s)
     cosine = math.cos(ringing * step_s)
+    # step_s is the limit of sin(w t) / w at critical damping.
     sine = math.sin(ringing * step_s) / ringing if ringing > 0.0 else step_s
     own, cross = fall * (cosine + decay * sine), fall * sine
     return [own, cross, -omega * omega * cross, fall * (cosine - decay * sine)]

@@ -82,6 +82,7 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
         rng: source of jitter and losses.
     """
     ticks = np.arange(samples)
+    # No bus: a frame a sample, seen at once.
     if bus.period <= 0.0:
         return Frames(ticks.astype(float), ticks.astype(float), ticks)
     # A few frames before the start, so that the first sample has one to show.
@@ -92,6 +93,7 @@ def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: floa
     # Frames of one ECU keep their order: a late one holds up those behind it.
     arrivals = np.maximum.accumulate(sample_times + latency) * rate_hz
     lost = rng.random(count) < bus.loss
+    # The first frame always arrives, or the first samples would have nothing to show.
     lost[0] = False
     arrived = np.flatnonzero(~lost)
     seen = arrived[np.searchsorted(arrivals[arrived], ticks, side="right") - 1]

@@ -26,6 +26,7 @@ def _filter(b: Array, a: Array, values: Array, out: Array) -> None:
 def lfilter(b: list[float], a: list[float], values: Array) -> Array:
     """Filter of order one or two with a[0] = 1, from rest, shape ``(time, channel)``."""
     out = np.empty(values.shape)
+    # Padded to order two, so that one compiled function serves both orders.
     numerator, denominator = (np.array([*c, 0.0, 0.0][:3]) for c in (b, a))
     _filter(numerator, denominator, np.ascontiguousarray(values, dtype=float), out)
     return out

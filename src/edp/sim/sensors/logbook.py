@@ -32,6 +32,7 @@ def write_events(state: Array, valves: Array, axes: Array, plant: Array, memory:
         if state[at.PUMP + m] > plant[at.PUMP_RELIEF]:
             relief = 1.0
     first, second = pump.demand(valves, axes, plant)
+    # Demand, not displacement: the limit acts where more power is asked for than there is.
     power = plant[at.MAX_FLOW] * (first * state[at.PUMP] + second * state[at.PUMP + 1])
     if power > plant[at.POWER_LIMIT]:
         limited = 1.0
@@ -40,6 +41,7 @@ def write_events(state: Array, valves: Array, axes: Array, plant: Array, memory:
     row[at.LOG_EVENTS + at.REGENERATION] = regeneration
     row[at.LOG_EVENTS + at.POWER_LIMITED] = limited
     row[at.LOG_EVENTS + at.SOIL_CONTACT] = memory[at.TOUCHED]
+    # Cleared at each sample: a touch between two samples is shown once.
     memory[at.TOUCHED] = 0.0
 
 

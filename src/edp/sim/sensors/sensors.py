@@ -16,6 +16,7 @@ from edp.sim.sensors import can, filters, transducers
 
 Array = NDArray[np.float64]
 DERIVATIVE_DAMPING = 0.7
+"""Share of critical: nearly flat up to the bandwidth, and no ringing in the acceleration."""
 ECUS = ("joints", "pressures", "valves")
 """Senders on the bus: rates of the joints, cylinder pressures, and pilot demands."""
 REFERENCE_TEMPERATURE = 313.15
@@ -40,6 +41,7 @@ class Instance:
 def instance_of(machine: Machine) -> Instance:
     """The fixed instance of a machine, drawn from its name and ``instance_seed``."""
     own = machine.sensors
+    # crc32, since hash() of a text differs from process to process.
     rng = np.random.default_rng([zlib.crc32(machine.name.encode()), int(own.instance_seed)])
     return Instance(
         rng.choice([-1.0, 1.0], 6) * rng.uniform(*own.pressure_offset, 6),
@@ -53,6 +55,7 @@ def filtered_derivative(values: Array, bandwidth_hz: float, rate_hz: float) -> A
 
     The filter starts at rest at the first value.
     """
+    # Below half of the rate, where the bilinear rule warps frequencies.
     omega = 2.0 * np.pi * min(bandwidth_hz, 0.4 * rate_hz)
     return filters.lfilter(*filters.bilinear_derivative(omega, DERIVATIVE_DAMPING, rate_hz), values - values[:1])
 
@@ -103,6 +106,7 @@ def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generato
     """Frames of each of `ECUS`, with random numbers of their own."""
     own, instance = machine.sensors, instance_of(machine)
     bus = can.Bus(own.can_period, own.can_latency, own.can_jitter, own.can_loss)
+    # A generator each: what one ECU draws does not move the noise of the others.
     each = zip(instance.phase, instance.latency_s, rng.spawn(len(ECUS)), strict=True)
     return [can.frames(samples, rate_hz, bus, phase, latency, child) for phase, latency, child in each]
 
@@ -115,11 +119,14 @@ def _velocity(log: Array, machine: Machine, rate_hz: float, frames: can.Frames, 
     play = pins.play_velocity(*pins.loads(log, axes, plant), np.array(own.pin_backlash), step_s)
     velocity = frames.take(log[:, at.LOG_VELOCITY : at.LOG_VELOCITY + 3] + play)
     angles, rates = frames.take(log[:, at.PSI : at.PSI + 3]), frames.take(log[:, at.RATE : at.RATE + 3])
+    # Without a bus each sample is a frame.
     frame_s = own.can_period or step_s
     drift, noise = rng.spawn(2)
+    # Files state the walk per root of a minute.
     error = transducers.random_walk(rates.shape, frame_s, np.deg2rad(own.joint_bias_walk_deg) / np.sqrt(60.0), drift)
     error += noise.normal(0.0, np.deg2rad(own.joint_rate_deg), rates.shape)
     lever = pins.lever_arms(transducers.quantised(angles, np.deg2rad(own.angle_quantum_deg)), plant)
+    # The play is in the velocity already; added is what angle quantum and rate error change of J times rate.
     velocity = velocity + (lever - pins.lever_arms(angles, plant)) * rates + lever * error
     return velocity + rng.normal(0.0, own.velocity, velocity.shape)
 
@@ -134,6 +141,7 @@ def _pressures(
     values = values + own.pressure_range * (instance_of(machine).pressure_offset + drift)
     values = values + rng.normal(0.0, own.pressure, values.shape)
     quantum = own.pressure_range / 2.0**own.pressure_bits if own.pressure_bits > 0 else 0.0
+    # In the order of a transmitter: the converter sees what the range has cut.
     return transducers.quantised(transducers.limited(values, own.pressure_range), quantum)
 
 

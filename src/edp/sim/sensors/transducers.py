@@ -21,6 +21,7 @@ def quantised(values: Array, quantum: float) -> Array:
 def random_walk(shape: tuple[int, int], step_s: float, size: float, rng: np.random.Generator) -> Array:
     """A bias that starts at zero and grows with the root of time: rms `size` after one second."""
     steps = rng.normal(0.0, size * np.sqrt(step_s), shape)
+    # The bias is zero when the recording begins.
     steps[0] = 0.0
     return np.asarray(np.cumsum(steps, axis=0))
 
