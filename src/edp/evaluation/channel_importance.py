@@ -31,6 +31,7 @@ from edp.signals import KINDS
 
 Array = NDArray[np.float64]
 OnGroup = Callable[[str, int, int], None]
+# Eight stretches give Student's t seven degrees of freedom: an interval that is wide, but means something.
 PIECES = 8
 """Stretches that intervals are taken over, at least; recordings are cut where there are fewer."""
 COVERAGE = 0.95
@@ -49,6 +50,7 @@ class ChannelImportanceSpec:
         seed: of the exchanges.
     """
 
+    # Three donors a channel: one exchange may by chance bring a similar course.
     repeats: int = 3
     groups: tuple[tuple[str, ...], ...] = ()
     lags: tuple[int, ...] = (0, 1, 2, 4, 8, 16)
@@ -153,6 +155,7 @@ def measure_channel_importance(
     places = [[data.task.inputs.index(name) for name in members] for members in groups]
     expected, explained = others.expect(places, [part.inputs for part in data.test])
     plain = ruler.errors(stream_predictions(predictor, data.test))
+    # The same donors for every channel, so that channels differ by themselves and not by the draw.
     donors = [_donors(data.test, np.random.default_rng([spec.seed, turn])) for turn in range(spec.repeats)]
     rows: list[ChannelImportance] = []
     for done, (members, columns) in enumerate(zip(groups, places, strict=True)):
@@ -160,6 +163,7 @@ def measure_channel_importance(
             on_group(", ".join(members), done, len(groups))
         growths = []
         for base in ([np.zeros_like(values) for values in expected[done]], expected[done]):
+            # All changed recordings go through the network together: streams side by side cost little more than one.
             changed = [part for turn in donors for part in _exchanged(data.test, columns, base, turn)]
             predictions, count = stream_predictions(predictor, changed), len(data.test)
             each = [ruler.errors(predictions[i * count : (i + 1) * count]) for i in range(spec.repeats)]
@@ -193,7 +197,9 @@ def _donors(series: Sequence[Series], rng: np.random.Generator) -> list[_Donor]:
     count = len(series)
     if count == 1:
         samples = series[0].samples
+        # At least a quarter of the recording away, so that the course is not the recording's own, shifted by a little.
         return [_Donor(0, int(rng.integers(samples // 4, max(samples // 4 + 1, 3 * samples // 4))))]
+    # A shift along a random order gives every recording another one, and each is used once.
     step, order = int(rng.integers(1, count)), rng.permutation(count)
     rank = np.argsort(order)
     others = [int(order[(rank[i] + step) % count]) for i in range(count)]
@@ -257,6 +263,7 @@ class _Ruler:
     def _growth(self, values: Array) -> Growth:
         share = self.weights / self.weights.sum()
         mean, count = float(share @ values), len(values)
+        # One stretch says nothing about the spread; the interval is the value itself.
         if count < 2:
             return Growth(mean, mean, mean)
         # Stretches of unequal length weigh by their ticks: the error of such a mean, then Student's t.

@@ -45,11 +45,13 @@ class OthersModel:
     def fit(parts: Sequence[NDArray[np.float32]], lags: Sequence[int], rows: int) -> OthersModel:
         """From stretches of inputs, each ``(time, channel)``, thinned evenly to about `rows` rows."""
         total = sum(len(part) for part in parts)
+        # Neighbouring rows of a 100 Hz log are nearly equal; thinning costs no information.
         every = max(1, total // rows)
         channels = parts[0].shape[1]
         thinned = np.concatenate([part[::every] for part in parts])
         knees = np.quantile(thinned, KNEES, axis=0).astype(np.float64)
         count, sums, products = 0, 0.0, 0.0
+        # A floor for channels that never move, which would divide by zero.
         size = np.maximum(thinned.std(axis=0, dtype=np.float64), 1e-30)
         shift = thinned.mean(axis=0, dtype=np.float64)
         pick = np.tile(np.arange(channels), len(lags) + len(KNEES))
@@ -59,7 +61,9 @@ class OthersModel:
             terms = (terms - shift[pick]) / size[pick]
             count, sums, products = count + len(terms), sums + terms.sum(axis=0), products + terms.T @ terms
         mean = np.asarray(sums / count)
+        # The covariance from sums: rows are read once, whatever the number of groups.
         gram = np.asarray(products / count) - np.outer(mean, mean)
+        # Rounding can make the variance of a constant slightly negative.
         spread = np.sqrt(np.maximum(np.diag(gram), 0.0))
         # A term that never moves has no say and no surprise.
         flat = spread < 1e-9
@@ -106,8 +110,10 @@ class OthersModel:
         if len(outside_terms) == 0:
             return weights, 0.0
         inner, cross = self.gram[np.ix_(outside_terms, outside_terms)], self.gram[np.ix_(outside_terms, members)]
+        # The penalty grows with the number of terms, so that collinear lags do not explode.
         solution = linalg.solve(inner + RIDGE * len(outside_terms) * np.eye(len(outside_terms)), cross, assume_a="pos")
         weights[outside_terms] = solution
+        # Variance explained by these weights, penalty included: 2 w'c - w'Gw and not w'c, which would flatter.
         explained = 2 * np.sum(solution * cross, axis=0) - np.sum(solution * (inner @ solution), axis=0)
         return weights, float(np.clip(explained, 0.0, 1.0).mean())
 
@@ -131,7 +137,9 @@ def collinear(parts: Sequence[NDArray[np.float32]], least: float = 0.9, rows: in
     if len(moving) < 2:
         return []
     ranks = stats.rankdata(values[:, moving], axis=0)
+    # Rank correlation: a bent copy is still a copy.
     apart = 1.0 - np.abs(np.corrcoef(ranks, rowvar=False))
+    # Complete linkage: every pair of a group is correlated, not a chain of neighbours.
     tree = hierarchy.linkage(np.clip(apart[np.triu_indices(len(moving), 1)], 0.0, None), "complete")
     label = hierarchy.fcluster(tree, 1.0 - least, "distance")
     groups = [moving[label == number].tolist() for number in np.unique(label)]

@@ -15,6 +15,7 @@ from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 
+# From shorter than a move of the operator to longer than any memory found (docs/findings.md, carried for a minute).
 CONTEXTS_S = (0.5, 2.0, 5.0, 10.0, 30.0, 60.0)
 BLOCK_S, EVERY_S = 0.5, 5.0
 LANES = 64
@@ -102,6 +103,7 @@ def context_errors(
             f"the shortest that was asked for is {asked_seconds[0]:g} s: give longer recordings"
         )
     first = max(1, round(measurable[-1] * rate))
+    # All contexts share their blocks: the longest one decides where the first block may be.
     blocks = [(part, at) for part in series for at in range(first, part.samples - block - reach + 1, step)]
     factors = np.array([KINDS[kind].report_factor for kind in kinds])
     owners = [part.machine or part.name for part, _ in blocks]
@@ -110,6 +112,7 @@ def context_errors(
     errors = []
     for context in measurable:
         block_errors = _block_errors(predictor, blocks, max(1, round(context * rate)), block) * factors
+        # Means within a machine first: machines weigh alike, however long they were recorded.
         errors.append(np.stack([block_errors[machine_index == i].mean(axis=(0, 1)) for i in range(len(machines))]))
         if on_done is not None:
             on_done(context)
@@ -133,6 +136,7 @@ def _block_errors(
         for part, at in blocks
     ]
     predictions = stream_predictions(predictor, pieces, LANES)
+    # Blocks of equal length fill the lanes without gaps.
     horizons = predictor.task.horizons
     return np.stack(
         [

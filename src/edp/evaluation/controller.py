@@ -158,10 +158,13 @@ def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str, size
     form = FORMATS[number_format]
     macs = sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)
     outputs = sum(cost.width_out for cost in costs)
+    # Products and element-wise outputs are counted apart: in W8A16 an output weighs as much as 46 products.
     step = macs * form.per_mac + outputs * form.per_output
     cycles = {
+        # Only the high estimate decides: a tick that sometimes misses its deadline misses it.
         name: (round(step * core.low), round(step * core.typical * BOARD_TYPICAL), round(step * BOARD_SLOW))
         for name, core in CORES.items()
     }
+    # The stack is an allowance, since compilers differ in what they keep on it.
     working = round(form.state_bytes * state_numbers)
     return Estimate(number_format, cycles, sizes.constants, sizes.program, working + STACK_BYTES)

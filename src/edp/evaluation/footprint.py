@@ -107,6 +107,7 @@ def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Foo
         parameters=sum(cost.parameters for cost in costs),
         parameters_folded=folded,
         macs_window=column * window + once,
+        # Four bytes a number: activations are counted in float32 in both formats.
         macs_tick=column + once + sum(cost.pooling for cost in costs),
         peak_activation_bytes=4 * max(cost.width_in + cost.width_out for cost in costs),
         peak_activation_bytes_window=4 * max(_window_width(cost, window) for cost in costs),
@@ -126,6 +127,7 @@ def _sizes(predictor: Predictor, adaptation: Adaptation | None) -> tuple[dict[st
         try:
             sizes[name] = sizes_of(in_format(predictor), adaptation)
         except ExportError as error:
+            # A network without an integer form still has a footprint; the reason is shown in place of figures.
             refused[name] = str(error)
     return sizes, refused
 

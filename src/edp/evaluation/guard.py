@@ -60,6 +60,7 @@ def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
             mean = sum(finite) / len(finite)
             lost = tuple(target for target, value in by_target.items() if value > LEAST)
             better.append((mean, Beaten(str(model["label"]), 1.0 - math.exp(-mean), lost)))
+    # Logarithms: halving one target's error and doubling another's cancel out.
     mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
     return worst if mean > LEAST else None
 
@@ -71,6 +72,7 @@ def _logarithm(network: Mapping[str, Any], model: Mapping[str, Any], target: str
         ours, theirs = (
             entry["overall"].get(str(horizon), {}).get(target, {}).get("rmse") for entry in (network, model)
         )
+        # A perfect prediction has no logarithm; such a target decides nothing.
         if ours and theirs:
             values.append(math.log(ours / theirs))
     return sum(values) / len(values) if values else math.nan

@@ -24,6 +24,7 @@ from edp.storage.memory import check_setting
 
 Predictions = list[NDArray[np.float32]]
 B = TypeVar("B", bound=Baseline)
+# Six bins show where an error grows with speed and leave enough samples in each.
 SPEED_BINS = 6
 SKIP = whole(0, MOST_ROWS)
 """Ticks that are not scored: a slice that begins with a negative one would score the last ticks alone."""
@@ -98,6 +99,7 @@ def judge(
         predict, baseline = baseline_predictions(BASELINES[name], data, spec)
         predictions[name] = predict(data)
         names[name], times[name] = baseline.label, time.perf_counter() - began
+    # A whole window from reset: before that the network's memory is not filled, and baselines lack history.
     skip = predictor.spec.window if spec.skip is None else spec.skip
     if data.task.features.starting:  # While the start is read there is nothing to predict.
         skip = max(skip, data.task.features.starting_ticks)
@@ -151,6 +153,7 @@ def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     inputs = (*_lasting(data), *_derived_targets(data))
     present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
     longest = min(series.samples for series in [*data.train, *data.test]) - data.task.max_horizon - 1
+    # At most half of the shortest recording, so that every recording still has ticks to score.
     history = max(1, min(spec.history, longest // 2))
     return BaselineTask(horizons=data.task.horizons, present=present, history=history, seed=spec.seed)
 
@@ -202,6 +205,7 @@ class _Ruler:
                 f"before the horizon, the first {skip} are start-up; give longer recordings"
             )
         pooled = np.concatenate([np.abs(truth[skip:, 0]).ravel() for truth in self.truth])
+        # The last half per cent of speeds are single events; they would stretch the bins and leave them empty.
         self.edges = np.linspace(0.0, float(np.quantile(pooled, 0.995)) or 1.0, SPEED_BINS + 1)
 
     def header(self) -> dict[str, Any]:
@@ -261,6 +265,7 @@ class _Ruler:
     def _ticks(self, predicted: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Scored ticks: after start-up and where the model has its history."""
         predicted, truth = predicted[self.skip :], truth[self.skip :]
+        # A baseline without its history says NaN; a tick counts only where all targets are predicted.
         predicted_ticks = np.isfinite(predicted).all(axis=1)
         return predicted[predicted_ticks], truth[predicted_ticks]
 
@@ -274,6 +279,7 @@ class _Ruler:
         """Mean absolute error in bins of the target's magnitude, outputs pooled."""
         truth = np.concatenate([np.abs(t).ravel() for _, t in pairs])
         error = np.concatenate([np.abs(p - t).ravel() for p, t in pairs])
+        # Speeds beyond the last edge belong to the last bin.
         bin_index = np.clip(np.digitize(truth, self.edges) - 1, 0, SPEED_BINS - 1)
         rows = []
         for i in range(SPEED_BINS):
@@ -292,6 +298,7 @@ class _Ruler:
             errors = []
             for p, t in zip(predicted, self.truth, strict=True):
                 difference = (p[:, h, column] - t[:, h, column])[self.skip :]
+                # Ticks without a prediction add nothing to the integral; NaN would end it.
                 errors.append(np.nancumsum(difference) / self.task.rate_hz)
             scores[target] = {"rmse": float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))}
         return scores

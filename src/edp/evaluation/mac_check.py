@@ -89,6 +89,7 @@ class Trace(TorchDispatchMode):
 
     def read(self, values: Any) -> None:
         """Take a tree of tensors for data: what the network is fed."""
+        # Without the mark of data every product would pass for one of weights, computed once.
         self._data |= {_storage(value) for value in _tensors(values)}
 
     def within(self, name: str) -> int:
@@ -99,6 +100,7 @@ class Trace(TorchDispatchMode):
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = function(*args, **(kwargs or {}))
         name = function._schema.name.removeprefix("aten::")
+        # In-place operations end with an underscore and count as what they compute.
         name = name if name.startswith("_") else name.rstrip("_")
         part = self._inside[-1]
         self.operations[part][name] += 1
@@ -180,6 +182,7 @@ def arithmetic_of(name: str, args: Iterable[Any], result: Tensor) -> int:
 
 def trace(predictor: Predictor, ticks: int, state: State | None = None) -> tuple[Trace, State]:
     """A traced call on `ticks` ticks of zeros from `state` or from reset, and the next state."""
+    # Zeros suffice: the operations of a tick do not depend on its numbers.
     like = next(predictor.parameters())
     x = like.new_zeros(1, ticks, predictor.front.inputs)
     state = predictor.initial_state(1, x) if state is None else state

@@ -45,6 +45,7 @@ def make_target(name: str, options: Mapping[str, object] | None = None) -> Expor
     """
     kind, stated_options = TARGETS[name], dict(options or {})
     option_types = _options(kind)
+    # An option that the target lacks would be dropped silently; a spelling error must not change an export.
     for option in stated_options:
         if option not in option_types:
             has = f"it has {', '.join(option_types)}" if option_types else "it has none"
@@ -73,4 +74,5 @@ def _read(target: str, option: str, value: object, kind: type) -> object:
         raise ConfigError(f"option '{option}' of export target '{target}' is '{value}'; it must be {rule}") from error
 
 
+# Command lines give text only; these are the spellings of TOML, YAML and shells.
 _SWITCH = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}

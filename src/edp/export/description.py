@@ -102,6 +102,7 @@ def golden(predictor: Predictor, window: int) -> dict[str, Any]:
         a tick one behind the other; what it predicts from the last `window` ticks alone, `window` ``(1, number)``; and
         the `tolerance` ``(1, number)``.
     """
+    # At least a window: the window graph is compared on the last one.
     inputs = random_inputs(predictor, max(GOLDEN_TICKS, window), seed=0)
     outputs = stream(predictor, inputs)
     return {
@@ -114,6 +115,7 @@ def golden(predictor: Predictor, window: int) -> dict[str, Any]:
 
 def as_json(content: Mapping[str, Any]) -> bytes:
     """A description as a JSON file."""
+    # NaN is no JSON; a reader in another language would fail on it.
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
@@ -134,6 +136,7 @@ def _for_matlab(value: Any) -> Any:
         return {key: _for_matlab(entry) for key, entry in value.items()}
     if not isinstance(value, list):
         return value
+    # An empty list becomes cells, as a list of texts would.
     if value and all(isinstance(entry, int | float) for entry in value):
         return np.array([value], dtype=float)
     cells = np.empty((1, len(value)), dtype=object)

@@ -19,6 +19,7 @@ LONGEST_NAME = 120
 """Characters of a name in XML, YAML and tables. In octal digits that is a C string of at most 1,920 characters."""
 C_SIGNIFICANT = 63
 """Characters of an identifier that C99 promises to tell apart; also the longest name of MATLAB."""
+# A name must not be empty in any language.
 UNNAMED = "unnamed"
 """Stands for an empty name."""
 
@@ -64,6 +65,7 @@ def visible(text: object, most: int = LONGEST_TEXT) -> str:
     a blank become ``\uXXXX``; what is longer than `most` characters ends in ``...``.
     """
     whole = str(text)
+    # The cut keeps the whole line within the limit, ellipsis included.
     cut = whole if len(whole) <= most else f"{whole[: most - 3]}..."
     return cut if cut.isprintable() else "".join(c if c.isprintable() else _code_point(c) for c in cut)
 
@@ -75,6 +77,7 @@ def _code_point(character: str) -> str:
 
 def c_comment(text: object) -> Code:
     """Text within ``/* */``: no end or beginning of a comment, no trigraph, and no backslash at its end."""
+    # Twice: a run of three question marks leaves a pair after the first replacement. Trigraphs begin with two.
     plain = visible(text).replace("??", "? ?").replace("??", "? ?").replace("*/", "* /").replace("/*", "/ *")
     return Code(plain + " " if plain.endswith("\\") else plain)
 
@@ -85,6 +88,7 @@ def c_string(text: object) -> Code:
     A lone surrogate, which has no UTF-8, becomes a question mark.
     """
     data = str(text).encode("utf-8", "replace")
+    # Octal digits end after three; hexadecimal ones would swallow the letters that follow.
     plain = (chr(b) if 32 <= b < 127 and chr(b) not in '"\\?' else f"\\{b:03o}" for b in data)
     return Code(f'"{"".join(plain)}"')
 
@@ -96,11 +100,13 @@ def matlab_comment(text: object) -> Code:
 
 def matlab_string(text: object) -> Code:
     r"""A literal of MATLAB in single quotes; control characters become ``\uXXXX``."""
+    # MATLAB ends a string with one quote and writes it with two.
     return Code("'" + visible(text, 10 * LONGEST_TEXT).replace("'", "''") + "'")
 
 
 def python_literal(text: object) -> Code:
     """A literal of Python in ASCII."""
+    # `ascii` escapes every character that could end the literal.
     return Code(ascii(str(text)))
 
 
@@ -111,6 +117,7 @@ def xml_text(text: object) -> Code:
 
 def yaml_scalar(text: object) -> Code:
     """A scalar of YAML in double quotes and ASCII, read back as it was; a lone surrogate becomes U+FFFD."""
+    # YAML readers refuse lone surrogates.
     whole = str(text).encode("utf-16", "surrogatepass").decode("utf-16", "replace")
     return Code('"' + "".join(c if " " <= c <= "~" and c not in '"\\' else _yaml_point(c) for c in whole) + '"')
 
@@ -123,6 +130,7 @@ def markdown_text(text: object) -> Code:
     """Text within a line or a cell of a table of Markdown: no markup, no HTML, no link, no end of the cell."""
     plain = re.sub(r"[\\`*\[\]|~$#!]|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", visible(text))
     plain = plain.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    # A bare address becomes a link in many readers.
     return Code(plain.replace("://", ":\\//").replace("www.", "www\\."))
 
 
@@ -163,6 +171,7 @@ def distinct(names: Iterable[str], most: int) -> list[str]:
             number += 1
         tried[name] = number + 1
         used_names.add(candidate)
+        # The number of the next trial is remembered: thousands of equal names take linear time.
         distinct_names.append(candidate)
     return distinct_names
 
@@ -186,6 +195,7 @@ def fill(template: str, values: Mapping[str, object]) -> Code:
         if not isinstance(value, Code | int | float) and not _HARMLESS(str(value)):
             raise ExportError(
                 f"the value of '{name}' is {visible(ascii(value), LONGEST_NAME)}, which is not escaped for the file it "
+                # Refusal is the last line of defence: text of a bundle's author must not become code.
                 "goes into; nothing was written. Export another bundle, and report this one"
             )
     return Code(Template(template).substitute(values))

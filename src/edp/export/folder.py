@@ -43,15 +43,19 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
     """
     path = make_folder(folder)
     with _held(path):
+        # The hash is of the content in memory, not of what a full disk made of it.
         new = {file: {hashlib.sha256(data).hexdigest()} for file, data in files.items()}
         old = _listed(path / LIST), _listed(path / UNFINISHED)
         every: Listed = {}
         for part in (*old, new):
             for file, digests in part.items():
                 every[file] = every.get(file, set()) | digests
+        # Only files that an export wrote, and that nobody changed, are removed.
         stale = [file for file in every if file not in new and _ours(path, file, every[file])]
+        # Checked before anything is written: a link in the folder could lead anywhere.
         for parent in {(path / file).parent for file in files} - {path}:
             _check_place(path, parent)
+        # The list of unfinished files lets the next export clean up after a kill.
         write_bytes(path / UNFINISHED, _as_list(every))
         _remove(path / LIST)
         _clean(path, every)
@@ -60,6 +64,7 @@ def write_export(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
         _remove_empty(path, stale)
         for file, data in files.items():
             write_bytes(path / file, data)
+        # The list comes last: its presence says that all files are whole.
         write_bytes(path / LIST, _as_list(new))
         _remove(path / UNFINISHED)
     return [path / file for file in files]
@@ -89,11 +94,13 @@ def _listed(path: Path) -> Listed:
     try:
         if path.is_symlink() or not path.is_file() or path.stat().st_size > LONGEST_LIST:
             return listed
+        # Characters beyond ASCII cannot match the form of a line, so they need not be an error.
         lines = path.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError as error:
         raise storage_error(path, error, "read") from error
     for match in filter(None, map(_LINE.fullmatch, lines)):
         parts = PurePosixPath(match[2]).parts
+        # A list is data from the folder: a path out of it must not be followed.
         if not match[2].startswith("/") and ".." not in parts:
             listed.setdefault("/".join(parts), set()).add(match[1])
     return listed
@@ -156,6 +163,7 @@ def _clean(path: Path, every: Mapping[str, object]) -> None:
 
 def _remove_empty(path: Path, stale: list[str]) -> None:
     """Remove folders that hold nothing any more."""
+    # In reverse order, inner folders come before outer ones.
     for folder in sorted({(path / file).parent for file in stale} - {path}, reverse=True):
         with contextlib.suppress(OSError):  # not empty
             folder.rmdir()

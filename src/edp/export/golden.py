@@ -29,6 +29,7 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     exact = stream(copy.deepcopy(predictor).double(), inputs)
     sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
     widths = np.tile(sigma, outputs.shape[1] // len(sigma))
+    # Where PyTorch in single precision is itself far from double precision, no other form can be asked for more.
     own = np.abs(outputs - exact).max(axis=0)
     result: Rows = np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
     return result
@@ -37,11 +38,13 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
 def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:
     """Smooth random inputs ``(tick, input)`` in the usual range of each channel, SI units."""
     centre, spread = usual_range(predictor)
+    # A private generator: an export draws nothing from the caller's.
     rng = np.random.default_rng(seed)
     noise = rng.normal(size=(ticks, len(centre)))
     value = rng.normal(size=len(centre))
     rows = []
     for kick in noise:
+        # A first-order process with near unit variance: signals of machines do not jump like white noise.
         value = 0.9 * value + 0.4 * kick
         rows.append(centre + spread * value)
     return np.asarray(rows, dtype=np.float32)

@@ -17,6 +17,7 @@ def model_hash(graph: Graph) -> str:
     state = hashlib.blake2b(digest_size=16)
     for layer in graph.layers:
         arrays = layer.tensors()
+        # Arrays are hashed by their bytes, everything else by its text: `repr` of an array is cut off.
         rest = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in arrays}
         state.update(repr((type(layer).__name__, rest)).encode())
         for name, values in arrays.items():
@@ -30,6 +31,7 @@ def scale_hash(predictor: Predictor) -> str:
     """Content address of the scaling between SI units and the network's numbers."""
     state = hashlib.blake2b(digest_size=16)
     for part in (predictor.front.offset, predictor.front.width, predictor.code.offset, predictor.code.width):
+        # Little-endian on every machine, so that hashes compare.
         state.update(part.detach().cpu().float().numpy().astype("<f4").tobytes())
     return state.hexdigest()
 

@@ -23,6 +23,7 @@ def check_numbers(bundle: Bundle) -> None:
     rate, horizons, coverages = bundle.task.rate_hz, bundle.task.horizons, bundle.predictor.output.coverages
     if not (isinstance(rate, int | float) and math.isfinite(rate) and 1e-6 <= rate <= 1e6):
         raise ExportError(f"the rate of the network is {rate!r} Hz; it must be a number from 1e-6 to 1e6: train again")
+    # Horizon 0 is the present; it is exported like the others.
     if not all(isinstance(k, int) and 0 <= k <= LARGEST for k in horizons):
         raise ExportError(f"a horizon of the network is {max(horizons)!r} ticks; at most {LARGEST:,} can be exported")
     if not all(isinstance(share, float) and 0.0 < share < 1.0 for share in coverages):

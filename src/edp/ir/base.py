@@ -27,6 +27,7 @@ class Number(StrEnum):
     @property
     def bytes(self) -> int:
         """Of one number."""
+        # Only activations are 16-bit; single precision and 32-bit states take four bytes.
         return 2 if self is Number.INT16 else 4
 
 
@@ -137,6 +138,7 @@ class Graph:
 
     def start(self, layer: str, slot: Slot) -> NDArray[Any]:
         """Values of a slot after a reset."""
+        # Slots without a learned start take their fill, so that graphs list only what differs.
         return self.initial.get((layer, slot.name), np.full(slot.shape, slot.fill, dtype=np.float32))
 
     @property

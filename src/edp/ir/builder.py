@@ -21,7 +21,9 @@ def constant(values: Any) -> Array:
         ExportError: one of them is not finite.
     """
     plain = values.detach().cpu().numpy() if hasattr(values, "detach") else values
+    # A copy in C order: a graph must not change when training goes on with the same tensors.
     array = np.array(plain, dtype=np.float32, order="C")
+    # A weight that is not finite would make every prediction NaN on the controller, long after the export.
     if not np.isfinite(array).all():
         raise ExportError("a weight of the network is NaN or infinite; train again before exporting")
     return array
@@ -59,6 +61,7 @@ class Builder:
         layer_names = {layer.name for layer in self.layers}
         if full in layer_names or full == INPUT:
             full = next(f"{full}_{n}" for n in range(2, len(layer_names) + 3) if f"{full}_{n}" not in layer_names)
+        # Options with a shape are arrays or tensors; plain numbers and tuples are part of the layer's meaning.
         layer_options = {key: constant(value) if hasattr(value, "shape") else value for key, value in options.items()}
         self.layers.append(kind(name=full, inputs=inputs, **layer_options))
         return full
@@ -66,6 +69,7 @@ class Builder:
     def pick(self, name: str, x: str, columns: Sequence[int]) -> str:
         """Chosen numbers of a value; the value itself where they are all of it in order."""
         chosen = tuple(columns)
+        # A gather that moves nothing would cost a copy a tick in the exported code.
         if chosen == tuple(range(self.width(x))):
             return x
         return self.add(Gather, name, x, columns=chosen)
@@ -98,9 +102,11 @@ class Builder:
         used_layers: list[Layer] = []
         used_values = set(results.values())
         for layer in reversed(self.layers):
+            # Layers of width zero act on what others remember, so nobody reads their value and they must stay.
             if layer.name in used_values or not layer.width:
                 used_layers.append(layer)
                 used_values |= set(layer.inputs)
+        # Copies of the layers: the builder may go on with its own.
         return Graph(
             self.inputs, tuple(replace(layer) for layer in reversed(used_layers)), results, self._initial, window
         )

@@ -41,6 +41,7 @@ class Gather(Layer):
 
 def runs(columns: Sequence[int], widths: Sequence[int]) -> list[tuple[int, int, int]]:
     """Runs of neighbouring columns of inputs that are laid end to end: which input, its first column, how many."""
+    # A run becomes one copy in C and one split in ONNX; single columns would be a table.
     origin = [(which, column) for which, width in enumerate(widths) for column in range(width)]
     column_runs: list[tuple[int, int, int]] = []
     for column in columns:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from edp.ir.base import Array, Layer, Slot
 
+# Finite on purpose: minus infinity would give NaN where all scores of a row are hidden.
 UNSEEN = -1e30
 """Score of a tick before the reset: no softmax notices it."""
 
@@ -67,6 +68,7 @@ class Convolution(Layer):
     @property
     def slots(self) -> tuple[Slot, ...]:
         _, taps, into = self.weight.shape
+        # A kernel of one tap has no past; an empty array has no form in C.
         return (Slot("ring", ((taps - 1) * self.dilation, into)),) if taps > 1 else ()
 
     @property

@@ -26,6 +26,7 @@ class Reference:
         dtype: float64 shows what the graph means, float32 what single precision makes of it.
     """
 
+    # Double precision by default: the reference judges single-precision forms, so its own rounding must not show.
     def __init__(self, graph: Graph, dtype: type[np.floating] = np.float64) -> None:
         self.graph, self.dtype = graph, dtype
         self._constants = {
@@ -90,17 +91,20 @@ def _step(kind: type[Layer]) -> Callable[[Step], Step]:
 
 def sigmoid(x: Values) -> Values:
     """``1 / (1 + exp(-x))`` without overflow."""
+    # exp of a negative number cannot overflow; the two branches are the same function.
     small = np.exp(-np.abs(x))
     return np.where(x >= 0, 1 / (1 + small), small / (1 + small))
 
 
 def softmax(x: Values) -> Values:
     """Weights that sum to 1 over the last axis."""
+    # Subtracting the largest score keeps exp below one; the weights do not change.
     raised = np.exp(x - x.max(axis=-1, keepdims=True))
     return np.asarray(raised / raised.sum(axis=-1, keepdims=True))
 
 
 def _gelu(x: Values) -> Values:
+    # NumPy has no error function; `math.erf` is exact to double precision.
     erf = np.array([math.erf(float(v) / math.sqrt(2)) for v in x], dtype=x.dtype)
     return np.asarray(x * (1 + erf) / 2)
 
@@ -110,6 +114,7 @@ FUNCTIONS: Mapping[plain.Function, Callable[[Values], Values]] = {
     plain.Function.SIGMOID: sigmoid,
     plain.Function.TANH: np.tanh,
     plain.Function.GELU: _gelu,
+    # `logaddexp` neither overflows for large x nor loses digits for small ones.
     plain.Function.SOFTPLUS: lambda x: np.logaddexp(x, np.zeros_like(x)),
     plain.Function.EXP: np.exp,
     plain.Function.SQRT: np.sqrt,
@@ -211,6 +216,7 @@ def _rows(layer: plain.RowAttention, w: Weights, m: Memory, *qkv: Values) -> Val
 
 @_step(memory.Difference)
 def _difference(layer: memory.Difference, w: Weights, m: Memory, x: Values) -> Values:
+    # At the first tick there is no past: the change is zero, not a jump from zero.
     before = m["before"] if layer.from_zero or m["age"][0] > 0 else x
     m["before"], m["age"] = x, np.ones_like(m["age"])
     return np.asarray(w["factor"] * (x - before))
@@ -238,6 +244,7 @@ def _lstm_states(gates: Values, m: Memory, share: float, squash: Callable[[Value
     fresh = sigmoid(f) * m["c"] + sigmoid(i) * np.tanh(g)
     out = sigmoid(o) * np.tanh(squash(fresh))
     dtype_share = gates.dtype.type(share)
+    # Old value plus a share of the change, in the order of the C code.
     m["h"], m["c"] = m["h"] + dtype_share * (out - m["h"]), m["c"] + dtype_share * (fresh - m["c"])
     return m["h"]
 
@@ -261,6 +268,7 @@ def _gru(layer: memory.Gru, w: Weights, m: Memory, x: Values) -> Values:
     back = np.split(w["weight_h"] @ m["h"] + w["bias_h"], 3)
     r, z = sigmoid(into[0] + back[0]), sigmoid(into[1] + back[1])
     n = np.tanh(into[2] + r * back[2])
+    # One product less than z h + (1 - z) n.
     m["h"] = n + z * (m["h"] - n)
     return m["h"]
 
@@ -299,6 +307,7 @@ def _window_attention(layer: memory.WindowAttention, w: Weights, m: Memory, *qkv
     q, k, v = qkv
     keys, values = np.concatenate([m["keys"], k[None]]), np.concatenate([m["values"], v[None]])
     m["keys"], m["values"], m["age"] = keys[1:], values[1:], np.minimum(m["age"] + 1, layer.window)
+    # Only ticks since the reset take part; the rest of the ring holds zeros.
     seen, heads = int(m["age"][0]), layer.heads
     ks, vs = (x[-seen:].reshape(seen, heads, -1) for x in (keys, values))
     scores = np.einsum("hd,shd->hs", q.reshape(heads, -1), ks) / q.dtype.type(math.sqrt(layer.size / heads))

@@ -80,6 +80,7 @@ class Baseline(ABC):
             raise ConfigError(f"{type(self).__name__} has not been fitted; call fit before predict")
         self._check_columns(series, self._inputs)
         shape = (series.samples, len(self.task.horizons), len(self.task.present))
+        # NaN marks ticks without a full history; the judge then leaves them out for all models.
         prediction = np.full(shape, np.nan, dtype=np.float32)
         first = self.task.history - 1
         if series.samples > first:
@@ -111,6 +112,7 @@ class Baseline(ABC):
 
 def _check_finite(name: str, what: str, values: FloatArray) -> None:
     """Refuse NaN and infinity; min and max carry both without a mask of the array's size."""
+    # Extremes of the array are finite exactly if all entries are: NaN and infinity pass through both.
     if values.size == 0 or (np.isfinite(values.min()) and np.isfinite(values.max())):
         return
     row, column = np.argwhere(~np.isfinite(values))[0]

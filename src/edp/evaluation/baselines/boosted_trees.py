@@ -50,10 +50,12 @@ class BoostedTrees(Baseline):
         from sklearn.ensemble import HistGradientBoostingRegressor
 
         model = HistGradientBoostingRegressor(
+            # A common setting of boosted trees; the number of trees alone is chosen, on validation.
             learning_rate=0.1,
             max_iter=self._trees,
             max_leaf_nodes=31,
             l2_regularization=1.0,
+            # Early stopping of the library splits off random rows, which lie between training rows of the same drive.
             early_stopping=False,
             random_state=self.task.seed,
         )
@@ -61,6 +63,7 @@ class BoostedTrees(Baseline):
         if not held_out.rows:
             return model, model.n_iter_
         truth = held_out.changes[:, output]
+        # One growth gives the error after every tree; the best number of them costs no further fit.
         losses = [np.mean((stage - truth) ** 2) for stage in model.staged_predict(held_out.features)]
         return model, int(np.argmin(losses)) + 1
 
@@ -71,6 +74,7 @@ class BoostedTrees(Baseline):
         columns = []
         for model, trees in self._models:
             change = np.zeros(len(features))
+            # `staged_predict` gives sums up to a tree; the last one taken is the prediction.
             for stage in islice(model.staged_predict(features), trees):
                 change = stage
             columns.append(change)

@@ -16,6 +16,7 @@ from edp.recording import FloatArray
 LAGS = (0, 1, 2, 4, 8, 16, 32)
 """Ticks back at which inputs are read: dense where a 100 Hz plant changes, sparse further back."""
 
+# Blocks bound the memory of the lag table, several times as wide as the inputs.
 BLOCK_ROWS = 16_384
 
 
@@ -51,6 +52,7 @@ def lag_features(inputs: FloatArray, ticks: NDArray[np.int64], history: int) -> 
         float32 ``(row, lag * input)``, lag-major.
     """
     now = inputs[ticks]
+    # Changes instead of past values: neighbouring samples are nearly equal, and trees split one feature at a time.
     parts = [now if lag == 0 else now - inputs[ticks - lag] for lag in LAGS if lag < history]
     return np.concatenate(parts, axis=1)
 
@@ -60,6 +62,7 @@ def sample_table(series: Sequence[Series], task: BaselineTask, means: DoubleArra
     lengths = np.array([len(origins(one, task)) for one in series], dtype=np.int64)
     total = int(lengths.sum())
     chosen = np.arange(total)
+    # Sorted, so that rows keep the order of their recording; without replacement, so that none counts twice.
     if total > cap:
         chosen = np.sort(np.random.default_rng(task.seed).choice(total, size=cap, replace=False))
     ends = np.cumsum(lengths)

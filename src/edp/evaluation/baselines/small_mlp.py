@@ -74,6 +74,7 @@ class SmallMlp(Baseline):
                 best_weights = [array.copy() for array in (*self._model.coefs_, *self._model.intercepts_)]
                 continue
             waited += 1
+            # Epochs are noisy; a few without gain end the training.
             if waited >= self._patience:
                 break
         if best_weights is not None:
@@ -95,7 +96,9 @@ class SmallMlp(Baseline):
 
 def _standard(values: FloatArray | DoubleArray) -> tuple[DoubleArray, DoubleArray]:
     """Mean and deviation of each column; a column that does not vary gets deviation one."""
+    # Double precision: the mean of pressures of 1e7 Pa in float32 has no digits left for their spread.
     centre = values.mean(axis=0, dtype=np.float64)
     scale = values.std(axis=0, dtype=np.float64)
+    # The threshold is relative: rounding alone gives a constant column a spread above zero.
     still = scale <= 1e-7 * np.maximum(np.abs(centre), 1e-30)
     return centre, np.where(still, 1.0, scale)

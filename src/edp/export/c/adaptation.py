@@ -44,6 +44,7 @@ def values(adaptation: Adaptation, upper: str, intervals: int) -> dict[str, obje
     rows = [f"    float rows_{k}[{k * row}];" for k in adaptation.horizons]
     return {
         "adaptation_digest": adaptation.digest,
+        # The lowest bit makes the marker odd: cleared memory, all zeros, never passes for a state that was reset.
         "adapt_marker": int(adaptation.digest[:8], 16) | 1,
         "ahead": ", ".join(map(str, adaptation.horizons)),
         "adapt_ahead": ", ".join(f"{k}u" for k in adaptation.horizons),
@@ -82,6 +83,7 @@ def constants(adaptation: Adaptation) -> list[CConstant]:
 
 def _intervals(upper: str) -> Code:
     """Bounds of intervals move with the prediction."""
+    # Bounds move with the prediction, so that the interval keeps its width.
     lines = [f"for (uint32_t i = 0; i < {upper}_INTERVALS; i++) {{"]
     for bound in ("lower", "upper"):
         lines.append(f"    adapted->{bound}[i][h][j] = out->{bound}[i][h][j] + correction[j];")

@@ -93,6 +93,7 @@ def needs_columns(calls: Calls, layer: Layer) -> bool:
     """Whether a layer's columns are written as a table."""
     if not isinstance(layer, layers.Gather | WGather):
         return False
+    # Columns of several inputs have no common address, so a table cannot reach them.
     return len(layer.inputs) == 1 and len(runs(calls, layer)) > MOST_COPIES
 
 
@@ -114,6 +115,7 @@ def _difference(calls: Calls, layer: memory.Difference) -> list[str]:
 
 def _convolution(calls: Calls, layer: memory.Convolution) -> list[str]:
     out, taps, into = layer.weight.shape
+    # A kernel of one tap is a dense layer, and needs neither ring nor counter.
     if taps == 1:
         return calls.simple(layer, "edp_dense", 1, out, into)
     sizes = (out, taps, into, layer.dilation)
@@ -194,6 +196,7 @@ CALLS: dict[type[Layer], Write] = {
     layers.LayerNorm: _norm,
     layers.RowAttention: lambda c, x: c.simple(x, "edp_row_attention", x.rows, x.size, c.scratch(x)),
     memory.Difference: _difference,
+    # The correction is added behind a condition, since the runtime says when the prefix has ended.
     memory.Starting: lambda c, x: c.simple(x, "edp_starting", len(x.mean), x.ticks, ring(x)),
     memory.Convolution: _convolution,
     memory.Lstm: _lstm,

@@ -71,9 +71,10 @@ class CConstant:
         """What it takes on a machine, up to the next constant."""
         if self.kind in STRUCTS:
             pointers, numbers = STRUCTS[self.kind]
+            # A struct is as aligned as its pointers.
             each = _up_to(pointers * machine.pointer + 4 * numbers, machine.pointer)
         else:
-            each = NUMBER_BYTES[self.kind]
+            each = NUMBER_BYTES[self.kind]  # scalars and arrays
         return _up_to(self.count * each, machine.boundary)
 
 
@@ -95,15 +96,18 @@ def constants_of(graph: Graph, plan: MemoryPlan, written: bool = False) -> Itera
         for name, values in layer.tensors().items():
             yield _tensor(layer, name, values, written)
         if needs_columns(calls, layer):
+            # 16-bit columns: half of the flash of a table of words.
             columns, name = layer.columns, constant(layer, "columns")  # type: ignore[attr-defined]
             text = array("uint16_t", name, (f"{column}u" for column in columns)) if written else ""
             yield CConstant("uint16_t", name, len(columns), text)
         for line in structs(layer) + integer_calls.structs(layer):
+            # The declaration is the single source of the name; counting reads it back instead of naming it twice.
             _, _, kind, name, *_ = line.split()  # static const KIND NAME = ...
             yield CConstant(kind, name, 1, line)
     for (layer_name, part), values in graph.initial.items():
         start = slot(layer_name, part).removeprefix("s->") + "_start"
         yield CConstant(TYPES[values.dtype.name], start, values.size, _array(start, values) if written else "")
+    # The table of tensors exists for the checksum at start-up, so it counts as a constant too.
     yield _tables(graph)
     for name in ("input_low", "input_high"):
         yield CConstant("float", name, graph.inputs)

@@ -38,6 +38,7 @@ def _gather(calls: Calls, x: made.WGather) -> list[str]:
 
 def _sum(calls: Calls, x: made.WSum) -> list[str]:
     a, b = (calls.value(name) for name in x.inputs)
+    # A difference is a sum with a negative factor: one function less in the runtime.
     factors = (str(2 ** x.lefts[0]), str((-1 if x.minus else 1) * 2 ** x.lefts[1]))
     return [call("edp_q_sum", a, b, x.size, *factors, x.right, calls.value(x.name))]
 
@@ -138,6 +139,7 @@ def structs(layer: Layer) -> list[str]:
         members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias')}, {constant(layer, 'bias')}, {layer.share}"
         return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
     if isinstance(layer, made.WGru):
+        # A GRU has no zoneout; 32768 is 1 in 2^-15.
         members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias_x')}, {constant(layer, 'bias_h')}, 32768"
         return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
     return []
@@ -148,6 +150,7 @@ def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
     if values.dtype != np.int8 or values.ndim < 2:
         return values
     if isinstance(layer, made.WConvolution):
+        # Taps first: the runtime multiplies one tick of the ring after the other.
         values = values.transpose(1, 0, 2)
     matrices = values.reshape(-1, *values.shape[-2:])
     return np.concatenate([_in_order(matrix) for matrix in matrices])
@@ -156,10 +159,13 @@ def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
 def _in_order(matrix: NDArray[Any]) -> NDArray[Any]:
     out, into = matrix.shape
     rows, columns = out - out % 4, into - into % 4
+    # Pairs of products: the order in which the Cortex-M4's SIMD instruction reads bytes after widening
+    # (docs/findings.md).
     groups = matrix[:rows, :columns].reshape(rows // 4, 4, columns // 4, 4)[..., [0, 2, 1, 3]]
     parts = []
     for block, group in enumerate(groups):
         parts.append(group.transpose(1, 0, 2).ravel())
+        # Columns left over follow their block, so that a block stays one stretch of memory.
         parts.append(matrix[4 * block : 4 * block + 4, columns:].T.ravel())
     return np.concatenate([*parts, matrix[rows:].ravel()])
 

@@ -103,6 +103,7 @@ class Model:
             "version": __version__,
             "model_hash": model_hash(self.graph),
             "scale_hash": scale_hash(predictor),
+            # Odd for the same reason: zeroed memory must not look like a state that was reset.
             "marker": int(model_hash(self.graph)[:8], 16) | 1,
             "crc": crc(self.graph),
             "inputs": self.graph.inputs,
@@ -145,6 +146,7 @@ class Model:
 
     def _enums(self) -> dict[str, str]:
         task, upper = self.bundle.task, self.name.upper()
+        # Names must differ within the 63 characters that C99 compares.
         most = C_SIGNIFICANT - len(f"{upper}_OUT_")
         inputs = [
             (f"{upper}_IN_{name} = {i},", f"{channel.unit}; {channel.description}")
@@ -175,6 +177,7 @@ class Model:
         }
 
     def _tangent(self, changes: MemoryPlan) -> dict[str, object]:
+        # Ages are counts, through which nothing is differentiated.
         parts = [(layer, part) for layer, part in self.graph.slots() if part.name != "age"]
         calls, work = tangents.Tangents(self.graph, self.plan, changes), changes.sizes[Number.FLOAT]
         lines = [line for layer in self.graph.layers for line in ("", describe(layer), *calls.of(layer))]
@@ -204,6 +207,7 @@ class Model:
         slots = sum(max(1, part.size) * part.number.bytes for _, part in self.graph.slots() if part.name != "age")
         rings = sum(has_ring(layer) for layer in self.graph.layers)
         work = sum(size * kind.bytes for kind, size in self.plan.sizes.items())
+        # Seven words: counters, marker, age and holding; rings have a place and a count.
         return 4 * (7 + self.whole + self.graph.inputs + 2 * rings) + slots + work
 
     def _code(self) -> dict[str, str]:
@@ -223,6 +227,7 @@ def remembered(graph: Graph) -> tuple[list[str], list[str]]:
         for part in layer.slots:
             if part.name == "age":
                 continue
+            # C has no array without elements.
             where, size = slot(layer, part.name), max(1, part.size)
             field = where.removeprefix("s->")
             declared.append(f"{STATES[part.number]} {field}[{size}];")
@@ -252,6 +257,7 @@ def computed(graph: Graph, plan: MemoryPlan) -> tuple[list[str], list[str]]:
     for meaning, value in graph.results.items():
         size, at = graph.width_of(value), calls.value(value)
         first = f"edp_all_finite({at}, {size}u)"
+        # The check of each result comes first in `&&`, so that every one of them is looked at.
         checks.append(f"finite = {first} && finite;" if checks else f"bool finite = {first};")
         zero = "[0][0]" if meaning == "prediction" else "[0][0][0]"
         copies.append(f"    edp_copy({at}, {size}u, &out->{meaning}{zero});")
@@ -296,6 +302,7 @@ def _check(model: Model) -> None:
     """
     graph, law = model.graph, model.bundle.adaptation
     check_numbers(model.bundle)
+    # Windows and ticks are 32-bit counts in C.
     layers = {f"ticks that '{x.name}' remembers": getattr(x, "window", getattr(x, "ticks", 0)) for x in graph.layers}
     constants = sum(values.nbytes for _, _, values in graph.tensors())
     check_sizes({"window": graph.window, "bytes of constants": constants, "bytes of the state": model.state_bytes()})

@@ -27,6 +27,7 @@ class MemoryPlan:
 
 def scratch_of(layer: Layer) -> int:
     """Numbers that a layer's C function needs while it runs."""
+    # Four gates; the layer norm keeps the sums of both sides apart, the GRU those of its two products.
     if isinstance(layer, memory.Lstm):
         return 4 * layer.width
     if isinstance(layer, memory.LayerNormLstm):
@@ -68,12 +69,14 @@ def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Memor
         scratch_of: scratch numbers that a layer needs beside its value.
     """
     last = {name: at for at, layer in enumerate(graph.layers) for name in layer.inputs}
+    # Results are read after the last layer, when they are copied out.
     last |= dict.fromkeys(graph.results.values(), len(graph.layers))
     busy: list[tuple[Number, int, int, int]] = []  # start, stop, the layer after which it is free
     values: dict[str, int] = {}
     scratch: dict[str, int] = {}
     sizes: dict[Number, int] = {}
     for at, layer in enumerate(graph.layers):
+        # A value may be overwritten by the layer after its last reader, never by that reader itself.
         busy = [block for block in busy if block[3] >= at]
         for places, wide, until, number in (
             (values, layer.width, last.get(layer.name, at), layer.number),
@@ -81,6 +84,7 @@ def plan(graph: Graph, scratch_of: Callable[[Layer], int] = scratch_of) -> Memor
         ):
             if not wide:
                 continue
+            # The first gap that fits: equal networks get equal plans.
             start = _gap(sorted((first, stop) for kind, first, stop, _ in busy if kind is number), wide)
             busy.append((number, start, start + wide, until))
             places[layer.name] = start

@@ -19,6 +19,7 @@ IN_REGISTERS = 4
 """Arguments of a call that are handed over in registers; those behind them go over the stack."""
 CALL = re.compile(r"\b(edp_\w+)\(([^()]*)\)")
 FLOAT = re.compile(r"-?[0-9.][0-9.e+-]*f")
+# A linear fit; docs/findings.md has its error, 1.3 % at most over 187 networks.
 OWN, EACH_CALL, ON_STACK, WIDE = 593.0, 14.6, 5.4, 9.7
 """Bytes of Thumb-2 code (GCC 12, -O2): of every model, a call, an argument on the stack, a number above 255."""
 MOST_COPIED = 64
@@ -39,6 +40,7 @@ def features(statements: Iterable[str]) -> tuple[int, int, int]:
         ]  # floats have registers of their own
         calls += 1
         on_stack += max(0, len(others) - IN_REGISTERS)
+        # Immediates above 255 take a second instruction in Thumb-2.
         wide += sum(argument.rstrip("u").isdigit() and int(argument.rstrip("u")) > 255 for argument in others)
     return calls, on_stack, wide
 
@@ -57,6 +59,7 @@ def called(statements: Iterable[str]) -> set[str]:
 def runtime_bytes(functions: Iterable[str]) -> int:
     """Functions of the runtime, with the functions, tables and parts of the C library that they need."""
     sizes, needs = _measured()
+    # A set: functions share what they need, and the linker takes it once.
     every = {symbol for function in functions for symbol in needs[function]}
     return sum(sizes[symbol] for symbol in every)
 

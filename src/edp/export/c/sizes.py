@@ -62,6 +62,7 @@ def program_bytes(graph: Graph, adaptation: Adaptation | None = None) -> int:
     compute, finish = computed(graph, places)
     statements = [*compute, *finish, *remembered(graph)[1]]
     functions = {*FIXED, *called(statements), *called(cleared_work(places))}
+    # The output is copied as a struct; beyond `MOST_COPIED` the compiler calls `memcpy`.
     copied = 4 * sum(map(graph.width_of, graph.results.values()))
     own = own_bytes(statements)
     if adaptation is not None:

@@ -21,6 +21,7 @@ def tangent_scratch_of(layer: Layer) -> int:
     if isinstance(layer, layers.Activate):
         return layer.size
     if isinstance(layer, memory.Lstm | memory.LayerNormLstm | memory.Gru):
+        # The old state is kept beside the scratch: the cell's tangent reads what the layer overwrites.
         return scratch_of(layer) + layer.width
     return scratch_of(layer)
 
@@ -71,6 +72,7 @@ class Tangents:
 
     def before(self, layer: Layer, function: str, *arguments: object) -> list[str]:
         """A tangent and then the layer; directions and the change of its value close the arguments."""
+        # Tangents come first: they read states that the layer itself brings on.
         return [call(function, *arguments, "d", self.change(layer.name)), *self.calls.of(layer)]
 
 
@@ -176,6 +178,7 @@ def _lstm(t: Tangents, layer: memory.Lstm | memory.LayerNormLstm) -> list[str]:
     else:
         inputs = (*t.changes(layer), states[0], weights, into, units)
         first = call("edp_lstm_gates_tangent", *inputs, "d", dgates)
+    # The LSTM overwrites its cell, whose old value the tangent still needs.
     copied_state = call("edp_copy", slot(layer, "c"), units, old)
     rest = (gates, units, number(layer.share), norms, old, dgates, *states)
     return [first, copied_state, *t.calls.of(layer), call("edp_lstm_cell_tangent", *rest, "d", t.change(layer.name))]

@@ -18,6 +18,7 @@ from edp.export.folder import write_export
 from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
 from edp.training.bundle import Bundle
 
+# A header of these names in the include path would hide the system's.
 _HEADERS = """
 assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic stdbool
 stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar unistd wchar wctype
@@ -82,6 +83,7 @@ def check_name(name: str) -> None:
     Raises:
         ExportError: it cannot.
     """
+    # 31 characters and a prefix stay within the 63 that C99 compares; lower case for file systems without case.
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in RESERVED or name.startswith("edp_"):
         raise ExportError(
             f"name '{visible(name, LONGEST_NAME)}' is the prefix of C functions and files: up to 31 lower-case "
@@ -93,6 +95,7 @@ def check_name(name: str) -> None:
 def golden(model: Model) -> str:
     """Inputs, and what PyTorch makes of them, as a header for the test on a computer."""
     predictor = model.bundle.predictor
+    # A fixed seed: the same network gives the same file, byte by byte.
     inputs = random_inputs(predictor, GOLDEN_TICKS, seed=0)
     outputs = stream(predictor, inputs)
     allowed = tolerance(predictor, inputs, outputs)

@@ -26,9 +26,11 @@ def number(value: float | np.floating) -> str:
         ExportError: NaN, or no float32, for which C has no literal.
     """
     with np.errstate(over="ignore"):
+        # Nine significant digits give every float32 back to the bit.
         text = f"{np.float32(value):.9g}"
     if text.lstrip("-") in ("inf", "nan"):
         raise ExportError(f"a constant of the network is {value}, which is no float32 number; train it again")
+    # A literal without `f` is a double: the compiler would compute in software on a controller.
     return text + ("f" if any(c in text for c in ".e") else ".0f")
 
 

@@ -23,10 +23,12 @@ def blanks(graph: Graph, name: str) -> dict[str, object]:
         load += _load_count(graph, graph.layer(layer), layer_states)
         for state in layer_states:
             if state.slot.name == "age":
+                # CasADi's numbers are doubles; a count up to 2^31 is exact in them.
                 store.append(f"x[{state.at}] = (double)s->{identifier(layer)}_ring_at.seen;")
                 store_change.append(f"x[{state.at}] = 0.0;")
                 continue
             for lines, who, fill in ((load, "s", None), (load_change, "t", None)):
+                # The ring of the C code begins anywhere; CasADi's column has the oldest tick first.
                 lines.append(_moved(graph, state, "load", who, fill))
             store.append(_moved(graph, state, "store", "s", number(UNSEEN if state.slot.name == "scores" else 0.0)))
             store_change.append(_moved(graph, state, "store", "t", "0.0f"))
@@ -68,6 +70,7 @@ def _load_count(graph: Graph, layer: Layer, layer_states: list[Place]) -> list[s
     elif scores:
         lines.append(f"{where}.seen = scored(x + {scores[0].at}, {rows}u);")
     if rings and counts(graph, rings[0]):
+        # A full ring begins at zero again; where it begins is free as long as the order is kept.
         lines.append(f"{where}.at = {where}.seen % {rows}u;")
     return lines
 

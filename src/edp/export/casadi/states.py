@@ -45,6 +45,7 @@ def places(graph: Graph) -> list[Place]:
     """Every slot with numbers. Ages are integers: ticks seen before the present one, as far as they matter."""
     states, at = [], 0
     for layer, slot in graph.slots():
+        # Empty rings have no place in a column.
         if slot.size:
             # Scores are a ring of one number a tick.
             shape = (slot.size, 1) if slot.name == "scores" else slot.shape

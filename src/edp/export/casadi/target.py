@@ -55,6 +55,7 @@ class CasadiTarget:
         check_name(name)
         graph = float_graph(bundle.predictor, "CasADi")
         data, described = arrays(graph), content(Description(name, bundle, graph))
+        # The recording covers a whole window at least, so that every ring has been round once.
         golden_run = golden(bundle.predictor, graph.window)
         model = make_model(name, bundle, tangent=True)
         here = resources.files("edp.export.casadi")
@@ -106,6 +107,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 def packed(data: dict[str, np.ndarray]) -> bytes:
     """Arrays as a file of NumPy; it holds no objects."""
     buffer = io.BytesIO()
+    # Objects in a NumPy file are pickles, which execute code when read.
     np.savez(buffer, allow_pickle=False, **data)
     return buffer.getvalue()
 

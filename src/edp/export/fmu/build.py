@@ -13,6 +13,7 @@ from pathlib import Path
 
 from edp.errors import ExportError
 
+# Products and sums stay apart (`-ffp-contract=off`): equal bits on every processor. No debug paths in the library.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-g0", "-fno-sanitize=all")
 
 
@@ -36,6 +37,7 @@ class Platform:
 
 
 PLATFORMS = {
+    # glibc 2.17 is that of RHEL 7: the library loads on every Linux since.
     "linux64": Platform("x86_64-linux-gnu.2.17", ".so", {2: "linux64", 3: "x86_64-linux"}, ("-fPIC",), ("-lm",)),
     "win64": Platform("x86_64-windows-gnu", ".dll", {2: "win64", 3: "x86_64-windows"}, (), ()),
 }
@@ -75,6 +77,7 @@ def libraries(sources: Sources, platforms: Sequence[str]) -> dict[int, dict[str,
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for file, text in sources.files.items():
+            # Line ends of C sources are those of Unix, whatever the exporting system writes.
             (folder / file).write_text(text, encoding="utf-8", newline="\n")
         for platform in map(PLATFORMS.__getitem__, platforms):
             flags = ("-target", platform.target, *FLAGS, *platform.flags, "-shared", "-s")

@@ -10,12 +10,14 @@ from edp import __version__
 from edp.export.fmu.interface import Variable
 from edp.export.fmu.units import BASES, shown, units_of
 
+# 500 ticks are 5 s at 100 Hz: several windows, and done at once.
 EXPERIMENT_TICKS = 500
 """Length of the simulation that is proposed to an importer."""
 CATEGORIES = {
     "logStatusWarning": "bad or missing inputs, ticks left out",
     "logStatusError": "calls that are refused, with the reason",
 }
+# The flags of an importer that compiles itself must not fuse products and sums either.
 OPTIONS = "-O2 -ffp-contract=off"
 FORMS2 = {"real": "Real", "whole": "Integer", "flag": "Boolean"}
 FORMS3 = {"real": "Float64", "whole": "Int32", "flag": "Boolean"}
@@ -84,9 +86,11 @@ def fmi3(about: About) -> bytes:
     _units(root, about)
     _categories(root)
     _experiment(root, about)
+    # FMI 2.0 counts unknowns from 1, value references from 0.
     listed = ET.SubElement(root, "ModelVariables")
     for reference, entry in enumerate(about.listed):
         ET.SubElement(listed, FORMS3[entry.form], _common(reference, entry) | _numbers(entry))
+    # Time is a variable in FMI 3.0; its name must not be one of the network's channels.
     time = {"name": _time(about), "valueReference": str(len(about.listed)), "causality": "independent"}
     ET.SubElement(listed, "Float64", time | {"variability": "continuous", "unit": "s", "description": "time"})
     structure = ET.SubElement(root, "ModelStructure")
@@ -158,6 +162,7 @@ def _common(reference: int, entry: Variable) -> dict[str, str]:
     if entry.description:
         attributes["description"] = entry.description
     attributes |= {"causality": entry.causality, "variability": "continuous" if entry.form == "real" else "discrete"}
+    # An input has a start value; everything else is calculated.
     return attributes if entry.causality == "input" else attributes | {"initial": "calculated"}
 
 
@@ -168,6 +173,7 @@ def _numbers(entry: Variable) -> dict[str, str]:
     also = shown(entry.kind)
     attributes |= {"displayUnit": also.name} if also is not None else {}
     attributes["nominal"] = repr(entry.nominal)
+    # A start of zero is required of inputs; the unit counts ticks as bad until the importer sets them.
     return attributes | ({"start": "0.0"} if entry.causality == "input" else {})
 
 

@@ -85,6 +85,7 @@ def _predictions(model: Model) -> list[Variable]:
 
 def _nominal(width: float) -> float:
     """A width with three digits; 1 where there is none."""
+    # Three digits: a nominal value is an order of magnitude for the importer's tolerances.
     return float(f"{abs(width):.3g}") or 1.0
 
 

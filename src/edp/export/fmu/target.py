@@ -39,6 +39,7 @@ TANGENT = """
 #define FMU_TANGENT_RESET {0}_tangent_reset
 #define FMU_STEP_TANGENT {0}_step_tangent
 """
+# The earliest date that a ZIP file can hold.
 DATE = (1980, 1, 1, 0, 0, 0)
 """Of every file in an FMU, so that the same network gives the same bytes."""
 
@@ -67,6 +68,7 @@ class FmuTarget:
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
         check_name(name)
+        # A staircase of integers has no derivative.
         tangent = self.derivatives and not isinstance(bundle.predictor, IntegerPredictor)
         model, versions = make_model(name, bundle, tangent), VERSIONS[self.version]
         listed = variables(model)
@@ -78,6 +80,7 @@ class FmuTarget:
         built = libraries(Sources(name, core | plumbing, common, own), BINARIES[self.binaries])
         files = {}
         for version in versions:
+            # Only the plumbing of its own version: two sets of entry points would clash in one library.
             sources = core | {file: plumbing[file] for file in (*COMMON, *OWN[version])}
             content = _files(version, about, sources, Description(name, bundle, model.graph))
             files[f"{name}_fmi{version}.fmu"] = _packed(content | built[version])
@@ -100,7 +103,9 @@ def _about(model: Model, listed: list[Variable], core: Mapping[str, str]) -> Abo
     """What the XML files tell; the token is that of the sources and of the variables."""
     described = Description(model.name, model.bundle, model.graph).content()
     state = hashlib.blake2b(digest_size=16)
+    # Everything that decides behaviour or interface is in the token: another FMU has another one.
     for text in (*core.values(), *_plumbing(*COMMON, *OWN[2], *OWN[3]).values(), repr(listed)):
+        # The zero byte separates texts: two files cannot be shifted into one another.
         state.update(text.encode() + b"\0")
     keys = ("model_hash", "scale_hash", "number_format", "window", "mode")
     facts = {key: str(described[key]) for key in keys}
@@ -134,6 +139,7 @@ def _packed(content: Mapping[str, bytes]) -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for path, data in content.items():
             entry = zipfile.ZipInfo(path, DATE)
+            # Executable rights and Unix origin: without them the libraries cannot be loaded after unpacking on Linux.
             entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o755 << 16
             entry.create_system = 3
             archive.writestr(entry, data)

@@ -24,6 +24,7 @@ Step = Callable[..., tuple[str, dict[str, str]]]
 
 def shape_of(slot: Slot) -> tuple[int, ...]:
     """The shape of a state in the graph: always a matrix."""
+    # A row and not a vector: Gemm takes matrices only.
     return (1, *slot.shape) if len(slot.shape) == 1 else slot.shape
 
 
@@ -38,12 +39,14 @@ def push(nodes: Nodes, ring: str, rows: int, x: str, axis: int = 0) -> tuple[str
 
 def _difference(nodes: Nodes, layer: memory.Difference, state: Held, x: str) -> tuple[str, dict[str, str]]:
     change = nodes.times(nodes.less(x, state["before"]), layer.factor)
+    # At the first tick `age` is 0, which takes the change out; a condition has no place in the graph.
     if not layer.from_zero:
         change = nodes.add("Mul", change, state["age"])
     return change, {"before": x, "age": nodes.clip(nodes.plus(state["age"], np.float32(1)), 0, 1)}
 
 
 def _starting(nodes: Nodes, layer: memory.Starting, state: Held, x: str) -> tuple[str, dict[str, str]]:
+    # Clipping a count gives 1 and 0 without comparison, which importers lack or type differently.
     left = nodes.plus(nodes.times(state["age"], np.float32(-1)), np.float32(layer.ticks))
     read = nodes.clip(left, 0, 1)
     # mean + read (x - mean) would lose the digits of a large x.
@@ -58,7 +61,7 @@ def _convolution(nodes: Nodes, layer: memory.Convolution, state: Held, x: str) -
     weight = layer.weight.reshape(out, taps * into)
     if taps == 1:
         return nodes.linear(x, weight, layer.bias), {}
-    # A tap, and the ticks up to the next one, which only wait.
+    # A tap, and the ticks up to the next one, which only wait.  # no output of a split may stay unread
     sizes = [1, layer.dilation - 1] * (taps - 1) if layer.dilation > 1 else [1] * (taps - 1)
     pieces = nodes.split(state["ring"], sizes, 0)
     read = pieces[:: 2 if layer.dilation > 1 else 1]
@@ -68,6 +71,7 @@ def _convolution(nodes: Nodes, layer: memory.Convolution, state: Held, x: str) -
 
 def _mixed(nodes: Nodes, old: str, new: str, share: float) -> str:
     if share == 1.0:
+        # Without zoneout the mix would be two products by 1 and 0.
         return new
     return nodes.add("Add", nodes.times(old, np.float32(1 - share)), nodes.times(new, np.float32(share)))
 
@@ -90,6 +94,7 @@ def _lstm(nodes: Nodes, layer: memory.Lstm, state: Held, x: str) -> tuple[str, d
 
 
 def _layer_norm_lstm(nodes: Nodes, layer: memory.LayerNormLstm, state: Held, x: str) -> tuple[str, dict[str, str]]:
+    # Gemm's bias is optional only from opset 11 on.
     none = np.zeros(1, np.float32)
     driven = normed(nodes, nodes.linear(x, layer.weight_x, none), layer.epsilon)
     back = normed(nodes, nodes.linear(state["h"], layer.weight_h, none), layer.epsilon)
@@ -118,6 +123,7 @@ def _rotation(nodes: Nodes, layer: memory.Rotation, state: Held, x: str) -> tupl
     a, b = layer.factor[:, :1], layer.factor[:, 1:]
     turned = [
         nodes.add("Add", nodes.times(real, a), nodes.times(imaginary, -b)),
+        # Real and imaginary part as columns; complex numbers have no operators in common use.
         nodes.add("Add", nodes.times(imaginary, a), nodes.times(real, b)),
     ]
     h = nodes.add("Add", nodes.join(turned, 1), nodes.shaped(x, states, 2))
@@ -129,6 +135,7 @@ def _trailing_mean(nodes: Nodes, layer: memory.TrailingMean, state: Held, x: str
     if layer.window == 1:
         return x, {"age": age}
     full, ring = push(nodes, state["ring"], layer.window - 1, x)
+    # The mean over the whole ring times its length: a sum operator is one more that importers need.
     total = nodes.times(nodes.mean(full, 0), np.float32(layer.window))
     return nodes.add("Div", total, age), {"ring": ring, "age": age}
 
@@ -164,6 +171,7 @@ def _window_attention(
     # Row j of the window was seen if at most window - 1 - j ticks are missing.
     places = np.arange(layer.window, 0, -1, dtype=np.float32)[None]
     unseen = nodes.clip(nodes.plus(nodes.times(age, np.float32(-1)), places), 0, 1)
+    # A finite offset, as in the network: minus infinity times zero would be NaN.
     value = attend(nodes, layer, (q, keys, values), nodes.times(unseen, np.float32(UNSEEN)))
     return value, {"keys": new_keys, "values": also, "age": age}
 
@@ -178,8 +186,10 @@ def step_correction(nodes: Nodes, layer: memory.PrefixCorrection, state: Held, x
     """The correction, zero but at the tick `ticks`, and the layer's own next states."""
     ticks, age = layer.ticks, state["age"]
     counting = nodes.clip(nodes.plus(nodes.times(age, np.float32(-1)), np.float32(ticks)), 0, 1)
+    # Only while the prefix lasts; later ticks must leave the total as it is.
     total = nodes.add("Add", state["total"], nodes.add("Mul", x, counting))
     numbers = correct(nodes, layer, nodes.join([nodes.times(total, np.float32(1 / ticks)), x], 1))
+    # One at the last tick of the prefix and after; with `counting` it is that tick alone.
     reached = nodes.clip(nodes.plus(age, np.float32(2 - ticks)), 0, 1)
     now = nodes.add("Mul", reached, counting)
     return nodes.add("Mul", numbers, now), {

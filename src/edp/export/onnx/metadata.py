@@ -51,6 +51,7 @@ def content(described: Description, files: Mapping[str, bytes], states: Sequence
 
 def with_full_starts(about: dict[str, Any], states: Sequence[State]) -> dict[str, Any]:
     """`content` with whole arrays as the starts of states, for MATLAB."""
+    # MATLAB has no rule for the short form of a start.
     step = about["graphs"]["step"]
     full = [entry | {"start": state.start} for entry, state in zip(step["states"], states, strict=True)]
     return about | {"graphs": about["graphs"] | {"step": step | {"states": full}}}
@@ -70,6 +71,7 @@ def _graph(described: Description, kind: str, data: bytes, opset: int) -> dict[s
 
 def _start(state: State) -> float | list[list[float]]:
     """One number where all are the same."""
+    # A single number keeps the JSON readable; rings hold hundreds of equal ones.
     first = float(state.start.flat[0])
     same = np.all(state.start == state.start.flat[0])
     return first if same else [[float(value) for value in row] for row in state.start]

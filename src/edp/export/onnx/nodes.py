@@ -88,6 +88,7 @@ class Nodes:
         """A float32 array, or an int64 one if that is what comes; equal ones are written once."""
         array = np.asarray(values)
         plain = np.ascontiguousarray(array, dtype=np.int64 if array.dtype == np.int64 else np.float32)
+        # Equal by bytes, so that 0.0 and -0.0 stay apart.
         key = (str(plain.dtype), array.shape, plain.tobytes())
         if key not in self._constants:
             self._constants[key] = name = self.name(what)
@@ -108,7 +109,7 @@ class Nodes:
             raise ExportError(f"operator {operator} is not one that importers can be counted on to have")
         output_names = [self.name(operator.lower()) for _ in range(outputs)]
         input_names = list(inputs)
-        while not input_names[-1]:  # optional ones at the end that are left out
+        while not input_names[-1]:  # optional ones at the end that are left out  # trailing only
             input_names.pop()
         self._nodes.append(
             self._onnx.helper.make_node(operator, input_names, output_names, output_names[0], **attributes)
@@ -119,6 +120,7 @@ class Nodes:
         """Neighbouring pieces; the value itself where there is one piece."""
         if len(sizes) == 1:
             return [x]
+        # Before opset 13 the sizes were an attribute, since then they are an input.
         if self.opset < 13:
             return self.several("Split", [x], len(sizes), axis=axis, split=list(sizes))
         return self.several("Split", [x, self.constant(np.array(sizes, np.int64), "sizes")], len(sizes), axis=axis)
@@ -133,6 +135,7 @@ class Nodes:
 
     def clip(self, x: str, low: float, high: float) -> str:
         """Each number, but no less than `low` and no more than `high`."""
+        # Before opset 11 the limits were attributes.
         if self.opset < 11:
             return self.add("Clip", x, min=float(low), max=float(high))
         return self.add("Clip", x, self.constant(np.float32(low)), self.constant(np.float32(high)))
@@ -206,9 +209,11 @@ class Nodes:
         )
         helper.set_model_props(model_proto, dict(notes))
         try:
+            # A full check infers all shapes: an error is found here and not in the importer.
             self._onnx.checker.check_model(model_proto, full_check=True)
         except Exception as error:
             raise ExportError(f"the ONNX checker refuses graph '{name}' at opset {self.opset}: {error}") from error
+        # Deterministic order of the maps, so that equal networks give equal bytes.
         return bytes(model_proto.SerializeToString(deterministic=True))
 
     def _name_outputs(self, inputs: set[str], outputs: Mapping[str, str]) -> None:
@@ -216,6 +221,7 @@ class Nodes:
         produced = {name for node in self._nodes for name in node.output}
         names: dict[str, str] = {}
         for out, value in outputs.items():
+            # An input or another output's value cannot be renamed; `Identity` gives it a second name.
             if value in names or value in inputs or value not in produced:
                 self._nodes.append(self._onnx.helper.make_node("Identity", [names.get(value, value)], [out], out))
             else:
@@ -227,6 +233,7 @@ class Nodes:
     def unread(self, ends: Iterable[str]) -> list[str]:
         """Values that nothing reads, of nodes with another one that some of `ends` rest on."""
         read_values = set(ends)
+        # Backwards: readers come after what they read.
         for node in reversed(self._nodes):
             if read_values & set(node.output):
                 read_values |= set(node.input)
@@ -242,6 +249,7 @@ class Nodes:
                 read_values |= set(node.input)
                 if node.op_type in OPTIONAL:
                     _leave_out(node, read_values)
+        # ONNX Runtime up to 1.18 lays unread outputs over values that are still needed (docs/findings.md).
         self._nodes = read_nodes[::-1]
         self._tensors = [tensor for tensor in self._tensors if tensor.name in read_values]
 

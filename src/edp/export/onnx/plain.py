@@ -23,9 +23,11 @@ Plain = Callable[[Nodes, Any, int, Sequence[str], Sequence[int]], str]
 def activate(nodes: Nodes, function: Function, x: str) -> str:
     """A function of each number."""
     if function is Function.GELU:
+        # GELU is an operator only from opset 20 on; here it is written out by the error function.
         half = nodes.plus(nodes.add("Erf", nodes.times(x, np.float32(1 / math.sqrt(2)))), np.float32(1.0))
         return nodes.add("Mul", nodes.times(x, np.float32(0.5)), half)
     if function is Function.POSITIVE:
+        # Sign gives -1, 0 and 1; ReLU makes 0 of the negative ones. Comparisons would give booleans.
         return nodes.add("Relu", nodes.add("Sign", x))
     return nodes.add(OPERATORS[function], x)
 
@@ -44,6 +46,7 @@ OPERATORS = {
 
 def normed(nodes: Nodes, x: str, epsilon: float) -> str:
     """Each row less its mean, over the root of its variance plus `epsilon`."""
+    # Variance by its definition: the difference of squares cancels for large means.
     middle = nodes.less(x, nodes.mean(x, 1))
     spread = nodes.plus(nodes.mean(nodes.add("Mul", middle, middle), 1), np.float32(epsilon))
     return nodes.add("Div", middle, nodes.add("Sqrt", spread))
@@ -61,6 +64,7 @@ def _gather(nodes: Nodes, layer: layers.Gather, ticks: int, values: Sequence[str
     column_runs = runs(layer.columns, widths)
     if len(column_runs) > MOST_PIECES:
         matrix = np.zeros((len(layer.columns), sum(widths)), np.float32)
+        # A 0/1 matrix moves numbers exactly: every sum has a single term.
         matrix[np.arange(len(layer.columns)), list(layer.columns)] = 1.0
         return nodes.linear(nodes.join(list(values), 1), matrix, np.zeros(1, np.float32))
     pieces: dict[int, dict[int, tuple[int, str]]] = {}
@@ -80,6 +84,7 @@ def _gather(nodes: Nodes, layer: layers.Gather, ticks: int, values: Sequence[str
 
 
 def _standardise(nodes: Nodes, layer: layers.Standardise, ticks: int, values: Sequence[str], *_: object) -> str:
+    # Sub and Div stay apart: with gain and shift pressures of 1e7 Pa would lose digits (decision 25).
     centred = nodes.add("Sub", values[0], nodes.constant(layer.offset, "offset"))
     return nodes.add("Div", centred, nodes.constant(layer.scale, "scale"))
 
@@ -97,6 +102,7 @@ def _glu(nodes: Nodes, layer: layers.Glu, ticks: int, values: Sequence[str], *_:
 def _accumulate(nodes: Nodes, layer: layers.Accumulate, ticks: int, values: Sequence[str], *_: object) -> str:
     rows = nodes.split(values[0], [layer.size] * layer.rows, 1)
     sums = rows[:1]
+    # CumSum comes with opset 11, and opset 9 is written too.
     for row in rows[1:]:
         sums.append(nodes.add("Add", sums[-1], row))
     return nodes.join(sums, 1)
@@ -121,6 +127,7 @@ def _norm(nodes: Nodes, layer: layers.LayerNorm, ticks: int, values: Sequence[st
 
 
 def _row_attention(nodes: Nodes, layer: layers.RowAttention, ticks: int, values: Sequence[str], *_: object) -> str:
+    # Ticks are split, since a product of more than two dimensions is no Gemm.
     split = [nodes.split(x, [1] * ticks, 0) for x in values]
     seen = []
     for tick in zip(*split, strict=True):

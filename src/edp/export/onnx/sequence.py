@@ -46,6 +46,7 @@ class Sequences:
         """The last `ticks` ticks as rows."""
         form = self._values[name]
         if not form.rows:
+            # Convolutions want channels before time, everything else time before channels.
             turned = self._nodes.add("Transpose", form.columns, perm=[0, 2, 1])
             form.rows = self._nodes.shaped(turned, form.ticks, form.width)
         return self._last(form.rows, form.ticks, ticks, 0)

@@ -77,7 +77,9 @@ def spoil(nodes: Nodes, inputs: str, ends: Iterable[str]) -> str:
     Values that nothing reads are read here. ONNX Runtime up to 1.18 puts them, from the second run on, over values that
     are still needed.
     """
+    # Zero times NaN or infinity is NaN, zero times anything else is zero.
     zero = nodes.mean(nodes.times(inputs, np.float32(0)), 1)
+    # Unread outputs are read here with weight zero: old runtimes overwrite what they share memory with.
     for value in nodes.unread(ends):
         nothing = nodes.times(nodes.shaped(nodes.add("ReduceMean", value, keepdims=1), 1, 1), np.float32(0))
         zero = nodes.add("Add", zero, nothing)
@@ -112,6 +114,7 @@ def step_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str], 
             *(values[name] for name in graph.results.values()),
             *(v for new_states in fresh.values() for v in new_states.values()),
         ]
+        # The state adds up: once spoilt, always spoilt, as the recurrent states are.
         spoilt = nodes.add("Add", SPOILT, spoil(nodes, INPUTS, ends))
         outputs = add_results(nodes, graph, values, spoilt, targets)
     for state in states[:-1]:

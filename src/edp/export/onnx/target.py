@@ -36,6 +36,7 @@ class OnnxTarget:
 
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
+        # The name is part of files and of graph names, which importers turn into identifiers.
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name):
             raise ExportError(
                 f"name '{visible(name, LONGEST_NAME)}' is that of files and graphs: up to 31 lower-case letters, "

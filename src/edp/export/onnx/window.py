@@ -28,11 +28,13 @@ ELEMENTWISE = (layers.Activate, layers.Add, layers.Multiply)
 def rows_before(layer: Layer, rows: int, ticks: int) -> int:
     """Rows of its inputs that the last `rows` rows of a layer rest on, at most `ticks`."""
     if isinstance(layer, memory.Difference):
+        # One tick more: the change at the first row needs its predecessor.
         return min(ticks, rows + 1)
     if isinstance(layer, memory.Convolution):
         return int(min(ticks, rows + (layer.weight.shape[1] - 1) * layer.dilation))
     if isinstance(layer, TRAILING):
         return min(ticks, rows + layer.window - 1)
+    # A recurrence rests on all ticks since the reset.
     return ticks if type(layer) in STEPS and not isinstance(layer, memory.Starting) else rows
 
 
@@ -41,6 +43,7 @@ def rows_needed(graph: Graph, ticks: int) -> dict[str, int]:
     need = dict.fromkeys((INPUT, *(layer.name for layer in graph.layers)), 0)
     need |= dict.fromkeys(graph.results.values(), 1)
     for layer in reversed(graph.layers):
+        # The correction reads the first ticks, wherever the results lie.
         if isinstance(layer, memory.PrefixCorrection):
             before = ticks if layer.ticks < ticks else 0
         else:
@@ -131,6 +134,7 @@ class Window:
             nodes.constant(layer.bias, "bias"),
             kernel_shape=[taps],
             dilations=[layer.dilation],
+            # Zeros in front stand for the ticks before the reset, as the ring does after it.
             pads=[rows + past - reach, 0],
         )
         self.values.give_columns(layer.name, convolved, rows, out)
@@ -142,6 +146,7 @@ class Window:
             self._give(layer, nodes.mean(source, 0), rows)
             return
         seen = self._seen(layer.window, rows, reach)
+        # Weights are known when the graph is written: at the start of a window fewer ticks count.
         weights = (seen / seen.sum(axis=1, keepdims=True)).astype(np.float32)
         self._give(layer, nodes.product(nodes.constant(weights, "weights"), source), rows)
 
@@ -211,6 +216,7 @@ class Window:
         """Values ``(ticks, width)`` and the states after them."""
         if isinstance(layer, memory.Lstm) and layer.share == 1.0:
             return lstm(self.nodes, layer, source, ticks, state)
+        # PyTorch's GRU resets behind the product, hence `linear_before_reset`.
         if isinstance(layer, memory.Gru):
             return gru(self.nodes, layer, source, ticks, state)
         tick_outputs = []
@@ -237,6 +243,7 @@ def _reordered(array: np.ndarray, order: Sequence[int]) -> np.ndarray:
 
 
 def _first(nodes: Nodes, state: str, units: int) -> str:
+    # An all-zero start is the operator's default.
     """A state as an operator takes it; left out where it is zero."""
     return "" if nodes.is_zero(state) else nodes.shaped(state, 1, 1, units)
 
@@ -296,6 +303,7 @@ def window_model(graph: Graph, targets: int, name: str, notes: Mapping[str, str]
         with nodes.inside(plain_name(layer.name)):
             window.add(layer)
     with nodes.inside("end"):
+        # One row of all inputs: a single value that is not finite spoils the window.
         flat = nodes.shaped(INPUTS, 1, window.ticks * graph.inputs)
         ends = {value: window.values.rows(value, 1) for value in graph.results.values()}
         outputs = add_results(nodes, graph, ends, spoil(nodes, flat, ends.values()), targets)

@@ -84,6 +84,7 @@ def _content(described: Description) -> dict[str, Any]:
 
 
 def _plain(name: str) -> str:
+    # Equal signs separate name and source in a parameter.
     plain = name.replace("=", "_")
     return f"_{plain}" if plain.startswith(("+", "-", "@")) else plain
 
@@ -108,6 +109,7 @@ def _blanks(model: Model, package: str, about: Mapping[str, Any]) -> dict[str, o
 
 def _source(name: str, kind: Kind) -> str:
     """A guess that the parameter file offers."""
+    # Pressures have no field in a message of joints.
     if kind in PRESSURES:
         return f"pressure:{name}"
     return f"{JOINTS.get(kind, 'effort')}:{name}"

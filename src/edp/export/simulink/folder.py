@@ -151,12 +151,14 @@ class Folder:
         """32-bit words that hold the C state, with what a compiler puts between its parts."""
         short = sum(slot.number is Number.INT16 for _, slot in self.model.graph.slots())
         short += sum(kind is Number.INT16 for kind in self.model.plan.sizes)
+        # Each 16-bit array may be followed by two bytes of padding; the sum is rounded up to words.
         return (self.model.state_bytes() + 2 * short + 7) // 4
 
     def _ports(self) -> dict[str, object]:
         """Result ports of the S-function and results of the C Caller's function."""
         sizes: list[str] = []
         give: list[str] = []
+        # MATLAB's matrices have columns first, C's have rows first.
         copies: list[str] = []
         ports, arguments = [], []
         for port, (meaning, (rows, columns)) in enumerate(self.described.shapes.items()):

@@ -17,6 +17,7 @@ from edp.ir import Array, Graph, Layer, layers, memory
 from edp.ir.base import INPUT
 from edp.ir.layers import Function, runs
 
+# 47 characters, a part behind them and a number stay within MATLAB's 63.
 LONGEST_LAYER = 47
 """Characters of a layer's part of it; names of constants and slots come behind."""
 MOST_PIECES = 8
@@ -53,6 +54,7 @@ class Native:
         keys += [(layer.name, part) for layer in self.graph.layers for part in self.laid(layer)]
         keys += [(name, slot.name) for name, slot in self.graph.slots()]
         short = (
+            # The end of a layer's name tells more than its beginning, which all layers of a part share.
             "_".join(filter(None, (name.replace(".", "_")[-LONGEST_LAYER:], part))).lstrip("_") for name, part in keys
         )
         return dict(zip(keys, matlab_names(list(short)), strict=True))
@@ -69,6 +71,7 @@ class Native:
         elif isinstance(layer, memory.Rotation):
             tensors["factor"] = layer.factor.T
         elif isinstance(layer, layers.Gather) and len(self.runs(layer)) > MOST_PIECES:
+            # MATLAB counts from 1.
             tensors["columns"] = np.array([[column + 1] for column in layer.columns], dtype=float)
         return tensors
 
@@ -129,12 +132,14 @@ def functions_for(code: str) -> Code:
     """The functions that code calls, and those that they call."""
     text = resources.files("edp.export.simulink").joinpath("templates/layers.m.in").read_text()
     bodies = {}
+    # Functions are cut out of one tested file, so that generated code and tests share them.
     for part in re.split(r"^(?=function )", text, flags=re.MULTILINE):
         signature = re.match(r"function (?:.*?= )?(\w+)\(", part)
         if signature:
             bodies[signature[1]] = part.strip() + "\n"
     needed: set[str] = set()
     search = [code]
+    # Functions call functions: the search goes on until nothing new is needed.
     while search:
         for name in set(re.findall(r"\b(\w+)\(", search.pop())) & set(bodies) - needed:
             needed.add(name)
@@ -156,6 +161,7 @@ def _simple(pattern: str) -> Write:
     def write(native: Native, layer: Any, x: Sequence[str]) -> list[str]:
         names = {part: native.constant(layer, part) for part in native.laid(layer)}
         names |= {f"s_{slot.name}": native.slot(layer.name, slot.name) for slot in layer.slots}
+        # Text of a layer is left out: only numbers and generated names may become code.
         plain = {key: _plain(value) for key, value in vars(layer).items() if isinstance(value, int | float)}
         return [pattern.format(*x, y=native.value(layer.name), **(plain | names))]
 
@@ -177,6 +183,7 @@ def _gather(native: Native, layer: layers.Gather, x: Sequence[str]) -> list[str]
         return [*lines, f"{native.value(layer.name)} = given({native.constant(layer, 'columns')});"]
     parts = []
     for value, first, length in column_runs:
+        # A whole value needs no index.
         whole = (first, length) == (0, native.graph.width_of(layer.inputs[value]))
         ends = str(first + 1) if length == 1 else f"{first + 1}:{first + length}"
         parts.append(x[value] if whole else f"{x[value]}({ends})")
@@ -205,6 +212,7 @@ def _prefix(native: Native, layer: memory.PrefixCorrection, x: Sequence[str]) ->
     sizes, at = {(name, slot.name): slot.size for name, slot in native.graph.slots()}, 0
     for owner in layer.corrects:
         state, size = native.slot(*owner), sizes[owner]
+        # MATLAB stores columns first; `reshape` with the state's own size keeps the order of the start.
         lines.append(f"{state} = {state} + reshape(change({at + 1}:{at + size}), size({state}));")
         at += size
     return lines

@@ -33,6 +33,7 @@ class SimulinkTarget:
         window: whether the ONNX window is written; it needs the package onnx.
     """
 
+    # Opset 11 is what MATLAB's importers read from R2021b on.
     opset: int = 11
     window: bool = True
 
@@ -49,6 +50,7 @@ class SimulinkTarget:
                 f"{LONGEST_NAME} must hold, give another one with --name"
             )
         model = make_model(name, bundle)
+        # There is no ONNX form in integer arithmetic.
         window = self.window and not model.whole
         written = Folder(model, window)
         files: dict[str, bytes] = {file: text.encode() for file, text in written.texts().items()}

@@ -46,11 +46,14 @@ class AdaptationSpec:
         ConfigError: an option out of its range.
     """
 
+    # 18 directions: 12 and 24 won alike on changed oil, 24 more on a changed dead band (decision 31).
     rank: int = 18
     forgetting_s: float = 60.0
+    # 100 times the variance of the errors: errors of neighbouring ticks overlap in all but one sample (decision 31).
     noise: float = 100.0
     prior: float = 0.3
     limit: float = 3.0
+    # At rest nothing is judged, and corrections learned in motion would stay in the output (decision 31).
     rest: float = 0.05
     judged_s: float = 10.0
     margin: float = 0.05
@@ -136,11 +139,13 @@ class Adaptation:
         Coefficients follow ``theta' = a theta + w`` with ``a = exp(-1 / (forgetting rate))`` and a variance of w that
         keeps their spread at `prior`: so their covariance never exceeds ``prior^2`` in any direction.
         """
+        # A forgetting time becomes a factor for each tick, whatever the sampling rate.
         forgetting = math.exp(-1.0 / (self.spec.forgetting_s * self.rate_hz))
         variance = self.spec.prior**2
         numbers = {
             "keep": forgetting,
             "keep_squared": forgetting * forgetting,
+            # A sum of decay and refresh whose fixed point is the prior, so that P cannot wind up (decision 31).
             "refresh": (1.0 - forgetting * forgetting) * variance,
             "prior": variance,
             "noise": self.spec.noise,
@@ -175,11 +180,13 @@ class Adaptation:
             ConfigError: they do not go together.
             TypeError: an entry is missing or unknown.
         """
+        # JSON has lists only; equality and hashing of an adaptation need tuples.
         entries: dict[str, Any] = {"horizons": tuple(plain["horizons"]), "columns": tuple(plain["columns"]), **arrays}
         return cls(spec=AdaptationSpec(**plain["spec"]), rate_hz=plain["rate_hz"], **entries)
 
     @property
     def digest(self) -> str:
+        # Sorted, so that the digest depends on the content and not on the order of fields.
         """Content address."""
         state = hashlib.blake2b(repr(sorted(self.to_plain().items())).encode(), digest_size=16)
         for name, values in sorted(self.arrays().items()):
@@ -190,6 +197,7 @@ class Adaptation:
     def macs(self) -> int:
         """Multiply-accumulates of a tick that learns."""
         n, targets, inputs = self.features, len(self.columns), len(self.offset)
+        # The covariance's product with phi, its update and its scale, and three inner products for each target.
         once = n * n + n * (n + 1) + n + 3 * targets * n
         return self.spec.rank * inputs + len(self.horizons) * once
 

@@ -40,6 +40,7 @@ class RlsState:
 
 def total(products: Array) -> Array:
     """Sums over the last axis, one number after the other, as a loop adds them."""
+    # `np.add.accumulate` adds in order; `np.sum` adds in pairs and would differ from C in the last bit.
     return np.asarray(np.add.accumulate(products, axis=-1, dtype=np.float32)[..., -1], dtype=np.float32)
 
 
@@ -76,6 +77,7 @@ class RlsCorrector:
         constants = self.adaptation
         ahead, targets, n = len(constants.horizons), len(constants.columns), constants.features
         self.theta = np.zeros((ahead, targets, n), dtype=np.float32)
+        # One covariance for all targets of a horizon: they share their features (decision 31).
         self.covariance = np.stack([self._start()] * ahead)
         self._plain, self._corrected = (np.zeros((ahead, targets), dtype=np.float32) for _ in range(2))
         self.fallback = np.zeros((ahead, targets), dtype=bool)
@@ -100,6 +102,7 @@ class RlsCorrector:
         """
         if learned.digest != self.adaptation.digest or learned.theta.shape != self.theta.shape:
             raise ConfigError("what was learned belongs to another adaptation; start from nothing instead")
+        # A coefficient beyond its bound cannot come from learning; the file was changed or damaged.
         if not (np.abs(learned.theta) <= self._numbers["bound"]).all():
             raise ConfigError("what was learned is damaged: a coefficient is out of its bounds; start from nothing")
         self.theta = learned.theta.astype(np.float32)
@@ -123,6 +126,7 @@ class RlsCorrector:
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
             self.interrupt()
             return y.copy(), RlsStatus.NONE
+        # Overflow is met by the limits behind it, as in C, where it raises no warning.
         with np.errstate(over="ignore"):
             return self._step(x, y, fresh, learn)
 
@@ -131,6 +135,7 @@ class RlsCorrector:
         measured, directed = x[self._columns], self._directed(x)
         for h, k in enumerate(constants.horizons):
             error = np.zeros(len(measured), dtype=np.float32)
+            # The prediction of k ticks ago is judged only if all ticks since then came without a gap.
             if fresh and self._streak >= k:
                 error = self._error(h, measured)
                 taught = self._due(h, error, learn) or taught
@@ -140,6 +145,7 @@ class RlsCorrector:
                 self._rows[h][self._at[h]] = np.concatenate([phi, y[h], correction])
                 self._at[h] = (self._at[h] + 1) % k
             out[h] = np.where(self.fallback[h], y[h], y[h] + constants.unit[h] * correction)
+        # The streak saturates: a counter that grows for months would overflow in C.
         self._streak = min(self._streak + 1, constants.max_horizon) if fresh else 0
         if self.fallback.any():
             return out, RlsStatus.FALLBACK
@@ -182,6 +188,7 @@ class RlsCorrector:
     def _due(self, h: int, error: Array, learn: bool) -> bool:
         """Judge, and learn from, the prediction that has come due; returns whether something was learned."""
         n, row = self.adaptation.features, self._rows[h][self._at[h]]
+        # The constant feature is 1 in motion, so a zero there says that the row was made at rest.
         if row[0] == 0:  # at rest
             return False
         self._judge(h, error, row[n + len(error) :], learn)
@@ -191,11 +198,13 @@ class RlsCorrector:
         """Compare the running errors without and with the correction; take it back, or let it out again."""
         constants, most = self._numbers, np.float32(MOST_ERROR)
         for running, of in ((self._plain[h], error), (self._corrected[h], error - correction)):
+            # A cap on single errors: one spike must not decide between correction and none.
             running += constants["rate"] * (np.minimum(np.abs(of), most) - running)
         worse = ~self.fallback[h] & (self._corrected[h] > constants["worse"] * self._plain[h])
         better = self.fallback[h] & (self._corrected[h] < constants["better"] * self._plain[h])
         self.fallback[h] = (self.fallback[h] | worse) & ~better
         if learn and worse.any():
+            # A correction that did worse starts again from nothing, beside the error it is compared with.
             self.theta[h][worse] = 0.0
             self._corrected[h][worse] = self._plain[h][worse]
             self.covariance[h] = self._start()
@@ -204,10 +213,12 @@ class RlsCorrector:
         constants, p = self._numbers, self.covariance[h]
         g = total(p * phi)
         d = constants["noise"] + total(phi * g)
+        # The negated comparison also catches NaN.
         if not d >= constants["noise"]:
             self._repair(h)
             return False
         inverse = np.float32(1.0) / d
+        # The innovation is clipped, not the error: outliers may judge, but not teach.
         innovation = _within(error - total(self.theta[h] * phi), CLIP)
         step = (innovation * inverse)[:, None]
         self.theta[h] = _within(constants["keep"] * (self.theta[h] + g * step), constants["bound"])
@@ -215,6 +226,7 @@ class RlsCorrector:
         diagonal = np.einsum("ii->i", p)
         diagonal += constants["refresh"]
         self.covariance[h] = p
+        # Rounding may cost the covariance its positive diagonal; the prior replaces it then.
         if not ((diagonal > 0) & (diagonal <= np.float32(2.0) * constants["prior"])).all():
             self._repair(h)
         return True

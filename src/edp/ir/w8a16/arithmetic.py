@@ -36,6 +36,7 @@ TABLE = 513
 
 def frac_for(largest: float, bits: int = 15) -> int:
     """The most fractional bits with which `largest` still fits in `bits` bits and a sign."""
+    # NaN and zero give the finest format: a value that never moves needs no range.
     if not largest > 0.0:
         return bits
     frac = math.floor(math.log2((2**bits - 1) / largest))
@@ -44,6 +45,7 @@ def frac_for(largest: float, bits: int = 15) -> int:
 
 def rounded_shift(x: Any, bits: int) -> Whole:
     """``x 2^-bits``, rounded half up."""
+    # Half up rather than half to even: one addition and a shift in C.
     x = np.asarray(x, dtype=np.int64)
     if bits <= 0:
         return np.asarray(x << -bits)
@@ -69,6 +71,7 @@ def factor(real: Any) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     """
     values = np.asarray(real, dtype=np.float64)
     mantissa, exponent = np.frexp(values)
+    # Rounding up can carry a mantissa to 2^31, one bit too many for the multiplier.
     multiplier = np.floor(mantissa * 2.0**31 + 0.5)
     over = multiplier >= 2.0**31
     multiplier, exponent = np.where(over, 2.0**30, multiplier), np.where(over, exponent + 1, exponent)
@@ -85,15 +88,18 @@ def scaled(accumulator: Any, multiplier: Any, shift: Any) -> Whole:
     """``accumulator multiplier 2^-shift`` rounded half up; accumulators of 32 bits."""
     shift = np.asarray(shift, dtype=np.int64)
     product = np.asarray(accumulator, dtype=np.int64) * np.asarray(multiplier, dtype=np.int64)
+    # A product of 32 and 31 bits needs 63: `int64` holds it in NumPy and in C.
     return np.asarray((product + (np.int64(1) << (shift - 1))) >> shift)
 
 
 def _table(function: Any, last: float) -> NDArray[np.uint16]:
     at = np.linspace(0.0, last, TABLE)
     values = np.array([function(float(x)) for x in at])
+    # 16 bits unsigned: 1.0 saturates at 65535 / 65536, below the resolution of the values.
     return np.clip(np.floor(values * 65536.0 + 0.5), 0, 65535).astype(np.uint16)
 
 
+# Beyond 8, tanh is 1 to within 2^-16; one table serves tanh and sigmoid.
 TANH = _table(math.tanh, 8.0)
 """tanh on [0, 8], in 2^-16."""
 EXP = _table(lambda x: math.exp(-x), 16.0)
@@ -106,6 +112,7 @@ NORMAL = _table(lambda x: 0.5 * (1.0 + math.erf(x / math.sqrt(2.0))), 8.0)
 
 def looked_up(table: NDArray[np.uint16], x: Whole, step: int) -> Whole:
     """A table at x >= 0, `2^step` apart, interpolated; beyond its end its last entries."""
+    # The last entry has no neighbour to interpolate to; x stays just below it.
     x = np.minimum(x, ((TABLE - 1) << step) - 1)
     at, rest = x >> step, x & ((1 << step) - 1)
     low = table[at].astype(np.int64)
@@ -123,6 +130,7 @@ def tanh(x: Whole, frac: int) -> Whole:
 
 def sigmoid(x: Whole) -> Whole:
     """In 2^-15, of x in 2^-16: ``(1 + tanh(x / 2)) / 2``."""
+    # A half of x: one bit less of the step, instead of a shift that would lose that bit.
     half = looked_up(TANH, np.abs(x), GATE_FRAC - 5)
     return np.minimum(rounded_shift(65536 + np.where(x < 0, -1, 1) * half, 2), LARGEST)
 
@@ -144,7 +152,9 @@ def normal(x: Whole) -> Whole:
 
 
 def softmax(scores: Whole) -> Whole:
+    # Differences to the largest score are never positive, which is the half that the table covers.
     """Weights in 2^-15 over the last axis, of scores in 2^-16."""
     raised = exp(scores - scores.max(axis=-1, keepdims=True))
     total = raised.sum(axis=-1, keepdims=True)
+    # Half of the divisor is added first, so that the quotient is rounded and not cut.
     return np.asarray(((raised << 15) + (total >> 1)) // total)

@@ -17,8 +17,10 @@ from edp.ir.w8a16.moments import InputMoments
 from edp.ir.w8a16.quantise import Formats, formats, integer_part, quantise, weights_of
 from edp.ir.w8a16.single import OVER_TIME
 
+# 500 ticks are 5 s at 100 Hz: longer than the networks remember, so that a piece shows steady values.
 PIECE = 500
 """Ticks of a piece, from reset."""
+# Errors of neighbouring formats are noisy; one finer format without gain is no sign of the end.
 PATIENCE = 2
 
 
@@ -47,12 +49,14 @@ def calibrate(
     ranges: dict[str, float] = {}
     moments = InputMoments(graph)
     for rows in recordings:
+        # Values before the first weights are cheap: their range is taken over all ticks, not over a sample.
         for name, values in _before_weights(graph, rows).items():
             _raise(ranges, name, values)
     for rows in pieces(recordings, ticks):
         moments.add(_follow(graph, rows, ranges))
     chosen = formats(ranges)
     if error_of is not None:
+        # Only the inputs' formats are tried: derivatives reach 50 deviations, which wastes bits of all others.
         names = [layer.name for layer in graph.layers if isinstance(layer, Standardise) and layer.name in chosen.fracs]
         fracs = {name: finer(chosen.fracs[name], error_of) for name in names}
         chosen = replace(chosen, fracs={**chosen.fracs, **fracs})
@@ -76,6 +80,7 @@ def pieces(recordings: Sequence[NDArray[np.floating]], ticks: int) -> list[NDArr
     cut = []
     for rows in recordings:
         count = max(1, round(share * len(rows) / PIECE))
+        # Even distances cover a whole recording; its beginning alone could be a standstill.
         starts = np.linspace(0, max(0, len(rows) - PIECE), count).astype(int)
         cut += [rows[start : start + PIECE] for start in starts]
     return cut

@@ -231,6 +231,7 @@ class WMinGru(Whole):
 
     units: int
 
+    # 14 more bits keep the state, and its difference to the input, within 32 bits.
     EXTRA = 14
 
     @property

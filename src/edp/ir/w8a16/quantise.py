@@ -24,6 +24,7 @@ from edp.ir.w8a16.rows import halves, rows, to_gates
 
 Ranges = Mapping[str, float]
 """Largest magnitude of each value, and of each slot as ``layer/slot``."""
+# Norms and attentions need sums of squares and quotients that 16-bit formats would spoil.
 FLOAT = (layers.LayerNorm, layers.RowAttention, layers.Accumulate, memory.WindowAttention)
 """Kinds that stay in single precision wherever they stand: they have no weights, or a few gains."""
 REFUSED = {
@@ -45,6 +46,7 @@ class Formats:
     weights: Mapping[str, NDArray[np.int8]] = field(default_factory=dict)
 
 
+# A quarter more than calibration has seen; one more bit would cost half of the resolution.
 def formats(ranges: Ranges, margin: float = 1.25) -> Formats:
     """The finest format of each value that holds `margin` times its largest magnitude."""
     fracs = {name: whole.frac_for(margin * size) for name, size in ranges.items() if "/" not in name}
@@ -130,6 +132,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
             work.out.append(replace(layer, inputs=tuple(work.real(name) for name in layer.inputs)))
             continue
         inputs = tuple(work.whole(name) for name in layer.inputs)
+        # Inputs are brought into integers first, since a layer's own format depends on theirs.
         done = LOWER[kind](work, layer, [work.integer_fracs[name] for name in inputs])
         work.out.append(replace(done, inputs=inputs))
         work.integer_fracs[layer.name] = done.frac
@@ -152,6 +155,7 @@ def outline(graph: Graph) -> Graph:
         hollow.append(replace(layer, **empty))
     names = [INPUT, *(layer.name for layer in graph.layers)]
     names += [f"{layer}/{slot.name}" for layer, slot in graph.slots()]
+    # Formats of zero bits do for counting: sizes do not depend on numbers.
     return quantise(replace(graph, layers=tuple(hollow)), Formats(dict.fromkeys(names, 0)))
 
 
@@ -180,6 +184,7 @@ def integer_part(graph: Graph) -> set[str]:
     for layer in graph.layers:
         if isinstance(layer, layers.Standardise) or scaled & set(layer.inputs):
             scaled.add(layer.name)
+    # Backwards: what no weights read any more is cheap and stays in single precision.
     for layer in reversed(graph.layers):
         if layer.macs or layer.name in before:
             before |= set(layer.inputs) | {layer.name}
@@ -187,6 +192,7 @@ def integer_part(graph: Graph) -> set[str]:
     for layer in graph.layers:
         if layer.name not in scaled or isinstance(layer, (layers.Standardise, *FLOAT)):
             continue
+        # The exponential leaves 16 bits quickly; it stays in single precision.
         exponential = isinstance(layer, layers.Activate) and layer.function is Function.EXP
         light = isinstance(layer, layers.Activate | layers.Gather) and set(layer.inputs) <= inside
         if not exponential and (layer.name in before or light):
@@ -203,6 +209,7 @@ Lower = Callable[[_Work, Any, list[int]], made.Whole]
 
 
 def _gather(work: _Work, x: layers.Gather, input_fracs: list[int]) -> made.Whole:
+    # The coarsest format of the inputs: a shift left could overflow, a shift right only loses bits.
     frac = min(input_fracs)
     shifts = tuple(own - frac for own in input_fracs)
     return made.WGather(name=x.name, inputs=(), frac=frac, columns=x.columns, shifts=shifts)
@@ -211,6 +218,7 @@ def _gather(work: _Work, x: layers.Gather, input_fracs: list[int]) -> made.Whole
 def _sum(work: _Work, x: layers.Add | layers.Subtract, input_fracs: list[int]) -> made.Whole:
     """The finer of two formats is the common one, as far as 32 bits reach."""
     frac, (a, b) = work.frac(x.name), input_fracs
+    # 14 bits of difference: 16-bit values shifted by more would leave 32 bits.
     common = min(max(a, b), min(a, b) + 14)
     lefts, minus = (common - a, common - b), isinstance(x, layers.Subtract)
     frac = _within(frac, common)
@@ -224,6 +232,7 @@ def _multiply(work: _Work, x: layers.Multiply, input_fracs: list[int]) -> made.W
 
 def _scale_shift(work: _Work, x: layers.ScaleShift, input_fracs: list[int]) -> made.Whole:
     # The offset is in the format of the product, 32-bit.
+    # Product and offset share the accumulator; 30 bits leave one for their sum.
     most = whole.frac_for(float(np.abs(x.shift).max()), 30) - input_fracs[0]
     gain, bits = halves(x.gain, most)
     frac = _within(work.frac(x.name), input_fracs[0] + bits)
@@ -234,9 +243,11 @@ def _scale_shift(work: _Work, x: layers.ScaleShift, input_fracs: list[int]) -> m
 
 def _activate(work: _Work, x: layers.Activate, input_fracs: list[int]) -> made.Whole:
     frac = input_fracs[0]
+    # Results of tanh and sigmoid lie between -1 and 1: their format needs no calibration.
     if x.function in (Function.SIGMOID, Function.TANH):
         frac = whole.UNIT_FRAC
     elif x.function is Function.SOFTPLUS:
+        # Finer than its table of 2^-16 a softplus cannot be.
         frac = min(work.frac(x.name), whole.GATE_FRAC)
     return made.WActivate(
         name=x.name, inputs=(), frac=frac, function=x.function, size=x.size, input_frac=input_fracs[0]
@@ -263,6 +274,7 @@ def _convolution(work: _Work, x: memory.Convolution, input_fracs: list[int]) -> 
 
 def _lstm(work: _Work, x: memory.Lstm, input_fracs: list[int]) -> made.Whole:
     work.slots |= {(x.name, "h"): whole.UNIT_FRAC, (x.name, "c"): whole.CELL_FRAC}
+    # A share of 1 is 32768, which fits since it is held in 32 bits.
     share = round(x.share * 2**whole.UNIT_FRAC)
     bias = whole.to_fixed(x.bias, whole.GATE_FRAC, whole.GATE_LIMIT).astype(np.int32)
     matrices = work.gates(x, input_fracs[0])
@@ -284,6 +296,7 @@ def _min_gru(work: _Work, x: memory.MinGru, input_fracs: list[int]) -> made.Whol
 
 
 def _rotation(work: _Work, x: memory.Rotation, input_fracs: list[int]) -> made.Whole:
+    # The state must not be coarser than its input, which is shifted left to it.
     state_frac = max(work.frac(f"{x.name}/h"), input_fracs[0])
     frac = _within(work.frac(x.name), state_frac)
     work.slots[x.name, "h"] = state_frac

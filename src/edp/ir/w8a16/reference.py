@@ -69,12 +69,15 @@ class Integers:
         wide = x * np.float32(2.0**layer.frac)
         top = np.float32(LARGEST)
         self.clipped += int((~((wide >= -top) & (wide <= top))).sum())
+        # NaN fails the comparison and takes the lower limit: it is counted as clipped and cannot spread.
         limited = np.where(wide >= -top, np.minimum(wide, top), -top)
+        # Half away from zero, as C truncates after adding half with the sign.
         return np.trunc(np.where(limited >= 0, limited + np.float32(0.5), limited - np.float32(0.5))).astype(np.int64)
 
 
 def matrix(x: Whole, weight: NDArray[np.int8]) -> Whole:
     """``x W'`` of integers: double precision holds the sums exactly, and is fast."""
+    # Sums of 16 by 8-bit products stay far below 2^53.
     return np.asarray(x.astype(np.float64) @ weight.T.astype(np.float64)).astype(np.int64)
 
 
@@ -146,6 +149,7 @@ def _lstm(layer: made.WLstm, m: Memory, x: Whole) -> Whole:
     for tick, ahead in enumerate(driven):
         gates = split(ahead + _gates(h, layer.weight_h, layer.multiplier_h, layer.shift_h), 4)
         i, f, o = np.moveaxis(whole.sigmoid(gates[..., [0, 1, 3], :]), -2, 0)
+        # Both terms in the format of the product, so that one rounding remains.
         product = f * c + ((i * whole.tanh(gates[..., 2, :], GATE_FRAC)) << (whole.CELL_FRAC - UNIT_FRAC))
         fresh = saturated(rounded_shift(product, UNIT_FRAC), whole.CELL_LIMIT)
         shown = rounded_shift(o * whole.tanh(fresh, whole.CELL_FRAC), UNIT_FRAC)
@@ -208,6 +212,7 @@ def _mean(layer: made.WTrailingMean, m: Memory, x: Whole) -> Whole:
     sums = total[layer.window :] - total[: -layer.window]
     count = np.minimum(age + 1 + np.arange(len(x)), layer.window)[:, None, None]
     m["ring"], m["age"] = history[len(x) :], np.full_like(m["age"], min(age + len(x), layer.window))
+    # Division of a negative integer rounds down in NumPy and to zero in C; magnitudes agree in both.
     return np.asarray(np.sign(sums) * ((np.abs(sums) + count // 2) // count))
 
 
@@ -217,6 +222,7 @@ def _pool(layer: made.WAttentionPool, m: Memory, x: Whole) -> Whole:
     ring, scores = np.concatenate([m["ring"], x]), np.concatenate([m["scores"], own])
     out = np.empty_like(x)
     for tick in range(len(x)):
+        # Only ticks since the reset: hidden scores have no integer value.
         first, stop = tick + window - min(age + tick + 1, window), tick + window
         weights = whole.softmax(scores[first:stop].T).astype(np.float64)
         sums = np.einsum("bs,sbn->bn", weights, ring[first:stop].astype(np.float64))

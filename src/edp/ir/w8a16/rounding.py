@@ -69,7 +69,10 @@ def least_error(weight: Array, scale: Array, moments: Array) -> NDArray[np.int8]
         moments: ``(terms, terms)``.
     """
     terms = len(moments)
+    # The small constant keeps the matrix invertible where no input ever moves.
     damped = moments + (DAMPING * np.trace(moments) / terms + 1e-12) * np.eye(terms)
+    # Large inputs first: their errors weigh most, and the most columns are left to make up for them. Stable: equal
+    # bits.
     order = np.argsort(-np.diag(damped), kind="stable")
     # Row i of the upper factor of the inverse says how the columns after i make up for an error in column i.
     upper = np.linalg.cholesky(np.linalg.inv(damped[np.ix_(order, order)])).T

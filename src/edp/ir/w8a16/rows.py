@@ -31,6 +31,7 @@ def rows(matrix: str, weight: Array, bias: Array, formats: tuple[int, int], roun
     terms = tuple(range(bias.ndim, weight.ndim))
     # A bias far larger than its weights takes part in the choice of the scale, else it would not fit.
     scale = np.maximum(np.abs(weight).max(axis=terms) / whole.WEIGHT, np.abs(bias) * 2.0 ** (input_frac - 30))
+    # A row of zeros has no scale; any positive one gives zeros again.
     scale = np.maximum(scale.astype(np.float64), 1e-30)
     rounded = rounding.of(matrix, weight, scale)
     offset = np.floor(bias / scale * 2.0**input_frac + 0.5)
@@ -53,6 +54,7 @@ def halves(gain: Array, most: int = 30) -> tuple[NDArray[np.int16], int]:
 
 def _check(name: str, weight: NDArray[np.int8], bias: Array) -> None:
     terms = tuple(range(bias.ndim, weight.ndim))
+    # The worst case over all inputs, since a sum that wraps around would be silent on the controller.
     sums = np.abs(weight.astype(np.int64)).sum(axis=terms) * whole.LARGEST + np.abs(bias)
     worst = float(sums.max())
     if worst > whole.ACCUMULATOR:

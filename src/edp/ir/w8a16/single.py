@@ -24,6 +24,7 @@ ONE = np.float32(1.0)
 
 def _small_expm1(r: Rows) -> Rows:
     f = np.float32
+    # Taylor's series to the seventh power: enough for float32 up to ln 2 / 2, and for the 0.34 of tanh.
     tail = f(1 / 6) + r * (f(1 / 24) + r * (f(1 / 120) + r * (f(1 / 720) + r * f(1 / 5040))))
     return np.asarray(r + r * r * (f(0.5) + r * tail))
 
@@ -31,10 +32,13 @@ def _small_expm1(r: Rows) -> Rows:
 def exp(x: Rows) -> Rows:
     """``edp_exp`` of the runtime."""
     f = np.float32
+    # Limits of float32: beyond them exp is 0 or infinite, and the shift below would leave the exponent's bits.
     limited = np.clip(x, f(-87.0), f(88.0))
     turns = limited * f(1.44269504)
     n = np.trunc(np.where(turns >= 0, turns + f(0.5), turns - f(0.5))).astype(np.int32)
+    # ln 2 in two parts (Cody and Waite): n times the first part is exact, so the rest keeps its digits.
     r = (limited - n.astype(f) * f(0.693359375)) - n.astype(f) * f(-2.12194440e-4)
+    # 2^n is written into the exponent's bits: exact, and cheaper than a power.
     power = ((n + 127).astype(np.uint32) << np.uint32(23)).view(np.float32)
     return np.asarray((ONE + _small_expm1(r)) * power)
 
@@ -43,6 +47,7 @@ def tanh(x: Rows) -> Rows:
     """``edp_tanh`` of the runtime."""
     f = np.float32
     size = np.abs(x)
+    # Near zero 1 - 2/(e+1) would cancel; the quotient of expm1 keeps relative accuracy.
     e = _small_expm1(f(2.0) * np.minimum(size, f(0.17)))
     near = e / (e + f(2.0))
     far = ONE - f(2.0) / (exp(f(2.0) * np.minimum(size, f(10.0))) + ONE)
@@ -60,6 +65,7 @@ def log1p(x: Rows) -> Rows:
     """log(1 + x) as the runtime has it, for x in [0, 1]."""
     f = np.float32
     s = x / (f(2.0) + x)
+    # The series of artanh: log(1+x) = 2 artanh(x / (2 + x)), whose argument stays below 1/3.
     q = s * s
     tail = f(1 / 11) + q * (f(1 / 13) + q * f(1 / 15))
     tail = f(1 / 3) + q * (f(1 / 5) + q * (f(1 / 7) + q * (f(1 / 9) + q * tail)))
@@ -78,10 +84,12 @@ def _gelu(x: Rows) -> Rows:
 def _turned(x: Rows, quarters: int) -> Rows:
     """The runtime's sine of x and of so many quarter turns more."""
     f = np.float32
+    # 8,192 rad: up to there n times the parts of pi/2 below stays exact.
     limited = np.clip(x, f(-8192.0), f(8192.0))
     turns = limited * f(0.636619772)
     n = np.trunc(np.where(turns >= 0, turns + f(0.5), turns - f(0.5))).astype(np.int32)
     whole = n.astype(f)
+    # pi/2 in three parts (Cody and Waite), for the digits of large angles.
     r = ((limited - whole * f(1.5703125)) - whole * f(4.83751297e-4)) - whole * f(7.54978995e-8)
     q = r * r
     sine = r + r * q * (f(-1 / 6) + q * (f(1 / 120) + q * (f(-1 / 5040) + q * f(1 / 362880))))
