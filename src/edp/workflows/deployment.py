@@ -28,9 +28,11 @@ def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footpr
             part that counts other work than it does.
     """
     predictor, name, adaptation = _predictor_of(path)
+    # Stated counts are held to what runs before anybody relies on them.
     check_counted(predictor)
     if budget is not None:
         alone = replace(predictor.spec, blocks=(), physics=None)
+        # One unit without blocks is the smallest network of these inputs: if it is too large, all are.
         check_possible(budget, footprint(_untrained(student(alone, units=1), predictor.task)))
     return footprint(predictor, adaptation), name
 
@@ -39,6 +41,7 @@ def _predictor_of(path: str | Path) -> tuple[Predictor, str, Adaptation | None]:
     source = Path(path)
     if source.suffix == ".toml":
         experiment = load_experiment(source)
+        # A settings file names no rate; counts do not depend on it, so the thesis's 100 Hz stands in.
         task = experiment.task.resolve(100.0, physics=experiment.model.physics)
         return _untrained(experiment.model, task), source.stem, None
     bundle = load_bundle(source)

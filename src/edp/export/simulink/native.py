@@ -55,7 +55,8 @@ class Native:
         keys += [(name, slot.name) for name, slot in self.graph.slots()]
         short = (
             # The end of a layer's name tells more than its beginning, which all layers of a part share.
-            "_".join(filter(None, (name.replace(".", "_")[-LONGEST_LAYER:], part))).lstrip("_") for name, part in keys
+            "_".join(filter(None, (name.replace(".", "_")[-LONGEST_LAYER:], part))).lstrip("_")
+            for name, part in keys
         )
         return dict(zip(keys, matlab_names(list(short)), strict=True))
 

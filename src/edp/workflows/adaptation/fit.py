@@ -47,6 +47,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
     """
     folder = Path(run)
     bundle, _, provenance, data = trained_run(folder)
+    # A trained run in the folder would be lost: its bundle has the same name.
     if (Path(out) / "run.json").exists():
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
     adaptation = fit_adaptation(bundle.predictor, data, spec or AdaptationSpec())
@@ -56,6 +57,7 @@ def adapt(run: str | Path, out: str | Path, spec: AdaptationSpec | None = None) 
                 write_bytes(target.file(name), (folder / name).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"adaptation": adaptation.digest})
         save_bundle(replace(bundle, adaptation=adaptation), target.file("bundle"))
+        # The footprint counts the adaptation too; the one of the source run would state too little.
         write_json(target.file("footprint.json"), footprint_of(target.path)[0].to_json(Budget()))
         facts = replay(bundle.predictor, adaptation, data.test).to_json(data.task, data.target_kinds)
         write_json(target.file("adaptation.json"), facts)
@@ -83,7 +85,9 @@ def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -
     inputs = np.concatenate([part.inputs for part in data.train]).astype(np.float64)
     offset, scale = inputs.mean(axis=0), _widths(inputs)
     present = inputs[:, list(columns)]
+    # Velocities rest at zero by nature; the median of other targets is where the machine usually is.
     middle = np.where([kind is Kind.VELOCITY for kind in data.target_kinds], 0.0, np.median(present, axis=0))
+    # Units come from the validation part: errors on training data are too small.
     change, unit = _of_predictions(predictor, data.validation)
     arrays = {
         "offset": offset,
@@ -101,19 +105,23 @@ def fit_adaptation(predictor: Predictor, data: Prepared, spec: AdaptationSpec) -
 def _widths(rows: Rows) -> Rows:
     """Standard deviations; 1 where nothing moves."""
     deviations = rows.std(axis=0)
+    # A relative threshold: rounding gives a constant column of pressures a spread above zero.
     return np.where(deviations > 1e-9 * (1.0 + np.abs(rows).max(axis=0)), deviations, 1.0)
 
 
 def _directions(scaled: Rows, columns: Sequence[int], rank: int) -> Rows:
     """Leading principal components ``(rank, inputs)``, each of them scaled to a spread of 1."""
     cut = np.clip(scaled, -FEATURE_LIMIT, FEATURE_LIMIT)
+    # The targets are features of their own; directions need not tell them again.
     cut[:, list(columns)] = 0.0
     possible = int((cut.std(axis=0) > 0).sum())
     if rank > possible:
         raise ConfigError(f"adaptation: rank = {rank}, but only {possible} inputs besides the targets move; lower it")
     values, vectors = np.linalg.eigh(np.cov(cut, rowvar=False))
+    # `eigh` sorts upwards; the leading components are the last.
     chosen = np.argsort(values)[::-1][:rank]
     axes = vectors[:, chosen] / np.sqrt(values[chosen])
+    # The sign of an eigenvector is arbitrary; the largest entry made positive gives the same numbers everywhere.
     signs = np.sign(axes[np.abs(axes).argmax(axis=0), range(rank)])
     return np.asarray((axes * signs).T)
 

@@ -20,6 +20,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 from edp.training import load_bundle
 
+# The last minute is what the filter remembers (60 s of forgetting), so longer bins would show no more.
 BINS = (0.0, 10.0, 30.0, 60.0)
 """Seconds of motion from which errors are gathered, each up to the next."""
 Rows = NDArray[np.float32]
@@ -137,11 +138,13 @@ def replay(
     for done, (part, base) in enumerate(zip(series, stream_predictions(predictor, series), strict=True)):
         if on_recording is not None:
             on_recording(part.name, done, len(series))
+        # The gap between recordings is no motion: predictions from before it must not be judged after it.
         adapter.interrupt()
         if not carry:
             adapter.reset()
         adapted, status = np.empty_like(base), np.zeros(len(base), dtype=np.int64)
         for tick, (x, y) in enumerate(zip(part.inputs, base, strict=True)):
+            # Before a whole window the network itself is not warm; its errors would teach the wrong thing.
             adapted[tick], status[tick] = adapter.step(x, y, fresh=tick + 1 >= skip, learn=learn)
         replayed.append(Replayed(part.name, base, adapted, motion_s(adaptation, part.targets), status, part.targets))
     return Replay(replayed, adaptation.horizons, skip, adapter.learned)

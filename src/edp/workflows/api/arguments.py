@@ -28,6 +28,7 @@ def check_together(recordings: Sequence[Recording]) -> None:
     if twice:
         raise DataError(f"recording name(s) {', '.join(twice)} occur twice; give each its own")
     for recording in recordings:
+        # Rates from time stamps differ in their last digits; equal within the tolerance is equal.
         if abs(recording.rate_hz - first.rate_hz) > RATE_TOLERANCE * first.rate_hz:
             raise DataError(
                 f"mixed rates: '{first.name}' {first.rate_hz:g} Hz, '{recording.name}' {recording.rate_hz:g} Hz; bring "
@@ -59,6 +60,7 @@ def matrix_of(values: Any, number: int) -> NDArray[Any]:
         raise DataError(
             f"array {number} has shape {matrix.shape}; (time, channel) must hold, one array for each recording{advice}"
         )
+    # Objects and texts would be turned into numbers by accident, or fail deep inside.
     if matrix.dtype.kind not in "fiub":
         raise DataError(f"array {number} holds {matrix.dtype}; numbers must hold")
     return matrix
@@ -86,6 +88,7 @@ def names_of(names: Sequence[str] | None, usual: list[str], what: str, counted: 
     """
     if names is None:
         return usual
+    # A text is a sequence of characters, and would name each channel by one letter.
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise DataError(f"{what} must be a list of texts, one for each of the {counted}")
     if len(names) != len(usual):

@@ -55,6 +55,7 @@ def columns_of(frame: Any, where: str) -> dict[str, NDArray[Any]]:
 
 def _numpy(column: Any) -> NDArray[Any]:
     """Values of a column; missing integers, which NumPy cannot hold, become NaN."""
+    # Object columns hold Python values, such as None beside integers.
     values = np.asarray(column.to_numpy())
     if values.dtype != object:
         return values
@@ -66,4 +67,5 @@ def _numpy(column: Any) -> NDArray[Any]:
 
 def _missing(value: Any) -> bool:
     """None, and pandas' NA, which is not even equal to itself."""
+    # Compared by name: pandas is not imported where a user has only Polars.
     return value is None or type(value).__name__ == "NAType"

@@ -78,6 +78,7 @@ class Predictions:
             DataError: no such recording.
         """
         which = self._number(recording)
+        # The farthest horizon: near ones lie on the measured line and show nothing.
         ahead = max(self.horizons) if horizon is None else horizon
         if ahead not in self.horizons:
             raise ConfigError(f"horizon = {ahead}; this predictor has {', '.join(map(str, self.horizons))}")
@@ -92,6 +93,7 @@ class Predictions:
             if recording not in names:
                 raise DataError(f"there are no predictions of '{recording}'{closest(recording, names)}")
             return names.index(recording)
+        # Negative numbers count from the end, as in any Python sequence.
         if not -len(names) <= recording < len(names):
             raise DataError(f"there are predictions of {len(names)} recording(s); {recording} is not one of them")
         return recording

@@ -46,6 +46,7 @@ class TrainedPredictor:
     def __init__(self, folder: str | Path, temporary: bool = False) -> None:
         self._folder = Path(folder)
         if temporary:
+            # Temporary folders go with the object; a folder that the user named stays.
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._bundle = load_bundle(self._folder)
         self._task = self._bundle.task
@@ -113,6 +114,7 @@ class TrainedPredictor:
         data = as_recordings(recordings)
         predictor = self._bundle.predictor
         series = [unlabelled(self._task, recording) for recording in data]
+        # Bounds cost a second pass, which a point output does not need.
         bounds = stream_intervals(predictor, series) if predictor.output.coverages else None
         return Predictions(
             recordings=tuple(data),
@@ -220,6 +222,7 @@ def load(path: str | Path) -> TrainedPredictor:
 
 
 def _memory(recordings: Recordings) -> MemorySource:
+    # Named by content: the same recordings judged twice share a folder, others never overwrite it.
     """Recordings of this process; their scores lie in a folder of the run that is named by their content."""
     content = "".join(f"{recording.name}\n{recording.digest}\n" for recording in recordings)
     digest = hashlib.blake2b(content.encode("utf-8", "surrogateescape"), digest_size=6).hexdigest()

@@ -219,10 +219,13 @@ class Recordings(Sequence[Recording]):
         check_bounds("split", SimpleNamespace(test=test, seed=seed), test=between(0.0, 1.0), seed=SEED)
         if len(self) == 1:
             (only,) = self._recordings
+            # At least one row on each side, however small the share.
             cut = min(max(1, only.samples - round(test * only.samples)), only.samples - 1)
             return Recordings([only.rows(0, cut)]), Recordings([only.rows(cut, only.samples)])
         order = np.random.default_rng(seed).permutation(len(self))
+        # At least one recording on each side: an empty part could neither be trained nor judged on.
         count = min(max(1, round(test * len(self))), len(self) - 1)
+        # Order of the recordings is kept within each part, so that only membership is drawn.
         tests = set(order[:count].tolist())
         parts = [[r for i, r in enumerate(self._recordings) if (i in tests) == testing] for testing in (False, True)]
         return Recordings(parts[0]), Recordings(parts[1])

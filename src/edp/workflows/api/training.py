@@ -75,6 +75,7 @@ def train(
     source = together.source or MemorySource(folder / RECORDINGS, recordings=tuple(together))
     try:
         _train(source, experiment, folder, on_progress)
+    # Even an interrupt must not leave a temporary folder behind, which nobody would find.
     except BaseException:
         if out is None:
             shutil.rmtree(folder, ignore_errors=True)
@@ -93,6 +94,7 @@ def _train(
             train_auto(source, experiment, folder, on_progress)
         else:
             train_evaluate.train(source, experiment, folder, on_progress)
+    # A diverged run keeps its best weights, which can only be judged with its recordings.
     except Diverged:
         _write(source)
         raise
@@ -127,6 +129,7 @@ def _experiment(
         usual = FEATURE_SETS.get(str(table["task"]["features"]))
         whole = usual is not None and set(usual.inputs) <= set(data.names)
         task["features"] = table["task"]["features"] if whole else "all"
+    # Arguments and settings could contradict each other in silence; one of them is asked for.
     for key in ("targets", "horizons"):
         if key in own.get("task", {}):
             raise ConfigError(f"settings: task.{key} is the argument `{key}` of edp.train; leave it out")
@@ -137,6 +140,7 @@ def _experiment(
                 "settings: split and the argument `test` both set recordings apart; leave one of them out"
             )
         table["split"] = {"kind": "recordings", "test": list(tests.recording_names)}
+    # A single recording cannot be split by recordings.
     elif len(data) == 1 and "split" not in own:
         table["split"] = {"kind": "time"}
     where, table = f"preset '{preset}' with settings", merged(table, own)
@@ -157,6 +161,7 @@ def _nested(settings: Mapping[str, Any]) -> Table:
     """Dotted keys as tables, in the order given."""
     table: Table = {}
     for key, value in settings.items():
+        # Keys are built up from the innermost part.
         first, *others = reversed(str(key).split("."))
         change: Table = {first: _nested(value) if isinstance(value, Mapping) else _plain(value)}
         for part in others:
@@ -188,5 +193,6 @@ def _write(source: DataSource) -> None:
     folder = make_folder(source.path)
     for number, recording in enumerate(source.recordings):
         file = folder / f"{number:05d}.parquet"  # read back in this order
+        # A resumed training finds the same files; writing them again would cost minutes of a large set.
         if not file.exists():
             write_recording(recording, file)

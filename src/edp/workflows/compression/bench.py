@@ -47,9 +47,11 @@ class CompressionRequest:
         """The network's settings."""
         if self.of is not None:
             return self.of.model(teacher)
+        # Rounding alone needs no narrower network.
         if self.units == width_of(teacher) and self.rounding is not None:
             return teacher
         channels = getattr(teacher.backbone, "channels", None)
+        # A pruned student keeps every level: weights of a level cannot be moved to another one.
         every = None if channels is None else len(channels)
         return student(teacher, self.units, every if self.pruned else self.levels)
 
@@ -97,6 +99,7 @@ class Bench:
 
     def network(self, order: CompressionRequest) -> Predictor:
         """The network of an order, trained now or before."""
+        # Orders are plain values, so equal orders are one training.
         if order not in self._made:
             start = None if order.of is None else self.network(order.of)
             self._made[order] = self.train(order, start)

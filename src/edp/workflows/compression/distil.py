@@ -80,6 +80,7 @@ def distil(
         name="student", units=spec.units, levels=spec.levels, pruned=spec.pruned, distillation=spec.distillation
     )
     model = order.model(teacher.spec)
+    # The teacher under another name would train for nothing.
     if model == teacher.spec:
         raise ConfigError(f"a student of {spec.units} units is the teacher itself; take fewer units or levels")
     teachers = [teacher, *(load_bundle(path).predictor for path in spec.teachers)]
@@ -110,10 +111,12 @@ def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, E
             )
     experiment = load_experiment(folder / "config.toml", None, changes)
     before = load_experiment(folder / "config.toml", None)
+    # A student of another task could not be compared with its teacher.
     if experiment.task != before.task or experiment.model != bundle.predictor.spec:
         raise ConfigError(
             "settings of the task or the model cannot be changed here: a student has those of its teacher"
         )
+    # Frozen sessions were judged once; a student that trains on them would make the test part worthless.
     keep_frozen(before.split, experiment.split)
     return bundle.predictor, experiment, DataSource.from_plain(read_provenance(folder)["data"]["reader"])
 
@@ -126,6 +129,7 @@ def frozen_sessions(run: str | Path, experiment: Experiment) -> dict[str, str]:
 def _run_folder(run: str | Path) -> Path:
     """The folder of a run, or of the run that a bundle lies in."""
     folder = Path(run)
+    # Both a run folder and the bundle inside it are accepted.
     inside = (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file()
     return folder.parent if inside else folder
 
@@ -145,6 +149,7 @@ def order_facts(order: CompressionRequest) -> dict[str, Any]:
 
 def _loss(spec: DistillationSpec) -> Any:
     """The soft loss with its name; a loss that is not registered, such as the softmax form, by its class."""
+    # Losses of a distillation need not be registered: the class name stands for them in the key.
     name = next((key for key, kind in LOSSES.items() if kind is type(spec.soft)), type(spec.soft).__name__)
     return {"kind": name} | {key: plain_tree(value) for key, value in vars(spec.soft).items()}
 

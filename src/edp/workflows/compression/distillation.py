@@ -42,6 +42,7 @@ class SoftmaxDivergence:
 
     outputs: ClassVar[tuple[str, ...]] = (POINT,)
 
+    # T = 2 is the temperature of the thesis (eq. 2.23).
     temperature: float = 2.0
 
     def __post_init__(self) -> None:
@@ -52,6 +53,7 @@ class SoftmaxDivergence:
         student = torch.log_softmax(answer.center / self.temperature, dim=-1)
         teacher = torch.log_softmax(target / self.temperature, dim=-1)
         scale = self.temperature**2 * target.shape[-1]
+        # T^2 keeps the gradient's size independent of the temperature (Hinton et al. 2015).
         return scale * teacher.exp() * (teacher - student)
 
 
@@ -112,7 +114,7 @@ class Distillation:
         for number, teacher in enumerate(self.teachers[1:], start=2):
             check_same_ends(teacher.task, self.teachers[0].task, f"teacher {number}", "teacher 1")
         task = self.teachers[0].task
-        self.said = len(task.horizons) * len(task.targets)
+        self.said = len(task.horizons) * len(task.targets)  # numbers of one teacher prediction
         self.components: Components | None = None
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
@@ -129,6 +131,7 @@ class Distillation:
             chunks = spec.chunks
             ticks = chunks.batch * (chunks.length if chunks.regime == "chunk" else 1)
             width = int(net.forward_features(*_one_tick(net))[2].shape[-1])
+            # The hint solves a regression in each batch: fewer than four ticks a feature would fit noise.
             if ticks < 4 * width:
                 raise ConfigError(
                     f"distillation: a batch has {ticks} ticks with a loss, too few to compare {width} hidden features "
@@ -143,6 +146,7 @@ class Distillation:
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
         """The dual objective of a batch; ticks without truth count for the teachers only."""
         spec, teacher_targets = self.spec, batch_context.teacher_targets
+        # The mark is a number among the targets; half is its threshold.
         labelled = batch_context.valid & (teacher_targets[..., 0] > 0.5)
         teacher_predictions = teacher_targets[..., 1 : 1 + self.said].unflatten(-1, batch_context.future.shape[2:])
         target = objective.code.encode(teacher_predictions, batch_context.features)
@@ -164,6 +168,7 @@ class Distillation:
 
     def _taught(self, part: Series, truth: bool) -> Series:
         answers = [stream_predictions(teacher, [part])[0] for teacher in self.teachers]
+        # The mean of teachers in double precision, so that their number does not change the last bit of the target.
         mean = np.mean(np.stack(answers), axis=0, dtype=np.float64).reshape(part.samples, -1)
         if not np.isfinite(mean).all():
             raise DataError(
@@ -178,6 +183,7 @@ class Distillation:
         return replace(part, targets=targets, teacher_targets=np.concatenate(columns, axis=1).astype(np.float32))
 
     def _hidden(self, part: Series) -> NDArray[np.float32]:
+        # Side by side: hidden spaces of several teachers have no common axes to average over.
         """Hidden features of all teachers side by side, ``(time, width)``."""
         return np.concatenate([stream_hidden(teacher, [part])[0] for teacher in self.teachers], axis=1)
 

@@ -33,8 +33,10 @@ class Components:
             values = part.astype(np.float64)
             count, total, squares = count + len(values), total + values.sum(axis=0), squares + values.T @ values
         mean = total / count
+        # Moments in one pass: hidden features of all recordings would not fit in memory.
         variances, vectors = np.linalg.eigh(squares / count - np.outer(mean, mean))
         strongest = np.argsort(variances)[::-1][:components]
+        # One scale for all components: weak ones must not count as much as strong ones.
         scale = np.sqrt(max(float(variances[strongest].mean()), 1e-12))
         return cls(mean, vectors[:, strongest] / scale)
 
@@ -57,10 +59,14 @@ def hint_error(hidden: Tensor, teacher_components: Tensor, valid: Tensor) -> Ten
     """
     rows = hidden[valid]
     if len(rows) < 4 * rows.shape[1]:
+        # Zero with a gradient path: too few ticks give no hint, and the optimiser needs no special case.
         return hidden.sum() * 0.0
+    # The constant column lets the map have an offset.
     rows = torch.cat([rows, rows.new_ones(len(rows), 1)], dim=1)
     goal = teacher_components[valid]
+    # The best map is a constant for the gradient: at its optimum the envelope theorem makes its own change vanish.
     with torch.no_grad():
+        # Double precision: normal equations square the condition number.
         student_features = rows.double()
         gram = student_features.T @ student_features
         gram += RIDGE * gram.diagonal().mean() * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)

@@ -40,6 +40,7 @@ def dynamic_int8(predictor: Predictor) -> Quantised:
     tick by itself: so a stream, a chunk and a window see the same numbers.
     """
     quantised = copy.deepcopy(predictor).eval()
+    # Shortcuts are 1x1 convolutions, which PyTorch's dynamic quantisation leaves alone.
     convolutions = {part.shortcut for part in quantised.modules() if isinstance(part, TemporalBlock)}
     errors: dict[str, float] = {}
     count = 0
@@ -55,6 +56,7 @@ def dynamic_int8(predictor: Predictor) -> Quantised:
                     count += weight.numel()
                 _round_heads(part)
     quantised.number_format = "dynamic int8"
+    # A rounded weight takes one byte instead of four.
     return Quantised(quantised, 4 * parameters_of(quantised) - 3 * count, errors)
 
 
@@ -63,6 +65,7 @@ def _round_heads(heads: Heads) -> None:
     heads.register_forward_pre_hook(_round_input)
     units = [_rounded(unit) for unit in heads.units]
     if heads.mix is not None:
+        # With a block across the outputs, that block's result is what the last layer reads.
         units[-1] = heads.units[-1]
         heads.mix.register_forward_hook(lambda module, arguments, result: (round_tick(result[0]), result[1]))
     heads.units = tuple(units)
@@ -87,7 +90,9 @@ def _round_weight(weight: Tensor, dim: int) -> float:
 
 def round_tick(x: Tensor) -> Tensor:
     """Round each tick's features ``(..., feature)`` to 256 levels from the least to the largest, zero among them."""
+    # Zero is always a level, so that padding and inactive units stay exact.
     low, high = x.amin(dim=-1, keepdim=True).clamp(max=0.0), x.amax(dim=-1, keepdim=True).clamp(min=0.0)
+    # A tick of zeros has no range.
     scale = ((high - low) / 255).clamp(min=1e-30)
     zero = (low / scale).round()
     return ((x / scale).round().clamp(min=zero, max=zero + 255)) * scale

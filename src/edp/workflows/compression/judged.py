@@ -90,11 +90,13 @@ def measure(deployed: Deployed, data: Prepared, skip: int) -> dict[str, dict[str
 
 def on_validation(data: Prepared) -> Prepared:
     """The same data with the validation part in the place of the test part."""
+    # Choices rest on the validation part; the test part is opened once, at the end.
     return replace(data, test=data.validation)
 
 
 def relative(scores: Mapping[str, Mapping[str, float]], teacher: Mapping[str, Mapping[str, float]]) -> float:
     """MAE over that of the teacher, the mean over horizons."""
+    # A ratio by horizon: far horizons have larger errors and would decide alone.
     return float(np.mean([scores[horizon]["mae"] / max(row["mae"], 1e-30) for horizon, row in teacher.items()]))
 
 
@@ -102,6 +104,7 @@ def choose(rows: Sequence[Judged]) -> tuple[list[int], int | None]:
     """The front of error, cycles and bytes, and of what fits the row with the least error (of equals the cheapest)."""
     points = [(row.error, row.resource_usage.cycles[2], row.resource_usage.parameter_bytes) for row in rows]
     fitting = [index for index, row in enumerate(rows) if row.fits]
+    # Ties of error go to fewer cycles, then fewer bytes, by the order of the tuple.
     best = min(fitting, key=points.__getitem__, default=None)
     return pareto(points), best
 

@@ -83,6 +83,7 @@ def make_plan(
         raise ConfigError(
             f"units = {', '.join(map(str, wrong))}; 1 <= units <= {full}, those of the teacher, must hold"
         )
+    # One and two units are there for budgets that no multiple of four meets.
     possible = [width for width in sorted({1, 2, full, *range(STEP, full, STEP)}) if width <= full]
     possible = [width for width in possible if not _why_not(teacher, _narrow(teacher.spec, width))]
     supported, notes = _supported(teacher, possible[0], formats or list(FORMATS))
@@ -94,6 +95,7 @@ def make_plan(
             notes.append(f"no width fits the budget in {FORMATS[name].label}")
     tops = set(fitting.values()) - {0}
     goals = {max(tops) * share for share in shares}
+    # Halves and quarters are rounded down to a possible width, so that they fit as well.
     widths = set(units) or tops | {max([width for width in possible if width <= goal] or tops) for goal in goals}
     orders = {width: _orders(teacher, width, recipes, notes) for width in sorted(widths - {full}, reverse=True)}
     return CompressionPlan(orders, tuple(supported), tuple(dict.fromkeys(notes)))
@@ -106,6 +108,7 @@ def _orders(teacher: Predictor, width: int, recipes: Sequence[str], notes: list[
         "pruned": CompressionRequest(name=f"p{width}", units=width, pruned=True),
     }
     orders = [order for recipe, order in both.items() if recipe in recipes]
+    # What cannot be pruned can still be distilled.
     try:
         check_pruning(teacher.spec, _narrow(teacher.spec, width))
     except ConfigError as error:
@@ -131,6 +134,7 @@ def _why_not(teacher: Predictor, model: ModelSpec) -> str:
 def _supported(teacher: Predictor, least: int, formats: Sequence[str]) -> tuple[list[str], list[str]]:
     """The formats that have a form for every part of the network, and why the others have none."""
     net = _untrained(_narrow(teacher.spec, least), teacher.task)
+    # Two windows of random inputs suffice to find whether a format has a form for every part.
     drawn = np.random.default_rng(0).normal(size=(2 * net.spec.window, len(net.task.inputs))).astype(np.float32)
     series = [Series("drawn", drawn, np.zeros((len(drawn), len(net.task.targets)), dtype=np.float32))]
     supported, notes = [], []
@@ -153,6 +157,7 @@ def _narrow(model: ModelSpec, units: int) -> ModelSpec:
 
 
 def _untrained(model: ModelSpec, task: Task) -> Predictor:
+    # Counts depend on sizes only: weights are not trained for them.
     return build_model(task, model, blank_scaler(task), seed=0)
 
 
@@ -163,6 +168,7 @@ def _usage_at(teacher: Predictor, units: int, name: str, budget: Budget) -> Reso
 def _widest(teacher: Predictor, name: str, budget: Budget, widths: Sequence[int]) -> int:
     """The widest network that fits; 0 for none."""
     low, high = 0, len(widths)  # those before `low` fit, those from `high` on do not
+    # Cost rises with the width, so bisection finds the widest that fits in a few builds.
     while low < high:
         middle = (low + high) // 2
         if _usage_at(teacher, widths[middle], name, budget).over(budget):
@@ -179,6 +185,7 @@ def _refusal(teacher: Predictor, budget: Budget, formats: Sequence[str], least_w
     def worst(name: str) -> float:
         return max(value / limit for value, limit in least[name].over(budget).values())
 
+    # The nearest is the one whose worst limit is exceeded by the least factor.
     nearest = min(formats, key=worst)
     over = least[nearest].over(budget)
     granted = ", ".join(f"{limit} = {pair[1]:,}" for limit, pair in over.items())

@@ -43,6 +43,7 @@ def prune(predictor: Predictor, model: ModelSpec, series: Sequence[Series]) -> P
     small = Predictor(predictor.task, model, blank_scaler(predictor.task)).eval()
     importances = importance(predictor, series)
     with torch.no_grad():
+        # These parts have no width to prune: they are copied whole.
         for name in ("front", "code", "output", "activation", "bypass", "physics"):
             part = getattr(small, name)
             if part is not None:
@@ -74,6 +75,7 @@ def _backbone(big: nn.Module, small: nn.Module, input_features: Tensor, importan
         input_features = units
     small.pooling.score.weight.copy_(big.pooling.score.weight[:, units])
     small.pooling.score.bias.copy_(big.pooling.score.bias)
+    # Pooled states, last states and their differences keep the same units, side by side.
     return _side_by_side([(units, big.pooling.units)] * (2 + len(big.extras)))
 
 
@@ -86,10 +88,12 @@ def _stack(
             out = input_features
         else:
             total = importances.sites[block].clone()
+            # Residual sums tie channels of following blocks together: they are chosen by their joint importance.
             for later, other in pairs[index + 1 :]:  # what follows without weights on its path keeps the same channels
                 if later.shortcut is not None or other.shortcut is not None:
                     break
                 total += importances.sites[later]
+            # Channels inside a block are free: nothing but its second convolution reads them.
             out = _best(total, len(narrow.second.bias))
         inner = _best(importances.sites[block.first], len(narrow.first.bias))
         _convolution(block.first, narrow.first, input_features, inner)
@@ -123,6 +127,7 @@ def _recurrent(big: nn.Module, small: nn.Module, input_features: Tensor, units: 
     """Matrices with one row a unit for each gate; those of the state have a column a unit, the others one an input."""
     full = _units(big)
     for (name, its), own in zip(big.named_parameters(), small.parameters(), strict=True):
+        # Gates lie one behind the other: a unit has a row in each of them.
         rows = torch.cat([units + gate * full for gate in range(its.shape[0] // full)])
         own.copy_(its[rows] if its.ndim == 1 else its[rows][:, units if "_hh" in name else input_features])
 
@@ -135,6 +140,7 @@ def _heads(big: Heads, small: Heads, input_features: Tensor, importances: Sequen
             if layer < len(big.units):
                 best = _best(importances[layer][output], small.widths[layer + 1])
                 factor = big.units[layer].factor
+                # A gated unit reads two halves; a feature is kept in both or in none.
                 out = torch.cat([best + half * big.widths[layer + 1] for half in range(factor)])
             else:
                 best = out = torch.arange(big.weights[layer].shape[2])
@@ -145,6 +151,7 @@ def _heads(big: Heads, small: Heads, input_features: Tensor, importances: Sequen
 
 def _best(importances: Tensor, count: int) -> Tensor:
     """The `count` most important features, in their order."""
+    # Sorted and stable: the order of features stays, and ties give the same network everywhere.
     return torch.sort(torch.argsort(importances, descending=True, stable=True)[:count]).values
 
 

@@ -59,6 +59,7 @@ class QuantisationAware:
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
         """The training series with what the teachers say of them, where there are any."""
+        # Ranges are found on the run's own series: those of a teacher may hold unlabelled recordings.
         self._known = own_series
         return list(own_series) if self.strategy is None else self.strategy.series(task, own_series)
 
@@ -70,9 +71,11 @@ class QuantisationAware:
         """
         if self.strategy is not None:
             self.strategy.begin(net, spec)
+        # The start replaces what the strategy has set, since training goes on from it.
         continue_from(net, self.start)
         self._rounding = NetworkRounding(net, self.spec.activation_bits, self.spec.recurrent)
         self._rounding.install(self._known)
+        # The rounded start is a candidate: training must improve on it.
         return True
 
     def loss(self, objective: Objective, batch_context: BatchContext) -> Tensor:
@@ -90,6 +93,7 @@ class QuantisationAware:
     def end(self, net: Predictor) -> None:
         """Leave an ordinary network with rounded weights."""
         if self._rounding is not None:
+            # Hooks go first: they would round what is being set.
             self._rounding.remove()
             self._rounding.keep()
             self._rounding = None

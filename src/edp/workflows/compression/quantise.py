@@ -39,6 +39,7 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
     if (Path(out) / "run.json").exists():
         raise ExportError(f"'{out}' holds a trained run, which would be lost; choose another folder with --out")
     integer_network = integer_predictor(bundle.predictor, data.train, ticks)
+    # Both errors on the validation part, so that the loss by rounding is not mixed with other data.
     errors = {
         name: mean_error(one, data.validation)
         for name, one in (("float", bundle.predictor), ("integer", integer_network))
@@ -48,5 +49,6 @@ def quantise(run: str | Path, out: str | Path, ticks: int = 20_000) -> dict[str,
             if (folder / name).is_file():
                 write_bytes(target.file(name), (folder / name).read_bytes())
         write_json(target.file("provenance.json"), provenance | {"number_format": integer_network.number_format})
+        # Scores are those of the float network; they would be wrong for the integer one.
         save_bundle(replace(bundle, predictor=integer_network, scores={}), target.file("bundle"))
     return errors | {"bytes": float(constant_bytes(integer_network.integers, bundle.adaptation))}

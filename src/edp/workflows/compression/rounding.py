@@ -30,6 +30,7 @@ def weight_levels(weight: Tensor, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
     levels again.
     """
     others = [axis for axis in range(weight.ndim) if axis not in axes]
+    # The floor serves rows of zeros, which have no step.
     steps = weight.abs().amax(dim=others, keepdim=True).clamp(min=1e-30) / LEVELS
     return (weight / steps).round(), steps
 
@@ -39,6 +40,7 @@ class _StraightThrough(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, rounded: Tensor) -> Tensor:
+        # Rounding has zero slope almost everywhere; its gradient is taken as one (straight-through estimator).
         return rounded
 
     @staticmethod
@@ -68,6 +70,7 @@ class Site:
     def __call__(self, x: Tensor) -> Tensor:
         """The values, rounded where the range is fixed."""
         if self.limit is not None:
+            # Outside of the range the clamp has no gradient: values there should not grow further.
             inside = x.clamp(-self.limit, self.limit)
             return _through(inside, self._rounded(x, self.limit))
         if self.errors is None:
@@ -79,6 +82,7 @@ class Site:
         return x
 
     def _rounded(self, x: Tensor, limit: float) -> Tensor:
+        # Symmetric levels, as in the exported integer code.
         step = limit / self.levels
         rounded: Tensor = (x / step).round().clamp(-self.levels, self.levels) * step
         return rounded
@@ -119,6 +123,7 @@ class NetworkRounding:
         if self.bits:
             for part in dict.fromkeys(matrix.part for matrix in self.matrices):
                 self._watch(part)
+            # The beginnings of all series give ranges of every kind of work at little cost.
             some = [
                 replace(one, inputs=one.inputs[:PIECE], targets=one.targets[:PIECE], teacher_targets=None)
                 for one in series
@@ -126,6 +131,7 @@ class NetworkRounding:
             stream_predictions(self.network, some)
             for site in self.sites:
                 site.compare()
+            # With 16 bits a single share is tried, and the second pass would choose nothing.
             if any(len(site.shares) > 1 for site in self.sites):
                 stream_predictions(self.network, some)
             for site in self.sites:
@@ -155,6 +161,7 @@ class NetworkRounding:
         """Let a part compute with rounded weights whenever it is called."""
         replaced = [(matrix.holder._parameters, matrix.key, matrix.values, matrix.axes) for matrix in matrices]
 
+        # Before the call the parameter is a rounded tensor, whose gradient flows to the real one.
         def enter(*_: object) -> None:
             for parameters, key, weight, axes in replaced:
                 levels, steps = weight_levels(weight.detach(), axes)
@@ -165,6 +172,7 @@ class NetworkRounding:
                 parameters[key] = weight  # type: ignore[assignment]
 
         self._handles.append(part.register_forward_pre_hook(enter))
+        # Called even after an error, so that the network never keeps rounded weights.
         self._handles.append(part.register_forward_hook(leave, always_call=True))
 
     def _watch(self, part: nn.Module) -> None:

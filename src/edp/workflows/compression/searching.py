@@ -117,6 +117,7 @@ class DiskBench(Bench):
         facts |= {"start": None if start is None else weights_digest(start)}
         run = self.folder / order.name
         done, self.done = self.done, self.done + 1
+        # A finished run with the same facts is read: a search that goes on trains nothing twice.
         status = read_object(run / "status.json", ("status",))["status"] if (run / "status.json").is_file() else ""
         if status == "finished":
             bundle = load_bundle(run)
@@ -172,11 +173,13 @@ def search(
     frozen = frozen_sessions(run, experiment)
     data = prepare_data(source or own, experiment, frozen)
     held_out = _held_out_test_of(source or own, experiment, data)
+    # The judge changes no weights; its settings stay out of the key.
     settings = {key: value for key, value in plain_tree(experiment).items() if key != "judge"}
     key = run_key(settings | {"teacher": weights_digest(teacher)}, data.digest)
     with RunFolder(out) as folder:
         folder.claim(key, experiment_toml(experiment))
         bench = DiskBench(teacher, data, experiment, source or own, make_folder(folder.file("runs")), callbacks)
+        # A network judged in several formats is streamed in float only once.
         bench.frozen = frozen
         evaluator = _Evaluator(bench, spec.budget, Path(run), held_out.data)
         rows, notes = _rows(bench, evaluator, plan, spec)
@@ -215,6 +218,7 @@ def _held_out_test_of(source: DataSource, experiment: Experiment, data: Prepared
     split = experiment.split
     if not isinstance(split, ByFrozen):
         return _HeldOutTest(data)
+    # Sessions count by content: a renamed file is still the same recording.
     there = {recording.digest for recording in source.read()}
     if not any(session.digest in there for session in split.second):
         return _HeldOutTest(data, opened_before=any(session.digest in there for session in split.test))
@@ -244,6 +248,7 @@ def _rows(
         networks = {order: bench.network(order) for order in orders}
         for order, network in networks.items():
             judge(order, network, plan.formats)
+        # The better recipe is chosen in float: rounding is tried on one of them only, since it costs a training.
         plain = {order: evaluator.float_error(network) for order, network in networks.items()}
         for order in plan.tuned(min(plain, key=plain.__getitem__)):
             judge(order, bench.network(order), [name for name in plan.formats if FORMATS[name].rounded])
@@ -323,6 +328,7 @@ def _judge_held_out(
 ) -> dict[str, Any]:
     """Judge teacher and chosen on the sealed test set, once; the opening is recorded before it is made."""
     pair = {"teacher": result.teacher, "chosen": result.best}
+    # Weights and format are the key of an opening: the same pair may be judged again without a second look.
     keys = [evaluator.key(row) for row in pair.values() if row is not None]
     why = "the network chosen by edp compress, and its teacher"
     ledgers = [folder.file("ledger")] if held_out.study is None else [held_out.study / "ledger", folder.file("ledger")]
@@ -338,6 +344,7 @@ def _judge_held_out(
 
 def _seen(run: Path, source: DataSource | None, own: DataSource, held_out: _HeldOutTest) -> bool:
     """Whether the sealed test set is the test part and was judged before, by ``edp evaluate``."""
+    # The test part of the same data that `edp evaluate` has judged is no sealed set any more.
     same = held_out.name == TEST_PART and (source is None or source.to_plain() == own.to_plain())
     return same and (run / "scores.json").is_file()
 

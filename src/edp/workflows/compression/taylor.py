@@ -17,6 +17,7 @@ from edp.networks.convolution import CausalConv, TemporalBlock
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import detach_state
 
+# 256 ticks: long enough for the state to settle after its lead, short enough for many pieces.
 PIECE = 256
 
 
@@ -55,6 +56,7 @@ def importance(predictor: Predictor, series: Sequence[Series], pieces: int = 64)
             _loss(predictor, part, start, stop).backward()
             for module, value in outputs.items():
                 if value.grad is not None:
+                    # The sum over ticks before the square: a feature counts by its effect on the whole piece.
                     change = (value * value.grad).sum(dim=(0, 1)).detach().square()
                     by_module[module] = by_module.get(module, torch.zeros_like(change)) + change
             for layer, change in enumerate(_hidden_changes(predictor)):
@@ -72,12 +74,14 @@ def _pieces(predictor: Predictor, series: Sequence[Series], most: int) -> list[t
     ]
     if not every:
         raise DataError(f"pruning: no series is longer than the horizon of {reach} ticks; give longer recordings")
+    # Even distances over all recordings; drawing would make importance depend on chance.
     chosen = np.unique(np.linspace(0, len(every) - 1, min(most, len(every))).round().astype(int))
     return [every[i] for i in chosen]
 
 
 def _loss(predictor: Predictor, part: Series, start: int, stop: int) -> Tensor:
     """Mean squared standardised error of a piece, after a lead of a window from reset."""
+    # A window of lead, so that the state is that of a stream and not of a reset.
     lead = max(0, start - predictor.spec.window)
     like = next(predictor.parameters())
     x = torch.from_numpy(part.inputs[lead:stop]).unsqueeze(0).to(like)
@@ -85,6 +89,7 @@ def _loss(predictor: Predictor, part: Series, start: int, stop: int) -> Tensor:
     if start > lead:
         with torch.no_grad():
             _, _, state = predictor.run(x[:, : start - lead], state)
+    # Gradients end at the piece: the lead only sets the state.
     answer, features, _ = predictor.run(x[:, start - lead :], detach_state(state))
     future = np.stack([part.targets[start + k : stop + k] for k in predictor.task.horizons], axis=1)
     target = predictor.code.encode(torch.from_numpy(future).unsqueeze(0).to(like), features)
@@ -125,6 +130,7 @@ def _hidden_changes(predictor: Predictor) -> list[Tensor]:
     for weight, bias, width in zip(heads.weights, heads.biases, heads.widths[1:-1], strict=False):
         if weight.grad is None or bias.grad is None:
             continue
+        # Weights times gradients give z dL/dz of the features that they make, without a hook inside the head.
         total = (weight * weight.grad).sum(dim=1) + bias * bias.grad
         changes.append(total[:, :width].detach())
     return changes

@@ -55,6 +55,7 @@ def _rounded(bench: Bench, name: str, of: CompressionRequest | None) -> Compress
     network = bench.network(order)
     folded = sum(cost.parameters - cost.foldable for cost in network.costs())
     rounded = sum(matrix.values.numel() for matrix in matrices_of(network, recurrent=False))
+    # Bytes as the thesis counts them: one for each rounded weight, four for the others.
     return CompressedCandidate(name, order, network, "dynamic_int8", 4 * folded - 3 * rounded)
 
 

@@ -26,6 +26,7 @@ from edp.storage.runs import command_line
 from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
 
 PROPOSED, DIFFERENCES, ALL = "proposed", "proposed + differences", "all candidates"
+# The file stays readable; the whole list is in `screening.json`.
 _MOST_DROPPED = 200
 
 
@@ -110,6 +111,7 @@ def select_features(
     """
     order, listeners = order or SelectionOrder(), listeners or Listeners()
     folder = check_writable(out)
+    # Without a map all channels are read under the names of the files: a screening may judge each of them.
     mapped = source if source.signal_map is not None or _lists_maps(source) else _taken_whole(source)
     quality = mapped.inspect(listeners.on_log)
     recordings, notes = _read(mapped, quality)
@@ -146,6 +148,7 @@ def _taken_whole(source: DataSource) -> DataSource:
 def _read(source: DataSource, quality: DataQuality) -> tuple[list[Recording], list[str]]:
     """The recordings with the channels that all of them hold; missing values of candidates are kept as such."""
     repair = source.repair or Repair()
+    # Missing values of one candidate must not refuse the whole log; the candidate is left out instead.
     lenient = replace(source, repair=replace(repair, nan="keep") if repair.nan == "refuse" else repair)
     recordings = common_channels(lenient.read())
     common = set(recordings[0].channel_names)
@@ -173,6 +176,7 @@ def _candidates(first: Recording, order: SelectionOrder) -> tuple[ScreeningSpec,
     chosen = [name for name in spec.candidates or first.channel_names if name not in order.exclude]
     notes = []
     if not order.truth and not spec.candidates:
+        # Channels that no machine has would look best of all.
         hidden = [name for name in chosen if is_truth(name) and name not in spec.targets]
         chosen = [name for name in chosen if name not in hidden]
         if hidden:
@@ -183,6 +187,7 @@ def _candidates(first: Recording, order: SelectionOrder) -> tuple[ScreeningSpec,
 def _sets(screening: ScreeningResult, first: Recording) -> dict[str, FeatureSettings]:
     """The proposed set with the targets in it, as the delta mode needs them; with pressure changes; the usual sets."""
     names = screening.proposal.kept
+    # Targets come first: delta mode reads their present values.
     channels = (*(target for target in screening.targets if target not in names), *names)
     proposed = FeatureSettings(name=PROPOSED, channels=channels)
     sets = {PROPOSED: proposed}
@@ -251,12 +256,14 @@ def _needed_map(source: DataSource, screening: ScreeningResult, first: Recording
     resolved_names = []
     for log in source.logs():
         log_entries, problems = resolve(open_log(log.path, SignalMap()), SignalMap())
+        # A log that cannot be resolved without a map shows that one is needed.
         resolved_names.append(() if problems else tuple(entry.channel.name for entry in log_entries))
     if all(set(names) <= set(own) and own == resolved_names[0] for own in resolved_names):
         return None
     entries: dict[str, Any] = {}
     for name in names:
         kind = first.channels[first.index(name)].kind
+        # The kind is stated where the name alone does not tell it.
         usual = VOCABULARY.get(name)
         entries[name] = {"column": name} | ({} if usual is not None and usual.kind == kind else {"kind": str(kind)})
     return "# The channels that edp screen proposed, under the names of the files.\n\n" + tomli_w.dumps(

@@ -34,6 +34,7 @@ FILE = "trials.json"
 COVERAGE = 0.95
 MOST_SETS = 1_000
 """Random sets, or seeds: each of them is a training."""
+# Small sets of few channels repeat themselves; the number of draws must end somewhere.
 _DRAWS = 20
 """Draws for one random set that is not there already."""
 
@@ -143,6 +144,7 @@ def try_feature_sets(
         EdpError: nothing that can be tried, or a training failed; what was finished stays.
     """
     spec = spec or TrialSpec()
+    # Sets are checked before the first training: an impossible one would fail after hours.
     first = source.read()[0]
     chosen, notes = _usable(sets, experiment, first)
     if not chosen:
@@ -162,6 +164,7 @@ def try_feature_sets(
                 training=replace(experiment.training, seed=seed),
             )
 
+            # Defaults bind the loop's values now; the function is called later.
             def tell(event: TrainingProgress | None, name: str = name, done: int = done) -> None:
                 if on_trial is not None:
                     on_trial(name, done, total, event)
@@ -169,6 +172,7 @@ def try_feature_sets(
             tell(None)
             run = folder / f"{_slug(name)}_seed{seed}"
             bundle = train(source, settings, run, tell)
+            # Persistence alone: the sets are compared with each other, other rivals cost minutes each.
             evaluate(run, baselines=["persistence"])
             finished.setdefault(name, []).append(_Finished.of(bundle, run))
             done += 1
@@ -204,7 +208,7 @@ def _usable(sets: Sets, experiment: Experiment, first: Recording) -> tuple[dict[
         if missing:
             notes.append(f"{name} was not tried: the recordings lack {', '.join(missing)}")
         else:
-            chosen[name] = features
+            chosen[name] = features  # impossible sets are notes, not errors
     return chosen, notes
 
 
@@ -233,6 +237,7 @@ def _drawn(
     free = [name for name in first.channel_names if name not in {*always, *spec.barred}]
     rng = np.random.default_rng(spec.draw)
     drawn: dict[str, str | FeatureSettings] = {}
+    # The first set itself would be no random one.
     drawn_sets = {frozenset(first_inputs)}
     for _ in range(_DRAWS * spec.random):
         picked = sorted(rng.choice(len(free), max(0, min(size - len(always), len(free))), replace=False))
@@ -282,6 +287,7 @@ def _compared(finished: Mapping[str, Sequence[_Finished]], notes: Sequence[str],
         models = [run.scores["models"]["network"] for run in finished[name]]
         by_seed = {h: tuple(float(m["overall"][h]["mean"]["mae"]) for m in models) for h in ahead}
         difference = None
+        # An interval needs two recordings at least.
         if name != names[0] and len(by_recording[name][ahead[0]]) > 1:
             difference = {h: _difference(by_recording[name][h], by_recording[names[0]][h]) for h in ahead}
         one = finished[name][0]
@@ -314,5 +320,6 @@ def _difference(ours: Mapping[str, float], reference: Mapping[str, float]) -> Pa
     """Paired over recordings, with Student's t."""
     gaps = np.array([ours[name] - reference[name] for name in reference])
     mean = float(gaps.mean())
+    # Pairs by recording: recordings differ more than feature sets do.
     reach = float(stats.t.ppf(0.5 + COVERAGE / 2, len(gaps) - 1)) * float(gaps.std(ddof=1)) / math.sqrt(len(gaps))
     return PairedDifference(mean, mean - reach, mean + reach)

@@ -17,6 +17,7 @@ from edp.registry import Registry
 from edp.training.bundle import Bundle
 
 NAME = "predictor"
+# The least of three rounds: other work on the machine only ever adds time.
 ROUNDS = 3
 
 
@@ -140,8 +141,10 @@ def compared(form: str, title: str, case: ParityCase, ran: Ran) -> Row:
         why = f"shape {computed.shape} instead of {expected.shape}"
         return Row(form, title, "different", why, **rest)  # type: ignore[arg-type]
     apart = np.abs(computed - expected)
+    # A tolerance of zero asks for equal bits.
     exact = not allowed.any()
     share = (computed != expected).astype(float) if exact else apart / allowed
+    # NaN compares false with everything and would pass as equal.
     share = np.where(np.isfinite(computed), share, np.inf)
     largest = float(share.sum() if exact else share.max())
     same = largest == 0.0 if exact else largest <= 1.0
@@ -170,6 +173,7 @@ def called(command: Sequence[object], folder: Path, feed: bytes = b"") -> bytes:
     """
     done = subprocess.run([str(part) for part in command], cwd=folder, input=feed, capture_output=True)
     if done.returncode:
+        # The last lines tell the cause; compilers write thousands before them.
         output = (done.stdout + done.stderr).decode(errors="replace").strip()[-600:]
         raise Broken(f"{Path(str(command[0])).name} ended with {done.returncode}: {output}")
     return done.stdout

@@ -62,6 +62,7 @@ def compare(
     rows: list[Row] = []
     for name in forms or list(FORMS):
         form = FORMS[name]()
+        # Each form has an empty folder: files of one must not help another.
         with tempfile.TemporaryDirectory() as temporary:
             try:
                 runs = form.run(case, Path(temporary))

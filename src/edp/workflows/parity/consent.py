@@ -19,5 +19,7 @@ def from_own_run(path: str | Path) -> bool:
     """
     folder = Path(path)
     return any(
-        (candidate / RUN).is_file() for candidate in (folder, *([folder.parent] if folder.name == "bundle" else []))
+        # The bundle of a run lies one folder below it.
+        (candidate / RUN).is_file()
+        for candidate in (folder, *([folder.parent] if folder.name == "bundle" else []))
     )

@@ -68,6 +68,7 @@ class ResourceUsage:
 
     def over(self, budget: Budget) -> dict[str, tuple[int, int]]:
         """Limits that are exceeded: what is taken, and what is granted."""
+        # The high estimate of cycles decides: a deadline that is missed at times is missed.
         pairs = {
             "cycles": (self.cycles[2], budget.cycles),
             "parameter_bytes": (self.parameter_bytes, budget.parameter_bytes),
@@ -101,6 +102,7 @@ def resource_usage(
         cycles=estimate.cycles[budget.core],
         parameter_bytes=weights,
         ram_bytes=weights + estimate.ram_bytes,
+        # Constants lie in flash, too; they are counted in both, as in the thesis.
         flash_bytes=weights + estimate.program_bytes,
     )
 

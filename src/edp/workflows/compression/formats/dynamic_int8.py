@@ -22,6 +22,7 @@ class DynamicInt8:
     """
 
     label: ClassVar[str] = "INT8"
+    # No code is exported in this format; cycles of single precision stand for it.
     estimated: ClassVar[str] = "float32"
     rounded: ClassVar[bool] = False
 

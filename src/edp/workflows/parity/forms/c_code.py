@@ -18,6 +18,7 @@ from edp.networks.integer import IntegerPredictor
 from edp.training.bundle import Bundle
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
 
+# Without contraction of products and sums: the tolerance is that of single precision, W8A16 asks for equal bits.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 DRIVER = Template("""/* Streams rows of inputs some times; then rows of outputs, and the least seconds as a double. */
 #define _POSIX_C_SOURCE 199309L
@@ -65,6 +66,7 @@ def streamed(bundle: Bundle, inputs: Rows, folder: Path) -> tuple[Rows, float]:
     runtime = sorted(path.name for path in folder.glob("edp_*.c"))
     called([compiler, *FLAGS, "driver.c", f"{NAME}.c", *runtime, "-lm", "-o", "driver"], folder)
     output = called([folder / "driver"], folder, np.ascontiguousarray(inputs, dtype=np.float32).tobytes())
+    # The driver writes the least time behind the numbers.
     (seconds,) = struct.unpack("<d", output[-8:])
     return np.frombuffer(output[:-8], dtype=np.float32).reshape(len(inputs), -1), seconds / len(inputs)
 

@@ -42,6 +42,7 @@ def _run(case: ParityCase, folder: Path, how: str, compiler: str = "") -> Sequen
     CasadiTarget().write(case.bundle, NAME, folder)
     (folder / "run.py").write_text(PROGRAM)
     np.save(folder / "inputs.npy", case.inputs)
+    # Isolated (`-I`): the exported files must run without EDP on the path.
     output = called([sys.executable, "-I", "run.py", folder, how, "inputs.npy", "found.npy", compiler], folder)
     return [("", Ran(np.load(folder / "found.npy"), json.loads(output)))]
 

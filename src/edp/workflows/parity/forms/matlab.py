@@ -67,10 +67,12 @@ int main(void) {
 def _octave(case: ParityCase, folder: Path, run: str, timed: str) -> tuple[Rows, float]:
     """What a program in Octave finds, and its least seconds."""
     program = need("octave-cli", "octave")
+    # The ONNX window is a form of its own and would need the package onnx here.
     SimulinkTarget(window=False).write(case.bundle, NAME, folder)
     scipy.io.savemat(folder / "rows.mat", {"rows": case.inputs})
     text = PROGRAM.substitute(folder=matlab_string(folder), run=run, timed=timed, rounds=ROUNDS)
     (folder / "parity_program.m").write_text(text)
+    # Without the user's start-up file, which may change paths and number formats.
     called([program, "--norc", "--quiet", "parity_program.m"], folder)
     octave_file = scipy.io.loadmat(folder / "found.mat")
     return np.asarray(octave_file["found"], dtype=np.float32), float(octave_file["seconds"].item())

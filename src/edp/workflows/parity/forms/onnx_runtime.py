@@ -14,6 +14,7 @@ import numpy as np
 from edp.export.onnx import OnnxTarget
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, Missing, ParityCase, Ran, called
 
+# Forty windows: PyTorch computes each from reset, fifty times the work of a stream.
 WINDOWS = 40
 PROGRAM = '''
 """Runs a graph of EDP: argv has the description, the kind of graph, inputs, outputs and the number of rounds."""
