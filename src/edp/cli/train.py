@@ -31,11 +31,12 @@ def train(
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
     preset: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="auto tries several models and keeps the best; or quick, small, committee, standard, thesis."
+            help="auto tries several models and keeps the best; quick, small, committee, standard, thesis. "
+            "Default: auto, or standard where the settings name a network or how to train it."
         ),
-    ] = "auto",
+    ] = None,
     minutes: Annotated[
         float | None, typer.Option(help="Of the preset auto: processor time to spend on training; default 5.")
     ] = None,
@@ -52,7 +53,10 @@ def train(
 
     Example: `edp train data/m22 --out runs/first --set "task.horizons=[1, 10]"`
     """
+    from edp.workflows.auto import usual_preset
+
     source = source_of(data, signal_map, repair)
+    preset = preset or usual_preset(config, changes)
     if preset == AUTO:
         _train_auto(source, folder, config, changes, minutes, as_json)
         return

@@ -35,7 +35,7 @@ def train(
     test: Recordings | Recording | Sequence[Recording] | None = None,
     features: Sequence[str] | str | None = None,
     out: str | Path | None = None,
-    preset: str = "auto",
+    preset: str | None = None,
     settings: Mapping[str, Any] | str | Path | None = None,
     on_progress: Callable[[TrainingProgress], None] | None = None,
 ) -> TrainedPredictor:
@@ -53,7 +53,8 @@ def train(
             have them all, else every channel.
         out: folder of the run; without it a temporary one, which is removed with the predictor.
         preset: ``auto`` trains a portfolio and keeps the simplest of the best, which its ``auto.json`` tells;
-            ``quick``, ``small``, ``committee``, ``standard`` and ``thesis`` are one model each.
+            ``quick``, ``small``, ``committee``, ``standard`` and ``thesis`` are one model each. Without a name
+            ``auto``, or ``standard`` where `settings` hold some of the network or of its training.
         settings: laid over the preset: a TOML file, or a mapping with the keys of docs/settings.md, nested or dotted
             (``{"training.epochs": 3}``).
         on_progress: called with the progress.
@@ -113,15 +114,16 @@ def _experiment(
     targets: Sequence[str],
     horizons: Sequence[int],
     features: Sequence[str] | str | None,
-    preset: str,
+    preset: str | None,
     settings: Mapping[str, Any] | str | Path | None,
 ) -> Experiment | AutoSettings:
     if isinstance(targets, str):
         raise ConfigError(f"targets = '{targets}'; give a list of names, such as [\"{targets}\"]")
     if not isinstance(horizons, Sequence):
         raise ConfigError(f"horizons = {horizons}; give a list of samples ahead, such as [{horizons}]")
-    table = preset_table(preset)
     own = _table(settings)
+    preset = preset or ("standard" if {"model", "training"} & own.keys() else AUTO)
+    table = preset_table(preset)
     task: Table = {"targets": list(targets), "horizons": list(horizons)}
     if features is not None:
         task["features"] = features if isinstance(features, str) else {"name": "own", "channels": list(features)}

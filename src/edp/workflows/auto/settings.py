@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from edp.config.experiment import (
+    AUTO,
     Experiment,
     TaskSettings,
     build,
@@ -59,6 +60,16 @@ class AutoSettings:
         """The experiment of a candidate, from its tables ``model`` and ``training``."""
         plain = {part: values for part, values in plain_tree(self).items() if part != "auto"}
         return build(Experiment, merged(plain, model_and_training), "of a candidate of the automatic preset")
+
+
+def usual_preset(path: str | Path | None = None, overrides: Sequence[str] = ()) -> str:
+    """The preset where none is named: ``auto``, or ``standard`` under settings of the network or its training.
+
+    Raises:
+        ConfigError: a file or an override that cannot be read.
+    """
+    tables = [{} if path is None else read_toml(path), *map(override, overrides)]
+    return "standard" if any(part in table for table in tables for part in CHOSEN) else AUTO
 
 
 def load_auto(path: str | Path | None = None, overrides: Sequence[str] = ()) -> AutoSettings:
