@@ -50,6 +50,12 @@ REFUSED = [
     ("velocity_skip", reads("force"), with_physics("force", "velocity_skip"), "physics base adds the velocity already"),
     ("cross_cylinder_attention", replace(TASK, targets=("v_1",)), with_blocks("cross_cylinder_attention"), "has one"),
     (
+        "linear",
+        TASK,
+        replace(with_blocks("cross_cylinder_attention"), head=HEADS["linear"]()),
+        "no hidden features for the block CrossCylinderAttention",
+    ),
+    (
         "kinematic",
         replace(reads("kinematic"), physics=()),
         with_physics("kinematic"),

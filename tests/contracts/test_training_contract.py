@@ -212,7 +212,7 @@ def test_laws_reach_as_far_as_their_quantiles():
         (lambda: Laplace(coverages=(0.5, 0.9)), "decreasing"),
         (lambda: Normal(coverages=(1.0,)), r"coverages = \[1.0\]; 0 < coverages < 1 must hold"),
         (lambda: Jitter(std=0.0), r"std = 0\.0; 0 < std <= 1 must hold"),
-        (lambda: WindowShift(most=0), "most = 0; whole numbers, 1 <= most"),
+        (lambda: WindowShift(most=0), "most = 0; integers, 1 <= most"),
         (lambda: TimeWarp(strength=0.6), r"strength = 0\.6; .* must hold"),
         (lambda: AVERAGES["ema"](decay=1.0), r"decay = 1\.0; .* must hold"),
         (lambda: AVERAGES["swa"](share=0.0), r"share = 0\.0.*must hold"),

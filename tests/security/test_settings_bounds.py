@@ -162,11 +162,11 @@ def test_the_bound_of_a_network_is_never_below_its_size(structure, predictor_of)
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("judge.skip=-5", r"judge: skip = -5; whole numbers, 0 <= skip"),
+        ("judge.skip=-5", r"judge: skip = -5; integers, 0 <= skip"),
         ("judge.skip=-100000", r"skip = -100000"),
         ("model.window=true", r"model\.window = True: true and false are no numbers"),
         ("model.window=1000000000", r"window = 1000000000"),
-        ("model.backbone.units=100000", r"units = 100000; whole numbers, 1 <= units <= 4,096"),
+        ("model.backbone.units=100000", r"units = 100000; integers, 1 <= units <= 4,096"),
         ("model.backbone.kernel=100000000", r"kernel = 100000000"),
         (f"model.backbone.channels={[4] * 300}", r"channels has 300 entries; 1 to 16 must hold"),
         ("training.chunks.length=100000000000", r"length = 100000000000"),

@@ -123,7 +123,7 @@ def test_mistakes_are_told(predictor, data):
         measure_channel_importance(predictor, data, ChannelImportanceSpec(skip=2000))
     with pytest.raises(ConfigError, match="repeats = 0"):
         ChannelImportanceSpec(repeats=0)
-    with pytest.raises(ConfigError, match=r"lags = \[0, -1\]; whole numbers, 0 <= lags"):
+    with pytest.raises(ConfigError, match=r"lags = \[0, -1\]; integers, 0 <= lags"):
         ChannelImportanceSpec(lags=(0, -1))
 
 

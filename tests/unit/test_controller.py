@@ -92,7 +92,7 @@ def test_what_a_budget_leaves_out_is_as_in_the_thesis(tmp_path):
     ("text", "message"),
     [
         ("cycle = 5", "unknown key 'cycle'; did you mean 'cycles'"),
-        ("cycles = 0", "cycles = 0; whole numbers, 1 <= cycles"),
+        ("cycles = 0", "cycles = 0; integers, 1 <= cycles"),
         ("cycles = true", "cycles = True: true and false are no numbers"),
         (
             "cycles = 1.5\nname = 3",

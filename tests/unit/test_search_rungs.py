@@ -181,7 +181,7 @@ def test_reports_that_cannot_be_are_refused():
         study.report(1, 10, 5.0)
     with pytest.raises(ConfigError, match="reports nan at step 10"):
         study.report(trial.number, 10, float("nan"))
-    with pytest.raises(ConfigError, match=r"told as pruned, with values \[5\.0\]"):
+    with pytest.raises(ConfigError, match=r"reported as pruned, with values \[5\.0\]"):
         study.tell(trial.number, [5.0], pruned=True)
     study.tell(trial.number, None, pruned=True)
     with pytest.raises(ConfigError, match="report before you tell"):

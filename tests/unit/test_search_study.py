@@ -159,7 +159,7 @@ def test_what_cannot_be_asked_or_told_is_refused():
         with pytest.raises(ConfigError, match=message):
             made.tell(number, values)
     made.tell(trial.number, [1.0])
-    with pytest.raises(ConfigError, match="was told before"):
+    with pytest.raises(ConfigError, match="tell each once"):
         made.tell(trial.number, [1.0])
     with pytest.raises(ConfigError, match="units = 17 is not in Choice"):
         made.suggest({"learning_rate": 1e-2, "units": 17})

@@ -82,7 +82,7 @@ def test_every_key_arrives_and_options_go_first(tmp_path):
         ("minutes = nan", "minutes = nan: a finite number must hold"),
         ("recordings = 2.5", "recordings = 2.5: an integer must hold"),
         ("seed = true", "seed = True: true and false are no numbers"),
-        ("seed = -1", "seed = -1; whole numbers, 0 <= seed"),
+        ("seed = -1", "seed = -1; integers, 0 <= seed"),
         ("rate_hz = 2000", "rate_hz = 2000.0; 1 <= rate_hz <= 1,000 must hold"),
         ("step_s = 0.01", "step_s = 0.01; 0 < step_s <= 0.0025 must hold"),
         ("step_s = 0.0003", "does not divide the sample time"),

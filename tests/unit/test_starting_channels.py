@@ -73,7 +73,7 @@ def test_sources_and_lengths_that_cannot_be_are_refused():
         FeatureSet("f", ("a",), (Derived("db", "b"),), starting=("b",))
     with pytest.raises(ConfigError, match="names a twice"):
         FeatureSet("f", ("a",), starting=("a",))
-    with pytest.raises(ConfigError, match="starting_ticks = 0; whole numbers, 1 <= starting_ticks"):
+    with pytest.raises(ConfigError, match="starting_ticks = 0; integers, 1 <= starting_ticks"):
         FeatureSet("f", ("a",), starting=("b",), starting_ticks=0)
     with pytest.raises(ConfigError, match="not a feature"):
         Task(FEATURES, ("boom",), (1,), TargetMode.DELTA, 100.0)

@@ -17,7 +17,7 @@ def _list_forms(listing_asked: bool) -> None:
         from edp.export import TARGETS
 
         for name, target in TARGETS.items():
-            out.print(f"{name}: {(target.__doc__ or '').strip().splitlines()[0]}", soft_wrap=True, markup=False)
+            out.print(f"{name}: {(target.__doc__ or '').strip().splitlines()[0]}", soft_wrap=True)
         raise typer.Exit
 
 

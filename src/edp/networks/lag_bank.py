@@ -13,6 +13,7 @@ from edp.ir.layers import ScaleShift
 from edp.ir.memory import Difference
 from edp.networks.streaming import Cost, State, Streaming
 from edp.networks.trailing import StreamingTrailingMean
+from edp.settings.bounds import shown
 
 MOST_LAG = 4096
 """Longest span in ticks; a longer memory is the work of a recurrent layer."""
@@ -26,8 +27,8 @@ def check_lags(lags: Sequence[int]) -> None:
     """
     if not lags or list(lags) != sorted(set(lags)) or lags[0] < 1 or lags[-1] > MOST_LAG:
         raise ConfigError(
-            f"lags: {list(lags)}; at least one span in ticks, each from 1 to {MOST_LAG} and longer than the one before "
-            "it, must hold"
+            f"lags: {shown(lags)}; at least one span in ticks, each from 1 to {MOST_LAG} and longer than the one "
+            "before it, must hold"
         )
 
 
@@ -48,7 +49,8 @@ class LagBank(Streaming):
         super().__init__()
         check_lags(lags)
         self.width, self.lags = width, tuple(lags)
-        self.means = nn.ModuleList(StreamingTrailingMean(width, lag) for lag in self.lags)
+        # A mean of one is the change itself, and would carry a ring without rows.
+        self.means = nn.ModuleList(StreamingTrailingMean(width, lag) for lag in self.lags if lag > 1)
         self.register_buffer("gain", torch.ones(len(self.lags), width))
 
     @property
@@ -67,18 +69,18 @@ class LagBank(Streaming):
         previous, age, rings = state
         first = torch.where(age > 0.5, previous, x[:, :1])
         change = x - torch.cat([first, x[:, :-1]], dim=1)
-        parts, new = [x], []
-        for lag, gain, mean, ring in zip(self.lags, self.gain, self._means(), rings, strict=True):
-            value, after = mean(change, ring)
-            parts.append(value * (lag * gain))
-            new.append(after)
+        results = [mean(change, ring) for mean, ring in zip(self._means(), rings, strict=True)]
+        values, new = [value for value, _ in results], [after for _, after in results]
+        if self.lags[0] == 1:
+            values.insert(0, change)
+        parts = [x, *(value * (lag * gain) for lag, gain, value in zip(self.lags, self.gain, values, strict=True))]
         return torch.cat(parts, dim=-1), (x[:, -1:], torch.ones_like(age), tuple(new))
 
     def lower(self, build: Builder, x: str) -> str:
         one = torch.ones(self.width)
         change = build.add(Difference, "change", x, factor=one, from_zero=False)
         means = [mean.lower(build, change) for mean in self._means()]
-        joined = build.join("changes", x, *means)
+        joined = build.join("changes", x, *([change] if self.lags[0] == 1 else []), *means)
         spans = torch.tensor(self.lags, dtype=self.gain.dtype, device=self.gain.device)
         gain = torch.cat([one.to(self.gain), (spans[:, None] * self.gain).flatten()])
         return build.add(ScaleShift, "scaled_changes", joined, gain=gain, shift=torch.zeros_like(gain))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Protocol
 
 import torch
@@ -282,7 +283,8 @@ class Normal(_Law):
 
     def build(self, horizons: int, outputs: int) -> Output:
         """A layer with a bounded log variance."""
-        sizes = [math.sqrt(2.0) * float(torch.erfinv(torch.tensor(c, dtype=torch.float64))) for c in self.coverages]
+        # The standard library's law, not a tensor's: sizes are asked for on a device without numbers, too.
+        sizes = [NormalDist().inv_cdf((1.0 + c) / 2.0) for c in self.coverages]
         return _Spread("normal", self.coverages, sizes, (horizons, outputs))
 
 

@@ -178,7 +178,7 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     shown = edp(*command, *asked).out
     assert "10 (100 ms)" in shown
     assert "commands known" in shown
-    assert "give whole numbers" in edp(*command, "--limit", "--horizons", "1,x").err
+    assert "give integers" in edp(*command, "--limit", "--horizons", "1,x").err
     assert "must be even" in edp(*command, "--limit", "--branches", 3).err
 
 

@@ -8,7 +8,7 @@ from edp.export.c.model import has_ring
 from edp.export.c.text import call, identifier, indented, number
 from edp.export.casadi.states import Place, counts, is_ring, places, start
 from edp.export.escape import Code
-from edp.ir import Graph, Layer, memory
+from edp.ir import Graph, Layer
 from edp.ir.memory import UNSEEN
 
 
@@ -65,7 +65,7 @@ def _load_count(graph: Graph, layer: Layer, layer_states: list[Place]) -> list[s
     scores = [state for state in rings if state.slot.name == "scores"]
     lines = []
     if ages:
-        most = rows if rings else layer.ticks if not isinstance(layer, memory.Difference) else 1  # type: ignore[attr-defined]
+        most = rows if rings else getattr(layer, "ticks", 1)  # a difference and a mean of one count to one
         lines.append(f"{where}.seen = whole(x[{ages[0].at}], {most}u);")
     elif scores:
         lines.append(f"{where}.seen = scored(x + {scores[0].at}, {rows}u);")
