@@ -15,6 +15,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -40,6 +41,7 @@ from edp.training.bundle import Bundle
 from embedded_step import whole
 
 ROOT = Path(__file__).parents[1]
+PLUGINS = ROOT / "tests" / "plugins"
 KERNELS = ROOT / "src/edp/export/c/kernels.toml"
 COMPILER = "arm-none-eabi-gcc"
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-mthumb", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16",
@@ -76,7 +78,11 @@ def contracts() -> ModuleType:
     if spec is None or spec.loader is None:
         raise RuntimeError("tests/conftest.py cannot be loaded")
     made = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(made)
+    sys.path.insert(0, str(PLUGINS))  # as pytest does, by its setting `pythonpath`
+    try:
+        spec.loader.exec_module(made)
+    finally:
+        sys.path.remove(str(PLUGINS))
     return made
 
 

@@ -5,15 +5,27 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+MOST_CHARACTERS = 8_000
+"""Of a message: two screens. Names and values in it come from files, which may hold a hundred thousand characters."""
+
 
 class EdpError(Exception):
     """Base of every error that the user can repair; the command line prints it without a traceback.
+
+    A message that is longer than `MOST_CHARACTERS` loses its middle: the file stands at the beginning, the advice at
+    the end.
 
     Attributes:
         exit_code: with which the command line then ends.
     """
 
     exit_code = 1
+
+    def __init__(self, message: str = "", *others: object) -> None:
+        half = MOST_CHARACTERS // 2
+        if len(message) > MOST_CHARACTERS:
+            message = f"{message[:half]} ... ({len(message) - 2 * half:,} characters left out) ... {message[-half:]}"
+        super().__init__(message, *others)
 
 
 class DataError(EdpError):
