@@ -110,7 +110,9 @@ class TimeWarp:
         for period, phase in zip(last * rng.uniform(0.25, 1.0, 3), rng.uniform(0.0, 2.0 * np.pi, 3), strict=True):
             turn = 2.0 * np.pi / period
             warped += self.strength / (3.0 * turn) * (np.sin(turn * rows + phase) - np.sin(phase))
+        # Both ends stay, so that a warped stretch reads no row outside of it.
         warped *= last / warped[-1]
+        # The last row is the end of the last interval, so it has a share of one.
         below = np.clip(warped.astype(np.int64), 0, last - 1)
         share = (warped - below).astype(np.float32)[:, None]
 

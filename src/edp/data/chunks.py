@@ -157,6 +157,7 @@ class ChunkSampler:
         """How many batches an epoch has."""
         if self.spec.regime == "window":
             total = sum(self._groups(part, 0) for part in self.series) * self.spec.consecutive
+            # Rounded up: the last batch may be smaller.
             return -(-total // self.spec.batch)
         return max(_ticks(lane) for lane in self._plan(np.random.default_rng([self.seed, number]))) // self.spec.length
 
@@ -172,6 +173,7 @@ class ChunkSampler:
         queue = [pieces[i] for i in rng.permutation(len(pieces))]
         plan: list[list[tuple[int, int, int]]] = [[] for _ in range(lanes)]
         load = np.zeros(lanes, dtype=np.int64)
+        # Longest first onto the least loaded lane: the usual heuristic that leaves lanes nearly equal.
         for entry in sorted(queue, key=lambda p: p[1] - p[2]):
             lane = int(load.argmin())
             plan[lane].append(entry)
@@ -183,6 +185,7 @@ class ChunkSampler:
         length = self.spec.length
         for i in rng.permutation(len(self.series)):
             samples = self.series[i].samples
+            # Cut elsewhere in each epoch, but never so late that much of a short series is lost.
             start = int(rng.integers(0, min(length, max(1, samples // 8))))
             while start < samples - self.spec.burn_in - max(self.horizons):
                 rest = -(-(samples - start) // length) * length
@@ -227,6 +230,7 @@ class ChunkSampler:
                 start = int(offsets[i] + (j - (ends[i - 1] if i else 0)) * together)
                 part, origin = self._stretch(int(i), start, start + length + together - 1, chance)
                 rows += [self._cut(part, start + late - origin, 0, length - 1) for late in range(together)]
+            # Windows always begin from reset.
             yield stack(rows, [True] * len(rows))
 
     def _groups(self, part: Series, offset: int) -> int:
@@ -267,7 +271,9 @@ def cut(part: Series, ticks: range, horizons: tuple[int, ...], silent: int) -> P
     at, length = ticks.start, len(ticks)
     inside = at + length + max(horizons) <= part.samples
     rows = np.arange(at, at + length)
+    # Valid only where the farthest horizon lies in the series, so that all horizons have the same ticks.
     valid = (rows - at >= silent) & (rows + max(horizons) < part.samples)
+    # Slices instead of indices: no copy of the inputs, for all pieces but the last of a series.
     if inside:
         future = np.stack([part.targets[at + k : at + k + length] for k in horizons], axis=1)
         return part.inputs[at : at + length], future, valid, _rows(part.teacher_targets, rows)

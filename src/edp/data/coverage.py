@@ -156,6 +156,7 @@ def cover(
     if not recordings:
         raise DataError("there are no recordings to look at; give a log or a folder of logs")
     first = recordings[0]
+    # A thousandth allows for rates that two loggers state with different digits.
     if any(abs(r.rate_hz - first.rate_hz) > 1e-3 * first.rate_hz for r in recordings):
         raise DataError("coverage needs recordings of one rate; set rate_hz in the signal map")
     roles = roles_of(first, inputs)
@@ -248,10 +249,12 @@ def _ends(occupancy: Occupancy) -> dict[str, tuple[float, float]]:
 
 def _integrated(recording: Recording, names: Sequence[str]) -> Array:
     way = np.cumsum(recording.select(names).astype(np.float64), axis=0) / recording.rate_hz
+    # An integral has no origin; its mean stands for mid stroke.
     return np.asarray(way - way.mean(axis=0))
 
 
 def _cell(values: NDArray[Any], low: float, high: float, count: int) -> NDArray[np.intp]:
+    # A channel that stands still falls into the first cell instead of dividing by zero.
     share = (np.asarray(values, dtype=np.float64) - low) / max(high - low, 1e-12)
     return np.clip(np.floor(share * count), 0, count - 1).astype(np.intp)
 
@@ -322,6 +325,7 @@ def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
         edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, bins + 1)[1:-1]))
         return np.searchsorted(edges, values, side="right")
 
+    # Evenly thinned: the estimate gains little from more samples, and the sort grows with them.
     step = max(1, len(x) // INFORMED)
     x, y = x[::step], y[::step]
     a, b = ranked(x), ranked(y)
@@ -329,6 +333,7 @@ def mutual_information(x: Array, y: Array, bins: int = QUANTILES) -> float:
     share = table / len(x)
     outer = share.sum(axis=1, keepdims=True) * share.sum(axis=0, keepdims=True)
     seen = share > 0
+    # Expected value for independent signals (Miller and Madow): (rows - 1) (columns - 1) / 2 n.
     chance = (np.count_nonzero(table.sum(axis=1)) - 1) * (np.count_nonzero(table.sum(axis=0)) - 1) / (2.0 * len(x))
     return float(max((share[seen] * np.log(share[seen] / outer[seen])).sum() - chance, 0.0))
 

@@ -15,6 +15,7 @@ from edp.recording import Recording
 
 Array = NDArray[np.float64]
 REFERENCES, QUERIES = 20_000, 4_000
+"""Samples searched in and searched for: distances shrink with the references, so both sides get equally many."""
 EARLIER_S = 0.2
 """Commands are looked at now and this long ago: the delay of a hydraulic axis."""
 
@@ -48,6 +49,7 @@ def split_distance(recordings: Sequence[Recording], axes: Sequence[Axis], split:
     if size < 2 or not len(second) or not len(test):
         return None
     mean, deviation = whole.mean(axis=0), whole.std(axis=0)
+    # Infinity takes a constant signal out of the distance.
     scale = np.where(deviation > 0, deviation, np.inf) * max(int(np.count_nonzero(deviation)), 1) ** 0.5
 
     def nearest(references: Array, queries: Array) -> Array:

@@ -99,6 +99,7 @@ def together(recordings: Sequence[Recording], axes: Sequence[Axis], dead_band: f
     shares = {f"{n} axes" if n != 1 else "1 axis": float((count == n).mean()) for n in range(len(commanded) + 1)}
     if all(axis.conflux for axis in commanded):
         flows = [np.concatenate([np.abs(signed(r, axis.conflux)) for r in recordings]) for axis in commanded]
+        # A flow that is always zero is never above its dead band.
         second = np.stack([flow > dead_band * max(flow.max(), 1e-12) for flow in flows], axis=1)
         shares["conflux in use"] = float(second.any(axis=1).mean())
         shares["both pumps shared"] = float((second & (count > 1)[:, None]).any(axis=1).mean())

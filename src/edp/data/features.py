@@ -115,6 +115,7 @@ FEATURE_SETS: Mapping[str, FeatureSet] = {"FG1": FG1, "FG2": FG2}
 
 def derive(entry: Derived, source: FloatArray, rate_hz: float) -> FloatArray:
     """A derived channel over a whole stretch, shape ``(time,)``; the first tick is 0."""
+    # The first tick is its own predecessor, as in a stream from reset.
     before = np.concatenate([source[:1], source[:-1]])
     return np.asarray(DERIVATIONS[entry.how](source, before, rate_hz), dtype=np.float32)
 

@@ -71,6 +71,7 @@ def fold_ridge(
             better = loss < best * (1.0 - LEAST_GAIN)
             if better.any():
                 best[better] = loss[better]
+                # Columns of the set chosen before must not stay beside those of the new one.
                 weights[:, :, better] = 0.0
                 weights[np.ix_(np.arange(folds.count), chosen, np.flatnonzero(better))] = np.stack(solved)[:, :, better]
                 intercepts[:, better] = np.stack(shifts)[:, better]

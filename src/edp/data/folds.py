@@ -53,6 +53,7 @@ def blocked_folds(lengths: Sequence[int], folds: int, gap: int) -> Folds:
             f"cross-validation: {total} rows for {folds} folds; each fold needs {FEWEST_ROWS}: record longer, or take "
             "fewer folds"
         )
+    # Contiguous: rows drawn one by one would share history and future with those that are left out.
     owner = np.arange(total) * folds // total
     ends = np.cumsum(lengths)
     stretch = np.repeat(np.arange(len(lengths)), lengths)

@@ -127,6 +127,7 @@ class ByFrozen:
     ) -> Split:
         """Parts for which no session is there are drawn from those that are free."""
         candidates = [recordings[i] for i in (*free, *validation, *test)]
+        # The second sealed test set stays out of the draw.
         names = {i: recordings[i].name for i in (*free, *validation, *test)}
         rule = ByRecording(
             validation_share=self.validation_share,
@@ -224,6 +225,7 @@ def _refuse_pieces(recordings: Sequence[Recording], frozen: Mapping[str, str], d
             names = [name for name in recording.channel_names if name in other.channel_names]
             if not names:
                 continue
+            # Different rows only: a machine at rest repeats one row thousands of times.
             own, theirs = (np.unique(_rows(one.select(names))) for one in (recording, other))
             shared = len(np.intersect1d(own, theirs, assume_unique=True))
             if shared >= min(SHARED_ROWS, len(own)) and shared >= SHARED_SHARE * len(own):
@@ -236,6 +238,7 @@ def _refuse_pieces(recordings: Sequence[Recording], frozen: Mapping[str, str], d
 
 def _rows(values: np.ndarray) -> np.ndarray:
     """Each row as one value that can be compared."""
+    # Rows as bytes: two equal rows are equal to the last bit, and sorting needs no tolerance.
     solid = np.ascontiguousarray(values)
     return solid.view(np.dtype((np.void, solid.dtype.itemsize * solid.shape[1]))).ravel()
 

@@ -55,6 +55,7 @@ class LagTask:
 
 def origins(series: Series, task: LagTask) -> range:
     """Ticks with a full history behind them and the longest horizon before them: the same ones for all horizons."""
+    # Empty instead of negative for a series that is too short.
     return range(task.history - 1, max(task.history - 1, series.samples - max(task.horizons)))
 
 

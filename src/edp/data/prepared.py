@@ -61,6 +61,7 @@ def prepare(recordings: Sequence[Recording], task: Task, split: SplitSpec, windo
     state = hashlib.blake2b(digest_size=16)
     for recording in recordings:
         state.update(recording.digest.encode())
+    # The split is part of what went in: the same recordings divided otherwise are other data.
     state.update(repr(parts).encode())
 
     def series(stretches: Sequence[Stretch]) -> list[Series]:

@@ -25,6 +25,7 @@ CROSSED_HISTORIES = (3, 5, 10, 20)
 """Histories tried by cross-validation beside the task's own."""
 
 BLOCK_ROWS = 16_384
+"""Rows taken to double precision at a time, so that memory does not grow with the recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +180,7 @@ def _solve(fitted: RidgeMoments, size: int, relative: float) -> DoubleArray:
     covariance[np.diag_indices(size)] += relative
     cross = fitted.xy[:size] / fitted.rows - np.outer(x, y)
     try:
+        # Cholesky: half the work of a general solution, and it fails where the matrix is not definite.
         factor = linalg.cho_factor(covariance, overwrite_a=True, check_finite=False)
     except linalg.LinAlgError as error:
         raise ConfigError(
@@ -192,6 +194,7 @@ def _squared_error(held_out: RidgeMoments, fitted: RidgeMoments, weights: Double
     if held_out.rows == 0:
         return np.zeros(weights.shape[1])
     size, rows = len(weights), held_out.rows
+    # The intercept that the training rows had, not one fitted to what is held out.
     offset = (fitted.y - fitted.x[:size] @ weights) / fitted.rows
     x, y, xy = held_out.x[:size] / rows, held_out.y / rows, held_out.xy[:size] / rows
     quadratic = np.einsum("io,io->o", weights, (held_out.xx[:size, :size] / rows) @ weights)
@@ -217,5 +220,6 @@ def _physical(
         if column is None:
             intercept[:, target] += standard.means[target]
         else:
+            # The map was fitted to the change from the present value, which is added here.
             maps[0, column, :, target] += 1.0
     return RidgeSolution(maps, intercept, chosen[0].reshape(shape), chosen[1].reshape(shape))

@@ -17,6 +17,7 @@ from edp.data.series import Series
 from edp.storage.memory import check_setting
 
 BLOCK_ROWS = 8_192
+"""Rows of lagged inputs held in double precision at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,7 @@ def moments_of(series: Sequence[Series], task: LagTask, standard: Standard) -> R
         if len(ticks) and lags > 1:
             head = _reversed_rows(one, standard, ticks.start - 1, lags - 1)
             tail = _reversed_rows(one, standard, ticks.stop - 1, lags - 1)
+            # One tick earlier the sum gains the row before the first and loses the last one.
             edges += np.outer(head, head) - np.outer(tail, tail)
     gram = _gram(first[:, :inputs, :], edges)
     xy = first[:, inputs:, :].transpose(0, 2, 1).reshape(lags * inputs, task.outputs)
@@ -129,5 +131,6 @@ def _gram(first: DoubleArray, edges: DoubleArray) -> DoubleArray:
         gram[lag, :, lag:] = gram[lag - 1, :, lag - 1 : lags - 1] + correction[lag - 1, :, lag - 1 :]
     square = gram.reshape(lags * inputs, lags * inputs)
     # Diagonal blocks are complete; blocks below them mirror those above.
+    # Exactly symmetric, which sums in another order are not.
     upper = np.triu(square)
     return upper + np.triu(square, 1).T

@@ -116,6 +116,7 @@ def _by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
             return tuple(commands[2 * i : 2 * i + 2])
         return tuple(commands[i : i + 1] if len(commands) == count else commands[:1])
 
+    # Head and rod pressure at most; more pressures an axis cannot be assigned by order.
     each = min(len(pressures) // count, 2) if count and len(pressures) % count == 0 else 0
     axes = tuple(
         Axis(

@@ -64,6 +64,7 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
         facts = KINDS[kind]
         if std[i] <= CONSTANT * facts.nominal:
             scale[i] = facts.nominal
+            # It is constant by construction while channels of the start are read, and no fault of the data.
             if task.features.features[i] != STARTING:
                 constant.append(task.features.features[i])
         elif facts.bounded:
@@ -75,6 +76,7 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
         _, _, target_mean, target_std = _moments([values for values in encoded_targets if len(values)])
         if task.mode is TargetMode.ABSOLUTE:
             target_offset[row] = target_mean
+        # A target that never changes keeps its unit instead of dividing by zero.
         target_scale[row] = np.where(target_std > 0, target_std, 1.0)
     return Scaler(offset, scale, target_offset, target_scale, tuple(constant))
 
@@ -95,6 +97,7 @@ def _moments(parts: Sequence[NDArray[np.float32]]) -> tuple[Vector, Vector, Vect
     low = np.min([part.min(axis=0) for part in parts], axis=0).astype(np.float64)
     high = np.max([part.max(axis=0) for part in parts], axis=0).astype(np.float64)
     mean = sum(part.sum(axis=0, dtype=np.float64) for part in parts) / count
+    # In two passes: the sum of squares less the squared mean would cancel for pressures of 30 MPa.
     spread = sum(_squares(part, mean) for part in parts) / count
     return low, high, np.asarray(mean), np.sqrt(spread)
 

@@ -10,11 +10,14 @@ from scipy import signal
 
 Array = NDArray[np.float64]
 LAGS = 50
+"""Block rows of the Hankel matrix: the window of 50 samples that the thesis's networks read."""
 LAG_STEPS = (1, 2, 3, 5, 8, 12, 16, 20, 25, 30, 35, 40, 45, 50)
 FLAT_DB = 10.0
+"""How far below its maximum a spectrum still counts as flat."""
 USED_HZ = 4.0
 """Up to here an excavator's axes answer their commands; slower logs are judged up to 0.4 of their rate."""
 SEGMENT_S = 10.24
+"""Length of Welch's segments: a tenth of a hertz at any rate."""
 
 
 def hankel_gram(inputs: Sequence[Array], lags: int) -> tuple[Array, int]:
@@ -64,6 +67,7 @@ def smallest_singular_values(inputs: Sequence[Array], lags: int = LAGS) -> dict[
     mean, deviation = whole.mean(axis=0), whole.std(axis=0)
     gram, columns = hankel_gram([(u - mean) / deviation for u in inputs], lags)
     width = whole.shape[1]
+    # Fewer columns than rows make any input look deficient.
     if columns <= lags * width:
         return {}
     steps = [n for n in LAG_STEPS if n < lags] + [lags]
@@ -77,10 +81,12 @@ def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
         frequencies in Hz without zero, shape ``(frequency,)``; density, shape ``(frequency, signal)``. Empty where no
         stretch fills a segment.
     """
+    # A power of two for the transform, and 16 samples at least for a slow logger.
     size = 1 << round(np.log2(max(SEGMENT_S * rate_hz, 16)))
     fitting = [u for u in stretches if len(u) >= size]
     if not fitting:
         return np.zeros(0), np.zeros((0, stretches[0].shape[1]))
+    # By stretch: a segment across two recordings would hold a jump that nobody commanded.
     parts = [signal.welch(u, rate_hz, nperseg=size, axis=0) for u in fitting]
     power = np.average([p for _, p in parts], axis=0, weights=[len(u) for u in fitting])
     return np.asarray(parts[0][0][1:]), np.asarray(power[1:])

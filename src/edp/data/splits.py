@@ -136,6 +136,7 @@ class ByTime:
         parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
         for i, recording in enumerate(recordings):
             n = recording.samples
+            # The end tests: a model is used later than it was trained.
             test = n - round(n * self.test_share)
             validation = test - round(n * self.validation_share)
             parts["train"].append(Stretch(i, 0, validation - gap))
@@ -174,6 +175,7 @@ class ByBlocks:
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide each recording into blocks."""
         parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
+        # Counted over all recordings: each of few blocks would otherwise give none to validation.
         turn = itertools.count(1)
         for i, recording in enumerate(recordings):
             size = round(self.block_s * recording.rate_hz)
@@ -314,12 +316,14 @@ def _spread(names: Sequence[str], families: Mapping[str, str]) -> list[str]:
     position = {}
     for name in names:
         family = families[name]
+        # Half a place inwards centres a family, so that one of two recordings lies on either side of the middle.
         position[name] = (seen[family] + 0.5) / size[family]
         seen[family] += 1
     return sorted(names, key=lambda name: position[name])
 
 
 def _take(names: list[str], share: float, total: int) -> tuple[list[str], list[str]]:
+    # At least one: a part without recordings is no part.
     count = max(1, round(share * total))
     return names[:count], names[count:]
 
@@ -329,6 +333,7 @@ def _hold_tail(parts: dict[str, list[Stretch]], share: float, gap: int) -> dict[
     train, validation = [], []
     for stretch in parts["train"]:
         cut = stretch.stop - round(share * (stretch.stop - stretch.start))
+        # The gap is taken from training, which has more to give.
         train.append(Stretch(stretch.recording, stretch.start, cut - gap))
         validation.append(Stretch(stretch.recording, cut, stretch.stop))
     return {"train": train, "validation": validation, "test": parts["test"]}

@@ -148,6 +148,7 @@ class Task:
         Raises:
             DataError: another rate, a missing channel, or a value that is not finite.
         """
+        # A thousandth: loggers state the same rate with different digits.
         if abs(recording.rate_hz - self.rate_hz) > 1e-3 * self.rate_hz:
             raise DataError(
                 f"recording '{recording.name}' has {recording.rate_hz:g} Hz, the task {self.rate_hz:g} Hz; all rates "

@@ -109,6 +109,7 @@ def _seconds(values: NDArray[Any], factor: float, column: str, name: str) -> NDA
     values = np.asarray(values)
     if values.dtype.kind in "mM":
         since = (values - values[:1]).astype("timedelta64[ns]")
+        # Nanoseconds as integers first: a float of a date has no digits left for them.
         return np.where(np.isnat(since), np.nan, since.astype(np.int64) * 1e-9)
     try:
         return np.asarray(values, dtype=np.float64) * factor

@@ -12,6 +12,7 @@ from edp.logs.sandboxed import read_apart
 from edp.signals import SignalMap
 
 _HEAD = 4096
+"""Bytes by which a format is recognised: beyond the header of every format."""
 BAG_MARK = "metadata.yaml"
 """The file that makes a folder a ROS 2 bag."""
 _EXPORT = {
@@ -89,8 +90,10 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
         raise DataError(f"cannot read '{source}': {reason}; check the path and its permissions") from error
     if not head:
         raise DataError(f"'{source}' is empty (0 bytes); copy or export it again")
+    # Downloads reserve their room first: zeros instead of a header.
     if not any(head):
         raise DataError(f"'{source}' begins with zeros only; it is half downloaded or damaged: copy it again")
+    # Text claims almost anything, so other known kinds are ruled out by name.
     if not named.claims(head) or any(head.startswith(magic) for magic in _OTHERS):
         raise DataError(f"'{source}' is named {source.suffix} but holds {_content(head)}; rename it or export it again")
     return read_apart(named, source, size, signal_map)
@@ -98,10 +101,12 @@ def open_log(path: str | Path, signal_map: SignalMap) -> RawLog:
 
 def _begin(path: Path) -> tuple[bytes, int]:
     """The first bytes of a regular file, and its size; nothing else is opened, as that may wait or do something."""
+    # Before opening: to open a pipe waits, and to open a device may do something.
     _check_regular(path, os.stat(path))
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with open(handle, "rb", buffering=0) as stream:
         status = os.fstat(handle)
+        # Again on the handle: the path may name something else by now.
         _check_regular(path, status)
         return stream.read(_HEAD), status.st_size
 

@@ -20,6 +20,7 @@ from edp.recording import Recording
 from edp.signals import SignalMap
 
 RATE_TOLERANCE = 1e-3
+"""Share by which rates of logs of one data set may differ: loggers state the same rate with different digits."""
 
 
 def read_recording(
@@ -160,6 +161,7 @@ def read_data_set(
             the map takes `others`.
     """
     path_list = [paths] if isinstance(paths, str | Path) else list(paths)
+    # A folder and a file in it may both be given; each log counts once.
     files = list(dict.fromkeys(file for path in path_list for file in find_recordings(path)))
     if not files:
         raise DataError("no log files given; give at least one file or folder")

@@ -65,6 +65,7 @@ def repair_stamps(stamps: Stamps, repair: Repair, where: str) -> tuple[Clock, Ro
                 f'(t = {stamps[clock.falling[0]]:g} s); repair the file or set repair falling = "sort"'
             )
         repairs.append({"repair": "falling = sort", "count": len(clock.falling), "row": int(clock.falling[0])})
+        # Stable: rows of equal stamps keep their order, so that `last` means the last in the file.
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
         clock = judge(stamps, where)
@@ -139,6 +140,7 @@ def repair_values(
                 f"{where}: channel '{name}' has {len(rows)} missing or infinite value(s), first in row {first} "
                 f'(t = {first / rate_hz:g} s); repair the file or set repair nan = "hold"'
             )
+        # Nothing is taken from later samples, which a machine would not have had.
         if bad[0]:
             raise DataError(
                 f"{where}: channel '{name}' starts with a missing value, nothing earlier can be held; "

@@ -14,6 +14,7 @@ from edp.logs.units import kind_of_unit, unit_for
 from edp.signals import VOCABULARY, Channel, ChannelMap, SignalMap, Unit
 
 _LOOKED_ROWS = 1000
+"""Rows looked at to tell a column of numbers."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ def _one(raw: RawLog, entry: ChannelMap) -> ChannelSource:
     if not present and entry.column in raw.scalars:
         unit = unit_for(entry.unit, channel.kind, where)
         value = raw.scalars[entry.column] * entry.scale * unit.factor + unit.offset
+        # A single number of a MAT file fills a channel: gains are constant by nature.
         return ChannelSource(channel, None, unit, constant=value)
     if not present and entry.constant is not None:
         return ChannelSource(channel, None, Unit((channel.kind,), 1.0), constant=entry.constant)

@@ -30,6 +30,7 @@ WORKER = "edp.logs.sandbox_worker"
 AHEAD = 2
 """Pieces asked for at a time: the next one is read while the last is worked on."""
 _NUMBER_BYTES = 8
+"""Most bytes of a number, in which answers are counted before they come."""
 _KINDS: Mapping[str, type[EdpError]] = {kind.__name__: kind for kind in (DataError, ConfigError, StorageError)}
 
 
@@ -51,6 +52,7 @@ def read_apart(chosen: LogFormat, path: Path, size: int, signal_map: SignalMap) 
     try:
         folder = os.getcwd()
     except FileNotFoundError:
+        # The current folder was removed: relative paths have no meaning, absolute ones do.
         folder = os.sep
     order = {"path": str(path), "folder": folder, "size": size, "format": FORMATS.name_of(chosen)}
     channel.send(order | {"map": plain_map(signal_map)})
@@ -75,6 +77,7 @@ def _raw_log(path: Path, log: _Log, facts: Header) -> RawLog:
     signals: dict[str, RawSignal] = {}
     for signal_index, (key, entry) in enumerate(facts["signals"]):
         name, samples, unit, kind, description, time, table, column = entry
+        # type() instead of isinstance, since True is an int for Python.
         if type(samples) is not int or samples < 0:
             raise ValueError(f"a column of {samples!r} values")
         served = None if table is None else tables.setdefault(table, _Table(log, int(table)))
@@ -203,6 +206,7 @@ class _Log:
         header, columns = self.channel.receive(stream.rows * stream.row_bytes)
         if columns:
             stream.rows -= len(columns[0])
+            # What comes was made by a process that a hostile file went through.
             if stream.rows < 0 or len(columns) * _NUMBER_BYTES != stream.row_bytes or len(set(map(len, columns))) > 1:
                 self.channel.close("its reading failed; open it again")
                 raise DataError(f"'{self.path}' cannot be read: it gives other columns than were asked for")

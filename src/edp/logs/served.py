@@ -56,6 +56,7 @@ def serve(requests: int, answers: int) -> None:
         order, _ = receive(read_into)
         os.chdir(order["folder"])
         path = Path(order["path"])
+        # Limits and lock-down both hold before the file is opened.
         allowance = Allowance(path, order["size"])
         keep_temporary_files_in_memory()
         lock_down([Path(os.path.realpath(path))])
@@ -207,6 +208,7 @@ class _Served:
 
     def _next(self, number: int, write: Callable[[Any], None], allowance: Allowance) -> None:
         stream = self.streams.get(number)
+        # Dropped by the other side while its request was under way.
         if stream is None:
             send(write, {"end": True})
             return
@@ -215,6 +217,7 @@ class _Served:
                 columns = next(stream.parts, None)
                 if columns is not None:
                     check_plain(self.raw.path, columns)
+            # The limit holds for the whole stream: a table in many pieces gets no new time for each.
             stream.seconds = left[0]
         except Exception as error:
             del self.streams[number]

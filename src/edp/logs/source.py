@@ -114,6 +114,7 @@ class DataSource:
             if on_log is not None:
                 on_log(log.path, i + 1, len(logs))
             seen.append(look_into(log.path, log.signal_map, log.name, log.rows))
+        # Before they are compared: a finding on two recordings must tell which is which.
         names = unique_names([report.name for report, _ in seen], [log.path for log in logs])
         reports = [replace(report, name=name) for (report, _), name in zip(seen, names)]
         sketches = [replace(sketch, name=name) for (_, sketch), name in zip(seen, names) if sketch is not None]
@@ -201,6 +202,7 @@ def _check_listed(recordings: list[Recording], path: Path) -> None:
     if twice:
         raise DataError(f"'{path}': recording name(s) {', '.join(twice)} occur twice; set name = \"...\" for each")
     rates = {round(recording.rate_hz, 6): recording.name for recording in recordings}
+    # A thousandth, as `edp.logs.read.RATE_TOLERANCE`.
     if max(rates) > 1.001 * min(rates):
         shown = ", ".join(f"{name} {rate:g} Hz" for rate, name in rates.items())
         raise DataError(f"'{path}': mixed rates: {shown}; set rate_hz in the signal map")

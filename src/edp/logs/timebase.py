@@ -24,14 +24,23 @@ Stamps = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 UNIFORM_RMS = 0.05
+"""Largest rms distance of the stamps from a line, in steps."""
 UNIFORM_MAX = 0.5
+"""Largest single distance: beyond half a step a row belongs to another tick."""
 GAP_STEPS = 5.0
+"""Median steps that a gap exceeds; it must exceed `GAP_SECONDS`, too."""
 GAP_SECONDS = 0.05
+"""Shortest gap: fast loggers skip some steps in ordinary operation."""
 LATEST_SECONDS = 1e11
+"""About 3,000 years: larger stamps count in another unit."""
 SHORTEST_STEP_S = 1e-9
+"""Clocks count nanoseconds."""
 _SAME_TICK = 1e-6
+"""Share of a tick by which a stamp may be late through rounding."""
 _EVEN = 1e-4
+"""Share of a step below which all distances from a line are rounding."""
 _MIN_ROLLOVERS = 5
+"""Ticks by which a rounded rate must leave the grid behind before lost rows are ruled out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +148,7 @@ def _even(stamps: Stamps) -> tuple[float, float] | None:
 
 def _line(stamps: Stamps) -> tuple[float, float]:
     """Start and step of a straight line through the stamps, robust against a few bad ones."""
+    # Steps across half of the log: a few bad stamps move the median hardly at all.
     half = len(stamps) // 2
     step = float(np.median((stamps[half:] - stamps[: len(stamps) - half]) / half))
     return float(np.median(stamps - step * np.arange(len(stamps)))), step
@@ -186,6 +196,7 @@ def nice_rate(step_s: float, samples: int, jitter: float) -> float:
 
     The shift is at most a quarter step, and the rate changes by at most 0.1 %.
     """
+    # Stamps without jitter tell the rate to a millionth of a step; above a quarter step rows would change places.
     allowed = float(np.clip(jitter, 1e-6, 0.25))
     rate = 1.0 / step_s
     candidates = [round(rate, digits) for digits in range(4)]
@@ -242,6 +253,7 @@ def hold_rows(clock: Clock, grid: Grid) -> tuple[Rows | None, NDArray[np.bool_]]
     if clock.uniform and same_rate and grid.count == len(clock.stamps) and clock.stamps[0] == grid.start_s:
         return None, missing
     ticks = grid.ticks
+    # Stamps since 1970 resolve 0.24 us in float64, more than a millionth of a tick at 100 Hz.
     slack = max(_SAME_TICK / grid.rate_hz, 4 * float(np.spacing(np.abs(clock.stamps).max())))
     rows = np.maximum(np.searchsorted(clock.stamps, ticks + slack, side="right") - 1, 0)
     if len(clock.gaps):

@@ -60,6 +60,7 @@ def unit_for(stated: str | None, kind: Kind, where: str) -> Unit:
     """
     unit = normalise_unit(stated)
     if unit is None or kind is Kind.GENERIC:
+        # Nothing stated means SI, and a generic channel has no unit to convert from.
         return Unit((kind,), 1.0)
     try:
         return conversion(unit, kind, where)

@@ -26,18 +26,23 @@ except ImportError:  # not POSIX
     resource = None  # type: ignore[assignment]
 
 START_BYTES = 512 << 20
+"""Memory for any file: libraries and the pools that they begin with."""
 COPIES = 16
 """A cell of text may take two bytes and becomes eight, which libraries hold twice while they build a column."""
 RESERVED_BYTES = 4 << 30
 """Address space beyond memory: arenas of threads and pools of allocators are reserved, and mostly never used."""
 START_S = 5.0
+"""Processor time for any request."""
 BYTES_PER_S = 1e6
+"""Of the file: well below the speed of a slow computer, since a refused sound log is worse than a late refusal."""
 WORK_PER_S = 2e6
 VALUES_PER_S = 1e6
 PART_S = 0.01
+"""Of an object that is walked: one of MAT v7.3 takes some 1.3 ms on a busy machine (findings)."""
 WALL = 12
 """Longest time by the clock, in allowed processor times: a process may also wait for ever."""
 MOST_S = 1e6
+"""Keeps announced sizes of a hostile header within what a timer takes."""
 _EXHAUSTED = re.compile(
     r"(?:out of|not enough|insufficient) memory|memory allocation|bad_alloc|malloc|alloc\w* failed|"
     r"(?:cannot|unable to) alloc",
@@ -54,6 +59,7 @@ class Allowance:
         self.memory = 0
         self.work_s = 0.0
         self.bound = START_BYTES + COPIES * size
+        # Before the limits are set, which `free_bytes` would count as the machine's.
         self.free = max(int(limits.SHARE * limits.free_bytes()), 0)
         self.start = _used()
         self._limit_files()
@@ -77,14 +83,17 @@ class Allowance:
     def running(self, seconds: float) -> Iterator[list[float]]:
         """Limit the time of what runs inside; what is left of it is found in the list afterwards."""
         left = [seconds]
+        # Windows: neither timers nor forks.
         if not hasattr(signal, "setitimer"):
             yield left
             return
+        # By the clock as well: a process that sleeps for ever uses no processor time.
         signal.setitimer(signal.ITIMER_REAL, WALL * seconds)
         signal.setitimer(signal.ITIMER_PROF, seconds)
         try:
             yield left
         finally:
+            # Never 0, which would turn a timer off instead of ending at once.
             left[0] = max(signal.setitimer(signal.ITIMER_PROF, 0)[0], 1e-3)
             signal.setitimer(signal.ITIMER_REAL, 0)
 
@@ -92,6 +101,7 @@ class Allowance:
         if hasattr(signal, "setitimer"):
             for timer, times in ((signal.ITIMER_PROF, 1), (signal.ITIMER_REAL, WALL)):
                 left = signal.getitimer(timer)[0]
+                # A timer that is not running stays so: nothing is being read.
                 if left:
                     signal.setitimer(timer, min(left + times * more, WALL * MOST_S))
 
@@ -102,10 +112,12 @@ class Allowance:
         with contextlib.suppress(OSError, ValueError):
             more = min(self.bound + self.memory, self.free)
             for kind, used, extra in (
+                # Data counts what is used; address space also what allocators reserve and never touch.
                 (resource.RLIMIT_DATA, self.start[1], 0),
                 (resource.RLIMIT_AS, self.start[0], RESERVED_BYTES),
             ):
                 hard = resource.getrlimit(kind)[1]
+                # A hard limit can only be lowered, so that of the system is kept where it is less.
                 most = [used + self.free + extra] + ([hard] if hard != resource.RLIM_INFINITY else [])
                 resource.setrlimit(kind, (min([used + more + extra, *most]), min(most)))
 
@@ -114,6 +126,7 @@ class Allowance:
         if resource is None:
             return
         with contextlib.suppress(OSError, ValueError):
+            # A core file would hold parts of a stranger's log, and fill the disk.
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
@@ -134,6 +147,7 @@ class Allowance:
 def is_exhausted(error: BaseException | None) -> bool:
     """Whether an exception comes from a lack of memory, however a library calls it."""
     depth = 0
+    # Chains of exceptions may be circular.
     while error is not None and depth < 20:
         if isinstance(error, MemoryError) or (not isinstance(error, DataError) and _EXHAUSTED.search(str(error))):
             return True

@@ -34,14 +34,18 @@ def restrict(readable: Iterable[Path]) -> None:
 
 def hook(readable: Iterable[Path]) -> Callable[[str, tuple[Any, ...]], None]:
     """What is called with every event; raises PermissionError for those refused."""
+    # Real paths: a link below an allowed folder must not lead out of it.
     places = tuple(os.path.realpath(path) for path in readable)
+    # With the separator at the end, or /lib would allow /library as well.
     below = tuple(os.path.join(folder, "") for folder in places)
 
     def judge(event: str, arguments: tuple[Any, ...]) -> None:
         if event in _OPENERS:
             path = arguments[0]
+            # The flags of the system's call: they hold however Python's mode was written.
             if event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING:
                 raise PermissionError(errno.EPERM, f"a reader of logs may not write files ({path!r})")
+            # A number is a handle that is open already, which this process was given.
             if isinstance(path, str | bytes | os.PathLike) and path != _IN_MEMORY:
                 real = [os.path.realpath(name) for name in _plain(os.fsdecode(path))]
                 if not any(name in places or name.startswith(below) for name in real):

@@ -43,6 +43,7 @@ def restrict(readable: Iterable[Path]) -> bool:
     if not sys.platform.startswith("linux"):
         return False
     libc = ctypes.CDLL(None, use_errno=True)
+    # Asked first: each version knows more rights, and a kernel refuses bits that it does not know.
     version = libc.syscall(_CREATE, None, ctypes.c_size_t(0), ctypes.c_uint(_VERSION))
     if version < 1:
         return False
@@ -57,6 +58,7 @@ def restrict(readable: Iterable[Path]) -> bool:
     try:
         for path in readable:
             _allow(libc, rules, path)
+        # Landlock asks for this of processes without rights: a set-user-id program must not run under foreign rules.
         if libc.prctl(_NO_NEW_PRIVILEGES, *map(ctypes.c_ulong, (1, 0, 0, 0))) or libc.syscall(
             _RESTRICT, ctypes.c_int(rules), ctypes.c_uint(0)
         ):
@@ -67,9 +69,11 @@ def restrict(readable: Iterable[Path]) -> bool:
 
 
 def _allow(libc: ctypes.CDLL, rules: int, path: Path) -> None:
+    # A path that this system lacks needs no rule.
     with contextlib.suppress(OSError):
         handle = os.open(path, os.O_PATH | os.O_CLOEXEC)
         try:
+            # A rule on a file with rights of folders is refused by the kernel.
             rights = _READ_FILE | _READ_DIR if path.is_dir() else _READ_FILE
             rule = struct.pack("=Qi", rights, handle)
             if libc.syscall(_ADD, ctypes.c_int(rules), ctypes.c_int(_PATH_BENEATH), rule, ctypes.c_uint(0)):

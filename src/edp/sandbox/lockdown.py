@@ -65,6 +65,7 @@ def lock_down(readable: Iterable[Path]) -> list[str]:
     """
     if not _folders:
         note_libraries()
+    # Listed before any layer holds: looking for folders needs what the layers forbid.
     allowed = [*readable, *_folders, *map(Path, _SYSTEM)]
     layers = []
     with contextlib.suppress(OSError):
@@ -73,5 +74,6 @@ def lock_down(readable: Iterable[Path]) -> list[str]:
     with contextlib.suppress(OSError):
         if syscalls.restrict():
             layers.append("system calls")
+    # Last: a hook cannot be removed, and would judge what the other layers open as well.
     audit.restrict(allowed)
     return [*layers, "audit hook"]

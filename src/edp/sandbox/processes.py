@@ -23,6 +23,7 @@ def die_with_parent(parent: int) -> None:
         parent: id of the parent process.
     """
     if sys.platform == "linux":
+        # SIGKILL cannot be caught or ignored, whatever a library has installed.
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     else:
         threading.Thread(target=_watch, args=(parent,), daemon=True).start()

@@ -20,7 +20,9 @@ HEADER_BYTES = 1 << 28
 """Of the JSON of one message: names and descriptions of all columns of a log."""
 _LENGTH = struct.Struct("<Q")
 _NUMBERS = re.compile(r"[<>|]?(?:f[248]|[iu][1248]|b1)")
+"""Plain numbers of at most eight bytes: no objects, which would be pickled, and no structures."""
 _WRITTEN_BYTES = 1 << 24
+"""Written at once: some systems refuse single writes of gigabytes."""
 Header = dict[str, Any]
 ReadInto = Callable[[memoryview], None]
 Write = Callable[[Any], None]
@@ -70,12 +72,14 @@ def receive(read_into: ReadInto, most: int = 0) -> tuple[Header, list[NDArray[An
     length = bytearray(_LENGTH.size)
     read_into(memoryview(length))
     (size,) = _LENGTH.unpack(length)
+    # Before memory is taken for what the other side announces.
     if size > HEADER_BYTES:
         raise ValueError(f"a message of {size} bytes")
     text = bytearray(size)
     read_into(memoryview(text))
     try:
         header = json.loads(text)
+    # Brackets nested thousands deep exhaust the parser's stack.
     except RecursionError as error:
         raise ValueError("a message nested too deeply") from error
     if not isinstance(header, dict):
@@ -92,11 +96,13 @@ def _arrays(announced: Any, most: int) -> list[NDArray[Any]]:
     kinds: list[tuple[np.dtype[Any], int]] = []
     try:
         for kind, count in announced:
+            # type() instead of isinstance: True is an int, too.
             if not isinstance(kind, str) or not _NUMBERS.fullmatch(kind) or type(count) is not int or count < 0:
                 raise ValueError(f"an array of {kind!r}, {count!r} long")
             kinds.append((np.dtype(kind), count))
     except TypeError as error:
         raise ValueError("arrays that are no list") from error
+    # All arrays together: many small ones may be as large as one that is refused.
     total = sum(kind.itemsize * count for kind, count in kinds)
     if total > most:
         raise ValueError(f"{total} bytes of numbers where {most} were asked for")

@@ -26,17 +26,20 @@ from edp.errors import DataError
 from edp.sandbox.protocol import Header, packed, reader, receive
 
 PIPE_BYTES = 1 << 20
+"""Wanted size of the answers' pipe: the usual 64 kB make the reader wait for each piece."""
 SMALL_BYTES = 4096
 """A request that any pipe takes at once."""
 SLOW_S = 5.0
 """After so long the watcher is informed what is being read."""
 REPORT_S = 1
 """At least so long between two words to the watcher."""
+# A fork of a process with threads may hang, so the worker's libraries get one each.
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 _SMALL_POOL = {"MIMALLOC_ARENA_RESERVE": "65536"}
 """Arrow's pool takes a gigabyte at once unless limited (KiB); every file would have to be allowed that."""
 _FORKS = hasattr(os, "fork") and hasattr(socket, "send_fds")
 _END_S = 5.0
+"""Time that a worker without a socket gets to end by itself."""
 _TRIES = 2
 """A worker that has been idle may end, or something kill it, in the moment in which it is asked."""
 Watcher = Callable[[Path, float, int], None]
@@ -83,6 +86,7 @@ def open_channel(worker: str, modules: Sequence[str], path: Path, libraries: Seq
             running_worker = _workers.get(worker)
             if running_worker is None or running_worker.process.poll() is not None:
                 _drop(worker)
+                # One that has been idle ends by itself, so each order may need a new one.
                 running_worker = _workers[worker] = _Worker(worker)
             try:
                 return running_worker.open(order, path)
@@ -109,6 +113,7 @@ def _forget() -> None:
     """In a fork of this process: its ends of the pipes are shared with its parent, and must not be used."""
     global _lock, _workers
     _lock = threading.RLock()
+    # Not waited for: they are children of the parent process, not of this fork.
     for worker in _workers.values():
         worker.process.returncode = 0
         worker.orders.close()
@@ -124,6 +129,7 @@ def _environment() -> dict[str, str]:
 
 
 def _start(worker: str, arguments: Sequence[str], **pipes: Any) -> subprocess.Popen[bytes]:
+    # -P: a module of the current folder must not take the place of a library's.
     command = [sys.executable, "-P", "-m", worker, *arguments]
     try:
         # A session of its own: Ctrl-C is for the process that asks.
@@ -246,6 +252,7 @@ class WorkerConnection:
         self._ended = ended
         self._read_into = reader(answers)
         self._close = weakref.finalize(self, _close, requests, answers)
+        # At the end of the process the system closes the pipes by itself.
         self._close.atexit = False
         self.gone = ""
         _channels.add(self)

@@ -29,7 +29,9 @@ IDLE_S = 60.0
 END_S = 5.0
 """Time for a process whose pipes are closed to end, before it is killed."""
 KEPT_CODES = 1024
+"""Of forks that nobody asks about: a data set of thousands of logs must not grow the list without end."""
 ORDER_BYTES = 1 << 16
+"""Read at once; longer orders come in several pieces."""
 Serve = Callable[[int, int], None]
 """Serves one log by what it reads from one pipe and writes to another."""
 
@@ -79,6 +81,7 @@ def main(serve: Serve) -> None:
     """Take orders from the socket that is standard input until it is closed, or nothing comes for long."""
     if "--alone" in sys.argv:
         requests, answers = os.dup(0), os.dup(1)
+        # What libraries print must not get into the answers.
         os.dup2(2, 1)
         serve(requests, answers)
         return
@@ -86,6 +89,7 @@ def main(serve: Serve) -> None:
     waking, woken = os.pipe()
     os.set_blocking(waking, False)
     os.set_blocking(woken, False)
+    # A child's end wakes the poll through a pipe: between the check and the poll a signal alone would be lost.
     signal.set_wakeup_fd(woken, warn_on_full_buffer=False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     poll = select.poll()
@@ -152,6 +156,7 @@ def _obey(orders: socket.socket, forks: _Forks, serve: Serve, inherited: list[in
         _serve(serve, (requests, answers), [*inherited, *forks.pipes.values()], worker)
     os.close(answers)
     forks.pids[order["open"]], forks.pipes[order["open"]] = pid, requests
+    # No event asked for: poll reports hang-ups always, and what is read belongs to the fork.
     poll.register(requests, 0)
     return True
 
@@ -175,8 +180,10 @@ def _serve(serve: Serve, pipes: tuple[int, int], inherited: list[int], worker: i
     code = 1
     try:
         die_with_parent(worker)
+        # The pipe belongs to the worker; a fork that wrote to it would wake the worker for nothing.
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        # Pipes of other logs: a fork that kept them open would hide their end from the worker.
         for handle in inherited:
             os.close(handle)
         nothing = os.open(os.devnull, os.O_RDWR)
@@ -187,4 +194,5 @@ def _serve(serve: Serve, pipes: tuple[int, int], inherited: list[int], worker: i
     except BaseException:
         traceback.print_exc()
     finally:
+        # Without the worker's handlers at exit, which belong to the worker.
         os._exit(code)

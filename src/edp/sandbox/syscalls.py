@@ -83,6 +83,7 @@ def filter_program(column: int, architecture: int, own_pid: int) -> list[Instruc
     allow: Instruction = (_RETURN, 0, 0, _ALLOW)
     program: list[Instruction] = [
         (_LOAD, 0, 0, _ARCHITECTURE_AT),
+        # Numbers mean other calls on another architecture: whoever switches is killed.
         (_EQUAL, 1, 0, architecture),
         (_RETURN, 0, 0, _KILL),
         (_LOAD, 0, 0, _NUMBER_AT),
@@ -99,13 +100,16 @@ def filter_program(column: int, architecture: int, own_pid: int) -> list[Instruc
         """Where the argument (its low 32 bits) passes the test: `fitting`, else the other answer."""
         number = numbers[column]
         if number is not None:
+            # Steps count instructions: past the load, the test and its two answers.
             program.append((_EQUAL, 0, 4, number))
             program.append((_LOAD, 0, 0, _ARGUMENTS_AT + 8 * argument))
             program.extend([test, fitting, allow if fitting is refuse else refuse])
 
+    # Threads are allowed, processes are not.
     judge(_CLONE, 0, (_ANY_BIT, 0, 1, _CLONE_THREAD), allow)
     for numbers in _SIGNALS.values():
         judge(numbers, 0, (_EQUAL, 0, 1, own_pid), allow)
+    # Opening for reading is left to Landlock, which sees paths; a filter sees only numbers.
     judge(_OPEN, 1, (_ANY_BIT, 0, 1, _WRITING), refuse)
     judge(_OPENAT, 2, (_ANY_BIT, 0, 1, _WRITING), refuse)
     return [*program, allow]
@@ -125,6 +129,7 @@ def restrict() -> bool:
     # struct sock_fprog: a count of 16 bits, then a pointer at its alignment.
     about = ctypes.create_string_buffer(struct.pack("@HP", len(program), ctypes.addressof(code)))
     libc = ctypes.CDLL(None, use_errno=True)
+    # The kernel takes a filter from a process without rights only after this.
     if libc.prctl(_SET_NO_NEW_PRIVILEGES, *map(ctypes.c_ulong, (1, 0, 0, 0))):
         return False
     return bool(libc.prctl(_SET_SECCOMP, ctypes.c_ulong(_MODE_FILTER), about) == 0)

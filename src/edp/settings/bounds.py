@@ -56,6 +56,7 @@ class Bound:
 
     def holds(self, value: Any) -> bool:
         """Whether a value is a number within; NaN, infinity, text and truth values are not."""
+        # True is an Integral for Python, and no number for a user.
         if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
             return False
         number: Any = value  # integers beyond what a float holds compare as they are
@@ -138,6 +139,7 @@ def check_count(what: str, name: str, entries: Sequence[object], most: int, leas
 
 def shown(value: Any) -> str:
     """A value as a message repeats it: long ones cut, numbers of thousands of digits by their length."""
+    # str() of an integer of thousands of digits takes quadratic time, and Python refuses it.
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 4 * MOST_SHOWN:
         return f"a number of about {round(value.bit_length() * 0.30103):,} digits"
     if isinstance(value, tuple | list):

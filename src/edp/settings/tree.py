@@ -78,6 +78,7 @@ def override(text: str) -> Table:
     try:
         return storage.parse_toml(f"{key.strip()} = {value.strip()}", where, ConfigError)
     except ConfigError:
+        # Words need no quotes on a command line, where a shell would take them away.
         return storage.parse_toml(f'{key.strip()} = "{value.strip()}"', where, ConfigError)
 
 
@@ -163,6 +164,7 @@ class SettingsTree:
             for name in field_names
             if name in table
         }
+        # Built only from sound values: the class's own checks would report what follows from these problems.
         if len(problems) > before:
             return None
         try:
@@ -232,6 +234,7 @@ _hints = cache(typing.get_type_hints)
 
 @cache
 def _adapter(hint: Any) -> pydantic.TypeAdapter[Any]:
+    # TOML has nan and inf; no setting means them.
     return pydantic.TypeAdapter(hint, config=pydantic.ConfigDict(allow_inf_nan=False))
 
 
@@ -245,6 +248,7 @@ def _leaves(hint: Any) -> frozenset[Any]:
 def _scalar(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
     """A value, or a list of any length, by pydantic; what it would coerce without a word is refused first."""
     leaves = _leaves(hint)
+    # pydantic takes true for 1 and "3" for 3: a slip of the pen would become a setting.
     if _truth_in(value) and not leaves & {bool, Any}:
         problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
         return None

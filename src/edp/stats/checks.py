@@ -62,6 +62,7 @@ def tested_cells(differences: ArrayLike, tested: ArrayLike | None) -> tuple[Arra
     runs, sessions = mask.any(axis=1), mask.any(axis=0)
     if not (runs.all() and sessions.all()):
         array, mask = array[..., runs, :][..., sessions], mask[runs][:, sessions]
+    # Values outside the mask may be NaN, so they go before the check.
     return finite(np.where(mask, array, 0.0), "table of differences", 2), mask
 
 

@@ -67,10 +67,12 @@ def clustered_t(differences: ArrayLike, tested: ArrayLike | None = None) -> Mean
     by_session = sessions / (sessions - 1) * np.square(rest.sum(axis=-2)).sum(axis=-1) / cells**2
     by_run = runs / (runs - 1) * np.square(rest.sum(axis=-1)).sum(axis=-1) / cells**2
     by_cell = np.square(rest).sum(axis=(-2, -1)) / cells**2
+    # With few clusters the sum less the cells can be below either part, or negative.
     variance = np.maximum(by_session + by_run - by_cell, np.maximum(by_session, by_run))
     # Equal differences leave rounding in the sums; what is below it is no variance.
     dust = (1e-14 * np.abs(array).max(axis=(-2, -1))) ** 2
     error = np.sqrt(np.where(variance > dust, variance, 0.0))
+    # The scarcer of both clusters limits what is known of the variance.
     df = float(min(runs, sessions) - 1)
     statistic, p = lower_p(mean, error, df)
     return MeanTest(np.asarray(mean), error, statistic, df, p)

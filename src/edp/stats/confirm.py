@@ -111,14 +111,17 @@ def confirm(
             f"scores of shape {array.shape} came for {len(modules)} modules; give (1 + module, run, session)"
         )
     mask = tested_mask(tested, array.shape)
+    # All arms at once, so that a failure costs every module the same.
     filled = fill_worst(array, mask, worst)
     differences = filled[1:] - filled[0]
     raced = race(differences, mask, rule.interim_analyses)
+    # Over all registered modules: those dropped before were tried on the same sessions.
     adjusted = adjust_registered({name: float(p) for name, p in zip(modules, raced.p)}, registered)
     evidence = {}
     for index, name in enumerate(modules):
         runs, dropped = int(raced.runs[index]), int(raced.dropped_after[index])
         part = mask[:runs]
+        # A module that was dropped early may not have met every session.
         seen = part.any(axis=0)
         cells = (filled[1 + index, :runs][:, seen], filled[0, :runs][:, seen], part[:, seen])
         evidence[name] = _evidence(name, cells, dropped, adjusted[name], rule)
@@ -139,8 +142,10 @@ def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjuste
     means = run_means(difference, mask)
     runs = len(means)
     judged = mask.sum() / runs
+    # Sessions judged over sessions trained on; 0 where every session is judged, which leaves the plain t-test.
     ratio = float(judged / (mask.shape[1] - judged)) if mask.shape[1] > judged else 0.0
     mixed = mixed_model(run_means(module, mask)[:, None], run_means(baseline, mask)[:, None])
+    # Significance and relevance are both asked for: many runs make any difference significant.
     confirmed = not dropped and adjusted < rule.alpha and change <= -rule.least_gain
     resampled = float(resampled_t(means, ratio).p)
     reason = _reason((change, low, high), adjusted, dropped, float(test.p), rule)

@@ -40,6 +40,7 @@ def cohens_dz(differences: ArrayLike) -> Array:
         raise DataError("one split has no spread; d_z needs at least two")
     mean, spread = array.mean(axis=-1), array.std(axis=-1, ddof=1)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Equal differences leave a spread of rounding, which would pass for a huge effect.
         ratio = np.where(mean == 0.0, 0.0, mean / np.where(spread > 1e-14 * np.abs(mean), spread, 0.0))
     return np.asarray(ratio)
 
@@ -116,6 +117,7 @@ def kendalls_w(scores: ArrayLike) -> Concordance:
     ranks = rankdata(array, axis=1)
     ties = sum(float((counts**3 - counts).sum()) for counts in (np.unique(row, return_counts=True)[1] for row in ranks))
     spread = float(np.square(ranks.sum(axis=0) - splits * (modules + 1) / 2).sum())
+    # Kendall's correction for ties: equal scores lower the largest possible spread of the ranks.
     scale = splits**2 * (modules**3 - modules) - splits * ties
     if scale <= 0.0:
         raise DataError("all modules are equal in every split; there is nothing to rank")

@@ -12,7 +12,9 @@ from edp.errors import ConfigError, closest
 from edp.stats.checks import Array, Mask
 
 MOST_RUNS = 256
+"""Trainings of one screening; the search for columns grows with the third power of the factors."""
 INTERACTION = 0.03
+"""Share of a run's variance that each interaction is taken to have when errors are weighed against aliases."""
 PASSES = 12
 """Rounds of exchanges; a design of 14 factors in 32 runs settles in fewer."""
 
@@ -78,6 +80,7 @@ def two_level_design(
 
 def least_runs(factors: int) -> int:
     """The smallest power of two in which a design of resolution IV holds so many factors."""
+    # Resolution IV in N runs takes at most N / 2 factors.
     return max(4, 1 << (2 * factors - 1).bit_length())
 
 
@@ -104,6 +107,7 @@ def _regular(factors: int, runs: int) -> Mask:
     while len(chosen) < factors:
         triples = [a ^ b ^ c for a, b, c in combinations(chosen, 3)]
         free = [word for word in words if word not in chosen]
+        # Ties go to the longer word and then to the smaller number, so that a design is the same everywhere.
         chosen.append(min(free, key=lambda word: (triples.count(word), -word.bit_count(), word)))
     return np.array([[(run & word).bit_count() % 2 == 1 for word in chosen] for run in range(runs)], dtype=bool)
 
@@ -137,6 +141,7 @@ def _exchanged(levels: Mask, groups: Sequence[tuple[int, ...]]) -> Mask:
             trials = trials[(counts <= 1).all(axis=0)]
             costs = _quality(trials, groups)[0]
             cheapest = int(np.argmin(costs))
+            # A gain below rounding would let two equal designs take turns for ever.
             if costs[cheapest] < cost - 1e-9:
                 best, cost = trials[cheapest], float(costs[cheapest])
         if cost == before:
@@ -161,6 +166,7 @@ def _quality(levels: Mask, groups: Sequence[tuple[int, ...]]) -> tuple[Array, Ar
     inverse = np.linalg.inv(moments + 1e-9 * np.eye(factors + 1))
     errors = 4.0 * np.diagonal(inverse, axis1=-2, axis2=-1)[..., 1:]
     alias = (inverse @ (design.swapaxes(-1, -2) @ (rest[..., first] * rest[..., second])))[..., 1:, :]
+    # What the small addition above leaves in designs without aliases.
     alias = np.where(np.abs(alias) < 1e-8, 0.0, alias)
     cost = errors.mean(axis=-1) + 4.0 * INTERACTION * np.square(alias).sum(axis=-1).mean(axis=-1)
     cost = np.where((errors > 0.0).all(axis=-1) & (errors < 1e6).all(axis=-1), cost, np.inf)

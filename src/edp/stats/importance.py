@@ -65,6 +65,7 @@ def main_effects(
     on = np.asarray(levels, dtype=bool)
     if y.ndim != 1 or on.shape != (y.size, len(factors)):
         raise DataError(f"{y.size} scores of {len(factors)} factors came with levels of shape {on.shape}")
+    # Half a unit to either side: a coefficient is then the effect of on minus off.
     columns = [np.ones(y.size), *np.where(on, 0.5, -0.5).T]
     if covariates is not None:
         extra = finite(covariates, "table of covariates", 2)
@@ -78,6 +79,7 @@ def main_effects(
     free = y.size - design.shape[1]
     if free < 1:
         raise DataError(f"{y.size} runs came for {design.shape[1]} coefficients; repeat the design")
+    # Beyond the root of float64's precision the normal equations have no digit left.
     if np.linalg.cond(design) > 1e8:
         raise DataError(
             "some factors or covariates cannot be distinguished; every factor must change, each in its own way"
@@ -88,6 +90,7 @@ def main_effects(
     chosen = slice(1, 1 + len(factors))
     effect, spread = coefficients[chosen], np.diag(inverse)[chosen]
     error = np.sqrt(noise * spread)
+    # The rise of the residual sum without the factor, so that factors that change seldom are not favoured.
     explained = np.square(effect) / spread
     total = float(explained.sum())
     p = stdtr(free, np.divide(effect, error, out=np.zeros_like(effect), where=error > 0.0))

@@ -80,6 +80,7 @@ def score(prediction: ArrayLike, truth: ArrayLike) -> Scores:
             f"{predicted.size} predictions came for {true.size} true values; score equal ticks of both, in order"
         )
     error = np.subtract(predicted, true, dtype=np.float64)
+    # Before the absolute value is taken in place.
     bias, squares = float(error.mean()), float(error @ error)
     r2 = _r2(squares, true)
     np.abs(error, out=error)

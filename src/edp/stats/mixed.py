@@ -69,6 +69,7 @@ def mixed_model(module: ArrayLike, baseline: ArrayLike) -> MixedModel:
         raise DataError(f"{splits} splits of {seeds} seeds leave no degree of freedom; add splits or seeds")
     residual = within / free
     split = (between / (splits - 1) - residual) / (2 * seeds)
+    # A variance cannot be negative: without the split's part all mean squares estimate the residual.
     residual = np.where(split > 0.0, residual, (within + between) / (2 * cells - 2))
     error = np.sqrt(2.0 * residual / cells)
     statistic, _ = lower_p(b1, error, np.inf)

@@ -33,6 +33,7 @@ def holm(p: ArrayLike) -> Array:
     """
     array, order, n = _sorted(p)
     scaled = np.take_along_axis(array, order, axis=-1) * np.arange(n, 0, -1)
+    # Steps down: no p-value may be adjusted below that of a smaller one.
     return _unsorted(np.minimum(np.maximum.accumulate(scaled, axis=-1), 1.0), order)
 
 

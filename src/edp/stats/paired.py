@@ -32,6 +32,7 @@ def fill_worst(scores: ArrayLike, tested: ArrayLike | None = None, worst: ArrayL
         raise DataError(f"the scores have shape {array.shape}; give (arm, run, session)")
     mask = tested_mask(tested, array.shape)
     finite = np.isfinite(array) & mask
+    # The worst of all arms on that session: sessions differ in difficulty.
     seen = np.where(finite, array, -np.inf).max(axis=(0, 1))
     if worst is not None:
         floor = np.asarray(worst, dtype=np.float64)

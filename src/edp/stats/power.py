@@ -47,6 +47,7 @@ def power(delta: float, variance: PairedVariance, sessions: int, runs: float, fo
     """
     error = math.sqrt(variance.of_mean(sessions, runs, sessions / folds))
     df = min(float(sessions), runs) - 1.0
+    # No variance at all: any difference is seen.
     if error == 0.0:
         return 1.0
     critical = float(stdtrit(df, alpha))
@@ -84,6 +85,7 @@ def plan_runs(
         raise ConfigError(f"delta {delta}, alpha {alpha}, power {target} came; all must be above 0, the last below 1")
     if sessions < folds or folds < 2:
         raise ConfigError(f"{sessions} sessions cannot be dealt into {folds} folds; record more or set fewer folds")
+    # Asked first: where endlessly many runs do not suffice, no search for a number is needed.
     limit = power(delta, variance, sessions, math.inf, folds, alpha)
     if limit < target:
         needed = _sessions_needed(delta, variance, folds, alpha, target)
@@ -93,6 +95,7 @@ def plan_runs(
             f"module's effect differs between sessions (sd {math.sqrt(variance.session):.3g}); {text}"
         )
         return ConfirmationPlan(None, limit, limit, needed, reason)
+    # Whole repeats only: a part of one would judge some sessions more often than others.
     for runs in range(folds, most + 1, folds):
         reached = power(delta, variance, sessions, runs, folds, alpha)
         if reached >= target:
@@ -107,6 +110,7 @@ def plan_runs(
 
 def _sessions_needed(delta: float, variance: PairedVariance, folds: int, alpha: float, target: float) -> int | None:
     """Smallest number of sessions with which endlessly many runs reach the target; None above 10,000."""
+    # Bisection: the power rises with the sessions.
     low, high = folds, 10_000
     if power(delta, variance, high, math.inf, folds, alpha) < target:
         return None

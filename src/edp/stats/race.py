@@ -72,6 +72,7 @@ def race(
     mask = tested_mask(tested, array.shape)
     dropped = np.zeros(array.shape[:-2], dtype=np.int64)
     for analysis in interim_analyses:
+        # One at the last run would be the test itself.
         if analysis.runs < mask.shape[0]:
             hopeless = clustered_t(array[..., : analysis.runs, :], mask[: analysis.runs]).p > analysis.drop_above
             dropped = np.where((dropped == 0) & hopeless, analysis.runs, dropped)

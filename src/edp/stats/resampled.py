@@ -69,4 +69,5 @@ def printed_p(d_z: ArrayLike, splits: int) -> np.ndarray:
 def _deviation(array: np.ndarray) -> np.ndarray:
     """Standard deviation (n - 1) over the last axis; zero where the values are equal to rounding."""
     spread = array.std(axis=-1, ddof=1)
+    # A spread of rounding is none: the differences are equal.
     return np.where(spread > 1e-14 * np.abs(array).max(axis=-1), spread, 0.0)

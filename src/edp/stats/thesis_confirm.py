@@ -16,7 +16,9 @@ from edp.stats.multiple import benjamini_hochberg
 from edp.stats.resampled import printed_p
 
 LEAST_DZ = 0.5
+"""The thesis's gate of relevance (3.3.4): a medium effect in Cohen's words."""
 LEAST_STABILITY = 0.75
+"""The thesis's third gate: three quarters of the pairs of runs won."""
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ def thesis_power(
     """
     if splits < 2 or min(delta, sigma_seed, seeds) <= 0.0:
         raise ConfigError("the thesis's power needs two splits at least, and delta, sigma_seed and seeds above zero")
+    # A stream for each number of splits: a power does not depend on which others were asked for.
     rng = np.random.default_rng([seed, splits])
     drawn = rng.normal(-delta, sigma_seed / math.sqrt(seeds), (experiments, splits))
     z = drawn.mean(axis=1) / (drawn.std(axis=1, ddof=1) / math.sqrt(splits))

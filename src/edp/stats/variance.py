@@ -67,6 +67,7 @@ def split_variance(scores: ArrayLike, level: float = 0.95) -> SplitVariance:
     mean, tail = float(array.mean()), 0.5 - 0.5 * level
     between = seeds * float(array.mean(axis=1).var(ddof=1))
     df1 = splits - 1
+    # Both variances are one figure then, and its interval the usual one of a variance.
     if seeds == 1:
         bounds = [float(np.sqrt(df1 * between / chdtri(df1, p))) for p in (tail, 1.0 - tail)]
         return SplitVariance(mean, float(np.sqrt(between)), None, (bounds[0], bounds[1]))
@@ -153,6 +154,7 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
         raise DataError(f"the differences have shape {array.shape}; give (run, session)")
     per_run, per_session, cells = mask.sum(axis=1), mask.sum(axis=0), int(mask.sum())
     runs, sessions = mask.shape
+    # The part of all sums of squares that the mean takes.
     level = float(array.sum()) ** 2 / cells
     sums = np.array(
         [
@@ -169,6 +171,7 @@ def paired_variance(differences: ArrayLike, tested: ArrayLike | None = None) -> 
             [cells - session_pairs, cells - run_pairs, cells - 1.0],
         ]
     )
+    # The three sums then say (nearly) the same, and the solution would be noise.
     if np.linalg.cond(expected) > 1e8:
         raise DataError(
             f"{runs} runs on {sessions} sessions with {cells} cells cannot tell sessions, runs and cells apart; "

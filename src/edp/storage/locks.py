@@ -41,9 +41,11 @@ def hold(path: str | Path) -> IO[str]:
         except OSError as error:
             holder = _holder(stream)
             stream.close()
+            # These two say that another process holds it, depending on the system; others are faults of the disk.
             if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
                 raise storage_error(lock, error, "lock") from error
             raise BusyError(f"'{lock}' is held by process {holder}") from None
+        # The file may have been removed between opening and locking: then the lock holds nothing.
         if still_ours(lock, stream):
             break
         stream.close()
@@ -125,6 +127,7 @@ def _opened(lock: Path) -> IO[str]:
 def _check_ours(lock: Path, stream: IO[str]) -> None:
     """Refuse to write into what is not a lock, such as a file that got this name by a hard link."""
     content, names = _read(stream), os.fstat(stream.fileno()).st_nlink
+    # An empty file with a second name is somebody's file by a hard link.
     if OURS.fullmatch(content) is None or (names > 1 and not content):
         stream.close()
         why = "has another name, too" if not content else "holds something else"

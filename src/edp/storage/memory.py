@@ -102,6 +102,7 @@ def _own_limits() -> Iterator[int]:
     used = {resource.RLIMIT_AS: pages[0] * page, resource.RLIMIT_DATA: pages[5] * page}
     for limit, used_bytes in used.items():
         soft, hard = resource.getrlimit(limit)
+        # In a sandbox the soft limit is this module's own, which announcements raise up to the hard one.
         most = soft if _listener is None else hard
         if most != resource.RLIM_INFINITY:
             yield most - used_bytes
@@ -120,6 +121,7 @@ def check_memory(path: Path, needed: int, what: str, advice: str) -> None:
         DataError: `needed` is more than this machine can give.
     """
     free = free_bytes()
+    # A share of what is free: other processes, and the results themselves, need some, too.
     if needed > SHARE * free:
         raise DataError(
             f"'{path}': {what} would take {gigabytes(needed)} of memory, {gigabytes(free)} are free; {advice}"

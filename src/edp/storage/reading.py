@@ -47,10 +47,12 @@ def read_bytes(path: str | Path, limit: int, where: str = "", error: type[Except
     where = where or f"'{path}'"
     try:
         _check_regular(os.stat(path), limit, where, error)  # opening a device may already do something
+        # Not blocking: a pipe that took the file's place since then would be waited for.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
         with open(handle, "rb", buffering=0) as stream:
             _check_regular(os.fstat(handle), limit, where, error)
             parts, size = [], 0
+            # One byte beyond the limit is enough to refuse a file that grows while it is read.
             while part := stream.read(min(2**20, limit + 1 - size)):
                 parts.append(part)
                 size += len(part)
@@ -185,6 +187,7 @@ def parse_toml(text: str, where: str, error: type[Exception] = StorageError) -> 
     """
     try:
         _refuse_mark(text)
+        # Before the parser, which is what such a key is made to stall.
         if DEEP_KEY.search(text) is not None:
             raise ValueError(f"a key of more than {DEPTH} parts")
         table = tomllib.loads(text)
@@ -210,6 +213,7 @@ def _distinct(pairs: Collection[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _whole(text: str) -> int:
+    # int() of thousands of digits takes quadratic time; one more character is the sign.
     if len(text) > DIGITS + 1:
         raise ValueError(f"a number of {len(text)} digits; at most {DIGITS} must hold")
     return int(text)

@@ -20,6 +20,7 @@ from edp.storage.reading import object_with, read_object
 from edp.storage.writing import make_folder, remove_unfinished, write_bytes, write_json
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
+"""Libraries whose versions can change a result."""
 
 
 def environment(threads: int) -> dict[str, str]:
@@ -91,6 +92,7 @@ class RunFolder:
                     "changed. Choose another folder with --out, or remove this one"
                 )
             return True
+        # Settings before the identity: a kill between the two leaves a folder that is not bound yet.
         write_bytes(self.file("config.toml"), config_text.encode())
         write_json(identity, {"schema": 1, "key": key, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")})
         return False

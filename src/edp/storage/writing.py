@@ -55,8 +55,10 @@ def check_writable(folder: str | Path) -> Path:
 def _temporary(target: Path) -> tuple[int, str]:
     """A new file beside `target`, with the rights that the user's umask leaves to any new file."""
     while True:
+        # Beside the target: a rename is atomic only within a file system. Cut: names have 255 bytes at most.
         name = f"{target.parent}/.{target.name[:80]}.{secrets.token_hex(6)}.tmp"
         with contextlib.suppress(FileExistsError):
+            # O_EXCL follows no link that somebody put there, and takes no other process's file.
             return os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666), name
 
 
@@ -76,6 +78,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary = Path(name)
         yield temporary
         with temporary.open("rb+") as stream:
+            # Before the rename: after a loss of power the new name must not show an empty file.
             os.fsync(stream.fileno())
         temporary.replace(target)
         temporary = None
@@ -93,6 +96,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 def remove_unfinished(folder: Path) -> None:
     """Remove what a process that was killed while it wrote has left; only for who holds the folder."""
     for rest in folder.glob(".*.tmp"):
+        # A link of this name is not ours.
         if rest.is_file() and not rest.is_symlink():
             rest.unlink(missing_ok=True)
 

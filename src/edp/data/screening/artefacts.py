@@ -33,6 +33,7 @@ def dead_flags(table: CandidateTable) -> list[Flag]:
         for name, count in table.missing.items()
     ]
     for i in np.flatnonzero(~table.live):
+        # 1e-6 of the mean: sums of float32 values differ by rounding between recordings of unequal length.
         if table.between[i] > 0.5 and np.ptp(table.sums[0][:, i]) > 1e-6 * max(1e-30, float(np.abs(table.mean[i]))):
             text = "constant within each recording, but not the same in all: it tells the file, not the machine"
             flags.append(Flag(table.names[i], FlagKind.ARTEFACT, value=1.0, evidence=text))
@@ -48,9 +49,11 @@ def clock_flags(table: CandidateTable, live: Sequence[int]) -> list[Flag]:
         flags = []
         for piece in table.pieces:
             values = max(piece.stretches, key=len)[:, i]
+            # 2,000 rows tell a clock, and ranking all rows would cost as much as the rank correlation itself.
             values = values[:: max(1, len(values) // 2_000)]
             if values.max() > values.min():
                 flags.append(abs(float(np.corrcoef(ranks_of(values), np.arange(len(values)))[0, 1])))
+        # The least of all pieces: a slow signal may rise throughout one of them.
         return min(flags) if len(flags) > len(table.pieces) // 2 else 0.0
 
     values = spread(of_channel, live)
@@ -165,6 +168,7 @@ def _broken(relation: Array, slope: Array, squares: Array) -> tuple[float, str] 
         )
     noise = float(np.median((squares[:, 0] * (1.0 - relation**2))[strong]))
     shown = float(np.median(slope[strong])) ** 2 * squares[:, 1]
+    # Correlation that this gain and noise would give where the source moves as it does in the stretch.
     looked = np.sqrt(shown / np.maximum(shown + noise, 1e-300)) >= VISIBLE
     absent = int((looked & (np.abs(relation) <= ABSENT)).sum())
     if high <= SAME * low and absent >= max(2, 0.2 * looked.sum()):
@@ -178,6 +182,7 @@ def _moments(stretches: Sequence[np.ndarray]) -> tuple[Array, Array, Array]:
     mean = sum(stretch.sum(axis=0, dtype=np.float64) for stretch in stretches) / count
     products = np.zeros((len(mean), len(mean)))
     for part in chunks(stretches):
+        # Centred before the products, which would cancel otherwise.
         part -= mean
         products += part.T @ part
     square = np.diag(products)
@@ -192,4 +197,5 @@ def lonely(values: Array, chance: float) -> int | None:
     """The only piece in which a correlation is strong, given one value a piece; None where there is no such."""
     order = np.argsort(-np.abs(values))
     first, second = float(abs(values[order[0]])), float(abs(values[order[1]]))
+    # Strong in itself, against the next piece, and against chance.
     return int(order[0]) if first > max(0.3, 4 * second, 3 * chance) else None

@@ -25,6 +25,7 @@ def clusters_of(spearman: Array, least: float) -> list[list[int]]:
     if count == 1:
         return [[0]]
     distance = 1.0 - np.abs(spearman)
+    # SciPy asks for an exactly symmetric matrix without negative rounding.
     distance = np.maximum(0.5 * (distance + distance.T), 0.0)
     np.fill_diagonal(distance, 0.0)
     labels = fcluster(linkage(squareform(distance, checks=False), "complete"), 1.0 - least, "distance")

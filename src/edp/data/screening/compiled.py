@@ -17,6 +17,7 @@ Result = TypeVar("Result")
 
 def compiled(function: Function) -> Function:
     """Compile with Numba, without the interpreter's lock; the machine code is cached where a folder is writable."""
+    # Without the interpreter's lock, threads run the loops side by side; divisions follow NumPy's rules.
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:
         fast: Any = numba.njit(cache=True, **options)(function)
@@ -27,6 +28,7 @@ def compiled(function: Function) -> Function:
 
 def threads() -> int:
     """Processors that this process may use."""
+    # Containers and schedulers may give a process fewer processors than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

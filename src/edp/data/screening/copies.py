@@ -45,10 +45,14 @@ EXPLAINED = 0.01
 SLACK = 1
 """Samples by which an exact copy may be off and still count as simultaneous."""
 _FAR = 30
+"""Samples ahead that a leak is searched at; one that is farther ahead is looked at around its peak."""
 _NEAR_PAST = range(21)
+"""Delays of the channels in question: densely, since what their past explains must not pass for the future."""
 _LONG_PAST = range(61)
 _SPARSE_PAST = (0, 1, 2, 4, 7, 12, 20)
+"""Delays of all others: the model has dozens of channels, and its solution grows with the third power of the taps."""
 _MOST_TRUSTED = 40
+"""Strongest trusted channels in a model, for the same reason."""
 _PARTNERS = 2
 
 
@@ -114,6 +118,7 @@ def _leak(
     source = min(gains, key=lambda k: gains[k])
     # the tap of the future with the largest share in the linear fit
     taps = [*past, *(tap for tap in future if tap[0] == source)]
+    # Neighbouring samples are nearly equal: without it their weights would be large and of turning sign.
     joint = gram(correlations, taps, taps) + 1e-5 * np.eye(len(taps))
     weights = np.linalg.solve(joint, gram(correlations, taps, [(channel, 0)])[:, 0])[len(past) :]
     ahead = -taps[len(past) + int(np.abs(weights).argmax())][1]
@@ -147,6 +152,7 @@ def find_copies(correlations: Array, least: float) -> list[CopiedChannel]:
     def judge(pair: tuple[int, int]) -> CopiedChannel | None:
         i, j = int(pair[0]), int(pair[1])
         lag, value = int(lags[i, j]), float(best[i, j])
+        # The peak may lie beyond the search.
         if abs(lag) >= reach:
             return None
         # What leads may be a reference that a controlled machine follows closely: there the rest always counts.
@@ -174,6 +180,7 @@ def rest_related(correlations: Array, i: int, j: int, lag: int, value: float) ->
         steps = np.sqrt(2.0 * np.maximum(1.0 - np.diagonal(correlations[reach + 1]), 1e-6))
         steps[i] = np.inf
         most = max(most, float((np.abs(np.diff(rest, axis=0)) / steps).max()))
+    # Correlations of the rest itself: divided by its own deviation, which is zero for an exact copy.
     return most / math.sqrt(max(1.0 - value * value, 1e-9))
 
 
@@ -190,6 +197,7 @@ def copy_flags(
         settled: columns that are flagged already, of no use as originals.
     """
     flags: dict[int, Flag] = {}
+    # Closest pairs first: of a chain of copies each is named after its nearest original.
     for pair in sorted(pairs, key=lambda p: -abs(p.correlation)):
         copy, source = pair.copy, pair.source
         if {copy, source} & settled or copy in trusted or copy in flags:
@@ -244,6 +252,7 @@ def explained_flags(
         text = f"the presents and pasts of {names[near[0]]} and others make up all but {100 * left:.2g} % of it"
         value = 1.0 - left
         flags.append(Flag(names[channel], FlagKind.REDUNDANT, names[near[0]], value=value, evidence=text))
+        # From now on it explains no other channel, so that something remains of each set.
         remaining.remove(channel)
     return flags
 

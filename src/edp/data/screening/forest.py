@@ -71,6 +71,7 @@ def _leaves(
         row = rows[out_index]
         other = swapped[row]
         node = 0
+        # scikit-learn marks leaves by children of -1.
         while left[node] >= 0:
             tested = feature[node]
             value = inputs[other, tested] if columns[tested] else inputs[row, tested]
@@ -178,6 +179,7 @@ def importances(
         number[list(group)] = g
     permuted = Permuted(model.estimators_, tests, number)
     plain = permuted.errors(None, np.arange(len(tests.inputs)))
+    # The same permutations for every group, so that groups differ by what they are and not by chance.
     orders = [_shuffled(tests.pieces, spec.seed + r) for r in range(forest.repeats)]
 
     def of_group(g: int) -> Array:
@@ -210,6 +212,7 @@ def _listed(increases: Array, members: Sequence[Sequence[str]], targets: Sequenc
     for name, values in columns:
         middle = values.mean(axis=1)
         positive = max(float(np.maximum(middle, 0.0).sum()), 1e-30)
+        # Pieces are the units: rows of one recording depend on one another.
         half = student.ppf(0.975, values.shape[1] - 1) * values.std(axis=1, ddof=1) / math.sqrt(values.shape[1])
         for g, group in enumerate(members):
             importances.append(

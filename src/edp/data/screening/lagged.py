@@ -72,6 +72,7 @@ class _Spectra:
 
     def __init__(self, table: CandidateTable, reach: int, live: NDArray[np.int64]) -> None:
         self.table, self.reach, self.live = table, reach, live
+        # A power of two, at least eight times the reach: then a quarter of a block at most is padding.
         self.size = 1024
         while self.size < 8 * reach:
             self.size *= 2
@@ -96,6 +97,7 @@ class _Spectra:
                 part = padded[i * self.block : i * self.block + self.size]
                 if not around:
                     part = part.copy()
+                    # Zeros around the block keep the products of the circular transform apart from each other.
                     part[: self.reach] = part[-self.reach :] = 0.0
                 cut.append(part)
         spectra = scipy.fft.rfft(np.stack(cut), axis=1)
@@ -133,6 +135,7 @@ def lagged_covariances(
         sums = spectra.back(_product(around, spectra.blocks(p, None, around=False)))
         pairs = []
         for shift in range(1, shifts + 1):
+            # Channels of this piece with targets of another one, where nothing can relate: chance.
             other = (p + shift) % count
             shared = min(around.shape[1], answers[other].shape[1])
             products = spectra.back(_product(around[:, :shared], answers[other][:, :shared]))

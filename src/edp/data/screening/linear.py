@@ -37,6 +37,7 @@ def unexplained(
     target_covariances = gram(correlations, [*taps, *more], [(channel, 0)])[:, 0]
     joint = gram(correlations, [*taps, *more], [*taps, *more])
     joint[np.diag_indices_from(joint)] += RIDGE
+    # One factor gives both shares: its first rows are those of `taps` alone.
     lower = scipy.linalg.cholesky(joint, lower=True, check_finite=False)
     parts = np.square(scipy.linalg.solve_triangular(lower, target_covariances, lower=True, check_finite=False))
     explained = np.cumsum(parts)

@@ -130,11 +130,13 @@ def redundant_flags(evidence: ScreeningEvidence, judged: Sequence[str], free: Se
         judged: channels that may go.
         free: all channels without a flag, `judged` among them.
     """
+    # Only channels without a value of their own may go; a related one is kept even where its importance is nil.
     idle = {name for name in judged if not (_adds(evidence, name) or evidence.gain(name)[0] > LARGE)}
     flags = _cluster_flags(evidence, idle)
     idle -= {flag.channel for flag in flags}
     names = [evidence.table.names[column] for column in evidence.live]
     scores = _scores(evidence)
+    # The least useful go first, and names break ties, so that a screening gives the same result each time.
     order = [names.index(name) for name in sorted(idle, key=lambda name: (scores[name], name))]
     gone = {flag.channel for flag in flags}
     base = [k for k, name in enumerate(names) if name in free and name not in gone]
@@ -205,6 +207,7 @@ def _scores(evidence: ScreeningEvidence) -> dict[str, float]:
     information = (np.nan_to_num(relations.information) * steady).max(axis=1)
     names = [evidence.table.names[column] for column in evidence.live]
     entries = [evidence.importance_of(name) for name in names]
+    # A group shares its importance: collinear channels take each other's place in a forest.
     weight = np.array([max(e.increase, 0.0) / len(e.members) if e is not None else 0.0 for e in entries])
     parts = [
         share * np.maximum(values, 0.0) / max(float(values.max()), 1e-30)
@@ -280,6 +283,7 @@ def _window(evidence: ScreeningEvidence, proposed: set[str], targets: Sequence[s
 def _notes(evidence: ScreeningEvidence, flags: Sequence[Flag], horizon: int) -> tuple[str, ...]:
     notes = []
     table = evidence.table
+    # Below eight pieces a standard error has hardly any degree of freedom.
     if len(table.pieces) < 8:
         notes.append(
             f"only {len(table.pieces)} pieces were compared: figures of stability are rough; give more recordings"

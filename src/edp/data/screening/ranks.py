@@ -64,6 +64,7 @@ def _swaps(keys: NDArray[np.int32], spare: NDArray[np.int32]) -> float:
     """Pairs out of order, by merging runs upwards; `keys` is sorted in the end or lies in `spare`."""
     n = len(keys)
     swaps = 0.0
+    # Runs of eight are sorted by insertion, which is faster than merging for so few.
     for start in range(0, n, 8):
         stop = min(start + 8, n)
         for i in range(start + 1, stop):
@@ -86,6 +87,7 @@ def _swaps(keys: NDArray[np.int32], spare: NDArray[np.int32]) -> float:
                     i += 1
                 else:
                     spare[row] = keys[j]
+                    # All that is left of the lower run is larger: each is one pair out of order.
                     swaps += middle - i
                     j += 1
         keys, spare = spare, keys

@@ -48,6 +48,7 @@ SHARES = {
 }
 """Stages in order, and about which share of the time each takes."""
 _SHIFTS = 6
+"""Other pieces with which each piece is paired for chance."""
 
 
 @dataclass(eq=False)
@@ -123,6 +124,7 @@ def _matrices(table: CandidateTable, spec: ScreeningSpec, clock: _Clock) -> Matr
         ranks = rank_columns(np.concatenate([stretch[:, live] for stretch in stretches]))
         tell("correlation", 0.8)
         spearman = correlation([ranks])
+        # As large as the table; the next stages need the room.
         del ranks
     with clock.stage("rank correlation") as tell:
         sample = table.sample(spec.rank_samples)[:, live]
@@ -225,6 +227,7 @@ def _clusters(
     """Clusters of two or more; a target speaks for its cluster, else a name of Table A.1, else the best correlated."""
     clusters = []
     for group in groups:
+        # One channel is no cluster.
         if len(group) < 2:
             continue
         members = [int(columns[k]) for k in group]

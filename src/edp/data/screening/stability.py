@@ -26,7 +26,9 @@ from edp.recording import FloatArray
 
 METRICS = ("pearson", "spearman", "kendall", "information")
 _SHIFTS = 2
+"""Other pieces for the chance of a metric: each costs as much as all pieces by themselves."""
 _DRAWS = 200
+"""Bootstrap draws for the interval of a lag, which is a whole number of samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +209,7 @@ def _t(values: Array) -> Array:
     """Absolute mean over its standard error among pieces, ``(piece, ...)`` to ``(...)``; NaN counts as no relation."""
     values = np.nan_to_num(values)
     error = values.std(axis=0, ddof=1) / math.sqrt(len(values))
+    # Equal values in all pieces are as sure as can be, not a division by zero.
     result: Array = np.abs(values.mean(axis=0)) / np.maximum(error, 1e-12)
     return result
 

@@ -102,6 +102,7 @@ class CandidateTable:
     @cached_property
     def live(self) -> NDArray[np.bool_]:
         """Whether a channel changes within some piece, ``(channel,)``."""
+        # Relative to the mean: rounding of a constant pressure of 30 MPa is no movement.
         return self.within > 1e-9 * np.abs(self.mean)
 
     def thinned(self, count: int, ahead: int = 0) -> list[NDArray[np.int64]]:
@@ -206,6 +207,7 @@ def _usual_targets(recording: Recording) -> tuple[str, ...]:
 
 def _long_enough(recordings: Sequence[Recording], max_lag: int) -> tuple[Sequence[Recording], tuple[str, ...]]:
     """Recordings of at least five times the largest lag, and the names of the others."""
+    # A correlation at the largest lag then rests on four fifths of the rows at least.
     least = 5 * max_lag
     long = [recording for recording in recordings if recording.samples >= least]
     short = tuple(recording.name for recording in recordings if recording.samples < least)

@@ -22,12 +22,14 @@ from edp.data.screening.result import Array, Value
 HISTORY = (0, 1, 2, 4, 8, 16, 32)
 """Delays of each channel, samples."""
 WINDOWS = (5, 10, 15, 20, 25, 30, 40, 50, 60, 80, 100, 150, 200, 300, 400, 500)
+"""Histories tried, samples."""
 ENOUGH = 0.02
 """A window is long enough when the held-out error is within this share of the best."""
 
 
 def held_out_pieces(count: int, share: float, seed: int) -> NDArray[np.int64]:
     """Which pieces are held out: at least two, at most all but two."""
+    # Two on either side at least, or there is no spread to judge by.
     piece_count = min(max(2, round(count * share)), count - 2)
     return np.sort(np.random.default_rng(seed).permutation(count)[:piece_count])
 
@@ -65,6 +67,7 @@ class _Model:
         unit = np.zeros((len(self.taps), len(columns)))
         unit[columns, np.arange(len(columns))] = 1.0
         inverse = scipy.linalg.cho_solve(self.factor, unit, check_finite=False)
+        # Solution without some regressors from the whole one, by the block inverse: no second factorisation.
         change = np.linalg.solve(inverse[columns], self.weights[columns])
         weights = self.weights - inverse @ change
         weights[columns] = 0.0
@@ -72,6 +75,7 @@ class _Model:
 
     def error(self, weights: Array, moments: Array, answers: Array, power: float) -> float:
         """Mean squared error on data with these sums."""
+        # Rounding can leave a perfect fit below zero.
         return max(float(power - 2.0 * weights @ answers + weights @ (moments @ weights)), 1e-12)
 
 
@@ -154,6 +158,7 @@ def window_needed(
     windows = [w for w in WINDOWS if w <= longest] or [longest]
 
     def of_window(window: int) -> float:
+        # Nine delays on a logarithmic scale: dense where signals change, and few for a long window.
         delays = sorted({round(d) for d in np.geomspace(1, window, 9)} | {1, 2})
         taps = [(k, d - 1) for k in read for d in delays]
         shares = []

@@ -26,6 +26,7 @@ _LONGEST_METADATA = 4 << 20
 _LONGEST_DEFINITION = 1 << 20
 """Characters of a message definition, with those of all types in it."""
 _PLAIN_TABLES = ("messages", "topics", "schema", "message_definitions", "metadata")
+"""Tables of a bag, whose columns are looked at."""
 
 
 @dataclass
@@ -52,6 +53,7 @@ def definitions_of(text: Any, message_type: str) -> Definitions | None:
     types: dict[str, Any] = dict(get_typestore(Stores.EMPTY).fielddefs)
     if text.format == MessageDefinitionFormat.MSG:
         return Definitions(types | get_types_from_msg(text.data, message_type))
+    # A line of 80 signs separates the types of a definition, by convention of ROS.
     for part in text.data.split("=" * 80 + "\n"):
         if part.strip():
             types |= get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part)
@@ -120,6 +122,7 @@ def _to_size(kind: str, data: bytes, size: int) -> bytes:
 
 def _by_ratio(kind: str, data: bytes) -> bytes:
     """For packed parts whose size unpacked is announced nowhere that the library looks."""
+    # A chunk of ROS 1 announces its size in its header, which the library's call does not hand over.
     limit = RATIO * len(data) + SPARE
     unpacked_bytes = unpack_to(kind, data, limit)
     if len(unpacked_bytes) > limit:
@@ -168,6 +171,7 @@ def _check_database(path: Path | MemoryFile) -> None:
     Raises:
         DataError: any other thing in the file, topics with the same number, or texts that are too long.
     """
+    # Signs with a meaning in SQLite's file names: a part of the path would become options.
     if any(sign in str(path) for sign in "?#%"):
         raise DataError(f"'{path}': a bag's path must not hold '?', '#' or '%'; rename it")
     size = path.stat().st_size
@@ -181,6 +185,7 @@ def _check_database(path: Path | MemoryFile) -> None:
             base.deserialize(path.data[:18] + b"\1\1" + path.data[20:])
         # A value cannot be longer than the file, whatever its header says.
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(size, 4096), (1 << 31) - 1))
+        # Functions and virtual tables that the schema names must not run as trusted ones.
         base.execute("PRAGMA trusted_schema = OFF")
         schema_rows = base.execute("SELECT type, name, sql FROM sqlite_master LIMIT 1000").fetchall()
         odd = [name for kind, name, sql in schema_rows if not _plain(kind, name, sql)]
@@ -189,6 +194,7 @@ def _check_database(path: Path | MemoryFile) -> None:
                 f"'{path}': {odd[0]!r} is not one of the plain tables and indices of a bag; record it again"
             )
         for table in {name for kind, name, _ in schema_rows if kind == "table" and name in _PLAIN_TABLES}:
+            # Column 6 tells computed columns, which ordinary table_info leaves out.
             if any(row[6] for row in base.execute(f"PRAGMA table_xinfo({table})")):
                 raise DataError(f"'{path}': table '{table}' has computed columns; record the bag again")
         names = {name for _, name, _ in schema_rows}
@@ -219,4 +225,5 @@ def check_counts(path: Path, counts: Mapping[str, Any], files: list[Path]) -> No
     for topic, count in counts.items():
         if not isinstance(count, int) or not 0 <= count <= most:
             raise DataError(f"'{path}': topic {topic[:80]!r} announces {count!r} messages; copy or record it again")
+    # Eight bytes a time stamp, for each announced message.
     check_memory(path, 8 * max(counts.values(), default=0), "the times of a topic", "it may be damaged")

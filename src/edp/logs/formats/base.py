@@ -140,6 +140,7 @@ class RawLog:
 LONGEST_NAME = 256
 """Characters of a column's name; a full path of a Simulink signal has some hundred."""
 MOST_COLUMNS = 65_536
+"""Columns of a log; a large Simulink model logs some thousand."""
 
 
 def check_names(path: Path, names: Iterable[str]) -> None:
@@ -259,6 +260,7 @@ def find_time(names: Sequence[str], signal_map: SignalMap, path: Path) -> str | 
         for name in names:
             if name.lower() == time_name:
                 return name
+    # Last, as the weakest hint, and in lower case only: T may be a temperature.
     return "t" if "t" in names else None
 
 
@@ -266,6 +268,7 @@ def time_factor(name: str, unit: str | None, signal_map: SignalMap) -> float:
     """Seconds per unit of the time column: the map's unit, else the header's, else the name's ending, else s."""
     stated = _TIME_UNIT_NAMES.get(unit or "", unit or "")
     ending = name.lower().rpartition("_")[2]
+    # s is the map's default, so it may be stated or not: the file's own word then counts.
     if signal_map.time_unit != "s":
         return TIME_UNITS[signal_map.time_unit]
     if stated in TIME_UNITS:

@@ -35,10 +35,13 @@ _HEAD_BYTES = (1 << 18, 1 << 22, 1 << 26)
 _MOST_CELLS_LOOKED = 200_000
 """Cells in which the layout is looked for; wide tables need fewer rows."""
 _DELIMITERS = (",", ";", "\t", "|")
+"""In the order in which a tie is decided."""
 _NAME_UNIT = re.compile(r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))$")
 _STATED = re.compile(r'sep=([^\w\s"]|\t)', re.IGNORECASE)
 _ROWS_LOOKED = 200
+"""Rows in which the layout is looked for."""
 _BLOCK_ROWS = 65536
+"""Rows written at a time, so that no second copy of the recording is made."""
 
 
 class CsvFormat:
@@ -105,6 +108,7 @@ def _layout(path: Path, signal_map: SignalMap) -> TextLayout:
     check_names(path, () if len(rows[0]) <= MOST_COLUMNS else map(str, range(len(rows[0]))))
     body = rows[1:] if signal_map.header else rows
     decimal = signal_map.decimal
+    # With commas between cells, 1,5 is two cells.
     if decimal == "." and delimiter != "," and _has_decimal_commas(body):
         decimal = ","
     if signal_map.header:
@@ -127,6 +131,7 @@ def _first_lines(path: Path) -> tuple[list[str], int, str, str | None]:
         # As the parser behind counts lines; other signs of Unicode end none.
         lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
         whole = len(head) < size
+        # The last line may be cut by the end of what was read.
         if not whole or not lines[-1]:
             lines.pop()
         skip, stated = 0, None
@@ -174,6 +179,7 @@ def _encoding(head: bytes) -> str:
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     try:
+        # Whole lines only: the end of what was read may cut a character.
         head[: head.rfind(b"\n") + 1].decode("utf-8")
     except UnicodeDecodeError:
         return "cp1252"
@@ -190,6 +196,7 @@ def _delimiter(path: Path, lines: list[str]) -> str:
         except DataError:
             # A line without this delimiter may be longer than a cell.
             continue
+        # Four fifths, since comments and a row of units may stand among the first lines.
         if counts[0] > 1 and counts.count(counts[0]) >= 0.8 * len(counts) and counts[0] > most:
             best, most = delimiter, counts[0]
     return best
@@ -229,12 +236,14 @@ def _name_and_unit(cell: str) -> tuple[str, str | None]:
     if match["square"] is not None:
         return match["name"], normalise_unit(match["square"])
     unit = normalise_unit(match["round"])
+    # Round brackets may belong to the name, as in "speed (filtered)".
     return (match["name"], unit) if unit in UNITS or unit in TIME_UNITS else (cell, None)
 
 
 def _is_unit_row(row: list[str], decimal: str) -> bool:
     cells = [cell.strip().strip("[]()") for cell in row]
     filled = [cell for cell in cells if cell]
+    # 1 is a number and the unit of a ratio: by itself it decides nothing.
     words = [cell for cell in filled if cell != "1"]
     is_unit = [normalise_unit(cell) in UNITS or normalise_unit(cell) in TIME_UNITS for cell in words]
     return any(is_unit) and not any(is_number(cell, decimal) for cell in words)

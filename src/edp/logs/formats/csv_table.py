@@ -27,7 +27,9 @@ _WIDEST = 4
 _TRIES = 8
 """Parses that end at text in a column of numbers; after the second, the columns are looked at all at once."""
 NULLS = ["", "NaN", "nan", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "-nan", "-nan(ind)", "1.#QNAN"]
+"""Spellings of a missing value, those of Excel, pandas, MATLAB and C runtimes among them."""
 _BLOCK_BYTES = 1 << 24
+"""Of text parsed at a time."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,10 @@ class CsvTable:
             return "skip"
 
         layout = self.layout
+        # pyarrow skips the byte-order mark of UTF-8 by itself; other encodings pass through Python, slowly.
         encoding = "utf-8" if layout.encoding == "utf-8-sig" else layout.encoding
         read = arrow_csv.ReadOptions(
+            # Threads take memory that the sandbox counts, and errors would name no row.
             use_threads=False,
             column_names=self.keys,
             skip_rows=layout.skip_rows,

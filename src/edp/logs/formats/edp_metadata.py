@@ -115,6 +115,7 @@ def _check_texts(texts: Sequence[str]) -> None:
 
 def _check_depth(value: Any) -> None:
     """Refuse what is nested so deep that writing it again would end in an error of the stack."""
+    # Level by level: a recursive walk would end in the very error that is looked for.
     level = [value]
     for _ in range(DEEPEST):
         level = [

@@ -32,6 +32,7 @@ from edp.recording import Recording
 from edp.signals import SignalMap
 
 _VERSIONS = {"v5": "v7", "v7.3": "v7.3"}
+"""Our names and the library's: its v7 is v5 with packed variables."""
 
 
 class MatFormat:
@@ -80,6 +81,7 @@ class MatFormat:
         if options.mat_version not in _VERSIONS:
             closest_version = closest(options.mat_version, _VERSIONS)
             raise DataError(f"MAT version '{options.mat_version}' cannot be written{closest_version}")
+        # 63 is MATLAB's namelengthmax.
         long = [name for name in recording.channel_names if not name.isidentifier() or len(name) > 63]
         if long:
             raise DataError(
@@ -129,6 +131,7 @@ class _Table:
 def _raw_log(path: Path, mat_variables: MatVariables, edp_metadata: EdpMetadata, signal_map: SignalMap) -> RawLog:
     names = [part.name for part in mat_variables.signals]
     timeless = [part.name for part in mat_variables.signals if part.time is None]
+    # EDP's files state their rate: a channel called t would be taken for time.
     time_name = None if edp_metadata.rate_hz else find_time(timeless, signal_map, path)
     time: Column | None = None
     if time_name is not None:

@@ -124,6 +124,7 @@ def _vectors(recording: Recording) -> list[tuple[str, str, Any]]:
     columns: list[tuple[str, str, Any]] = []
     for (key, unit), places in groups.items():
         width = max(places)
+        # At most half of the columns may be missing: names such as step_1 and step_1000 are no vector.
         if 1 in places and len(places) > 1 and 0 not in places and keys.count(key) == 1 and width <= 2 * len(places):
             values = np.full((recording.samples, width), np.nan, dtype=np.float32)
             for row_index, i in places.items():
@@ -155,6 +156,7 @@ def _timetable(recording: Recording) -> Any:
     """A ``timetable`` with one variable per channel."""
     from edp.logs.formats.matlab.library import pandas as pd
 
+    # Whole nanoseconds, as pandas counts durations, which are the row times of a timetable.
     stamps = np.rint(np.arange(recording.samples) * (1e9 / recording.rate_hz)).astype("timedelta64[ns]")
     columns = {name: np.ascontiguousarray(recording.column(name)) for name in recording.channel_names}
     return pd.DataFrame(columns, index=pd.TimedeltaIndex(stamps, name="Time"))

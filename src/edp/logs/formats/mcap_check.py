@@ -22,7 +22,9 @@ SPARE = 1 << 20
 _LONGEST = {_SCHEMA: 1 << 20, _CHANNEL: 1 << 16}
 """Bytes of a definition of messages, and of a topic with its settings."""
 _SMALLEST_MESSAGE = 31
+"""Bytes of the shortest record of a message: prefix 9, channel 2, sequence 4, both times 16."""
 _PREFIX = 9
+"""Bytes before the content of a record."""
 
 
 def check_records(path: Path | MemoryFile) -> None:
@@ -42,6 +44,7 @@ def check_records(path: Path | MemoryFile) -> None:
 
 
 def _walk(path: Path, view: mmap.mmap | memoryview, size: int) -> None:
+    # Looked at first: without its end a file has no index, and the library would search for one.
     if view[-len(_MAGIC) :] != _MAGIC:
         raise _broken(path, "has no end (truncated, half downloaded, or its recorder was killed)")
     walk = _Walk(path, view)
@@ -117,6 +120,7 @@ class _Walk:
             raise _broken(self.path, f"has at byte {at} a chunk of {packed} bytes that claims to hold {unpacked}")
         check_memory(self.path, unpacked, "a chunk of messages", "it may be damaged; record smaller chunks")
         self.unpacked += unpacked
+        # Starts (1) sort before ends (2) of the same moment, so that touching chunks count together.
         self.spans += [(start, 1, unpacked), (max(start, stop), 2, -unpacked)]
 
     def end(self) -> None:

@@ -34,11 +34,13 @@ _FACTS = "edp_info.json"
 _FACTS_BYTES = 1 << 24
 """A thousand channels take 150 kB."""
 _PIECE_BYTES = 1 << 25
+"""Of records read at a time, so that wide groups take larger steps than `PIECE_ROWS`."""
 _NUMBERS = range(6)
 """Data types of whole numbers and floats; above are texts, bytes, dates and pictures."""
 _PLAIN_TYPES = (0, 2, 3, 6)
 """Channel types: fixed length, master, virtual master, virtual."""
 _TIME = 1
+"""Kind of synchronisation of a master channel that counts seconds; others count angles, metres or records."""
 
 
 class MdfFormat:
@@ -56,6 +58,7 @@ class MdfFormat:
     def read(self, path: Path, signal_map: SignalMap) -> RawLog:
         """Read names, units and groups; values and times are read when asked for."""
         asammdf = _library()
+        # Before the library opens the file, which follows every link.
         check_blocks(path)
         with _damage(path):
             stream = path.open("rb")
@@ -68,6 +71,7 @@ class MdfFormat:
                 stream.close()
                 raise
             file = _File(path, log)
+            # Columns are read later: the file closes when the last of them is gone.
             weakref.finalize(file, _close, log, stream)
             edp_metadata = file.facts()
             named_signals = [
@@ -199,6 +203,7 @@ class _Table:
                     record_offset=first,
                     record_count=count,
                     copy_master=False,
+                    # Raw values: the library would apply conversions, formulas among them.
                     raw=True,
                 )
                 columns = [_plain(signal) for signal in selected]
@@ -239,6 +244,7 @@ def _embedded(attachment: Any, where: str) -> bytes:
     if not embedded or otherwise or (packed and attachment.zip_type):
         raise DataError(f"{where}: is not embedded as EDP embeds it; it is damaged: copy or export the file again")
     if packed:
+        # One byte more than allowed tells that there is more.
         data = zlib.decompressobj().decompress(data, _FACTS_BYTES + 1)
     if len(data) > _FACTS_BYTES:
         raise DataError(f"{where}: is larger than {_FACTS_BYTES} bytes; it is damaged: copy or export the file again")
@@ -262,6 +268,7 @@ def _damage(path: Path) -> Iterator[None]:
     """The library meets damaged bytes with any exception there is; every one means the same to the user."""
     logger = logging.getLogger("asammdf")
     level = logger.level
+    # The library logs each defect with its stack; the message to the user says it once.
     logger.setLevel(logging.CRITICAL + 1)
     try:
         yield

@@ -17,15 +17,21 @@ from edp.logs.formats.unpack import unpacked_size
 from edp.storage.memory import check_memory
 
 _HEAD = 24
+"""Bytes of a block before its links: id 4, reserved 4, length 8, count of links 8."""
 _FIRST = 64
+"""Where the header block lies: behind the identification of the file."""
 _MAX_BLOCK = 1 << 31
+"""Of unpacked bytes; larger data are lists of blocks."""
 _DEFLATE_RATIO = 1100
+"""Deflate packs no better than 1,032 to 1."""
 _COPIES = 3
 """A packed block is in memory as it was unpacked, transposed and as columns."""
 _DEEPEST_CONVERSION = 8
+"""Conversions within one another that are walked; `mdf_conversion.DEEPEST` bounds those that are applied."""
 _MOST_ENTRIES = 2_000_000
 """Entries of all conversions that the library would load, each table within a table counted as often as it does."""
 _MOST_TEXT = 1 << 26
+"""Bytes of text that blocks may share in any file."""
 _TEXT_RATIO = 8
 """Bytes of text that blocks may share, beyond `_MOST_TEXT`, for each byte of the file."""
 _PACKINGS = ("zlib", "zlib", "lz4", "lz4", "zstd", "zstd")
@@ -111,6 +117,7 @@ class _Walk:
                     continue
                 linked_block = self.block(target)
                 if link_index in chosen:
+                    # A tree has one owner a block; a second one makes a cycle, or doubles what is loaded.
                     if target in owned:
                         raise self.broken(target, f"a {_name(linked_block)} block that two others own")
                     owned.add(target)
@@ -137,6 +144,7 @@ class _Walk:
         """Counts and sizes that the library takes as they are."""
         if block.id == b"##DZ":
             _, _, _, _, original, packed = struct.unpack_from("<2sBBIQQ", self.view, block.data_at)
+            # 64 bytes more: the head of a packed stream weighs in the shortest ones.
             fits = packed <= block.length and original <= min(_MAX_BLOCK, _DEFLATE_RATIO * (packed + 64))
             if not fits:
                 raise self.broken(block.at, f"a packed block of {packed} bytes that claims to hold {original}")
@@ -208,6 +216,7 @@ class _Walk:
             raise self.broken(first, "no channel group where a data group leads")
         _, cycles, _, _, _, values, invalid = struct.unpack_from("<QQHHIII", self.view, head.data_at)
         record_ids = self.view[group.data_at]
+        # Unsorted groups mix records of several lengths, which the library sorts itself.
         if head.links[0] or record_ids:
             return
         data = self.block(group.links[2]) if group.links[2] else None

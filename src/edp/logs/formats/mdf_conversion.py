@@ -103,6 +103,7 @@ class Conversion:
         if self.default is None and not any(self.inner):
             return raw
         entry = self._entries(raw)
+        # Rows of one entry beside each other: each conversion is called once.
         order = np.argsort(entry, kind="stable")
         sorted_entry = entry[order]
         starts = np.flatnonzero(np.r_[True, sorted_entry[1:] != sorted_entry[:-1]])
@@ -145,6 +146,7 @@ def _in_ranges(
 
 
 def _linear(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
+    # Nothing to convert: whole numbers keep their type.
     if (block.a, block.b) == (1, 0):
         return raw
     values = raw * block.a
@@ -154,6 +156,7 @@ def _linear(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
 
 def _rational(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
     x = raw.astype(np.float64)
+    # Horner's form of ASAM's (P1 x^2 + P2 x + P3) / (P4 x^2 + P5 x + P6).
     top = (block.P1 * x + block.P2) * x + block.P3
     return np.asarray(top / ((block.P4 * x + block.P5) * x + block.P6))
 

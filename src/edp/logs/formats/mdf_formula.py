@@ -86,6 +86,7 @@ class Formula:
         with np.errstate(all="ignore"):
             for step in self.steps:
                 if isinstance(step, float):
+                    # float64, not float: Python raises an error at overflow and at division by zero.
                     stack.append(np.float64(step))
                 elif step == "x":
                     stack.append(x)

@@ -42,7 +42,9 @@ from edp.storage.memory import check_memory
 _MAGIC = b"PAR1"
 _KEY = b"edp_recording"
 _GROUP_ROWS = 1 << 17
+"""Rows of a group: what a reader takes at a time, 22 min at 100 Hz."""
 _LARGEST_LIST = 256
+"""Longer lists are pictures and spectra, not signals."""
 RATIO = 1100
 """Bytes of values that a byte of the file may mean, as in the other formats."""
 SPARE = 1 << 28
@@ -67,6 +69,7 @@ class ParquetFormat:
         """Read the footer; each column is read from disk when its values are asked for."""
         with path.open("rb") as stream:
             stream.seek(0, 2)
+            # The footer is written last: its magic number at the end tells a whole file.
             stream.seek(max(stream.tell() - 4, 0))
             tail = stream.read(4)
         if tail != _MAGIC:
@@ -106,6 +109,7 @@ class ParquetFormat:
                 schema,
                 compression="zstd",
                 use_dictionary=False,
+                # Bytes of equal weight beside each other: noisy floats pack better so; dictionaries do not help.
                 use_byte_stream_split=True,
                 write_page_checksum=True,
             ) as writer,
@@ -236,6 +240,7 @@ def _numbers(column: pa.Array, element: int | None = None) -> NDArray[Any]:
         column = pc.list_element(column, element)
     if pa.types.is_boolean(column.type):
         column = column.cast(pa.int8())
+    # Only float64 has a NaN for the missing ones.
     if column.null_count:
         column = column.cast(pa.float64(), safe=False)
     return np.asarray(column.to_numpy(zero_copy_only=False))

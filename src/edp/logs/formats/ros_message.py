@@ -38,6 +38,7 @@ _DTYPES = {
 }
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 _DEEPEST = 32
+"""Types within one another; those of ROS have some six."""
 _MOST_STEPS = 100_000
 """Fields of one message, each element of a list counted; only lists of lists and of messages can have so many."""
 
@@ -105,6 +106,7 @@ class _Walk:
 
     def align(self, size: int) -> None:
         if self.cdr:
+            # CDR aligns from behind its header of 4 bytes.
             self.at += -(self.at - 4) % size
 
     def length(self) -> int:
@@ -190,6 +192,7 @@ class _Walk:
         """A text of its own may change from message to message where its length does not."""
         before = len(self.layout.fixed)
         self.text(kind)
+        # The length stays among the fixed bytes, since it decides where all later fields lie.
         del self.layout.fixed[before + 1 :]
 
 
@@ -206,6 +209,7 @@ def columns_of(
     """
     columns: list[NDArray[Any] | None] = [None] * len(names)
     sizes = np.fromiter((len(raw) for raw in raws), dtype=np.int64, count=len(raws))
+    # Messages of one length form a matrix of bytes, which is read by columns.
     for size in np.unique(sizes):
         rest = np.flatnonzero(sizes == size)
         block = np.frombuffer(b"".join([raws[i] for i in rest.tolist()]), dtype=np.uint8).reshape(len(rest), int(size))

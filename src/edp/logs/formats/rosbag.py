@@ -31,6 +31,7 @@ from edp.signals import VOCABULARY, SignalMap
 KEPT_BYTES = 1 << 29
 """Wanted columns up to this size are read in one go through the file; beyond, each topic in pieces."""
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+"""Both parts of a header's time, as the library names them for ROS 1 and ROS 2."""
 _LOG_TIME, _HEADER_TIME = "log_time", "header.stamp"
 
 
@@ -149,6 +150,7 @@ class _Collected:
         self.log_ns.append(log_ns)
         if self.paths:
             self.raws.append(raw)
+            # An eighth, since a message holds many numbers.
             if len(self.raws) >= PIECE_ROWS // 8:
                 self.flush()
 
@@ -233,7 +235,9 @@ class _Topic:
         seconds = np.zeros(0)
         if len(self.stamp_paths) == 2:
             seconds, nanoseconds = columns[0], columns[1]
+        # A header that nobody filled states zero.
         if seconds.any():
+            # Integers: float64 has no digit left for nanoseconds since 1970.
             at_ns = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
         elif self.bag.time == _HEADER_TIME:
             raise DataError(

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from typing import Any
 
 _STEP = 1 << 20
+"""Most bytes that are unpacked before they are counted."""
 _FEED = 1 << 16
+"""Packed bytes given to the engine at a time."""
 
 
 def unpacked_size(packing: str, data: bytes | memoryview, limit: int) -> int:
@@ -61,6 +63,7 @@ def _parts(packing: str, data: bytes | memoryview) -> Iterator[bytes]:
                 feed = b""
             yield engine.decompress(feed, _STEP)
         at -= len(engine.unused_data or b"")
+        # An engine that takes nothing would loop for ever.
         if at <= begun:
             return
 

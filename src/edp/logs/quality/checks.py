@@ -18,14 +18,21 @@ from edp.signals import KINDS, UNITS, Channel, Kind
 SEVERITIES = ("error", "warning", "note")
 """Worst first."""
 _STUCK_SECONDS = 1.0
+"""Shortest stay that is reported of a channel that may rest, and its least number of samples below."""
 _STUCK_SAMPLES = 50
 _FROZEN_SECONDS = 0.5
+"""The same of a channel whose last digit always moves."""
 _FROZEN_SAMPLES = 10
 _CLIPPED_SAMPLES = 3
+"""Least stay at an end of the range: noise touches its own extreme in single samples."""
 _CLIPPED_SHARE = 1e-3
+"""Least share of the time at that end."""
 _NOISY_RATIO = 2.0
+"""Deviation over noise floor below which a channel is mostly noise."""
 _FEW_LEVELS = 64
+"""Most levels of a channel that is called coarse."""
 _COARSE_STEP = 0.1
+"""Share of the deviation from which a step is coarse."""
 _MANY_SPIKES = 3
 # A channel of these kinds whose largest value is below this part of the nominal size was hardly stored in SI.
 _TOO_SMALL = {Kind.PRESSURE: 1e-4, Kind.PILOT_PRESSURE: 1e-4}
@@ -137,6 +144,7 @@ def copies(recording: Recording) -> list[Finding]:
     findings = []
     for channel_index, channel in enumerate(recording.channels):
         values = np.ascontiguousarray(recording.values[:, channel_index])
+        # Constant channels equal each other without being copies.
         if len(values) < 2 or not np.nanmin(values, initial=np.inf) < np.nanmax(values, initial=-np.inf):
             continue
         first = seen.setdefault(hashlib.blake2b(values.tobytes(), digest_size=16).digest(), channel.name)
@@ -280,6 +288,7 @@ def _check_noise(at: Looked) -> list[Finding]:
     noise = at.measures.noise
     if not at.measures.busy or noise <= 0:
         return []
+    # Double precision: the deviation of float32 pressures loses digits in the sum.
     ratio = float(at.good.astype(np.float64).std()) / noise
     if ratio >= _NOISY_RATIO:
         return []

@@ -15,7 +15,9 @@ from edp.logs.quality.repeats import Repeat, Sketch, find_repeats
 from edp.signals import UNITS, Kind
 
 _LEAST_RATIO = 9.0
+"""Units nearer than this cannot be told from a recording that is merely livelier."""
 _NEAR_DECADES = 0.35
+"""How far size and noise may lie off the ratio of two units: a factor of 2.2."""
 
 
 @dataclass(frozen=True)

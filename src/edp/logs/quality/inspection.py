@@ -21,10 +21,12 @@ from edp.logs.timebase import Clock, judge
 from edp.recording import Recording
 from edp.signals import VOCABULARY, SignalMap
 
+# Everything is read, so that every defect can be found and counted.
 _LENIENT = Repair(nan="keep", gaps="keep", duplicates="last", falling="sort")
 _MOST_NAMES = 2000
 """Columns that are compared with the vocabulary: each costs half a millisecond."""
 _LONGEST_MISS = 64
+"""Characters of a name that is compared: the time grows with the product of both lengths."""
 
 
 def inspect_log(path: str | Path, signal_map: SignalMap | None = None) -> QualityReport:
@@ -64,6 +66,7 @@ def look_into(
     if not signal_map.channels and not signal_map.others:
         findings += _near_misses(raw)
     findings += _unit_clashes(raw, signal_map)
+    # Columns that cannot be read are findings here; the others are still looked at.
     usable, more = _readable(sources)
     findings += more
     try:

@@ -169,6 +169,7 @@ def _facts(looked: Looked, verdict: str) -> ChannelFacts:
     if len(good):
         sums = good.astype(np.float64)
         low, high, mean = (in_report_unit(channel, float(x)) for x in (good.min(), good.max(), sums.mean()))
+        # The sum of a constant leaves rounding, which would pass for a deviation.
         std = 0.0 if looked.constant else size_in_report_unit(channel, float(sums.std()))
     noise = size_in_report_unit(channel, measures.noise)
     return ChannelFacts(

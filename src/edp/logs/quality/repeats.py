@@ -19,20 +19,30 @@ from scipy.spatial import cKDTree
 from edp.recording import Recording
 
 SKETCH_HZ = 10.0
+"""Rate of a sketch: fast enough for moves of a machine, and any logger reaches it."""
 WINDOW = 128
+"""Blocks of a fingerprint, 12.8 s."""
 _HOP = 32
+"""Distance of the windows that are searched in; all windows are searched for, so any lag meets one."""
 _COEFFICIENTS = 12
+"""Cosines of a fingerprint: up to 0.47 Hz."""
 _NEAR = 0.15
+"""Distance of two fingerprints of length one that still agree: a correlation of 0.989."""
 _NEIGHBOURS = 4
 _MOVES = 0.1
+"""Deviation of a window, in those of the channel, from which it moves."""
 _CHANNELS = 3
 _OWN, _OWN_UNNAMED = 2, 16
 _SAME = 0.98
+"""Correlation of a window in both recordings."""
 _LEAST_WINDOWS = 2
 _LEAST_VOTES = 4
+"""Fingerprints that must agree on a lag before it is checked."""
 _HOPELESS = 0.8
+"""Correlation below which no fraction of a block makes two windows the same."""
 _LEAST_SHARE = 0.5
 _SHIFTS = (0.0, -0.25, 0.25, -0.5, 0.5)
+"""Fractions of a block: two recordings began at different moments between the ticks of 10 Hz."""
 
 Floats = NDArray[np.float32]
 
@@ -108,6 +118,7 @@ def sketch(recording: Recording, name: str | None = None) -> Sketch:
     rate = recording.rate_hz
     hz = min(SKETCH_HZ, rate)
     blocks = max(int(recording.samples * hz / rate), 1)
+    # 1e-9: a rate that divides evenly must not lose a sample to rounding.
     starts = np.minimum(np.ceil(np.arange(blocks) * rate / hz - 1e-9).astype(np.intp), recording.samples - 1)
     block_means = np.empty((blocks, len(recording.channels)), dtype=np.float32)
     counts = np.diff(np.append(starts, recording.samples))
@@ -118,6 +129,7 @@ def sketch(recording: Recording, name: str | None = None) -> Sketch:
         values = np.where(good, values - mean, 0.0)
         coarse = np.add.reduceat(values, starts) / np.maximum(counts, 1)
         std = float(coarse.std())
+        # A deviation of rounding would blow a channel at rest up to noise.
         block_means[:, channel_index] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
     digest = hashlib.blake2b(np.ascontiguousarray(recording.values).tobytes(), digest_size=16).hexdigest()
     return Sketch(name or recording.name, recording.channel_names, block_means, hz, digest)

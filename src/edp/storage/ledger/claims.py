@@ -50,6 +50,7 @@ class Claim:
 def free_dead_claims(folder: str | Path) -> None:
     """Remove the claims of processes that were killed."""
     for file in Path(folder, "claims").glob("*.lock"):
+        # A claim whose process is gone can be locked, and leaving it removes its file.
         with contextlib.suppress(BusyError), claim(folder, file.stem):
             pass
 
@@ -70,4 +71,5 @@ def whole(file: Path) -> Record | None:
 
 def known(folder: str | Path, key: str) -> Record | None:
     """The final record of a training that the coordinator or a worker has left."""
+    # The ledger first: what arrived is entered there, and then removed.
     return whole(Path(folder, "records", f"{key}.json")) or whole(Path(folder, "arrived", f"{key}.json"))

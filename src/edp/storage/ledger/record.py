@@ -61,6 +61,7 @@ def canonical(value: Any) -> str:
 def _check_plain(value: Any, where: str) -> None:
     if isinstance(value, float):
         if not math.isfinite(value):
+            # NaN equals nothing, so that no training with it could be found again.
             raise NotFiniteError(f"'{where or 'value'}' is {value}; give a finite number, or none")
     elif isinstance(value, Mapping):
         for name, part in value.items():
@@ -88,6 +89,7 @@ def code_version() -> str:
     for file in sorted([*root.rglob("*.py"), *root.rglob("*.toml")]):
         relative_path = file.relative_to(root).as_posix()
         if not _below(relative_path, UNREAD) or _below(relative_path, READ):
+            # Zero bytes between name and content: a line moved from file to file changes the hash.
             state.update(f"{relative_path}\0".encode() + file.read_bytes() + b"\0")
     return f"{__version__}+{state.hexdigest()}"
 

@@ -54,6 +54,7 @@ def read_state(file: str | Path) -> bytes | None:
         return None
     size = len(_head("0" * 32, b""))
     state = data[size:]
+    # Name and checksum at once: a state of another training is as useless as a damaged one.
     return state if data[:size] == _head(path.stem, state) else None
 
 

@@ -54,6 +54,7 @@ def _read(folder: Path) -> tuple[dict[str, bytes], list[Damage]]:
         try:
             data = read_bytes(file, RECORD_BYTES)
             body = body_of(data)
+            # Canonical JSON is sorted, so schema and status stand at its end; parsing each record would take longest.
             if f'"schema":{SCHEMA},"status":"'.encode() not in body[-48:]:
                 Record.from_bytes(data)  # says which schema it is
             if f'"key":"{key}"'.encode() not in body:
@@ -175,6 +176,7 @@ class Ledger:
             StorageError: the disk is full (earlier records stay, nothing half written is left), or the ledger holds
                 another end of the same training.
         """
+        # A lock file that somebody removed lets a second coordinator in, which must not be overwritten.
         check_held(self.path / ".lock", self._lock)
         existing = self.finished(record.key)
         if existing is not None and existing.reported() != record.reported():
@@ -182,10 +184,12 @@ class Ledger:
                 f"training {record.key} is in '{self.path}' as {existing.status} and came again, {record.status}, with "
                 "another result; equal trainings must give equal results: is something not in its key?"
             )
+        # Before the record: a kill between the two leaves a state without a record, never a record without its state.
         self._take_state(record.key)
         if existing is None:
             write_bytes(self.path / "records" / f"{record.key}.json", record.to_bytes())
             self._records[record.key] = record
+        # Last: until the record is on disk, what the worker left is the only copy.
         (self.path / "arrived" / f"{record.key}.json").unlink(missing_ok=True)
 
     def state(self, key: str) -> Path | None:
@@ -223,6 +227,7 @@ class Ledger:
             ConfigError: it is bound to something else; the message says in which part. Nothing is changed.
         """
         file = self.path / "about.json"
+        # For its refusals only: what JSON would change could never be compared again.
         canonical(facts)
         expected = json.loads(json.dumps(facts))
         if not file.exists():
@@ -296,6 +301,7 @@ class Ledger:
 
     def _move(self, file: Path, folder: str) -> None:
         target = make_folder(self.path / folder)
+        # Numbered: the same training may be damaged or set aside more than once.
         number = len(list(target.glob(f"{file.stem}.*")))
         try:
             file.replace(target / f"{file.stem}.{number}{file.suffix}")

@@ -57,6 +57,7 @@ def _announced_v5(path: Path) -> tuple[int, int]:
     size, total, objects = path.stat().st_size, 0, 0
     with path.open("rb") as stream:
         head = stream.read(_HEADER)
+        # The two letters as the writer's processor laid them out.
         order = ">" if head[126:128] == b"MI" else "<"
         at = _HEADER
         while at + 8 <= size:
@@ -79,6 +80,7 @@ def _announced_v5(path: Path) -> tuple[int, int]:
 def _unpacked(start: bytes, order: str) -> int:
     """Bytes that a packed element announces; 0 where it is damaged, which its reader finds."""
     try:
+        # Eight bytes unpacked tell the length, whatever the rest would lead to.
         head = zlib.decompressobj().decompress(start, 8)
     except zlib.error:
         return 0
@@ -126,6 +128,7 @@ class _Walk:
                 self.array(name, part)
 
     def add(self, name: str, part: Any) -> None:
+        # By address: links may lead back, and one object may have many names.
         address = h5py.h5o.get_info(part).addr
         if address in self.seen:
             return
@@ -156,6 +159,7 @@ class _Walk:
         part = h5py.Dataset(data)
         size, stored = part.size or 0, data.get_storage_size()
         chunk = math.prod(part.chunks or (0,))
+        # A chunk is unpacked whole, even where an array uses a corner of it.
         memory_bytes = max(size, chunk if stored else 0) * part.dtype.itemsize
         if memory_bytes > _DEFLATE_RATIO * stored + _UNSTORED_BYTES:
             raise _impossible(self.path, f"the array {_shown(name)}", memory_bytes, stored)

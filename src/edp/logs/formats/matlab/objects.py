@@ -86,6 +86,7 @@ def _add_array(
     mat_variables: MatVariables,
     unit: str | None = None,
 ) -> None:
+    # A single number without a time is a gain or a constant, no signal.
     if array.size == 1 and time is None:
         mat_variables.scalars[name] = float(array.ravel()[0])
         return
@@ -109,6 +110,7 @@ def _columns(array: NDArray[Any], samples: int | None) -> NDArray[Any] | None:
     axis = fitting[0] if fitting else int(np.argmax(array.shape))
     if array.ndim > 2 and not fitting:
         return None
+    # Simulink logs vectors as (1, 1, time) or (column, time) as well.
     moved = np.moveaxis(array, axis, 0)
     return moved.reshape(moved.shape[0], -1)
 

@@ -22,6 +22,7 @@ from edp.storage.memory import announce
 COPIES = 8
 """Memory a byte of unpacked variables: the libraries copy them several times."""
 OBJECT_BYTES = 8192
+"""Memory an HDF5 object in the library: handles, attributes and references."""
 
 
 def unpack(path: Path, variable: str | None = None) -> MatVariables:
@@ -50,6 +51,7 @@ def unpack(path: Path, variable: str | None = None) -> MatVariables:
 def _load(path: Path) -> dict[str, Any]:
     with path.open("rb") as stream:
         head = stream.read(128)
+    # A file that is cut off inside its header begins like one.
     if any(magic.startswith(head[: len(magic)]) for magic in MAGIC) and len(head) < 128:
         raise DataError(f"'{path}' is a MAT file that ends inside its header (truncated); copy or export it again")
     memory_bytes, objects = (path.stat().st_size, 1) if is_v4(head) else check_size(path)
@@ -67,6 +69,7 @@ def _load(path: Path) -> dict[str, Any]:
                 f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {brief(error)}); it may be truncated "
                 "or damaged: copy or export it again"
             ) from error
+    # The library warns and leaves the object out: signals would be missing without a word.
     failed = [str(item.message) for item in caught if "Failed to load" in str(item.message)]
     if failed:
         raise DataError(

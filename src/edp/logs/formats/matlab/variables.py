@@ -47,6 +47,7 @@ def is_v4(head: bytes) -> bool:
     """Whether a file begins with the numbers of a v4 header."""
     if len(head) < 20:
         return False
+    # v4 has no magic number; its five integers must be sound in one of both byte orders.
     for order in ("<", ">"):
         kind, rows, columns, imaginary, name = (int(x) for x in np.frombuffer(head[:20], dtype=f"{order}i4"))
         digits = [int(digit) for digit in f"{kind:04d}"] if 0 <= kind < 5000 else []
