@@ -39,6 +39,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="markdown",
+    # Tracebacks are for developers; users get one message.
     pretty_exceptions_enable=False,
 )
 app.command("demo")(demo.demo)
@@ -81,6 +82,7 @@ def main() -> None:
     """Entry point of ``edp``."""
     stop_on_request()
     if isinstance(sys.stdout, TextIOWrapper):  # a terminal that lacks a character gets its escape
+        # An old terminal must not end a training because of a Greek letter.
         sys.stdout.reconfigure(errors="backslashreplace")
     tell_of_slow_logs()
     sys.exit(run_app(app))

@@ -105,6 +105,7 @@ def replay_tables(facts: dict[str, Any]) -> None:
 def _line(row: dict[str, Any]) -> list[str]:
     base, adapted = (sum(row[of]) / len(row[of]) for of in ("base", "adapted"))
     when = f"over {row['from_s']:g}" if row["to_s"] is None else f"{row['from_s']:g} to {row['to_s']:g}"
+    # Nothing to relate to where the error is zero.
     change = f"{100 * (adapted / base - 1):+.1f} %" if base else "-"
     pairs = [f"{b:.3g} / {a:.3g}" for b, a in zip(row["base"], row["adapted"], strict=True)]
     return [when, f"{base:.4g}", f"{adapted:.4g}", change, *pairs]

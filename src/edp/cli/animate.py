@@ -64,6 +64,7 @@ def _read(log: Path, signal_map: Path | None) -> Recording:
     if truth is None:
         return recording
     new = [c for c in truth.channels if c.name not in recording.channel_names]
+    # The truth may hold one sample more or less than the log.
     rows = min(recording.samples, truth.samples)
     values = np.concatenate((recording.values[:rows], truth.select([c.name for c in new])[:rows]), axis=1)
     return replace(recording, channels=(*recording.channels, *new), values=values)

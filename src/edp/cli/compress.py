@@ -64,6 +64,7 @@ def compress(
         display = SeriesDisplay(shown, as_json, "compress", "network")
 
         def on_training(name: str, done: int, count: int, event: TrainingProgress) -> None:
+            # At least one: the number of networks is known only after planning.
             display.done, display.count = done, max(1, count)
             display.on_training(name, event)
 
@@ -75,6 +76,7 @@ def compress(
     def show() -> None:
         _tables(facts)
         if best is not None:
+            # An integer network leaves its run in float; quantising it is the next step.
             whole = best.number_format == "w8a16"
             then = f"edp quantise {best.run} --out {folder / 'w8a16'}" if whole else f"edp evaluate {best.run}"
             out.print(f"next: {then}, or edp footprint {best.run}")

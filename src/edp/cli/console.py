@@ -30,6 +30,7 @@ def visible(text: str) -> str:
     Control characters and escape sequences, bidirectional and other invisible controls, line breaks, and the bytes of
     file names that are not UTF-8 become ``\x1b``, ``\u202e``, ``\n`` and ``\xff``.
     """
+    # Control characters of a file name could move the cursor or hide text.
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else _escape(c) for c in text)
 
 
@@ -44,6 +45,7 @@ class Terminal(Console):
     """Where all text of the command line becomes output: nothing in it is markup, and all of it is visible."""
 
     def __init__(self, stderr: bool = False) -> None:
+        # Names of channels may look like markup.
         super().__init__(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
     def print(self, *objects: Any, **options: Any) -> None:
@@ -73,6 +75,7 @@ PATH_OPTIONS = frozenset(
 def emit(as_json: bool, facts: dict[str, Any], show: Callable[[], None]) -> None:
     """Print facts as JSON for machines, or run `show` for people."""
     if as_json:
+        # Strict JSON: NaN would break every other reader.
         sys.stdout.write(json.dumps(facts, indent=1, allow_nan=False) + "\n")
     else:
         show()
@@ -131,6 +134,7 @@ def progress(quiet: bool = False) -> Iterator[Progress]:
         Words(lambda task: task.fields["note"]),
         TimeRemainingColumn(elapsed_when_finished=True),
     )
+    # Four updates a second: more only flickers, and slow terminals lag behind.
     with Progress(*columns, console=err, disable=quiet or not err.is_terminal, refresh_per_second=4) as shown:
         yield shown
 
@@ -139,6 +143,7 @@ class Steps:
     """Plain progress lines for output that is not a terminal, at most one every few seconds."""
 
     def __init__(self, quiet: bool, every_s: float = 5.0) -> None:
+        # Lines instead of a bar where output goes to a file.
         self.active = not quiet and not err.is_terminal
         self.every_s = every_s
         self._last = 0.0
@@ -183,6 +188,7 @@ def run_app(app: typer.Typer) -> int:
     """Run the command line; a user's mistake ends in one message and that error's exit code, Ctrl-C in 130."""
     try:
         refuse_empty(sys.argv[1:])
+        # Click would end the process itself; errors are to be told here.
         code = app(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
         if code == INTERRUPTED:
             raise KeyboardInterrupt
@@ -198,6 +204,7 @@ def run_app(app: typer.Typer) -> int:
         if out_of_memory(error):
             _say_error(memory_message(error))
             return 1
+        # Errors of usage have a message; anything else is a fault of the program, with its traceback.
         if not hasattr(error, "format_message"):
             raise
         _say_usage(error)

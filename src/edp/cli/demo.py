@@ -13,6 +13,7 @@ from edp.cli import simulate as simulate_command
 from edp.cli import train as train_command
 from edp.cli.console import JsonFlag, duration, emit, out
 
+# 180 min in 60 recordings: with 75 min the network's lead over ridge ARX was smaller (docs/findings.md).
 MINUTES = 180.0
 RECORDINGS = 60
 

@@ -21,6 +21,7 @@ def stop_on_request() -> None:
 
 def _stop(number: int, frame: FrameType | None) -> None:
     _stopped_by.append(number)
+    # As Ctrl-C: `finally` blocks run, locks are let go.
     raise KeyboardInterrupt
 
 
@@ -33,6 +34,7 @@ def out_of_memory(error: BaseException) -> bool:
     """Python's, NumPy's and PyTorch's ways to say that memory is gone."""
     message = str(error)
     named = isinstance(error, MemoryError) or any("OutOfMemory" in kind.__name__ for kind in type(error).__mro__)
+    # PyTorch on the CPU raises a plain RuntimeError; only its text tells.
     return named or (isinstance(error, RuntimeError) and ("can't allocate memory" in message or "bad_alloc" in message))
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
     from edp.logs.source import DataSource
 
+# Scripts can tell a network that should not be used without reading JSON.
 BEATEN = 6
 """Exit code where a baseline has less error than the network."""
 
@@ -70,6 +71,7 @@ def run_evaluation(
     from edp.storage import read_object
     from edp.workflows.train_evaluate import evaluate as judge_run
 
+    # Every step is told: there are few, and each takes long.
     steps, began = Steps(quiet, every_s=0.0), time.monotonic()
     with progress(quiet) as shown:
         bar = shown.add_task("evaluate", total=None, note="")

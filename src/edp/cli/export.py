@@ -57,6 +57,7 @@ def export(
 
 def _option(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
+    # An empty value is a forgotten one.
     if not (name and equals and value):
         raise ConfigError(f"--set {text}: an option is NAME=VALUE, such as opset=11")
     return name.strip(), value.strip()

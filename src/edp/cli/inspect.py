@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from edp.data.coverage import Coverage
     from edp.logs.source import DataSource
 
+# Scripts can tell unusable data by the exit code.
 FAULTY = 3
 
 
@@ -50,6 +51,7 @@ def inspect(
     errors = quality.errors
     asked = page is not None or bool(split or inputs)
     coverage_facts, why = None, "" if covered or asked else "not asked for"
+    # Recordings with errors have no coverage: training would refuse them.
     if not errors and (covered or asked):
         coverage_facts, why = _coverage(source, split, tuple(filter(None, inputs.split(","))), asked)
     if coverage_facts is not None and page is not None:
@@ -90,6 +92,7 @@ def _coverage(source: DataSource, split: str, inputs: tuple[str, ...], asked: bo
     try:
         return coverage(source, inputs, split), ""
     except EdpError as error:
+        # What was asked for by name must not be missing silently.
         if asked:
             raise
         return None, str(error)

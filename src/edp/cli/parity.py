@@ -60,6 +60,7 @@ def parity(
             err.print(f"{row.title}: {row.verdict}", style="dim")
 
     rows = compare(case, forms, interpreters, tell)
+    # A form that needs an absent program is no failure of the network, unless asked.
     bad = {"different", "failed"} | ({"not run"} if strict else set())
     failed = [row.title for row in rows if row.verdict in bad]
     facts = {"ticks": len(case.inputs), "rows": [row.to_json() for row in rows], "failed": failed}
@@ -78,6 +79,7 @@ def _ask(bundle: Path) -> None:
     from edp.workflows.parity import WHAT
 
     why = f"'{bundle}' is not the folder of a run of yours. {WHAT}"
+    # Without a person at the terminal nobody can agree.
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigError(f"{why}. Give --yes if you trust its source; nothing was run")
     err.print(f"{why}.")

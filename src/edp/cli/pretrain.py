@@ -47,6 +47,7 @@ def pretrain(
 
     meta = MetaSpec(inner_rate=inner_rate, inner_steps=inner_steps, shots=shots, head_only=head_only)
     order = Pretrain(method=method, meta=meta, start=start)
+    # Other splits are refused; the default makes the usual call short.
     experiment = load_experiment(config, preset, ['split.kind="machines"', *changes])
     with progress(as_json) as shown:
         steps = Steps(as_json)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from edp.training import TrainingProgress
     from edp.workflows.feature_selection.select import Selection, SelectionOrder
 
+# A terminal's page; everything is in the files.
 SHOWN = 40
 SHOWN_FLAGS = 20
 TOLD_SHARE = 0.005

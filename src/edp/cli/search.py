@@ -36,6 +36,7 @@ class _RunByDefault(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Options before the data belong to `run`."""
         if args and args[0].startswith("-") and args[0] not in ("--help", "-h"):
+            # Options may stand before the data, as in every other command.
             args = [DEFAULT, *args]
         return super().parse_args(ctx, args)
 
@@ -91,6 +92,7 @@ def run(
     from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 
     changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
+    # JSON quotes the path as TOML wants it.
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)
     resources = Resources(
@@ -111,6 +113,7 @@ def run(
             on_decision=display.on_decision,
         )
         result = run_search(source, plan, study, resources, phase, callbacks)
+        # Pictures take long; an unfinished study is drawn when it is asked for.
         page = _write_report(study, None, pictures=result.state == "finished")
     emit(as_json, _facts(result) | {"report": str(page)}, lambda: _show(result, data, page))
 
@@ -189,6 +192,7 @@ class SearchDisplay:
     def on_progress(self, study_log: StudyLog) -> None:
         """Show how far it is."""
         counts, left = study_log.counts(), study_log.seconds_left()
+        # No more than are asked for: workers may be idle at the end of a batch.
         running = min(study_log.workers, counts["asked"] - counts["done"])
         note = f"{self.title}: {counts['done']} trainings, {running} running, {counts['total'] - counts['done']} left"
         self.shown.update(self.bar, completed=counts["done"] / max(1, counts["total"]), note=note)

@@ -80,6 +80,7 @@ def simulate(
     arguments["scatter"] = scatter
     tables = {
         "masses": None if masses is None else _range(masses),
+        # Equal shares of several soils.
         "materials": dict.fromkeys(material, 1.0) if material else None,
     }
     suffix = None if form is None else suffix_of(form)
@@ -113,6 +114,7 @@ def run(folder: Path, order: SimulationOrder, workers: int = 0, quiet: bool = Fa
             counts["seconds"] += 0.0 if existed else recording.duration_s
             elapsed = time.monotonic() - began
             done = counts["kept"] + counts["new"]
+            # Recordings that were there before took no time, and say nothing about the others.
             left = elapsed / max(1, counts["new"]) * (order.recordings - done)
             note = f"{counts['seconds'] / max(1e-9, elapsed):,.0f} simulated s per s"
             shown.update(bar, advance=1, note=note)
@@ -165,6 +167,7 @@ def _range(text: str) -> tuple[float, float]:
 
     low, dash, high = text.partition("-")
     try:
+        # A single mass is a range of one.
         return float(low), float(high if dash else low)
     except ValueError as error:
         raise ConfigError(f"--masses {text}: give the lightest and the heaviest in t, such as 10-50") from error

@@ -9,6 +9,7 @@ from edp.cli.console import err
 from edp.sandbox import sandbox
 from edp.storage.memory import readable
 
+# Each line takes twice as long: a slow log is told often at first, and never floods a terminal.
 _AGAIN = 2.0
 """Times as long until the next line: after 5, 10, 20, 40 s and so on."""
 
@@ -22,6 +23,7 @@ class SlowLogs:
 
     def __call__(self, path: Path, seconds: float, size: int) -> None:
         """Say so, ever more seldom for one log."""
+        # A new log, or the same one from the start.
         if path != self.path or seconds < self.next_s / _AGAIN:
             self.path, self.next_s = path, 0.0
         if seconds >= self.next_s:

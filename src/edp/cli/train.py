@@ -142,6 +142,7 @@ def source_of(data: Path, signal_map: Path | None, repair: list[str]) -> DataSou
 
     table: dict[str, str] = {}
     for text in repair:
+        # Only the first sign parts key and value.
         key, sign, value = text.partition("=")
         if not sign:
             raise ConfigError(f"--repair '{text}': write what=how, for example nan=hold")

@@ -163,9 +163,11 @@ def load_experiment(
     if preset is not None:
         table = preset_table(preset)
     if path is not None:
+        # Files named in settings lie beside the settings file.
         table = merged(table, with_set_file(read_toml(path), Path(path).parent))
         where = f"'{path}'"
     for text in overrides:
+        # Files named on the command line lie in the working directory.
         table = merged(table, with_set_file(override(text), Path()))
     where += " with --set" if overrides else ""
     return build(Experiment, table, where)
@@ -185,6 +187,7 @@ def preset_table(name: str) -> Table:
 
 def experiment_toml(experiment: Experiment) -> str:
     """The whole settings as TOML, defaults included: what a run folder keeps."""
+    # Defaults included: a run must not change with the defaults of a later version.
     return tomli_w.dumps(plain_tree(experiment))
 
 
@@ -195,5 +198,6 @@ def with_set_file(table: Table, folder: Path) -> Table:
         return table
     path = folder / task["features"]
     features = read_set_table(path)
+    # Checked here, where the file can still be named.
     build(FeatureSettings, features, f"'{path}'")
     return {**table, "task": {**task, "features": features}}

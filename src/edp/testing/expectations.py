@@ -32,6 +32,7 @@ def expect_near(
     """
     first, second = (_array(values) for values in (actual, expected))
     expect(first.shape == second.shape, f"{message}: shapes {first.shape} and {second.shape}")
+    # NaN on both sides is agreement: both say that there is no value.
     near = np.isclose(first, second, rtol=rtol, atol=atol, equal_nan=True)
     if not near.all():
         largest = float(np.nanmax(np.abs(first - second)))
@@ -41,4 +42,5 @@ def expect_near(
 def _array(values: Tensor | ArrayLike) -> np.ndarray:
     if isinstance(values, torch.Tensor):
         values = values.detach().cpu().numpy()
+    # Double precision, so that the comparison itself does not round.
     return np.asarray(values, dtype=np.float64)

@@ -17,6 +17,7 @@ from edp.recording import Recording
 from edp.signals import TABLE_A1, SignalMap
 from edp.testing.expectations import ContractError, expect
 
+# Whole, odd and slow rates, and one whose period no decimal fraction holds.
 RATES_HZ = (100.0, 50.0, 128.98, 0.25, 1000.0 / 3.0)
 HEAD_BYTES = 4096
 """Of a file, by which `LogFormat.claims` tells its own."""
@@ -25,7 +26,9 @@ HEAD_BYTES = 4096
 def sample_recording(rate_hz: float = 100.0, ticks: int = 400) -> Recording:
     """Three channels of the vocabulary, of sizes from 0.1 to 1e7."""
     channels = tuple(TABLE_A1[name] for name in ("CylVels_1", "CylPressures_1", "BmUp"))
+    # Sizes from 0.1 to 1e7 show whether a format keeps the digits of each channel.
     values = np.random.default_rng(0).standard_normal((ticks, 3)) * np.array([0.1, 1e7, 1e6])
+    # A letter beyond ASCII: encodings are lost without a word.
     return Recording("R1", channels, values.astype(np.float32), rate_hz, "sim:test", {"seed": 3, "text": "ü"})
 
 
@@ -64,6 +67,7 @@ def check_round_trip(form: LogFormat, recording: Recording) -> None:
     where = f"format '{form.name}' at {recording.rate_hz:g} Hz"
     expect(again.channels == recording.channels, f"{where}: channels are {again.channel_names}, or of another kind")
     expect(again.values.tobytes() == recording.values.tobytes(), f"{where}: values are not those that were written")
+    # The rate comes back from stamps or periods, which may differ in the last digit.
     same_rate = math.isclose(again.rate_hz, recording.rate_hz, rel_tol=1e-9)
     expect(same_rate, f"{where}: read at {again.rate_hz!r} Hz")
     expect(again.name == recording.name, f"{where}: the recording is called '{again.name}'")
@@ -80,9 +84,11 @@ def check_damage(form: LogFormat) -> None:
         if not path.is_file():
             return
         content = path.read_bytes()
+        # Nothing, less than a head, half, and all but an end that many formats need.
         for size in (0, 10, len(content) // 2, len(content) - 10):
             path.write_bytes(content[:size])
             _refused(form, path, f"a file that is cut off after {size} of {len(content)} bytes")
+        # Random bytes of the same length: nothing in them must be taken for a log.
         path.write_bytes(np.random.default_rng(0).bytes(len(content)))
         expect(_refused(form, path, "random bytes"), f"format '{form.name}' reads random bytes as a log")
 

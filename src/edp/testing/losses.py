@@ -39,6 +39,7 @@ def loss_batch(streams: int = 4, ticks: int = 12, seed: int = 0) -> Batch:
     """Inputs ``(batch, time, input)``, future targets ``(batch, time, horizon, target)`` and which ticks count."""
     rng = np.random.default_rng(seed)
     valid = rng.random((streams, ticks)) > 0.2
+    # Ticks of a burn-in count for no stream; the others are drawn.
     valid[:, :3] = False
     return (
         torch.from_numpy(rng.normal(size=(streams, ticks, 3))),
@@ -77,6 +78,7 @@ def check_objective(loss: str, output: str) -> None:
         if gradient is None or not torch.isfinite(gradient).all():
             raise ContractError(f"the gradient of '{name}' is not finite, or there is none")
         if name not in indifferent_parameters(network):
+            # 1e-9 tells a path from rounding.
             expect(float(gradient.abs().sum()) > 1e-9, f"the objective does not reach '{name}'")
 
 
@@ -94,6 +96,7 @@ def check_masked_ticks(loss: str, output: str) -> None:
     """Ticks that do not count do not matter."""
     network = loss_network(output)
     x, future, valid = loss_batch()
+    # A value far from all others: a masked tick that leaks shows at once.
     changed = torch.where(valid[..., None, None], future, 100.0)
     with torch.no_grad():
         first = objective_value(network, objective_of(loss), (x, future, valid))
@@ -111,6 +114,7 @@ def check_least_value(loss: str, output: str) -> None:
         perfect = spec.evaluate(answer, answer.center)
         expect(perfect.shape == answer.center.shape, f"the loss has shape {tuple(perfect.shape)}; one a prediction")
         before = perfect
+        # From hundredths to beyond the thresholds of robust losses.
         for away in (0.01, 0.1, 1.0, 3.0):
             for sign in (-1.0, 1.0):
                 worse = spec.evaluate(answer, answer.center + sign * away)

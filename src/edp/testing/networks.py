@@ -24,6 +24,7 @@ from edp.registry import Registry
 from edp.testing.expectations import ContractError, expect
 from edp.testing.streaming import check_network
 
+# Nine ticks: odd, and no multiple of kernels or dilations.
 WINDOW = 9
 FEATURES = FeatureSet(
     "contract",
@@ -32,6 +33,7 @@ FEATURES = FeatureSet(
     hidden=("load",),
 )
 TARGETS = ("CylVels_1", "CylVels_3")
+# One horizon and two, changes and values: shapes that differ only there are told.
 FORMS = tuple((horizons, mode) for horizons in ((3,), (1, 4)) for mode in (TargetMode.DELTA, TargetMode.ABSOLUTE))
 """Horizons and encodings in which networks are tried."""
 SMALL_BACKBONES: Mapping[str, BackboneSpec] = {
@@ -64,6 +66,7 @@ def small_network(model: ModelSpec, task: Task, shake: float = 0.2) -> Predictor
     """
     shape, features = (len(task.horizons), len(task.targets)), len(task.features.features)
     rng = np.random.default_rng(7)
+    # Drawn scaling: an offset of zero or a width of one would hide a missing term.
     scaler = Scaler(
         rng.normal(size=features), rng.uniform(0.5, 2, features), rng.normal(size=shape), rng.uniform(0.5, 2, shape)
     )
@@ -71,6 +74,7 @@ def small_network(model: ModelSpec, task: Task, shake: float = 0.2) -> Predictor
     draw = torch.Generator().manual_seed(11)
     with torch.no_grad():
         for parameter in predictor.parameters():
+            # Shaken weights: gates that start open and layers that start at zero would hide errors.
             parameter.add_(shake * torch.randn(parameter.shape, generator=draw))
     return predictor.eval()
 
@@ -87,6 +91,7 @@ def check_spec(registry: Registry[Any], name: str) -> None:
         spec = part()
     except TypeError as error:
         raise ContractError(f"{registry.what} '{name}' has an option without a default: {error}") from error
+    # Settings files and bundles hold plain values: a part must survive the way there and back.
     plain = json.loads(json.dumps(SETTINGS.plain(spec)))
     expect(SETTINGS.build(part, plain, name) == spec, f"{registry.what} '{name}' is another one after JSON")
     expect(registry.name_of(spec) == name, f"{registry.what} '{name}' is registered under another name")

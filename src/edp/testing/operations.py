@@ -106,6 +106,7 @@ def check_operations(predictor: Predictor) -> None:
     Raises:
         ContractError: an operation that is not declared, is declared and not used, or has no word.
     """
+    # Operations of twelve ticks are those of any number.
     seen, _ = trace(predictor, TICKS)
     errors = declaration_errors(predictor, seen)
     expect(not errors, f"declared operations differ from those that run: {'; '.join(errors)}")

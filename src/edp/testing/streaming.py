@@ -27,6 +27,7 @@ from edp.networks.streaming import (
 from edp.testing.expectations import ContractError, expect, expect_near
 from edp.testing.operations import check_operations
 
+# More ticks than the window, so that rings go round.
 TICKS = 24
 MACHINE_CONSTANTS = 800
 """Numbers of a machine's geometry that a physics base may add to the list of layers."""
@@ -64,6 +65,7 @@ def check_shapes(predictor: Predictor) -> None:
         expect(values.shape == shape, f"{what} gives {tuple(values.shape)}; {shape} must hold")
     expect(code.dtype == x.dtype, f"forward gives {code.dtype} for inputs of {x.dtype}")
     expect(bool(torch.isfinite(code).all()), "forward gives values that are not finite")
+    # Encoding and decoding round in single precision.
     expect_near(again, code, "encoding what predict gives is not what forward gives", rtol=1e-4, atol=1e-5)
     fresh = predictor.initial_state(2, x)
     expect(_layout(fresh) == _layout(state), "the state after a run has other shapes or types than the one at reset")
@@ -78,8 +80,10 @@ def check_causality(predictor: Predictor) -> None:
     """
     x, cut = drawn_inputs(predictor), 13
     changed = x.clone()
+    # Large changes: a small one could hide in a saturated unit.
     changed[:, cut:] = 50.0 * drawn_inputs(predictor, seed=1)[:, cut:]
     before, after = run_network(predictor, x)[0], run_network(predictor, changed)[0]
+    # Double precision: what remains is the order of sums, never a leak.
     expect_near(after[:, :cut], before[:, :cut], "a later tick changes an earlier prediction", rtol=0, atol=1e-12)
     expect(not torch.equal(after[:, cut], before[:, cut]), "the present tick does not reach its prediction")
 
@@ -95,6 +99,7 @@ def check_chunks(predictor: Predictor) -> None:
     x = torch.from_numpy(random_inputs(predictor, window, seed=0)).to(next(predictor.parameters())).unsqueeze(0)
     with torch.no_grad():
         whole, _ = predictor.predict(x, predictor.initial_state(1, x))
+        # Four ticks before the end: the boundary lies inside of the window.
         _, state = predictor.predict(x[:, : window - 4], predictor.initial_state(1, x))
         chunk, _ = predictor.predict(x[:, window - 4 :], state)
     stream = Stream(predictor)
@@ -103,6 +108,7 @@ def check_chunks(predictor: Predictor) -> None:
         step = stream.step(row)
     expect(stream.warm, "a stream is not warm after a whole window")
     expect_near(chunk[:, -1], whole[:, -1], "a chunk with carried state differs from one run", rtol=0, atol=1e-10)
+    # The stream answers in single precision.
     expect_near(step.prediction, whole[0, -1].float(), "a stream differs from one run", rtol=1e-6, atol=1e-7)
 
 
@@ -119,6 +125,7 @@ def check_reset(predictor: Predictor) -> None:
     fresh, carried = run_network(predictor, later[:1])[0], run_network(predictor, later, state)[0][1]
     expect_near(both[:1], fresh, "a stream remembers something after its reset", rtol=0, atol=1e-12)
     expect_near(both[1], carried, "a reset of one stream changes another", rtol=0, atol=1e-12)
+    # A state that makes no difference is no memory; the part should not carry one.
     forgot = torch.allclose(both[1], run_network(predictor, later)[0][1], rtol=0, atol=1e-6)
     expect(not forgot, "the state that is carried makes no difference")
 
@@ -145,6 +152,7 @@ def check_determinism(predictor: Predictor) -> None:
     x = drawn_inputs(predictor)
     first = run_network(predictor, x)[0]
     torch.manual_seed(99)
+    # Another state of the generator shows a hidden draw.
     expect(torch.equal(run_network(predictor, x)[0], first), "two evaluations of the same inputs differ")
     other = copy.deepcopy(predictor)
     expect(torch.equal(run_network(other, x)[0], first), "a copy of the network gives another result")
@@ -175,6 +183,7 @@ def check_gradients(predictor: Predictor) -> None:
     x = drawn_inputs(predictor, batch=4)
     code, _ = predictor(x, predictor.initial_state(4, x))
     # An error of the size of a standard deviation, however far a physics base goes on inputs drawn at random.
+    # The target is drawn around the answer itself, so that every output has an error.
     loss = (code - code.detach() - torch.randn(code.shape, dtype=code.dtype)).square().sum()
     learned = {name: parameter for name, parameter in predictor.named_parameters() if parameter.requires_grad}
     fixed = {name for name, _ in predictor.named_parameters()} - set(learned)
@@ -185,6 +194,7 @@ def check_gradients(predictor: Predictor) -> None:
         expect(gradient is not None, f"the error does not reach '{name}'")
         size = float(gradient.abs().sum())
         silent = name in indifferent
+        # Numbers far apart: rounding on one side, any real gradient on the other.
         expect(size < 1e-8 if silent else size > 1e-9, f"the gradient of '{name}' adds up to {size:.3g}")
 
 
@@ -193,6 +203,7 @@ def check_parameters_counted(predictor: Predictor) -> None:
     rows, named = predictor.costs(), dict(predictor.named_parameters())
     counted, there = sum(row.parameters for row in rows), sum(parameter.numel() for parameter in named.values())
     expect(counted == there, f"the parts count {counted} parameters, the network has {there}")
+    # Gains and amplitudes are what an inference build folds away.
     gains = sum(p.numel() for name, p in named.items() if name.endswith((".gain", "activation.free")))
     foldable = sum(row.foldable for row in rows)
     expect(foldable == gains, f"the parts count {foldable} foldable parameters, the network has {gains}")
@@ -246,8 +257,10 @@ def check_graph_costs(predictor: Predictor) -> None:
     expect(graph.macs == counted, f"the list has {graph.macs} multiply-accumulates a tick, the parts count {counted}")
     carried = sum(slot.size for _, slot in graph.slots())
     state = state_numbers(predictor.initial_state(1, torch.zeros(1)))
+    # A tenth more and eight numbers: counters that exports need and networks do not.
     expect(carried <= 1.1 * state + 8, f"the list carries {carried} numbers, the network {state}")
     machine = 0 if predictor.physics is None else MACHINE_CONSTANTS
+    # Constants of scaling and geometry are no parameters, but take memory.
     most = parameters_of(predictor) * 1.1 + 200 + machine
     expect(graph.parameters <= most, f"the list holds {graph.parameters} numbers; at most {most:.0f} must hold")
 
@@ -261,6 +274,7 @@ def check_network(predictor: Predictor) -> None:
     Raises:
         ContractError: one of them is broken; the message says which and how.
     """
+    # Shapes and types are those of single precision; everything else is held in double.
     single = copy.deepcopy(predictor).float().eval()
     double = copy.deepcopy(single).double()
     for check in (check_shapes, check_determinism):

@@ -17,6 +17,7 @@ from edp.testing.expectations import expect
 from edp.testing.networks import SMALL_BACKBONES, WINDOW, small_network, small_task
 from edp.training.bundle import Bundle
 
+# Empty, upper case, a digit first, a space, too long, a path out of the folder.
 WRONG_NAMES = ("", "Upper", "2nd", "with space", "a" * 60, "../up")
 Options = Mapping[str, object] | None
 
@@ -54,6 +55,7 @@ def refusal_of(target: str, bundle: Bundle, folder: Path, options: Options = Non
         check_written(target, bundle, folder, options)
     except ExportError as error:
         expect(bool(str(error)), f"export target '{target}' refuses a network without a reason")
+        # A refusal that leaves files would look like half an export.
         expect(not list(folder.rglob("*.*")), f"export target '{target}' leaves files behind a refusal")
         return str(error)
     return ""
@@ -89,6 +91,7 @@ def check_export_target(target: type, **options: object) -> None:
         ContractError: a contract is broken; the message says which and how.
     """
     name = TARGETS.name_of(target)
+    # Four networks: recurrent, convolutional, with intervals, with blocks. No target need take all of them.
     plain = ModelSpec(backbone=SMALL_BACKBONES["lstm"], head=MlpHead(hidden=6), window=WINDOW)
     models = [
         plain,

@@ -44,6 +44,7 @@ from edp.training.spec import check_training
 from edp.training.strategy import TrainingStrategy
 
 SHOWN_RECORDINGS = 6
+# 60,000 ticks are ten minutes at 100 Hz: more than a picture can show.
 SHOWN_TICKS = 60_000
 
 
@@ -83,10 +84,12 @@ def prepare_data(source: RecordingSource, experiment: Experiment, frozen: Mappin
         EdpError: recordings or settings that cannot be used, or a frozen session that would train.
     """
     recordings = source.read()
+    # Sessions that this split freezes itself are allowed to stay in its test part.
     others = {key: name for key, name in (frozen or {}).items() if key not in frozen_of(experiment.split)}
     refuse_frozen(recordings, others, "would be divided into training and test part")
     first = recordings[0]
     task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
+    # Contradictions come before hours of reading features.
     check_combination(task, experiment.model)
     check_training(task, experiment.model, experiment.training)
     return prepare(recordings, task, experiment.split, experiment.model.window)
@@ -130,8 +133,10 @@ def train(
         Diverged: the loss was not finite any more, now or in an earlier sitting; a bundle holds the best weights
             before that, where an epoch was finished.
     """
+    # The judge changes no weights: the same run may be judged in several ways.
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
     if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read
+        # The machine's numbers are part of the key: its file may change under the same name.
         settings["machine"] = experiment.model.physics.digest()
     taught = {} if strategy_factory is None else {"lesson": dict(strategy_factory.facts)}
     frozen = {} if strategy_factory is None else strategy_factory.frozen
@@ -146,6 +151,7 @@ def train(
             fitted = fit(data, experiment.model, experiment.training, (run, key), on_event, strategy)
         except Diverged as end:
             if end.fitted is not None:
+                # Without weights from before the divergence there is nothing to keep.
                 provenance = _provenance(source, experiment, data, end.fitted.seconds, frozen) | taught
                 _keep(run, end.fitted, provenance | {"diverged": str(end)}, data)
             run.write_status("diverged", message=str(end), **end.facts)
@@ -190,6 +196,7 @@ def _keep(run: RunFolder, fitted: Fitted, provenance: dict[str, Any], data: Prep
 
 def _refuse_diverged(run: RunFolder) -> None:
     """A run that diverged would do so again, to the same bits."""
+    # Every training is deterministic: trying again would take as long and end alike.
     status = run.status()
     if status.get("status") == "diverged":
         bundle_note = " Its bundle holds the weights from before." if run.file("bundle").exists() else ""
@@ -259,6 +266,7 @@ def evaluate(
     if source is not None:
         recordings = source.read()
         data = replace(data, test=[bundle.task.series(recording) for recording in recordings])
+        # Content by name and digest: the same file changed is another judgement.
         judged += [part for recording in recordings for part in (recording.name, recording.digest)]
         target = make_folder(folder / f"on_{source.path.stem}")
     chosen = experiment.judge if baselines is None else replace(experiment.judge, baselines=tuple(baselines))

@@ -20,7 +20,7 @@ from edp.networks.running import stream_predictions
 from edp.signals import KINDS, Kind
 from edp.training import load_bundle
 
-# The last minute is what the filter remembers (60 s of forgetting), so longer bins would show no more.
+# 60 s are the usual forgetting time: beyond it the adaptation is settled.
 BINS = (0.0, 10.0, 30.0, 60.0)
 """Seconds of motion from which errors are gathered, each up to the next."""
 Rows = NDArray[np.float32]

@@ -42,7 +42,6 @@ class SoftmaxDivergence:
 
     outputs: ClassVar[tuple[str, ...]] = (POINT,)
 
-    # T = 2 is the temperature of the thesis (eq. 2.23).
     temperature: float = 2.0
 
     def __post_init__(self) -> None:

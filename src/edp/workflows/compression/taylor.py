@@ -17,7 +17,7 @@ from edp.networks.convolution import CausalConv, TemporalBlock
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import detach_state
 
-# 256 ticks: long enough for the state to settle after its lead, short enough for many pieces.
+# Short pieces bound the memory of the backward pass; many of them cover every kind of work.
 PIECE = 256
 
 

@@ -41,6 +41,7 @@ class Meta(ABC):
     @property
     def passes(self) -> int:
         """Through the network that an update goes back through."""
+        # The gradient passes through every inner step and the query, so memory grows with their number.
         return 1 + self.spec.inner_steps
 
     def series(self, task: Task, own_series: Sequence[Series]) -> list[Series]:
@@ -51,6 +52,7 @@ class Meta(ABC):
         """Take over the weights and scaling of the start, which then is a candidate itself."""
         self.training = spec
         parts = decompose(net)
+        # The head alone adapts where the representation is to stay common to all machines.
         self.adapted = frozenset(parts.head) if self.spec.head_only else frozenset((*parts.head, *parts.encoding))
         if self.start is None:
             return False
@@ -85,6 +87,7 @@ class Meta(ABC):
         """What one machine costs, a scalar with the gradient to go down."""
 
     def start_of(self, net: Predictor) -> Weights:
+        # Frozen parameters do not adapt: their gradient would be missing.
         """The weights that adapt."""
         return {name: p for name, p in net.named_parameters() if name in self.adapted and p.requires_grad}
 
@@ -111,11 +114,13 @@ class Meta(ABC):
                     for name, tensor in adapted_parameters.items():
                         tensor.copy_(saved_parameters[name])
             count = sum(part.samples for part in rest)
+            # Machines count by their ticks, as joint training would count them.
             total, ticks = total + count * np.array(scores), ticks + count
         score, report, loss = (float(value) for value in total / ticks)
         return score, report, loss
 
     def _halves(self, net: Predictor, parts: Sequence[Series]) -> tuple[Pieces, list[Series]]:
+        # The first half adapts and the second judges: the order on a machine, too.
         """Pieces of the first halves, as many as an episode has, and the second halves."""
         chunks, horizons = self.training.chunks, net.task.horizons
         starts, rest = [], []
@@ -129,6 +134,7 @@ class Meta(ABC):
                 )
             starts += [(index, at) for at in range(0, half - chunks.length - net.task.max_horizon, chunks.length)]
             rest.append(replace(part, inputs=part.inputs[half:], targets=part.targets[half:]))
+        # Even distances over the first halves: neighbouring pieces would show one kind of work.
         chosen = [starts[i * len(starts) // self.spec.shots] for i in range(min(self.spec.shots, len(starts)))]
         rows = [cut(parts[i], range(at, at + chunks.length), horizons, chunks.burn_in) for i, at in chosen]
         batch = stack(rows, [True] * len(rows))

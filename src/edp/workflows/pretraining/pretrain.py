@@ -47,6 +47,7 @@ class Pretrain:
     start: str | Path | None = None
 
     def __post_init__(self) -> None:
+        # An unknown method fails before hours of reading.
         _ = PRETRAININGS[self.method]
 
 
@@ -78,6 +79,8 @@ def pretrain(
         Diverged: the loss was not finite any more.
     """
     if not isinstance(experiment.split, ByMachine):
+        # Other splits leave recordings of a machine on both sides, and the network would know the machines that judge
+        # it.
         raise ConfigError(
             "pretraining holds out whole machines, but the settings divide the recordings otherwise; set "
             'split.kind = "machines"'
@@ -120,6 +123,7 @@ def _carrying(experiment: Experiment, episodic: bool, rate_hz: float) -> Experim
     chunks = experiment.training.chunks
     if episodic or chunks.carried or chunks.regime == "window":
         return experiment
+    # At least one chunk, however long chunks are.
     carried = max(1, round(CARRIED_S * rate_hz / chunks.length))
     return replace(experiment, training=replace(experiment.training, chunks=replace(chunks, carried=carried)))
 

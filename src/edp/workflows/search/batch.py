@@ -24,6 +24,7 @@ def complete(
         StorageError: a record could not be written; what ran is stopped, and what was entered stays.
     """
     tell = on_record or (lambda record, trained: None)
+    # Equal jobs share a key and are trained once.
     jobs_by_key = {job.key: job for job in jobs}
     records: dict[str, Record] = {}
     waiting: set[str] = set()
@@ -37,14 +38,17 @@ def complete(
                 executor.submit(replace(job, folder=str(ledger.path)))
                 waiting.add(key)
         while waiting:
+            # Everything is submitted before the first wait, so that no worker is idle while others train.
             record = executor.wait_any()
             if record is None:
                 raise RuntimeError(f"the executor gave up {len(waiting)} trainings without a word")
             waiting.discard(record.key)
+            # Into the ledger before anybody hears of it: what was told must survive a kill.
             ledger.put(record)
             records[record.key] = record
             tell(record, True)
     finally:
+        # An exception or an interrupt must not leave trainings running that nobody waits for.
         for key in waiting:
             executor.cancel(key)
     return {key: records[key] for key in jobs_by_key}

@@ -23,7 +23,9 @@ from edp.workflows.search.executor import RETRIES, START, ClosedAtExit, Job, end
 from edp.workflows.search.local import LocalPool
 
 NAMESPACE = "edp"
+# An hour: nodes may be busy with a training before they answer.
 HOUR_S = 3600.0
+# Five seconds: Ray itself tries for minutes where nothing answers (docs/findings.md).
 PROBE_S = 5.0
 _pool: dict[int, LocalPool] = {}
 """Of a process of Ray, which does one training after the other: its worker stays warm between them."""
@@ -57,6 +59,7 @@ class RayPool(ClosedAtExit):
         self._ready: deque[Record] = deque()
         try:
             self._check_nodes()
+        # Half a connection must not stay open: Ray allows one a process.
         except BaseException:
             self.close()
             raise
@@ -118,6 +121,7 @@ class RayPool(ClosedAtExit):
             data, state = self.ray.get(reference)
             record = Record.from_bytes(data)
             if state is not None and job.folder is not None:
+                # The state goes in before the record, which says that it is there.
                 write_bytes(left_state(job.folder, job.key), state)
         except errors.OutOfMemoryError as error:
             record = ended(job, TrainingStatus.OOM, f"the node was out of memory: {_line(error)}")
@@ -139,6 +143,7 @@ class RayPool(ClosedAtExit):
         asked = {}
         for node in self.ray.nodes():
             if node["Alive"] and node["Resources"].get("CPU", 0.0) >= self.threads:
+                # Hard affinity: another node's answer would prove nothing about this one.
                 strategy = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
                 remote = self.ray.remote(num_cpus=self.threads, scheduling_strategy=strategy)(_state_there)
                 asked[f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"] = remote.remote(self.threads)
@@ -148,6 +153,7 @@ class RayPool(ClosedAtExit):
         for name, reference in asked.items():
             try:
                 there = self.ray.get(reference, timeout=HOUR_S)
+            # A whole hour, since the task may wait behind trainings.
             except (errors.TaskUnschedulableError, errors.NodeDiedError):
                 continue  # it was killed a moment ago, and the cluster had not noticed; nothing will run there
             except errors.RayError as error:
@@ -176,6 +182,7 @@ def _perform_there(job: Job, threads: int, start: tuple[str, bytes] | None) -> t
     """
     pool = _pool.get(threads)
     if pool is None:
+        # One pool for each number of threads: workers keep theirs for life.
         pool = _pool[threads] = LocalPool(1, threads)
     with tempfile.TemporaryDirectory(prefix="edp-training-") as folder:  # stands for the ledger
         where = dict(job.where)
@@ -187,6 +194,7 @@ def _perform_there(job: Job, threads: int, start: tuple[str, bytes] | None) -> t
         try:
             record = pool.wait_any()
         finally:
+            # Whatever happened, the process must not go on with a training that nobody waits for.
             pool.cancel(job.key)
         if record is None:
             raise RuntimeError("the pool of a node gave a training up without a word")
@@ -232,6 +240,7 @@ def check_closed(address: str) -> None:
 
 def _is_loopback(host: str) -> bool:
     try:
+        # A host name is no loopback by its looks; only addresses and `localhost` pass.
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return host == "localhost"

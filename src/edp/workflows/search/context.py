@@ -103,9 +103,11 @@ class SearchContext:
     second: tuple[str, ...] = ()
 
     @property
+    # Sessions of the first run: choices of later phases rest on the same ones.
     def validation(self) -> tuple[str, ...]:
         """Development sessions that judge where the others train: those of the first run; two at least are left."""
         chosen = [name for name, judges in zip(self.development, self.folds(1)[0], strict=True) if judges]
+        # Two sessions at least must be left to train.
         return tuple(chosen[: max(1, len(self.development) - 2)])
 
     @property
@@ -121,6 +123,7 @@ class SearchContext:
         sessions, folds = len(self.development), self.spec.folds
         if self.spec.mode == "thesis":
             return repeated_splits(sessions, max(1, round(sessions / folds)), runs, self.spec.seed)
+        # Whole repeats of the folds, cut to the runs: every session is judged once before any is judged twice.
         return repeated_folds(sessions, folds, -(-runs // folds), self.spec.seed)[:runs]
 
     def shaped(self, settings: Table) -> Table:
@@ -141,6 +144,7 @@ class SearchContext:
             runs: their numbers, from 0.
             seed: number of the seed within a run.
         """
+        # The mask is made for all runs up to the last, since folds of a run depend on those before it.
         mask = self.folds(max(runs) + 1)
         names = np.array(self.development)
         return [
@@ -149,6 +153,7 @@ class SearchContext:
                 self.source,
                 tuple(names[~mask[run]].tolist()),
                 tuple(names[mask[run]].tolist()),
+                # A seed a run and not an arm: common random numbers make differences between arms smaller.
                 self.seed("run", run, seed),
                 self.spec.updates,
                 **self.several(tuple(names[mask[run]].tolist())),
@@ -165,6 +170,7 @@ class SearchContext:
     def seed(self, *parts: object) -> int:
         """A seed of its own for each purpose, from the root."""
         text = " ".join(map(str, (self.spec.seed, *parts)))
+        # 31 bits: libraries take seeds as signed 32-bit numbers.
         return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big") >> 1
 
     def table(self, outcomes: Sequence[Outcome], name: str = "composite") -> Array:
@@ -202,6 +208,7 @@ def set_apart(
         raise ConfigError(f"search: {', '.join(both)} is named in test and in second; each must be in one of them")
     free = [name for name in sessions if name not in spec.second]
     named = tuple(name for name in sessions if name in spec.test)
+    # The seed differs from all others of the search, so that the same draw never serves two purposes.
     test = named or _drawn(free, families, [spec.seed, 0x7E57], max(1, round(spec.test_share * len(sessions))))
     rest = [name for name in free if name not in test]
     second: tuple[str, ...] = ()
@@ -210,6 +217,7 @@ def set_apart(
         named = tuple(name for name in sessions if name in spec.second)
         second = named or _drawn(rest, families, [spec.seed, 0x7E58], count)
     development = tuple(name for name in sessions if name not in (*test, *second))
+    # Rounded up: the largest fold must leave two sessions to train.
     fold = -(-len(development) // spec.folds)
     if len(development) < max(spec.folds, 3) or len(development) - fold < 2:
         less = "a smaller test_share" + (", --set search.compression.on=false" if second else "")

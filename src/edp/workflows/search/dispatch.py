@@ -49,6 +49,7 @@ class Dispatcher:
         jobs = [self._job(order) for order in orders]
         if self.on_orders is not None:
             self.on_orders([job.key for job in jobs], orders)
+        # Asked before the trainings: afterwards every record is there.
         new = any(self.ledger.finished(job.key) is None for job in jobs)
         records_by_key = complete(
             self.ledger, self.executor, [self._begun(*pair) for pair in zip(jobs, orders)], self.on_record
@@ -67,6 +68,7 @@ class Dispatcher:
         """The job with the state from which it goes on, where there is one."""
         if self.ledger.finished(job.key):
             return job
+        # The latest rung saves most of the training.
         earlier = [replace(order, until=stop, stops=()) for stop in reversed(order.stops)]
         for one in [*earlier, *before(order)]:
             file = self.ledger.state(self._job(one).key)

@@ -11,6 +11,7 @@ from edp.errors import ConfigError
 from edp.storage.ledger import Record, TrainingIdentity, TrainingStatus
 
 START = "start"
+# Two restarts tell bad luck from a fault of the training itself.
 RETRIES = 2
 """How often a training whose process was killed starts again before it counts as lost."""
 

@@ -59,15 +59,18 @@ def ended_studies(study: Mapping[str, Any]) -> list[FinishedStudy]:
 def _ended_study(
     name: str, trials: Sequence[Mapping[str, Any]], space: Space, modules: Sequence[str], study: Mapping[str, Any]
 ) -> FinishedStudy:
+    # A viewer shows objectives without units; the names carry them.
     cost, score = study["spec"]["cost"], f"composite, {study['unit']}"
     full: dict[str, Range] = dict(space) | {module: Choice((0, 1)) for module in modules}
     objectives = (score,) if cost == "none" else (score, cost)
     rows = []
     for trial in trials:
+        # Options of modules that were off are absent, switches are always there.
         values = dict(trial["values"]) | {module: int(module in trial.get("modules", ())) for module in modules}
         trial_score = trial["score"]
         answer = None if trial_score is None else [trial_score] if cost == "none" else [trial_score, trial[cost]]
         attributes = {key: value for key, value in trial.items() if key not in NO_VALUES}
+        # Pruned questions keep their reports, which the viewer draws as curves.
         reports = {int(step): float(value) for step, value in trial.get("rungs", ())}
         rows.append(FinishedTrial(values, answer, attributes, reports, bool(trial.get("pruned"))))
     return FinishedStudy(name, full, rows, objectives)

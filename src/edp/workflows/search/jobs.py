@@ -28,9 +28,11 @@ def job_of(
     Raises:
         ConfigError: settings that cannot be built, or an unknown machine.
     """
+    # Threads are part of a result: sums change their order with them.
     settings = {**order.settings, "training": {**order.settings.get("training", {}), "threads": threads}}
     config: dict[str, Any] = {"settings": settings, "updates": order.updates}
     sessions = {"train": list(order.train), "judged": list(order.judged)}
+    # One epoch leaves these out, so that keys of earlier studies stay what they were.
     if order.epochs > 1:
         config |= {"epochs": order.epochs, "patience": order.patience}
         sessions["validation"] = list(order.validation)
@@ -68,5 +70,6 @@ def train(identity: TrainingIdentity, where: Mapping[str, Any]) -> dict[str, Any
     plain = {**identity.config, **identity.split, "seed": identity.seed, "source": where["source"]}
     part = train_part if identity.config.get("recipe") is None else make_smaller
     result, state = part(plain, read_state(where[START]) if START in where else None)
+    # Seconds differ from run to run; equal trainings give equal results.
     del result["seconds"]
     return result if state is None else WithState(result, state)

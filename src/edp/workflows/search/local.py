@@ -28,6 +28,7 @@ from edp.workflows.search.worker import BEGUN
 
 TICK_S = 0.1
 """Interval of checks of the memory of a training; without a cap the pool sleeps until something happens."""
+# Five minutes: imports of torch on a busy machine take their time, and a cap must not end them.
 START_S = 300.0
 """What a process may take until the function of its training is called."""
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -51,13 +52,16 @@ class _Worker:
         ours, theirs = socket.socketpair()
         self.connection = Connection(ours.detach())
         self.output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process
+        # Libraries read these when they are loaded, so they are set before the process begins.
         pinned = {name: str(threads) for name in THREADS}
         places = os.pathsep.join(folder for folder in sys.path if folder)
+        # `-P`: the working directory must not shadow modules of the library.
         command = [sys.executable, "-P", "-m", "edp.workflows.search.worker", str(theirs.fileno()), str(os.getpid())]
         try:
             self.process = subprocess.Popen(
                 command,
                 pass_fds=[theirs.fileno()],
+                # No input: a library that asks a question would wait for ever.
                 stdin=subprocess.DEVNULL,
                 stdout=self.output,
                 stderr=self.output,
@@ -96,6 +100,7 @@ class _Worker:
     def end(self) -> None:
         """Kill the process and what it started."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
+            # The whole process group: a training may have started processes of its own.
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         self.connection.close()
@@ -119,6 +124,7 @@ class LocalPool(ClosedAtExit):
                 f"a pool of {workers} workers with {threads} threads each cannot do anything; give 1 or more"
             )
         self.workers, self.threads, self.retries = workers, threads, retries
+        # The parent-death signal is tied to the thread that starts the worker.
         self._thread = threading.get_ident()
         self._idle: list[_Worker] = []
         self._busy: dict[str, _Worker] = {}
@@ -181,10 +187,13 @@ class LocalPool(ClosedAtExit):
 
     def _start(self) -> None:
         """Give waiting jobs to free workers."""
+        # The workers of another thread would die with it, and nobody would know why.
         if threading.get_ident() != self._thread:
             raise RuntimeError("a LocalPool is used from the thread that made it; its workers would die with this one")
         while self._queue and len(self._busy) < self.workers:
             turn = self._queue[0]
+            # A fresh process is asked for; an idle worker makes room, so that memory holds no more processes than
+            # workers.
             if turn.fresh and self._idle:
                 self._idle.pop().end()
             worker = self._idle.pop() if self._idle and not turn.fresh else _Worker(self.threads)
@@ -201,6 +210,7 @@ class LocalPool(ClosedAtExit):
         now = time.monotonic()
         nearest = min(worker.deadline for worker in self._busy.values()) - now
         capped = any(self._jobs[key].memory_mb for key in self._busy)
+        # A second at most without a cap: a death without a message is noticed then.
         pause = max(0.0, min(left, nearest, TICK_S if capped else 1.0))
         by_connection: dict[Any, _Worker] = {worker.connection: worker for worker in self._busy.values()}
         for connection in wait(list(by_connection), pause):
@@ -222,6 +232,7 @@ class LocalPool(ClosedAtExit):
             return
         record = Record.from_bytes(message)
         del self._busy[turn.job.key]
+        # The number of attempts is measured, not decided: it is no part of the result.
         self._ready.append(replace(record, measured={**record.measured, "attempts": turn.attempt}))
         worker.turn, worker.used, worker.deadline = None, True, float("inf")
         self._idle.append(worker)
@@ -239,6 +250,7 @@ class LocalPool(ClosedAtExit):
         else:
             return
         self._drop(worker)
+        # Memory of earlier trainings may still be with the process: a fresh one decides.
         if status is TrainingStatus.OOM and worker.used:
             self._queue.appendleft(replace(turn, fresh=True))
         else:
@@ -248,6 +260,7 @@ class LocalPool(ClosedAtExit):
         """Start a training whose process ended again, or give it up."""
         turn, last_output = worker.now(), worker.said()
         self._drop(worker)
+        # The same training again, first in line: others wait behind it as before.
         if turn.attempt <= self.retries:
             self._queue.appendleft(replace(turn, attempt=turn.attempt + 1))
             return

@@ -83,6 +83,7 @@ def _space(name: str) -> Mapping[str, Sequence[Any]]:
 
 
 def _block(name: str, title: str, **fixed: Any) -> None:
+    # Options that the thesis fixes are not searched.
     free = {key: values for key, values in _space(name).items() if key not in fixed}
     THESIS_MODULES.register(name)(Module(title, block={"kind": name, **fixed}, options=free))
 
@@ -165,6 +166,7 @@ def with_modules(
     Raises:
         ConfigError: an unknown module or option, or modules that contradict one another or the network; every reason.
     """
+    # Sets, so that the order of names cannot make two keys of one network.
     module_names = set(names)
     reasons = conflicts(settings, module_names, channels)
     if reasons:
@@ -174,6 +176,7 @@ def with_modules(
         changed_settings = shape(changed_settings)
     for name in (name for name in MODULES if name in module_names):
         for key, option in _options(settings, name, shape).items():
+            # What is not chosen keeps its present value, which is always among the options.
             label = (options or {}).get(key, option.present)
             if label not in option.values:
                 raise ConfigError(f"modules: {key} = {label!r}; one of {list(option.values)} must hold")
@@ -231,6 +234,7 @@ def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str
         for key in keys:
             present_value = present_value[key]
         present = _label(present_value)
+        # A value of the settings outside of the searched ones stays possible.
         labelled = {_label(value): value for value in values}
         if present not in labelled:
             labelled = {present: present_value, **labelled}
@@ -266,9 +270,11 @@ def conflicts(settings: Table, names: Iterable[str], channels: Sequence[str] = (
     if reasons:
         return reasons
     try:
+        # Building the experiment is the rule: every part knows its own conflicts.
         experiment = build(
             Experiment, _added(settings, module_names), "with " + (", ".join(sorted(module_names)) or "no modules")
         )
+        # Conflicts do not depend on the rate; 100 Hz is the thesis's.
         task = experiment.task.resolve(100.0, channels, physics=experiment.model.physics)
         check_combination(task, experiment.model)
     except ConfigError as error:
@@ -300,6 +306,7 @@ def _added(settings: Table, names: set[str]) -> Table:
         if name not in names:
             continue
         changed_settings = merged(changed_settings, copy.deepcopy(dict(module.change)))
+        # A block of the same kind with other options is replaced, not doubled.
         if module.block is not None and dict(module.block) not in changed_settings["model"]["blocks"]:
             other_blocks = [
                 block for block in changed_settings["model"]["blocks"] if block["kind"] != module.block["kind"]

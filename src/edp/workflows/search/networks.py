@@ -85,6 +85,7 @@ def write_networks(
         experiment = replace(recipe.experiment(experiment_of(order)), split=split)
         first = recordings[0]
         task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
+        # Scaling follows from the training sessions, not from the second test set.
         data = prepare(recordings, task, split, experiment.model.window)
         network = network_of(result["weights"], task, experiment.model)
         written[name] = folder / FOLDER / name
@@ -94,6 +95,7 @@ def write_networks(
 
 def _write_run(folder: Path, network: Predictor, experiment: Experiment, data: Prepared, facts: dict[str, Any]) -> None:
     make_folder(folder)
+    # The recipe is part of the key: another recipe of the same settings is another run.
     key = run_key({"experiment": experiment_toml(experiment), "made by": facts["search"]}, data.digest)
     with RunFolder(folder) as run:
         run.claim(key, experiment_toml(experiment))

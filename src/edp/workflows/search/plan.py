@@ -69,6 +69,7 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     where = f"preset '{preset}' of the search"
     table = parse_toml(text, where, ConfigError)
     if path is not None:
+        # Files named in settings are looked for beside the settings file, not in the working directory.
         table, where = merged(table, _with_files(read_toml(path), Path(path).parent)), f"'{path}'"
     for change in overrides:
         table = merged(table, _with_files(override(change), Path()))
@@ -79,6 +80,7 @@ def load_plan(path: str | Path | None = None, preset: str = "quick", overrides: 
     experiment = build(Experiment, merged(preset_table(base), table), where)
     spec = _spec(dict(search), where)
     _check_parts(spec, settings_of(experiment), f"settings {where}: search")
+    # Scores exist for the horizons of the task only.
     if spec.horizon not in experiment.task.horizons:
         horizons = ", ".join(map(str, experiment.task.horizons))
         raise ConfigError(
@@ -124,6 +126,7 @@ def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
                 "your own is named by its file (.toml)"
             )
     for backbone in spec.backbones:
+        # One feature set suffices: values of the space act on backbone and training.
         arm = arm_settings(settings, backbone, next(iter(spec.feature_sets.values())))
         for key, space in (("space", applicable(spec.space, arm)), ("deferred", spec.deferred)):
             _check_values(space, arm, f"{where}.{key}", backbone, spec.widths)
@@ -131,6 +134,7 @@ def _check_parts(spec: SearchSpec, settings: Table, where: str) -> None:
 
 def _check_values(space: Space, arm: Table, where: str, backbone: str, widths: str) -> None:
     for name, range_ in space.items():
+        # Ends of a range suffice: parts refuse values beyond a bound, not between two good ones.
         for value in range_.options if isinstance(range_, Choice) else (range_.low, range_.high):
             try:
                 build(Experiment, WIDTHS[widths](apply(arm, {name: value})), "of the search")
@@ -158,6 +162,7 @@ def space_of(
     for name, entry in dict(table).items():
         if name not in DIMENSIONS:
             raise ConfigError(f"settings {where}: unknown dimension 'search.{key}.{name}'{closest(name, DIMENSIONS)}")
+        # `false` takes a dimension out of the preset's space.
         if entry is False:
             space.pop(name, None)
         else:

@@ -48,6 +48,7 @@ def run_phases(
         if on_phase is not None:
             on_phase(name, context)
         decision = _run(name, context, do)
+        # A new context each time: phases cannot change what others have decided.
         context = replace(context, decided={**context.decided, name: decision})
         if on_decision is not None:
             on_decision(decision)
@@ -57,6 +58,7 @@ def run_phases(
 def _run(name: str, context: SearchContext, do: Do) -> Decision:
     course = PHASES[name].run(context)
     try:
+        # A phase is a coroutine: it keeps its place between batches and holds no other state.
         orders = next(course)
         while True:
             orders = course.send(do(orders))

@@ -84,6 +84,7 @@ class Resources:
             from edp.workflows.search.cluster import RayPool  # Ray takes seconds to import, and few have it
 
             return RayPool(self.cluster, self.threads, open_cluster=self.open_cluster)
+        # The cores that this process may use, which in a container are fewer than those of the machine.
         return LocalPool(self.workers or max(1, len(os.sched_getaffinity(0)) // self.threads), self.threads)
 
 
@@ -162,6 +163,7 @@ def run_search(
         ledger = open_things.enter_context(Ledger(target / "ledger"))
         if ledger.damaged:
             callbacks.on_note(f"{len(ledger.damaged)} damaged records were set apart and will be trained again")
+        # A folder is bound to data and settings: another search in it would mix records.
         ledger.bind({"data": data.digest, **plan.to_plain()})
         settings = settings_of(plan.experiment)
         context = SearchContext(
@@ -186,9 +188,11 @@ def run_search(
             context = run_phases(
                 context, lambda orders: _whole(doing(orders)), until, work.on_decision, on_phase=work.on_phase
             )
+            # States were for going on; at the end nothing reads them.
             ledger.keep_states(())
             state = "finished" if len(context.decided) == len(PHASES) else "stopped"
         finally:
+            # Openings are written down even where the search ends with an error.
             study_log.openings = ledger.openings()
             study_log.end(state)
         split = frozen_split(target, context, data.digests)
@@ -221,6 +225,7 @@ class _Data:
         families = {name: kind if count[kind] > 1 else "" for name, kind in kinds.items()}
         state = hashlib.blake2b(digest_size=16)
         for recording in recordings:
+            # The zero byte separates name and digest, so that no pair can be shifted into another.
             state.update(f"{recording.name}\0{recording.digest}\0".encode())
         hours = sum(recording.duration_s for recording in recordings) / 3600
         digests = {recording.name: recording.digest for recording in recordings}
@@ -257,6 +262,7 @@ class _Work:
         self.callbacks.on_progress(self.study_log)
 
     def _open(self, test_set: str, keys: Sequence[str], why: str) -> None:
+        # Recorded before it is made: a kill in between must not leave an opening without a trace.
         """Record an opening before it is made. ``edp compress`` may have opened the second test set before phase 6."""
         earlier = [one for one in self.ledger.openings(test_set) if one.judged != tuple(keys)]
         self.ledger.open_test_set(test_set, keys, why, again=test_set == SECOND_TEST_SET)
@@ -292,6 +298,7 @@ def _whole(outcomes: list[Outcome]) -> list[Outcome]:
             f"{len(lost)} trainings were lost: {lost[0].message}. What is done is kept; free memory or take fewer "
             "workers, and give the same command again"
         )
+    # One failure is a result; a whole batch of them is a fault that a decision must not rest on.
     failed = [outcome for outcome in outcomes if outcome.status == TrainingStatus.FAILED]
     if len(outcomes) > 1 and len(failed) == len(outcomes):
         raise DataError(f"all {len(outcomes)} trainings of a batch failed; the first says: {failed[0].message}")
@@ -315,6 +322,7 @@ def _check_channels(recordings: Sequence[Recording], plan: SearchPlan) -> str:
     units: set[str] = set()
     kinds: dict[tuple[str, ...], Recording] = {}
     for recording in recordings:
+        # Recordings of equal channels need one check.
         kinds.setdefault(recording.channel_names, recording)
     for name, features in plan.spec.feature_sets.items():
         settings = settings_of(plan.experiment)

@@ -140,6 +140,7 @@ class SearchSpec:
     folds: int = 5
     backbones: tuple[str, ...] = ("lstm", "tcn", "hybrid")
     features: tuple[str | FeatureSettings, ...] = ("FG1", "FG2")
+    # Ten runs: two repeats of five folds, the least from which spread between sessions and runs can be told apart.
     variance_runs: int = 10
     variance_seeds: int = 2
     trials: int = 40
@@ -178,6 +179,7 @@ class SearchSpec:
         bounds = dict.fromkeys(counts, whole(1, MOST_TRAININGS)) | {"seed": SEED, "horizon": whole(0, MOST_TICKS)}
         bounds |= {"epochs": whole(1, MOST_EPOCHS), "patience": whole(0, MOST_EPOCHS)}
         check_bounds("search", self, epochs=bounds["epochs"])
+        # Zero steps stand for passes over the data, which only several epochs know.
         steps = whole(1 if self.epochs == 1 else 0, MOST_UPDATES)  # 0: passes over the data
         bounds |= dict.fromkeys(("updates", "final_updates"), steps)
         bounds |= dict.fromkeys(("folds", "variance_runs", "most_runs", "screening_runs"), whole(2, MOST_TRAININGS))
@@ -229,6 +231,7 @@ class SearchSpec:
     @property
     def stops(self) -> tuple[int, ...]:
         """The rungs as steps of a training, epochs where it has several; those that are the same one count once."""
+        # At least one step: a rung before the first update judges nothing.
         steps = sorted({max(1, round(share * self.length)) for share in self.rungs})
         return tuple(step for step in steps if step < self.length)
 

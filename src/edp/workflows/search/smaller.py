@@ -70,6 +70,7 @@ class Recipe:
         """How it is made of the teacher; None for the teacher."""
         if self.units is None:
             return None
+        # Rounded networks are made of plain ones, whose order comes first.
         plain = CompressionRequest(
             name=f"{'p' if self.pruned else 'u'}{self.units}", units=self.units, pruned=self.pruned
         )
@@ -87,6 +88,7 @@ class Recipe:
             return experiment
         epochs, steps = experiment.training.epochs, self.updates
         if order.rounding is not None and epochs == 1:
+            # Tuning is a third of the training (see `bench`); of several epochs the epochs are fewer instead.
             steps = max(1, round(TUNING_EPOCHS * steps))  # of several epochs a third is left
         each = max(1, steps // epochs) if steps else 0
         training = order.training(replace(experiment.training, updates=each))
@@ -109,6 +111,7 @@ def before(order: TrainingRequest) -> list[TrainingRequest]:
     if order.recipe is None:
         return []
     recipe = Recipe.from_json(order.recipe)
+    # From what saves most: the network itself, the one that it was rounded from, the teacher.
     chain = [recipe] if recipe.final else []
     if recipe.rounded:
         chain.append(replace(recipe, rounded=False))
@@ -137,6 +140,7 @@ def make_smaller(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[
     """
     order = TrainingRequest.from_json(plain)
     recipe = Recipe.from_json(plain["recipe"])
+    # Checked again here: an order may come from anywhere.
     both = sorted(set(order.train) & {*recipe.validation, *order.judged})
     if both:
         raise DataError(f"phase 6: {', '.join(both)} would train and judge; each session must do one of the two")
@@ -176,6 +180,7 @@ def _judged(recipe: Recipe, network: Predictor, data: Prepared) -> dict[str, Any
     plain = score_predictions(stream_predictions(network, data.test), data, skip)
     formats, left_out, shown = {}, {}, plain
     for name in [recipe.final] if recipe.final else recipe.formats:
+        # A network trained for rounding is judged in the formats that round.
         if recipe.rounded and not FORMATS[name].rounded:
             continue
         try:

@@ -51,11 +51,13 @@ class Real:
             reach: to both sides.
             beyond: whether it may leave the range, as in the thesis; what is not logarithmic then stays in [0, 1].
         """
+        # Reach is in decades for logarithmic ranges, as in the thesis.
         if self.log:
             low, high = value / 10.0**reach, value * 10.0**reach
         else:
             low, high = value - reach, value + reach
         if beyond:
+            # Rates such as dropout have no meaning outside of 0 to 1.
             return Real(low, high, self.log) if self.log else Real(max(0.0, low), min(1.0, high))
         return Real(max(self.low, low), min(self.high, high), self.log)
 
@@ -193,6 +195,7 @@ def apply(settings: Table, candidate: Candidate) -> Table:
         ConfigError: an unknown dimension.
     """
     changed_settings = copy.deepcopy(settings)
+    # The order of the registry, whatever the order of the candidate: equal candidates give equal settings.
     for name in DIMENSIONS:  # depth after width, whatever the order of the candidate
         if name in candidate:
             DIMENSIONS[name](changed_settings, candidate[name])

@@ -154,6 +154,8 @@ class Study:
         waiting = any(trial.state.name == "WAITING" for trial in self._study.trials)
         if waiting:
             number = next(trial.number for trial in self._study.trials if trial.state.name == "WAITING")
+        # A sampler for each question, seeded by its number: questions do not depend on how often the search was
+        # stopped.
         self._study.sampler = self._sampler(number)
         asked = self._study.ask(self._distributions)
         self._open[asked.number] = asked
@@ -169,6 +171,7 @@ class Study:
     def _allowed(self, on: tuple[str, ...]) -> tuple[str, ...]:
         allowed: tuple[str, ...] = ()
         for name in on:
+            # Barred partners: the first of a pair in the registry's order stays on.
             if not any(name in pair and set(pair) <= {*allowed, name} for pair in self.barred):
                 allowed = (*allowed, name)
         return allowed
@@ -219,6 +222,7 @@ class Study:
                     f"study: trial {number} is reported {what} {list(numbers)}; {expected_count} finite ones must hold"
                 )
         self._waiting[number] = (values, costs, pruned)
+        # In the order of numbers, whatever the order in which trainings end.
         while self._told in self._waiting:
             self._pass_on(self._told, *self._waiting.pop(self._told))
             self._told += 1
@@ -230,6 +234,7 @@ class Study:
         for index, cost in enumerate(costs):
             trial.set_constraint(f"bound {index}", cost)
         if values is None:  # Never as infinity: a sampler would model the wall.
+            # Beyond a bound is pruned, not failed: the sampler learns the constraint.
             beyond = pruned or any(cost > 0 for cost in costs)
             self._study.tell(trial, state=TrialState.PRUNED if beyond else TrialState.FAIL)
         else:
@@ -355,6 +360,7 @@ def write_journal(path: str | Path, studies: Sequence[FinishedStudy]) -> None:
     from optuna.storages.journal import JournalFileBackend
 
     logging.getLogger("optuna").setLevel(logging.ERROR)
+    # Replaced whole: a dashboard that reads meanwhile sees the old file or the new one.
     with replacing(path) as temporary:
         storage = optuna.storages.JournalStorage(JournalFileBackend(str(temporary)))
         for study_copy in studies:

@@ -19,6 +19,7 @@ from edp.workflows.search.trainings import TrainingRequest
 
 SCHEMA = 2
 FILE = "study.json"
+# Two seconds: a viewer does not follow faster, and a record a second would cost more than it tells.
 EVERY_S = 2.0
 
 
@@ -93,12 +94,14 @@ class StudyLog:
         self._end_paused(self._row_of.values())
         for key, order in zip(keys, orders, strict=True):
             if self._row_of[key] not in self.rows:
+                # A training in parts is one row, so its key is that of the whole.
                 phase["trainings"] += 1
                 row = {"phase": phase["name"], "number": len(self.rows), "label": label_of(order.settings)}
                 self.rows[self._row_of[key]] = row | {"status": "waiting", "seconds": 0.0}
 
     def on_record(self, record: Record, order: TrainingRequest, trained: bool) -> None:
         """A training, or a part of one, is in the ledger."""
+        # A search that goes on comes by earlier records again.
         if record.key in self._heard:
             return
         self._heard.add(record.key)
@@ -108,7 +111,7 @@ class StudyLog:
         score, result = outcome.mean(self.horizon), record.result or {}
         seconds = float(record.measured.get("seconds", 0.0))
         row |= {
-            "score": score if score == score else None,
+            "score": score if score == score else None,  # NaN is not equal to itself
             "seconds": round(row["seconds"] + seconds, 3),
             "parameters": result.get("parameters"),
             "macs_tick": result.get("macs_tick"),
@@ -158,6 +161,7 @@ class StudyLog:
         phase, earlier = self._phase, self._before.get(decision.phase, {})
         self._end_paused(())
         spent = time.monotonic() - self._phase_began
+        # A search that was stopped has spent time before; the longer figure is closer to the truth.
         phase["wall_s"] = round(max(spent, float(earlier.get("wall_s", 0.0))), 1)
         phase["ended"] = earlier.get("ended") or _now()
         self.decisions.append(decision)
@@ -226,6 +230,7 @@ def look_at(folder: str | Path) -> Table:
     study = dict(read_study(folder))
     ledger = Path(folder, "ledger")
     holder = held_by(ledger / ".lock")
+    # Claims of a dead coordinator are stale.
     claims = list((ledger / "claims").glob("*.lock")) if holder else []
     if study["state"] == "running" and holder is None:
         study["state"] = "killed"
@@ -253,6 +258,7 @@ def label_of(settings: Table) -> str:
 def _held_before(file: Path) -> Table:
     """What an earlier sitting wrote; what cannot be read is written anew, since the ledger holds all that counts."""
     try:
+        # The log is for viewers; the ledger holds all that counts.
         content = read_json(file)
     except StorageError:
         return {}

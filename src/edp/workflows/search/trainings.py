@@ -171,6 +171,7 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
     fitted, state = fit_part(data, experiment.model, experiment.training, order.until, start, windowed)
     spec = JudgeSpec(baselines=(), skip=experiment.judge.skip)
     if windowed:
+        # Windows have no start-up of their own; the first whole one ends at the window's last tick.
         skip = max(spec.skip or 0, experiment.model.window, data.task.features.starting_ticks)
         by_recording = score_predictions(window_predictions(fitted.predictor, data.test), data, skip)["recordings"]
     else:
@@ -205,6 +206,7 @@ def experiment_of(order: TrainingRequest) -> Experiment:
         epochs=order.epochs,
         updates=order.updates // order.epochs,
         patience=order.patience,
+        # A refit would train on the sessions that judge.
         refit="none",
         seed=order.seed,
     )
@@ -241,6 +243,7 @@ def prepared(order: TrainingRequest, experiment: Experiment) -> Prepared:
         data = prepare(chosen, task, _Named(order.train, order.validation, order.judged), experiment.model.window)
         return data
     # A training needs a part that validates; with one epoch it decides nothing, so it is one of those that train.
+    # The first training session stands in as validation part, since every training has one.
     split = ByRecording(validation=order.train[:1], test=order.judged)
     data = prepare(chosen, task, split, experiment.model.window)
     return replace(data, train=[*data.validation, *data.train])
@@ -262,9 +265,11 @@ class _Named:
 
 
 def _frozen(source: Mapping[str, Any]) -> str:
+    # Text as a key: `lru_cache` needs something that can be hashed.
     return json.dumps(source, sort_keys=True)
 
 
+# One source: a worker serves one search, and two data sets might not fit in memory.
 @lru_cache(maxsize=1)
 def _recordings(source: str) -> Sequence[Recording]:
     """The recordings of a source, kept by the process that trains on them again and again."""
@@ -279,6 +284,7 @@ def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
     """
     experiment = build(Experiment, settings, "of a search")
     task = experiment.task.resolve(100.0, channels, experiment.model.physics)
+    # Weights do not matter to counts; building takes milliseconds, training minutes.
     network = build_model(task, experiment.model, blank_scaler(task), seed=0)
     check_counted(network)
     counted = footprint(network)
@@ -289,6 +295,7 @@ def settings_of(experiment: Experiment) -> Table:
     """An experiment as plain tables, without what an order decides itself, so that equal orders have equal keys."""
     settings: Table = plain_tree(experiment)
     del settings["split"], settings["judge"]["baselines"]
+    # Orders decide these; left in the settings they would make equal trainings different.
     for name in ("epochs", "updates", "patience", "refit", "seed"):
         del settings["training"][name]
     return settings

@@ -56,6 +56,7 @@ def perform(
                 stack.enter_context(_claimed(folder, identity.key))
             except (BusyError, StorageError) as error:
                 return Record(identity, TrainingStatus.LOST, None, str(error))
+            # Asked again under the claim: another worker may have finished it meanwhile.
             before = known(folder, identity.key)
             if before is not None:
                 return before
@@ -78,6 +79,7 @@ def _claimed(folder: str, key: str) -> Any:
             return claim(folder, key)
         except BusyError:
             if time.monotonic() > patience:
+                # Patience has an end: a claim that is held for long belongs to a living worker.
                 raise
             time.sleep(0.05)
 
@@ -90,20 +92,24 @@ def _end_of(
     try:
         function = resolve(identity.job)
         begun()
+        # The clock starts at the call: imports of a busy machine are no part of the training.
         started = time.monotonic()
         returned = function(identity, where)
         result = returned.result if isinstance(returned, WithState) else returned
         if not isinstance(result, Mapping):
             raise ConfigError(f"'{identity.job}' returned {type(result).__name__}; a training returns a table")
+        # A result that is no plain JSON fails here, by name, and not in the ledger.
         canonical(result)
         state = returned.state if isinstance(returned, WithState) else None
     except NotFiniteError as error:
         status, result, message = TrainingStatus.DIVERGED, None, str(error)
     except EdpError as error:
         status, result, message = TrainingStatus.FAILED, None, str(error)
+    # `SystemExit` too: a library that ends the process would look like a lost training.
     except (Exception, SystemExit) as error:
         status = TrainingStatus.OOM if _out_of_memory(error) else TrainingStatus.FAILED
         result, message, trace = None, f"{type(error).__name__}: {error}", traceback.format_exc()[-SHOWN_TRACE:]
+    # macOS gives bytes, Linux kilobytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     measured: dict[str, Any] = {
         "seconds": time.monotonic() - started,
@@ -131,6 +137,7 @@ def resolve(name: str) -> Callable[[TrainingIdentity, Mapping[str, Any]], Any]:
 
 def _out_of_memory(error: BaseException) -> bool:
     """Python's, NumPy's and PyTorch's ways to say so."""
+    # By name: PyTorch's class is not there without torch.
     named = any("OutOfMemoryError" in kind.__name__ for kind in type(error).__mro__)
     return named or isinstance(error, MemoryError) or "can't allocate memory" in str(error)
 
@@ -153,6 +160,7 @@ def serve(connection: Connection) -> None:
 
 
 if __name__ == "__main__":
+    # Children of the training must not inherit the socket, or the pool would wait for them.
     os.set_inheritable(int(sys.argv[1]), False)
     die_with_parent(int(sys.argv[2]))
     serve(Connection(int(sys.argv[1])))

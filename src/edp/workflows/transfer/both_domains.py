@@ -24,6 +24,7 @@ from edp.training.warm_start import WarmStart
 
 TARGET, SOURCE = 0.0, 1.0
 HIDDEN = 64
+# The steepness of Ganin et al. (2016).
 STEEPNESS = 10.0
 
 
@@ -73,6 +74,7 @@ class BothDomains:
             for part, values in zip(self.source_series, source_predictions, strict=True)
         ]
         ticks = [sum(part.samples for part in parts) for parts in (own, rehearsed)]
+        # Equal shares of ticks: hours of the source would drown minutes of the target.
         # The arrays are shared, so to name a series again takes no memory.
         own, rehearsed = (
             parts * max(1, round(max(ticks) / n)) for parts, n in zip((own, rehearsed), ticks, strict=True)
@@ -86,6 +88,7 @@ class BothDomains:
             x = torch.zeros(1, 1, len(net.task.inputs))
             with torch.no_grad():
                 width = int(net.forward_features(x, net.initial_state(1, x))[2].shape[-1])
+            # The classifier draws apart from the network, so that it does not change the network's dropout.
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(spec.seed)
                 net.add_module("classifier", Classifier(width))
@@ -95,6 +98,7 @@ class BothDomains:
     def loss(self, objective: Objective, batch: BatchContext) -> Tensor:
         """The loss of the target, that of the source, and that of the classifier with its gradient reversed."""
         spec, domain = self.spec, batch.teacher_targets[..., 0]
+        # The domain is a number among the targets; half separates 0 from 1.
         here, there = batch.valid & (domain < 0.5), batch.valid & (domain > 0.5)
         loss = objective.evaluate(batch.answer, batch.future, batch.features, here)
         if spec.soft < 1:
@@ -123,6 +127,7 @@ class BothDomains:
             for domain_logits, domain in ((logits[here], TARGET), (logits[there], SOURCE))
             if domain_logits.numel()
         ]
+        # A batch of one domain still gives a loss; a batch of none gives zero with a gradient path.
         return torch.stack(parts).mean() if parts else logits.sum() * 0.0
 
     def _marked(self, part: Series, domain: float, source_predictions: np.ndarray[Any, Any] | None) -> Series:
@@ -160,6 +165,7 @@ class _Reverse(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, factor: float) -> Tensor:
         ctx.factor = factor
+        # A view: autograd skips functions that return their input itself.
         return values.view_as(values)
 
     @staticmethod

@@ -74,6 +74,7 @@ class TransferCase:
         if strategy is not None:
             make, training_facts = strategy, {"method": name, "source": self.source.facts, **(facts or {})}
             if centred and self.spec.center and not phase:
+                # A phase is not centred: only the last one leaves a network.
                 strategy_factory = StrategyFactory(
                     {**training_facts, "centred": True}, lambda data: Centred(make()), self.source.frozen
                 )
@@ -81,6 +82,7 @@ class TransferCase:
                 strategy_factory = StrategyFactory(training_facts, lambda data: make(), self.source.frozen)
         experiment = replace(self.experiment, training=training)
         folder = self.folder / "phases" / phase if phase else self.folder
+        # The source's validation part counts too where both domains are to be kept.
         data = replace(self.data, validation=[*self.data.validation, *judged])
         return train(
             self.logs, experiment, folder, lambda event: self.tell(name, event), strategy_factory, data
@@ -102,12 +104,14 @@ def tuned(
         optimizer: by default SOAP with one rate for all that learns.
         epochs: by default those of methods without phases.
     """
+    # The source's own smoothness is replaced by that of the fine-tuning.
     terms = tuple(term for term in training.terms if not isinstance(term, Smoothness))
     if spec.smoothness:
         smooth: Any = Smoothness(weight=spec.smoothness)
         terms = (*terms, smooth)
     chunks = replace(training.chunks, batch=spec.batch, consecutive=1)
     if chunks.regime == "window":
+        # Neighbouring windows must divide the batch.
         near = NEIGHBOURS if spec.batch % NEIGHBOURS == 0 else spec.batch
         chunks = replace(chunks, consecutive=near if terms else 1)
     else:
@@ -127,4 +131,5 @@ def walked_again(chunks: ChunkSpec) -> ChunkSpec:
     """Chunks with which minutes of logs, which do not fill many lanes, are walked again, cut elsewhere."""
     if chunks.carried or chunks.regime == "window":
         return chunks
+    # A piece must be longer than its burn-in; eight chunks leave most of its ticks with a loss.
     return replace(chunks, carried=max(8, chunks.burn_in // chunks.length + 1))

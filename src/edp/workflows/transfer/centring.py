@@ -22,6 +22,7 @@ from edp.training.spec import TrainingSpec
 from edp.training.strategy import BatchContext, TrainingStrategy
 
 ROUNDS = 6  # one is enough unless the heads end in a function that bends
+# A tenth: less would divide by noise where the heads hardly answer.
 LEAST_ANSWER = 0.1
 CLOSE = 0.005  # of the mean absolute error that may be left
 SHORTEST_S = 30.0  # of logs: the mean error of fewer says little of other logs
@@ -72,6 +73,7 @@ def centre(net: Predictor, series: Sequence[Series]) -> None:
     bias = net.heads.biases[-1]  # (target, horizon * value), of which the first value is the prediction
     before = bias.detach().clone()
     mean, size = _errors(net, series)
+    # Recordings too short to be judged leave the network as it is.
     if not np.isfinite(size).all():
         return
     allowed, answered = DEAREST * size, np.ones_like(size)
@@ -84,6 +86,7 @@ def centre(net: Predictor, series: Sequence[Series]) -> None:
         # A bent end of the heads answers with less than it is given.
         share = np.divide(last - mean, step, out=np.ones_like(step), where=step != 0.0)
         answered = np.where(step != 0.0, np.clip(share, LEAST_ANSWER, 1.0), answered)
+    # Outputs for which centring costs more than it brings get their bias back.
     dear = torch.from_numpy(size > allowed).transpose(0, 1).to(bias.device)
     with torch.no_grad():
         own = bias[:, :: net.spec.output.values]
@@ -95,6 +98,7 @@ def _shift(net: Predictor, change: NDArray[np.float64]) -> None:
     bias = net.heads.biases[-1]
     features = torch.zeros(1, 1, len(net.task.features.features), device=bias.device)
     future = torch.as_tensor(change, dtype=torch.float32, device=bias.device)[None, None]
+    # The difference of two codes turns an SI change into the network's units, whatever the scaling.
     coded: Tensor = net.code.encode(future, features) - net.code.encode(torch.zeros_like(future), features)
     with torch.no_grad():
         bias[:, :: net.spec.output.values] += coded[0, 0].transpose(0, 1)
@@ -108,5 +112,6 @@ def _errors(net: Predictor, series: Sequence[Series]) -> tuple[NDArray[np.float6
         total[index] += error.sum(axis=0, dtype=np.float64)
         size[index] += np.abs(error).sum(axis=0, dtype=np.float64)
         ticks[index] += len(error)
+    # No ticks give NaN, which the caller looks for.
     with np.errstate(invalid="ignore"):
         return total / ticks, size / ticks

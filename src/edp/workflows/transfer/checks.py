@@ -62,6 +62,7 @@ def check_channels(recordings: Sequence[Recording], task: Task) -> None:
             "map the columns that hold them (--map); give a channel that this machine does not have a value there "
             "(constant = 0.0); or train the source without it (task.features)"
         )
+    # A thousandth: rates from time stamps are never exact.
     other = [f"'{r.name}' {r.rate_hz:g} Hz" for r in recordings if abs(r.rate_hz - task.rate_hz) > 1e-3 * task.rate_hz]
     if other:
         raise DataError(
@@ -76,6 +77,7 @@ def check_lengths(data: Prepared, chunks: ChunkSpec, window: int) -> None:
     Raises:
         DataError: which parts, and how long the shortest log must be.
     """
+    # The longest start-up of the regime, so that at least one tick is left to learn from.
     lead = max(window, chunks.burn_in if chunks.regime == "chunk" else chunks.length + chunks.consecutive - 2)
     needed = lead + data.task.max_horizon + 1
     rate = data.task.rate_hz
@@ -106,6 +108,7 @@ def check_moving(data: Prepared) -> None:
             for name, kind, mean, std in zip(
                 data.task.targets, data.target_kinds, values.mean(axis=0), values.std(axis=0), strict=True
             )
+            # A share of the kind's nominal size: noise of a frozen sensor is not motion.
             if std <= CONSTANT * KINDS[kind].nominal
         ]
         if still:
@@ -130,11 +133,14 @@ def check_units(data: Prepared, scaler: FrontEnd) -> None:
     """
     names = data.task.features.channels
     offset, width = (values[: len(names)].detach().double().cpu().numpy() for values in (scaler.offset, scaler.width))
+    # Two widths beyond the offset hold nearly all that the source has seen.
     there = np.abs(offset) + 2.0 * width
     logged = np.concatenate([np.abs(part.inputs[:, : len(names)]) for part in data.train])
+    # The 99 % quantile: single spikes must not look like another unit.
     here = np.quantile(logged, 0.99, axis=0).astype(np.float64)
     wrong = here > FAR * there
     kinds = np.array([channel.kind for channel in data.inputs[: len(names)]])
+    # A kind that is too small as a whole is in another unit; a single quiet channel may just rest.
     for kind in dict.fromkeys(kinds):
         same = (kinds == kind) & (here > 0.0)
         if same.sum() >= 2 and (here[same] * FAR < there[same]).all():
@@ -169,6 +175,7 @@ def check_signs(data: Prepared, source: Prepared | None) -> list[str]:
     own = {pair: correlation(data, data.train, pair) for pair in pairs}
     usual = {pair: float(CONVENTION[pair]) for pair in pairs if tuple(pair) in CONVENTION}
     source_correlations = usual if source is None else {pair: correlation(source, source.train, pair) for pair in pairs}
+    # Both correlations must be clear: a weak one has its sign by chance.
     sure = {p: (r, own[p]) for p, r in source_correlations.items() if min(abs(r), abs(own[p])) >= TOGETHER}
     turned = {pair: both for pair, both in sure.items() if both[0] * both[1] < 0}
     if turned:
@@ -203,6 +210,7 @@ def correlation(data: Prepared, parts: Sequence[Series], pair: PilotPair) -> flo
     reach = round(SEARCHED_S * data.task.rate_hz)
     pilot = [part.inputs[:, column].astype(np.float64) for part in parts]
     moved = [part.targets[:, target].astype(np.float64) for part in parts]
+    # Ten lags suffice: pressures and motions are smooth over 50 ms.
     correlations = [_pearson(pilot, moved, lag) for lag in range(0, reach + 1, max(1, reach // 10))]
     return max(correlations, key=abs)
 

@@ -73,6 +73,7 @@ class FinetuneRequest:
         for name in (self.method, *self.baselines):
             if name in RENAMED:
                 raise ConfigError(f"method '{name}' is now called '{RENAMED[name]}'; give that name")
+            # Unknown methods fail before hours of training.
             _ = METHODS[name]
         if not METHODS[self.method].trains:
             trainable = ", ".join(name for name, method in METHODS.items() if method.trains)
@@ -131,6 +132,7 @@ def finetune(
         try:
             results[name] = METHODS[name]().make(case)
         except Diverged as end:
+            # The asked method must succeed; rivals may fail with a note.
             if name == order.method:
                 raise
             notes.append(f"{METHODS[name].label} is left out: {end}")
@@ -183,6 +185,7 @@ def _result(
     source: SourceModel, data: Prepared, experiment: Experiment, order: FinetuneRequest, results: dict[str, Made]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
     """Scores of all methods in both domains, and the predictions before and after that pictures show."""
+    # The longest start-up of all methods, so that all are scored on the same ticks.
     skip = max(source.predictor.spec.window, experiment.judge.history, data.task.features.starting_ticks)
     predictions = {name: one.predict(data) for name, one in results.items()}
     errors = {name: errors_of(values, data, skip) for name, values in predictions.items()}

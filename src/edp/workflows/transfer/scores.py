@@ -12,6 +12,7 @@ from edp.data.prepared import Prepared
 from edp.evaluation.judge import Predictions, score_predictions
 from edp.signals import KINDS
 
+# An odd number, so that one bin is centred on zero error.
 BINS = 81
 SHOWN_S = 30.0
 SHOWN_RECORDINGS = 3
@@ -67,6 +68,7 @@ def distributions(errors: Mapping[str, Errors], targets: Sequence[str]) -> dict[
     for horizon in next(iter(errors.values())):
         histograms[horizon] = {}
         for index, target in enumerate(targets):
+            # The outermost half per cent is cut off: single outliers would squeeze all others into one bin.
             reach = (
                 max(
                     float(np.quantile(np.abs(method_errors[horizon][:, index]), 0.995))
@@ -94,6 +96,7 @@ def excerpts(predictions: Mapping[str, Predictions], data: Prepared, skip: int) 
     candidates = []
     for number, series in enumerate(data.test):
         ticks = series.samples - data.task.max_horizon
+        # Half-overlapping stretches: the liveliest one may lie across a boundary.
         for start in range(skip, max(skip + 1, ticks - size + 1), max(1, size // 2)):
             stop = min(start + size, ticks)
             if stop > start:
@@ -101,6 +104,7 @@ def excerpts(predictions: Mapping[str, Predictions], data: Prepared, skip: int) 
                 candidates.append((float(moved.std(axis=0).sum()), number, start, stop))
     best: dict[int, tuple[float, int, int, int]] = {}
     for entry in candidates:
+        # One stretch a recording, so that pictures show different drives.
         best[entry[1]] = max(entry, best.get(entry[1], entry))
     excerpt_arrays: dict[str, NDArray[np.float32]] = {}
     for _, number, start, stop in sorted(best.values(), reverse=True)[:SHOWN_RECORDINGS]:

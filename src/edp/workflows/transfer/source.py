@@ -73,6 +73,7 @@ def read_source(path: str | Path) -> SourceModel:
         BundleError: not a bundle, or one of an integer network (W8A16).
     """
     folder = Path(path)
+    # A bundle inside of its run folder finds the run beside it.
     if (folder.parent / "config.toml").is_file() and not (folder / "config.toml").is_file():
         folder = folder.parent
     bundle = load_bundle(path)
@@ -88,6 +89,7 @@ def read_source(path: str | Path) -> SourceModel:
     experiment = load_experiment(folder / "config.toml", None)
     try:
         return SourceModel(bundle, experiment, trained_run(folder)[3])
+    # Missing or changed recordings do not prevent a transfer; methods that need them are left out.
     except EdpError as error:
         return SourceModel(bundle, experiment, None, str(error))
 
@@ -102,6 +104,7 @@ def target_experiment(source: SourceModel, changes: Sequence[str] = ()) -> Exper
     """
     for text in changes:
         key = text.partition("=")[0].strip()
+        # Task and network decide what the weights mean; changed ones would not fit them.
         if key.partition(".")[0] not in PLACES:
             raise ConfigError(
                 f"--set {key}: a transfer keeps task and network of its source; settings of "
@@ -111,6 +114,7 @@ def target_experiment(source: SourceModel, changes: Sequence[str] = ()) -> Exper
         if own or key in ("training", "training.chunks"):
             raise ConfigError(f"--set {key}: a fine-tuning has options of its own for it; see edp finetune --help")
     task = task_settings(source.bundle.task)
+    # Zero: passes over the target's logs, not the number of updates that suited the source.
     training = replace(source.experiment.training, updates=0)
     experiment = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec, training=training)
     table = plain_tree(experiment)
@@ -122,6 +126,7 @@ def target_experiment(source: SourceModel, changes: Sequence[str] = ()) -> Exper
 def task_settings(task: Task) -> TaskSettings:
     """Settings that resolve to a task, its features by name where the name says them."""
     feature_settings: str | FeatureSettings = task.features.name
+    # A name may stand for another set by now; then the channels are listed.
     if FEATURE_SETS.get(task.features.name) != task.features:
         feature_settings = FeatureSettings(
             **{entry.name: getattr(task.features, entry.name) for entry in fields(FeatureSettings)}

@@ -46,8 +46,10 @@ class LowRank:
         """
         self.base.begin(net, spec)
         self._frozen = [parameter for parameter in net.parameters() if parameter.requires_grad]
+        # Weights are held: only the changes learn.
         for parameter in self._frozen:
             parameter.requires_grad_(False)
+        # A generator of its own: adapters do not move the draws of the network's dropout.
         draw = torch.Generator().manual_seed(spec.seed)
         self._changes = [(matrix, _Change(matrix, self.rank, draw)) for matrix in matrices_of(net)]
         net.add_module("adapters", nn.ModuleList(change for _, change in self._changes))
@@ -66,6 +68,7 @@ class LowRank:
         with torch.no_grad():
             for matrix, change in self._changes:
                 matrix.values.add_(change())
+                # The LSTM keeps flat copies of the tensors it was last called with.
                 if isinstance(matrix.part, nn.LSTM):  # it holds what it was last called with
                     matrix.part._init_flat_weights()
         del net.adapters
@@ -97,12 +100,14 @@ class _Change(nn.Module):
         super().__init__()
         weight = matrix.values
         others = [axis for axis in range(weight.ndim) if axis not in matrix.axes]
+        # Outputs first, so that any weight becomes a matrix of outputs by inputs.
         order = [*matrix.axes, *others]
         self.shape = [weight.shape[axis] for axis in order]
         self.back = [order.index(axis) for axis in range(weight.ndim)]
         rows = int(torch.tensor(self.shape[: len(matrix.axes)]).prod())
         columns = weight.numel() // rows
         rank = min(rank, rows, columns)
+        # A random, B zero: the change begins at nothing and still has a gradient.
         self.a = nn.Parameter(torch.randn(rank, columns, generator=draw).to(weight) / columns**0.5)
         self.b = nn.Parameter(weight.new_zeros(rows, rank))
 

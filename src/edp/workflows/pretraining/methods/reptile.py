@@ -46,10 +46,13 @@ class Towards(Meta):
         start = self.start_of(net)
         weights = start
         for number, rate in enumerate(self.spec.steps):
+            # Support and query in turn: Reptile learns from all pieces alike.
             weights = adapt(net, weights, objective, query if number % 2 else support, (rate,))
         with torch.no_grad():
             value = loss_with(net, weights, objective, query)
+        # The sum of the rates turns the way back into the size of a gradient.
         scale = sum(self.spec.steps)
         way = [((tensor - weights[name]).detach() / scale * tensor).sum() for name, tensor in start.items()]
         path = torch.stack(way).sum()
+        # The value is the query's loss, the gradient is that of the path: a difference with itself adds zero.
         return value + path - path.detach()

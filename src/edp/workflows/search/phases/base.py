@@ -129,11 +129,13 @@ def answer_all(
         batch = [
             _asked(context, quest_number, trial, quest.settings(trial))
             for quest_number, quest in enumerate(quests)
+            # Never more than are left: a study must not ask what nobody answers.
             for trial in quest.study.ask(min(spec.batch, quest.trials - len(answers[quest_number])))
         ]
         alive = batch
         for number, stop in enumerate([*stops, None]):
             earlier = tuple(stops[:number])
+            # Rungs of a training are separate jobs with keys of their own (decision 26).
             some = [[replace(order, until=stop, stops=earlier) for order in one.orders] for one in alive]
             outcomes = iter((yield [order for orders in some for order in orders]))
             for one, orders in zip(alive, some, strict=True):
@@ -154,6 +156,7 @@ def answer_all(
 def _asked(context: SearchContext, quest_number: int, trial: Trial, settings: Table) -> _Asked:
     spec = context.spec
     costs = _costs(settings, context)
+    # Limits on cost are checked before training: what does not fit is never trained.
     fits = bool(costs) and all(costs[name] <= most for name, most in spec.limits.items())
     return _Asked(
         quest_number, trial, settings, costs, context.orders(settings, range(spec.trial_runs)) if fits else []
@@ -173,8 +176,10 @@ def _goes_on(context: SearchContext, study: Study, one: _Asked, stop: int) -> bo
 
 
 def _costs(settings: Table, context: SearchContext) -> dict[str, float]:
+    # The study decides by batches before this one, so that the order of ends does not matter.
     try:
         return costs_of(settings, context.channels)
+    # A combination of legal values without a network is an answer too: the study learns to avoid it.
     except ConfigError:  # values that are each in their range, and make no network together
         return {}
 
@@ -200,9 +205,11 @@ def possible(context: SearchContext, space: Space, arm: Table) -> tuple[Space, l
 def tell(context: SearchContext, study: Study, answer: AnsweredQuestion) -> None:
     """Pass an answer on to its study."""
     spec = context.spec
+    # Positive means violated, as Optuna has it.
     bounds = [answer.costs[name] / most - 1.0 if answer.costs else 1.0 for name, most in sorted(spec.limits.items())]
     values = None
     if answer.score is not None:
+        # Failed trainings have no value: a worst one would bend the sampler's model.
         values = [answer.score] if spec.cost == "none" else [answer.score, answer.costs[spec.cost]]
     study.tell(answer.trial.number, values, bounds, answer.pruned)
 
@@ -227,6 +234,7 @@ def said_of_pruned(context: SearchContext, answers: Sequence[AnsweredQuestion]) 
     if not pruned:
         return []
     saved = sum(1.0 - max(answer.rungs) / context.spec.length for answer in pruned)
+    # Questions refused for their costs spent no steps and do not count.
     share = saved / max(1, sum(bool(answer.outcomes) for answer in answers))
     return [
         f"{len(pruned)} of {len(answers)} questions were ended at a rung as worse than the median there, which spared "
@@ -237,6 +245,7 @@ def said_of_pruned(context: SearchContext, answers: Sequence[AnsweredQuestion]) 
 def best(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
     """The answer with the lowest score; None where none was trained to its end."""
     done = [answer for answer in answers if answer.score is not None]
+    # Ties go to the earlier question, so that replays decide alike.
     return min(done, key=lambda answer: (answer.score, answer.trial.number), default=None)
 
 

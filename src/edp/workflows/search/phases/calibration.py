@@ -44,11 +44,13 @@ class Calibration:
         """All backbones side by side: every size in turn, then what the sampler asks; the best of each on all folds."""
         features = context.spec.feature_sets[context.decided["isolation"].facts["features"]]
         arms = {backbone: arm_settings(context.base, backbone, features) for backbone in context.spec.backbones}
+        # Only values that make a network of this arm are asked for.
         spaces = {name: possible(context, applicable(context.spec.space, arm), arm) for name, arm in arms.items()}
         quests = [_quest(context, name, arm, spaces[name][0]) for name, arm in arms.items()]
         answers = yield from answer_all(context, quests, context.spec.stops)
         notes = [f"{name}: {note}." for name, (_, some) in spaces.items() for note in some]
         asked = dict(zip(arms, answers, strict=True))
+        # Of each backbone the efficient size goes on, since later phases multiply its cost.
         chosen = {name: picked for name, own in asked.items() if (picked := _efficient(own)) is not None}
         final: list[Outcome] = []
         # One fold may be easy for one of them; the thesis decides by it.
@@ -110,6 +112,7 @@ def _quest(context: SearchContext, backbone: str, arm: Table, space: Space) -> Q
     spec = context.spec
     study = new_study(context, f"calibration {backbone}", space)
     sizes = space.get("units")
+    # A warm round: every width once, so that no size is left out by chance.
     for _ in range(spec.warm_rounds):
         for size in sizes.options if isinstance(sizes, Choice) else ():
             study.suggest({"units": size})
@@ -121,6 +124,7 @@ def _final(context: SearchContext, backbones: list[str], outcomes: Sequence[Outc
     mask = context.folds(context.spec.folds)
     parts = np.split(np.arange(len(outcomes)), len(backbones))
     raw = np.stack([context.table([outcomes[index] for index in part]) for part in parts])
+    # Failed cells count as the worst of all backbones: a failure must not win by its absence.
     tables = dict(zip(backbones, fill_worst(raw, mask), strict=True))
     scores = {name: float(table[mask].mean()) for name, table in tables.items()}
     return {"runs": context.spec.folds, "scores": scores, "against": lowest_against_others(tables, mask)}
@@ -132,6 +136,7 @@ def _efficient(answers: list[AnsweredQuestion]) -> AnsweredQuestion | None:
     for answer in answers:
         if answer.score is None:
             continue
+        # Of each size its best question stands for it.
         best_of_size = by_size.get(answer.costs["parameters"])
         if best_of_size is None or best_of_size.score is None or answer.score < best_of_size.score:
             by_size[answer.costs["parameters"]] = answer

@@ -35,6 +35,7 @@ class _Made:
     def error(self) -> float:
         """MAE in float32, the mean over horizons; infinite where it was not trained to its end."""
         result = self.outcome.result
+        # A failed network must never be the least.
         if result is None:
             return float("inf")
         return sum(float(scores["mae"]) for scores in result["plain"].values()) / len(result["plain"])
@@ -64,6 +65,7 @@ class CompressionPhase:
             yield from ()
             return Decision(NAME, {"on": False}, ("Left out: search.compression.on is false.",))
         settings = teacher_settings(context)
+        # The teacher first: all others are made of it.
         (first,) = yield [order_of(context, settings, recipe_of(context))]
         teacher = _Made(recipe_of(context), first)
         if first.result is None:
@@ -79,13 +81,16 @@ class CompressionPhase:
         outcomes = yield [order_of(context, settings, recipe) for recipe in recipes]
         networks += map(_Made, recipes, outcomes)
         if plan.rounds:
+            # The better recipe of each width is rounded; rounding both would double the trainings.
             better = [replace(_better(networks, units).recipe, rounded=True) for units in plan.orders]
             outcomes = yield [order_of(context, settings, recipe) for recipe in better]
             networks += map(_Made, better, outcomes)
         rows = rows_of(context, teacher, networks)
         chosen = chosen_of(rows)
         if chosen is None:
+            # The second test set is not opened where nothing fits.
             return self.decide(context, plan, rows, None, ())
+        # Teacher and choice alone are judged there: more looks would make it a validation set.
         final = [replace(recipe_of(context), final="float32"), _final(context, rows[chosen])]
         outcomes = yield [order_of(context, settings, recipe, context.second) for recipe in final]
         return self.decide(context, plan, rows, chosen, outcomes)
@@ -182,6 +187,7 @@ def plan_of(context: SearchContext, settings: Table) -> CompressionPlan:
     experiment = build(Experiment, settings, "of the search")
     task = experiment.task.resolve(100.0, context.channels, experiment.model.physics)
     network = build_model(task, experiment.model, blank_scaler(task), seed=0)
+    # Widths beyond the teacher's are left out here: settings are written before its width is known.
     units = [width for width in spec.units if width <= width_of(experiment.model)]
     return make_plan(network, spec.budget, units, spec.formats, shares=spec.shares)
 
@@ -222,6 +228,7 @@ def rows_of(context: SearchContext, teacher: _Made, networks: Sequence[_Made]) -
 def chosen_of(rows: Sequence[Row]) -> int | None:
     """Place of the row that fits with the least error, of equals the cheapest; None where none fits."""
     fitting = [index for index, row in enumerate(rows) if not row["over"]]
+    # Ties of error go to fewer cycles, then to fewer bytes.
     return min(
         fitting,
         key=lambda i: (

@@ -64,12 +64,15 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
         filled = fill_worst(scores[alive, :stop], mask[:stop])
         if stop < runs:
             hopeless = _hopeless(filled, mask[:stop], stop, interim_analyses)
+            # The baseline (0) is never dropped: all others are held against it.
             alive = [0, *(arm for arm, out in zip(alive[1:], hopeless, strict=True) if not out)]
         if len(alive) == 1:
+            # Nothing but the baseline is left: further runs would compare it with itself.
             break
     evidence = confirm(
         scores[:, :start],
         passed,
+        # All modules that were screened count for the adjustment, not only those that passed.
         context.decided["screening"].facts["registered"],
         mask[:start],
         Rule(alpha=context.spec.alpha, least_gain=context.spec.least_gain, interim_analyses=interim_analyses),
@@ -84,6 +87,7 @@ def _sound(context: SearchContext, passed: list[str], arms: list[Table]) -> Cour
 def _hopeless(filled: Array, mask: Mask, stop: int, interim_analyses: Sequence[InterimAnalysis]) -> list[bool]:
     """Which modules the interim analysis after `stop` runs drops."""
     level = next(analysis.drop_above for analysis in interim_analyses if analysis.runs == stop)
+    # Sessions that no run has judged so far hold nothing.
     seen = mask.any(axis=0)
     p = clustered_t((filled[1:] - filled[0])[..., seen], mask[:, seen]).p
     return [bool(value > level) for value in np.atleast_1d(p)]
@@ -106,6 +110,7 @@ def _by_metric(context: SearchContext, outcomes: Sequence[Outcome], arms: int, s
     rows = [[outcome.mean(context.spec.horizon, metric) for outcome in outcomes] for metric in METRICS]
     scores = np.array(rows).reshape(len(METRICS), arms, seeds, runs).swapaxes(2, 3)
     for own in scores:
+        # NaN would drop out of medians, and failing would look good.
         own[~np.isfinite(own)] = np.nanmax(np.where(np.isfinite(own), own, np.nan))
     return scores
 

@@ -31,6 +31,7 @@ class Exploration:
         base = baseline_of(context)[0]
         free = fitting(base, context.channels, spec.modules)
         earlier = context.decided["synthesis"].facts
+        # The winner of phase 4 is the warm start: phase 5 is to find at least that.
         starts = [(earlier["values"], earlier["modules"])]
         options = {name: options_of(base, name, context.shaped) for name in free}
         switches = [*free, *spec.toggles]
@@ -46,6 +47,7 @@ class Exploration:
         """The teacher: the winner of phase 5 where fresh folds bear it out, else that of phase 4."""
         earlier = context.decided["synthesis"].facts
         size = len(outcomes) // 2
+        # The last rows of the mask are the fresh runs.
         mask = context.folds(fresh_runs(context)[-1] + 1)[-size:]
         seen = mask.any(axis=0)
         scores = np.stack([context.table(part)[:, seen] for part in (outcomes[:size], outcomes[size:])])
@@ -53,6 +55,7 @@ class Exploration:
         test = clustered_t(filled[1] - filled[0], mask[:, seen])
         fresh = [float(own[mask[:, seen]].mean()) for own in filled]
         comparison = changed(test, fresh[0])
+        # Both: a gain, and one that chance hardly makes.
         better = comparison["change"] < 0 and comparison["p"] < context.spec.alpha
         names = ", ".join(map(title_of, facts["modules"])) or "no module"
         facts |= {
@@ -76,6 +79,7 @@ def fresh_runs(context: SearchContext) -> range:
     """Two repeats of the folds behind all that phases 0 to 4 may have used."""
     spec = context.spec
     used = max(spec.most_runs, spec.variance_runs, spec.trial_runs, spec.screening_repeats)
+    # Rounded up to whole repeats, so that the fresh folds are complete.
     start = -(-used // spec.folds) * spec.folds
     return range(start, start + 2 * spec.folds)
 

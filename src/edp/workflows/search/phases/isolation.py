@@ -31,6 +31,7 @@ def arm_settings(base: Table, backbone: str, features: Any) -> Table:
         arm_backbone = dict(base_backbone)
     else:
         arm_backbone = dict(DEFAULT_BACKBONE[backbone])
+        # Like width: backbones are compared before any is tuned.
         width = int(base_backbone.get("units", (base_backbone.get("channels") or [64])[-1]))
         if "units" in arm_backbone:
             arm_backbone["units"] = width
@@ -87,6 +88,7 @@ class Isolation:
         # Table 4.3 compares feature sets by their mean absolute error.
         what, judging = ("MAE", errors) if spec.mode == "thesis" else ("composite score", tables)
         means = {
+            # Common folds and seeds: feature sets are compared within them.
             features: float(np.mean([np.nanmean(t) for (_, f), t in zip(arms, judging, strict=True) if f == features]))
             for features in spec.feature_sets
         }
@@ -153,6 +155,7 @@ def _tables(context: SearchContext, outcomes: Sequence[Outcome], arms: int, name
     mask, seen = _judged(context)
     raw = np.stack([context.table(outcomes[at : at + size], name)[:, seen] for at in range(0, len(outcomes), size)])
     filled = fill_worst(raw, mask)
+    # Cells that no run judges are no scores.
     filled[:, ~mask] = np.nan
     return list(filled.reshape(arms, spec.variance_seeds, size, -1))
 
@@ -173,11 +176,13 @@ def _proxy(context: SearchContext, tables: list[Array], arms: list[tuple[str, st
     """
     mask, _ = _judged(context)
     pairs = [(i, j) for i in range(len(arms)) for j in range(i + 1, len(arms))]
+    # Pairs of the same backbone show what a feature set changes; other pairs only where there are none.
     alike = [(i, j) for i, j in pairs if arms[i][0] == arms[j][0]] or pairs
     differences = [tables[i][0] - tables[j][0] for i, j in alike] or [tables[0][0] - own for own in tables[0][1:]]
     if not differences:
         raise DataError("one backbone, one feature set and one seed show no variance; set variance_seeds = 2 or more")
     variances = [paired_variance(np.where(mask, difference, 0.0), mask) for difference in differences]
+    # The largest variance: planning should not promise too much.
     largest = max(variances, key=lambda variance: variance.session + variance.run + variance.cell)
     return {"session": largest.session, "run": largest.run, "cell": largest.cell}
 

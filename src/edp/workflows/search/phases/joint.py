@@ -46,10 +46,12 @@ def ask_together(
         options: what is varied of a module where it is on.
     """
     base, _, window = baseline_of(context)
+    # Pairs that contradict each other are barred, so that no question is wasted on them.
     space = {**window, **context.spec.deferred}
     study = new_study(context, name, space, modules, contradicting(base, modules, context.channels))
     study.options = options or {}
     for values, flags in starts[:trials]:
+        # Options of phase 4 stand at their present values, which phase 5 may change.
         present = present_options(base, flags, context.shaped) if options else None
         study.suggest(_inside(space, values), flags, present)
 
@@ -103,6 +105,7 @@ def winner_of(
 
 def _inside(window: Space, values: Candidate) -> dict[str, Any]:
     """Values of the window's dimensions, brought into it."""
+    # Values from outside of the window would be refused as a warm start.
     clipped: dict[str, Any] = {}
     for name, dimension in window.items():
         if name in values:

@@ -31,16 +31,19 @@ def _sound(context: SearchContext) -> Decision:
     spec = context.spec
     facts = context.decided["isolation"].facts
     mean = facts["mean_scores"][facts["features"]]
+    # At least one, so that the level stays defined where nothing is registered.
     modules = max(1, len(context.decided["screening"].facts["registered"]))
     plan = plan_runs(
         spec.least_effect * mean,
         PairedVariance(**facts["variance"]),
         len(context.development),
         folds=spec.folds,
+        # Bonferroni's level: the strictest that a single true module has to pass.
         alpha=spec.alpha / modules,
         target=spec.power,
         most=spec.most_runs,
     )
+    # Whole repeats of the folds, even where the power is not reached.
     runs = plan.runs or spec.most_runs - spec.most_runs % spec.folds
     sentences = [f"To see {100 * spec.least_effect:g} % of {mean:.3g} {context.unit}: {plan.reason}."]
     if plan.runs is None:
@@ -61,6 +64,7 @@ def _thesis(context: SearchContext) -> Decision:
     sigma = max((arms[f"{one} {features}"]["seed"] or 0.0) for one in spec.backbones)
     mean = arms[f"{backbone} {features}"]["mean"]
     if sigma <= 0.0:
+        # Seeds that agree to the last digit leave nothing to plan for; two splits are the least of a mixed model.
         plan = {"splits": 2, "simulated": None, "analytical": 0.0}
     else:
         power_plan = thesis_plan(

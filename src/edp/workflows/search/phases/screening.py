@@ -47,12 +47,14 @@ def _sound(context: SearchContext) -> Course:
     base, _, window = baseline_of(context)
     free = fitting(base, context.channels, spec.modules)
     barred = [sorted(pair) for pair in contradicting(base, free, context.channels)]
+    # A design needs more runs than effects.
     design = two_level_design(free, max(spec.screening_runs, least_runs(len(free))), sorted(barred))
     drawn = _drawn(context, window, spec.screening_repeats * len(design.levels))
     orders, rows = [], []
     for repeat in range(spec.screening_repeats):
         for row, levels in enumerate(design.levels):
             values = drawn[repeat * len(design.levels) + row]
+            # Values are drawn anew for each row: main effects are then averages over the window.
             chosen = [name for name, on in zip(free, levels, strict=True) if on]
             settings = context.network(apply(base, values), chosen)
             orders += context.orders(settings, [repeat])
@@ -71,6 +73,7 @@ def _drawn(context: SearchContext, window: Space, count: int) -> list[dict[str, 
             dimension = window[name]
             if isinstance(dimension, Choice):
                 continue
+            # Rates act by their order of magnitude.
             low, high = (
                 (np.log10([dimension.low, dimension.high])) if dimension.log else (dimension.low, dimension.high)
             )
@@ -89,11 +92,14 @@ def _passed_by_design(
     """Main effects by least squares, with the drawn values and the fold as covariates; what shows a sign passes."""
     scores = np.array([outcome.mean(context.spec.horizon) for outcome in outcomes])
     failed = int((~np.isfinite(scores)).sum())
+    # A failed training counts as the worst that was seen, not as missing.
     if failed < len(scores):
         scores = np.where(np.isfinite(scores), scores, np.nanmax(scores))
+    # Logarithms of rates are the covariates, since they were drawn so.
     drawn = [[np.log10(v) if v > 0 and name != "dropout" else v for name, v in row[1].items()] for row in rows]
     folds = [[float(row[2] == repeat) for repeat in range(1, context.spec.screening_repeats)] for row in rows]
     covariates = np.hstack([np.array(drawn), np.array(folds).reshape(len(rows), -1)])
+    # A column that never changes would make the regression singular.
     covariates = covariates[:, covariates.std(axis=0) > 0]
     levels = np.stack([row[0] for row in rows])
     effects = main_effects(levels, design.factors, scores, covariates if covariates.size else None)
@@ -114,6 +120,7 @@ def _thesis(context: SearchContext) -> Course:
     base, _, window = baseline_of(context)
     free = fitting(base, context.channels, spec.modules)
     median = yield [order for seed in range(spec.run_seeds) for order in context.orders(base, [0], seed=seed)]
+    # A median over seeds, as in the thesis: the bar must not be that of one lucky seed.
     reference = float(np.median([outcome.mean(spec.horizon) for outcome in median]))
     quests = [_quest(context, base, name, window) for name in free]
     answers = yield from answer_all(context, quests)

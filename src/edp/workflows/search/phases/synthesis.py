@@ -31,6 +31,7 @@ class Synthesis:
         confirmed = list(context.decided["confirmation"].facts["confirmed"])
         switches = [*confirmed, *context.spec.toggles]
         base, values, _ = baseline_of(context)
+        # All confirmed modules, and none of them: the sampler begins with both ends.
         starts = [(values, confirmed), (values, [])] if confirmed else [(values, [])]
         if context.spec.mode == "thesis":  # whose phase 4 has no warm start (3.3.5)
             starts = []
@@ -71,6 +72,7 @@ def final_orders(context: SearchContext, settings: Table) -> list[TrainingReques
     train = context.development
     validation: tuple[str, ...] = ()
     if context.spec.epochs > 1:
+        # With several epochs the sessions of a fold choose the best epoch; test sessions never do.
         first = context.orders(settings, [0])[0]
         train, validation = first.train, first.judged
     return [
@@ -107,6 +109,7 @@ def gained(context: SearchContext, outcomes: Sequence[Outcome]) -> dict[str, flo
     """
     scores = np.array([[o.score(name, context.spec.horizon) for name in context.test] for o in outcomes])
     arms = scores.reshape(2, context.spec.run_seeds, len(context.test))
+    # A clustered test needs two sessions and two seeds.
     if min(arms.shape[1:]) < 2 or not np.isfinite(arms).all():
         return None
     return changed(clustered_t(arms[0] - arms[1]), float(arms[1].mean()))

@@ -34,9 +34,11 @@ class FewSteps:
         frozen = decompose(source.predictor).encoding if meta.get("head_only") else ()
         training = replace(
             case.tuning(Sgd(learning_rate=rate), spec.inner_steps),
+            # Plain descent at a constant rate without an average: what meta-learning trained for.
             terms=case.experiment.training.terms,
             schedule=Constant(),
             average=NoAverage(),
+            # One update over all logs makes each step an epoch, which validation can choose.
             updates=1,
         )
         network = case.train("few_steps", training, lambda: WarmStart(source.predictor, frozen), centred=False)

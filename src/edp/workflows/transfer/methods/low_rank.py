@@ -32,4 +32,5 @@ def change_size(shape: tuple[int, ...], axes: tuple[int, ...], rank: int) -> int
     rows = columns = 1
     for axis, size in enumerate(shape):
         rows, columns = (rows * size, columns) if axis in axes else (rows, columns * size)
+    # A rank beyond the smaller side brings no further change.
     return min(rank, rows, columns) * (rows + columns)

@@ -64,6 +64,7 @@ def train_both(case: TransferCase, name: str, spec: BothSpec) -> Made:
     if source.data is None:
         raise ConfigError(f"method '{name}' needs the recordings of the source: {source.absent}")
     source_series = source.data.train
+    # Four start-ups at least: a shorter piece would judge its beginning alone.
     least = 4 * (
         max(source.predictor.spec.window, case.experiment.training.chunks.burn_in) + case.data.task.max_horizon
     )
@@ -81,6 +82,7 @@ def train_both(case: TransferCase, name: str, spec: BothSpec) -> Made:
 
 def share(series: Sequence[Series], ticks: int, least: int) -> list[Series]:
     """The beginnings of as many series as `ticks` ticks suffice for, each of `least` ticks or more, spread over all."""
+    # As many ticks of the source as of the target: the larger domain must not choose the epoch alone.
     count = max(1, min(len(series), ticks // least))
     size = max(least, ticks // count)
     chosen = [series[i * len(series) // count] for i in range(count)]

@@ -23,6 +23,7 @@ class TwoPhase:
     def make(self, case: TransferCase) -> Made:
         """Both phases; the first is a run of its own within the run of the second."""
         spec, parts = case.spec, decompose(case.source.predictor)
+        # 0.999 is AdamW's usual value; the library's default of 0.99 is for short runs.
         heads = AdamW(learning_rate=spec.head_rate, weight_decay=spec.weight_decay, beta2=0.999)
         warmed = case.train(
             "two_phase, head",
@@ -30,6 +31,7 @@ class TwoPhase:
             lambda: WarmStart(case.source.predictor, parts.encoding),
             phase="head",
         )
+        # Depth counts from the head: layers near the input change least.
         above = list(reversed(parts.backbone))
         rates = tuple((part, spec.backbone_rate * spec.depth_decay**depth) for depth, part in enumerate(above))
         optimizer = Discriminative(rates=rates, learning_rate=spec.head_rate, weight_decay=spec.weight_decay)
