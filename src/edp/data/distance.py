@@ -66,6 +66,7 @@ def _states(recordings: Sequence[Recording], axes: Sequence[Axis], stretches: Se
     parts = []
     for stretch in stretches:
         recording = recordings[stretch.recording]
+        # A stretch shorter than the delay keeps its last sample.
         back = min(round(EARLIER_S * recording.rate_hz), stretch.stop - stretch.start - 1)
         rows = slice(stretch.start + back, stretch.stop)
         commands = [axis.signed_command(recording) for axis in axes if axis.command]

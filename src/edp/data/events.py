@@ -57,6 +57,7 @@ def rises(on: NDArray[np.bool_]) -> int:
 
 def reversals(command: Array, threshold: float) -> int:
     """Changes of sign between moments at which a command exceeds the threshold."""
+    # Samples within the dead band are left out, so that noise about zero is no reversal.
     signs = np.sign(command[np.abs(command) > threshold])
     return int(np.count_nonzero(signs[1:] != signs[:-1]))
 

@@ -109,6 +109,7 @@ def _by_kind(channels: Sequence[Channel], inputs: tuple[str, ...]) -> Roles:
     speeds = of(Kind.VELOCITY) or of(Kind.ANGULAR_VELOCITY) or (of(Kind.GENERIC) if commands else [])
     places, pressures = of(Kind.POSITION) or of(Kind.ANGLE), of(Kind.PRESSURE)
     count = max(len(speeds), min(len(commands), 1))
+    # Two pilot pressures for each velocity are the two sides of a spool.
     one_sided = len(commands) == 2 * count and all(kinds[name] == Kind.PILOT_PRESSURE for name in commands)
 
     def command(i: int) -> tuple[str, ...]:

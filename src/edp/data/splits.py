@@ -175,7 +175,7 @@ class ByBlocks:
     def split(self, recordings: Sequence[Recording], gap: int) -> Split:
         """Divide each recording into blocks."""
         parts: dict[str, list[Stretch]] = {part: [] for part in PARTS}
-        # Counted over all recordings: each of few blocks would otherwise give none to validation.
+        # Counted over all recordings: recordings of few blocks would otherwise give none to validation.
         turn = itertools.count(1)
         for i, recording in enumerate(recordings):
             size = round(self.block_s * recording.rate_hz)

@@ -204,7 +204,7 @@ def prepare(
     for line in lines.values():
         missing |= line.missing
     part = _rows(rows, grid.count, where)
-    # Gaps of the wanted rows only: one outside of them is nobody's concern.
+    # Gaps of the wanted rows only: those outside of them do not matter to the reader.
     keep, gap_facts = repair_gaps(missing[part], grid.rate_hz, repair, where)
     first = part.start + (keep.start or 0)
     last = part.start + (len(missing[part]) if keep.stop is None else keep.stop)

@@ -129,6 +129,7 @@ def find_recordings(path: str | Path) -> tuple[Path, ...]:
         entry
         for entry in source.rglob("*")
         if entry.suffix.lower() in suffixes
+        # Files that are being written have names that begin with a dot.
         and not entry.name.startswith(".")
         and entry.is_file()
         and not _is_truth(entry)

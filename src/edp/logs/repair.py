@@ -130,6 +130,7 @@ def repair_values(
         if sound[column]:
             continue
         bad = ~np.isfinite(values[:, column])
+        # Gaps that are to stay NaN are no missing values.
         repairable = bad & ~missing if repair.gaps in ("keep", "refuse") else bad
         rows = np.flatnonzero(repairable)
         if not len(rows) or repair.nan == "keep":
@@ -146,6 +147,7 @@ def repair_values(
                 f"{where}: channel '{name}' starts with a missing value, nothing earlier can be held; "
                 f"start the rows at {first_row + int(np.argmin(bad))} or later"
             )
+        # Each row's latest good row, without a loop.
         source = np.maximum.accumulate(np.where(bad, 0, np.arange(len(bad))))
         values[repairable, column] = values[source[repairable], column]
         repairs.append({"repair": "nan = hold", "channel": name, "count": len(rows), "row": first})

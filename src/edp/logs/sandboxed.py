@@ -155,6 +155,7 @@ class _Log:
             try:
                 check_memory(self.path, size, f"a column of {size} bytes", "read it in parts, or some rows")
             except DataError:
+                # Its bytes are under way already, so this connection cannot be used any more.
                 self.channel.close("a column is larger than memory")
                 raise
             return self.channel.receive(size)[1][0]
@@ -162,6 +163,7 @@ class _Log:
     def open(self, table: int, keys: Sequence[str], start: int, stop: int) -> _Stream:
         """Begin to read pieces."""
         with self.lock:
+            # Both sides would wait for ever: this one to send a long request, the other one to send its answers.
             if sum(map(len, keys)) + _NUMBER_BYTES * len(keys) > SMALL_BYTES // 2:
                 self._drain()
             self.opened += 1

@@ -26,7 +26,7 @@ from edp.errors import DataError
 from edp.sandbox.protocol import Header, packed, reader, receive
 
 PIPE_BYTES = 1 << 20
-"""Wanted size of the answers' pipe: the usual 64 kB make the reader wait for each piece."""
+"""Wanted size of the answers' pipe: with the usual 64 kB the reader would wait for each of them to be taken."""
 SMALL_BYTES = 4096
 """A request that any pipe takes at once."""
 SLOW_S = 5.0

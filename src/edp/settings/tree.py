@@ -248,7 +248,7 @@ def _leaves(hint: Any) -> frozenset[Any]:
 def _scalar(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
     """A value, or a list of any length, by pydantic; what it would coerce without a word is refused first."""
     leaves = _leaves(hint)
-    # pydantic takes true for 1 and "3" for 3: a slip of the pen would become a setting.
+    # pydantic takes true for 1 and "3" for 3: a typing error would become a setting.
     if _truth_in(value) and not leaves & {bool, Any}:
         problems.append(f"{path} = {shown(value)}: true and false are no numbers or names; write one")
         return None
@@ -261,6 +261,7 @@ def _scalar(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
     try:
         return _adapter(hint).validate_python(value)
     except pydantic.ValidationError as error:
+        # One problem a key: pydantic lists one for each type that a union has.
         first = error.errors()[0]
         rule = _RULES.get(first["type"], f"{first['msg'][0].lower()}{first['msg'][1:]}")
         problems.append(f"{path} = {shown(value)}: {rule}")

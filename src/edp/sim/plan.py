@@ -131,6 +131,7 @@ class DataSetSpec:
                 rate_hz=self.rate_hz,
                 step_s=self.step_s,
                 sensor_noise=self.sensor_noise,
+                # 32 bits, which every generator and JSON hold.
                 seed=int(seeds[i].generate_state(1)[0]),
                 name="_".join(part for part in (label, f"{i:03d}", excitations[i], Path(soils[i]).stem) if part),
                 material=soils[i],

@@ -47,6 +47,7 @@ def repeated_splits(sessions: int, test_sessions: int, splits: int, seed: int = 
         )
     tested = np.zeros((splits, sessions), dtype=bool)
     for split in range(splits):
+        # A stream for each split: more splits leave the first ones as they are.
         rng = np.random.default_rng([seed, split])
         tested[split, rng.choice(sessions, test_sessions, replace=False)] = True
     return tested

@@ -164,6 +164,7 @@ def _vector(values: ArrayLike, what: str) -> NDArray[np.generic]:
 
 def _r2(squared_errors: float, truth: NDArray[np.generic]) -> float | None:
     """1 - residual / total sum of squares, or None where the truth does not vary."""
+    # Asked of the values themselves: the mean of a constant may differ from it by rounding.
     if truth.min() == truth.max():
         return None
     deviation = np.subtract(truth, truth.mean(dtype=np.float64), dtype=np.float64)

@@ -75,6 +75,7 @@ def race(
         # One at the last run would be the test itself.
         if analysis.runs < mask.shape[0]:
             hopeless = clustered_t(array[..., : analysis.runs, :], mask[: analysis.runs]).p > analysis.drop_above
+            # The first analysis that drops a module decides; later runs of it do not exist in a study.
             dropped = np.where((dropped == 0) & hopeless, analysis.runs, dropped)
     p = np.where(dropped == 0, clustered_t(array, mask).p, 1.0)
     return RaceResult(dropped, np.where(dropped == 0, mask.shape[0], dropped), p)

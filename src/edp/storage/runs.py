@@ -30,7 +30,9 @@ def environment(threads: int) -> dict[str, str]:
         try:
             facts[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
+            # Also a fact: without a library another way may be taken.
             facts[name] = "absent"
+    # The number of threads changes the order of sums, and so their last bits.
     return facts | {"threads": str(threads)}
 
 

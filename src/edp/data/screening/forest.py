@@ -171,6 +171,7 @@ def importances(
     model = RandomForestRegressor(
         forest.trees, min_samples_leaf=forest.leaf, max_features=forest.share, n_jobs=-1, random_state=spec.seed
     )
+    # One target goes as a vector, since scikit-learn warns of a single column.
     model.fit(train.inputs, train.changes if train.changes.shape[1] > 1 else train.changes[:, 0])
     if on_share is not None:
         on_share(0.6)

@@ -268,7 +268,7 @@ def time_factor(name: str, unit: str | None, signal_map: SignalMap) -> float:
     """Seconds per unit of the time column: the map's unit, else the header's, else the name's ending, else s."""
     stated = _TIME_UNIT_NAMES.get(unit or "", unit or "")
     ending = name.lower().rpartition("_")[2]
-    # s is the map's default, so it may be stated or not: the file's own word then counts.
+    # s is the map's default, so it may not have been stated: the unit in the file then decides.
     if signal_map.time_unit != "s":
         return TIME_UNITS[signal_map.time_unit]
     if stated in TIME_UNITS:

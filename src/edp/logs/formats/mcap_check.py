@@ -53,6 +53,7 @@ def _walk(path: Path, view: mmap.mmap | memoryview, size: int) -> None:
         if at + _PREFIX > size - len(_MAGIC):
             raise _broken(path, f"has at byte {at} a record that is cut off")
         last, length = struct.unpack_from("<BQ", view, at)
+        # Operation code 0 is none of MCAP's: zeros of a lost block would be walked as empty records.
         if not last or at + _PREFIX + length > size - len(_MAGIC):
             raise _broken(path, f"has at byte {at} a record of {length} bytes, more than the file holds")
         try:
@@ -87,6 +88,7 @@ class _Walk:
             (self.announced,) = struct.unpack_from("<Q", self.view, at)
             (count,) = struct.unpack_from("<I", self.view, at + 42)
             for entry in range(min(count, length) // 10):
+                # Pairs of a channel's number (2 bytes) and its count of messages (8).
                 (messages,) = struct.unpack_from("<Q", self.view, at + 46 + 10 * entry + 2)
                 self.announced = max(self.announced, messages)
 

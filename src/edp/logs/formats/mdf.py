@@ -101,6 +101,7 @@ class MdfFormat:
         with asammdf.MDF(version="4.10") as log, path.open("wb+") as stream:
             log.append(signals, acq_name=recording.name, comment="EDP", common_timebase=True)
             log.attach(facts_text(recording).encode(), file_name=_FACTS, mime="application/json")
+            # 2 packs transposed records: bytes of equal weight lie beside each other.
             log.save(stream, compression=2)
 
 

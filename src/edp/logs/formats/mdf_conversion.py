@@ -139,6 +139,7 @@ def _in_ranges(
         return np.full(len(raw), -1, dtype=np.intp)
     closed = raw.dtype.kind in "uib" if closed is None else closed
     x = raw.astype(np.float64)
+    # A file need not list its ranges in order.
     order = np.argsort(lower, kind="stable")
     range_index = order[np.maximum(np.searchsorted(lower[order], x, side="right") - 1, 0)]
     inside = (x >= lower[range_index]) & ((x <= upper[range_index]) if closed else (x < upper[range_index]))

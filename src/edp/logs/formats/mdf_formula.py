@@ -27,6 +27,7 @@ MOST_TOKENS = 512
 """Numbers, names and signs of a formula: each is at most one pass over the values."""
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)|(?P<name>[A-Za-z_][A-Za-z_0-9]*)"
+    # Two stars before one: a power would otherwise be read as two products.
     r"|(?P<sign>\*\*|[-+*/^(),]))"
 )
 FUNCTIONS: Mapping[str, Callable[..., Any]] = {
@@ -95,6 +96,7 @@ class Formula:
                     stack.append(_TWO_SIDED[step](left, right))
                 else:
                     stack.append(_ONE_SIDED[step](stack.pop()))
+        # A formula without X gives one number for all rows; copied, since a broadcast array cannot be written to.
         return np.array(np.broadcast_to(stack.pop(), x.shape), dtype=np.float64)
 
 

@@ -35,6 +35,7 @@ def told_apart(named_signals: Sequence[tuple[str, RawSignal]]) -> Named:
             signals[signal.name] = signal
             aliases[full] = signal.name
             continue
+        # A full name may be the short name of another column.
         while full in signals or full in once:
             numbers[name] += 1
             full = f"{name}#{numbers[name] + 1}"

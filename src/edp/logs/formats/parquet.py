@@ -240,7 +240,7 @@ def _numbers(column: pa.Array, element: int | None = None) -> NDArray[Any]:
         column = pc.list_element(column, element)
     if pa.types.is_boolean(column.type):
         column = column.cast(pa.int8())
-    # Only float64 has a NaN for the missing ones.
+    # Integers have no NaN for the missing ones.
     if column.null_count:
         column = column.cast(pa.float64(), safe=False)
     return np.asarray(column.to_numpy(zero_copy_only=False))

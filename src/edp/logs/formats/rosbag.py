@@ -186,6 +186,7 @@ class _Topic:
             raise DataError(f"no message of topic '{name}', of which {self.samples} are announced")
         fields = layout_of(first[2], self.kind, self.types, bag.cdr).fields
         self.stamp_paths = [path for path in _STAMP if path in fields and bag.time != _LOG_TIME]
+        # Headers are time, and layouts describe how an array is to be read: neither is a signal.
         numbers = [path for path in fields if not path.startswith(("header.", "layout."))]
         for path in numbers:
             parent, _, last = path.rpartition(".")

@@ -208,6 +208,7 @@ def likely_unit(kind: Kind, largest: float) -> str | None:
         if kind not in unit.kinds or name == facts.si_unit or not facts.plausible[0] <= value <= facts.plausible[1]:
             continue
         # The report unit is the likeliest: it is the field's usual one.
+        # Decades from the nominal size: units differ by factors.
         off = abs(math.log10(max(value, 1e-30) / facts.nominal)) - (1.0 if name == facts.report_unit else 0.0)
         if off < best_off:
             best, best_off = name, off

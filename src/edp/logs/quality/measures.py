@@ -75,6 +75,7 @@ def measure(values: Values) -> Measures:
     step, levels = quantum(values)
     steps = np.diff(values)
     every = update_every(steps)
+    # Repeated values would hide the noise: the third differences need one value a transmission.
     fresh = values if every < 1.5 else values[np.flatnonzero(steps) + 1]
     floor, steady = noise_floor(fresh) if levels > 3 else (0.0, False)
     low, high = values == values.min(), values == values.max()
@@ -164,6 +165,7 @@ def spikes(values: Values, floor: float) -> NDArray[np.intp]:
     """
     low, high = np.quantile(values, (0.005, 0.995))
     least = max(0.5 * float(high - low), 40.0 * floor)
+    # Of a spike both neighbours lie on the same side; of a step only one does.
     before, after = values[1:-1] - values[:-2], values[1:-1] - values[2:]
     size = np.minimum(np.abs(before), np.abs(after))
     alone = (size > least) & ((before > 0) == (after > 0)) & (np.abs(values[2:] - values[:-2]) < 0.25 * size)

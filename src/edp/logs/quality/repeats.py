@@ -129,7 +129,7 @@ def sketch(recording: Recording, name: str | None = None) -> Sketch:
         values = np.where(good, values - mean, 0.0)
         coarse = np.add.reduceat(values, starts) / np.maximum(counts, 1)
         std = float(coarse.std())
-        # A deviation of rounding would blow a channel at rest up to noise.
+        # Divided by a deviation of rounding, a channel at rest would become noise.
         block_means[:, channel_index] = coarse / std if std > 1e-6 * (abs(mean) + float(np.abs(coarse).max())) else 0.0
     digest = hashlib.blake2b(np.ascontiguousarray(recording.values).tobytes(), digest_size=16).hexdigest()
     return Sketch(name or recording.name, recording.channel_names, block_means, hz, digest)

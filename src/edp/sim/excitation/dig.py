@@ -124,7 +124,7 @@ class Dig(Tracked):
             return
         if view.payload_kg > self._full_kg:
             self.end_leg()
-        # Before the reference stands still, which would give the leg up.
+        # The error at which a leg counts as blocked: the bucket is raised before the leg is given up.
         elif self.behind > 0.75 * self.WAITS_BEHIND:
             rise = self.RELIEF_RATE * self.step_s
             self._leg[tip_control.START + 1] += rise

@@ -78,6 +78,7 @@ class Tracked(Excitation):
             self._begun = True
             self._queue[:] = view.strokes
             self._leg = self.next_leg(view)
+        # By the reference's own clock, which stands still while the cylinders are behind.
         elif memory[tip_control.TIME] >= self._leg[tip_control.LENGTH]:
             self._leg, memory[tip_control.TIME] = self.next_leg(view), 0.0
         self.steer(view)

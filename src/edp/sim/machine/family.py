@@ -251,6 +251,7 @@ def _valves(valves: Valves, s: float, draws: Draws) -> Valves:
         changed[key] = _times(getattr(valves, key), quicker)
     for key in ("dead_band_extend", "dead_band_retract", "conflux_dead_band_extend", "conflux_dead_band_retract"):
         band = np.asarray(getattr(valves, key)) + wear + draws.uniform(-0.01, 0.01, 3)
+        # Wear and scatter must leave a dead band, and most of the spool's travel behind it.
         changed[key] = _times((1.0, 1.0, 1.0), np.clip(band, 0.04, 0.35))
     for key in (
         *("meter_in_extend", "meter_in_retract", "conflux_in_extend", "conflux_in_retract"),

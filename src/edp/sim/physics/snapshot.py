@@ -165,6 +165,7 @@ def restored(current: Any, plain: Any, arrays: tuple[NDArray[Any], ...]) -> Any:
     for name, part in content.items():
         old = getattr(current, name)
         new = restored(old, part, arrays)
+        # Frozen parts refuse to be set, and what was restored in place needs no setting.
         if new is not old:
             setattr(current, name, new)
     return current

@@ -16,7 +16,7 @@ from edp.sim.sensors import can, filters, transducers
 
 Array = NDArray[np.float64]
 DERIVATIVE_DAMPING = 0.7
-"""Share of critical: nearly flat up to the bandwidth, and no ringing in the acceleration."""
+"""Share of critical: nearly flat up to the bandwidth, with hardly any overshoot of the acceleration."""
 ECUS = ("joints", "pressures", "valves")
 """Senders on the bus: rates of the joints, cylinder pressures, and pilot demands."""
 REFERENCE_TEMPERATURE = 313.15

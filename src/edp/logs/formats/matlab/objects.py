@@ -133,6 +133,7 @@ def _struct_time(element: Any, fields: tuple[str, ...]) -> tuple[str, NDArray[np
     for name in _TIME_FIELDS:
         if name in fields and isinstance(element[name], np.ndarray) and element[name].dtype.kind in "fiu":
             stamps = element[name].ravel().astype(np.float64)
+            # A single number called time is no clock.
             if len(stamps) > 1:
                 return name, stamps
     return None
@@ -174,6 +175,7 @@ def _walk_object(value: MatlabOpaque, name: str, path: str, mat_variables: MatVa
     elif "Values" in props:
         _walk(props["Values"], _text(props.get("Name")) or name, path, None, mat_variables)
     else:
+        # Where MATLAB's classes keep what they hold, from saved objects to plain containers.
         for key in ("any", "Storage", "Elements", "Data"):
             if key in props:
                 _walk_contents(props[key], name, path, mat_variables)

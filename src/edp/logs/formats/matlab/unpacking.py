@@ -69,7 +69,7 @@ def _load(path: Path) -> dict[str, Any]:
                 f"'{path}' cannot be read as a MAT file ({type(error).__name__}: {brief(error)}); it may be truncated "
                 "or damaged: copy or export it again"
             ) from error
-    # The library warns and leaves the object out: signals would be missing without a word.
+    # The library warns and leaves the object out: its signals would be missing unnoticed.
     failed = [str(item.message) for item in caught if "Failed to load" in str(item.message)]
     if failed:
         raise DataError(
