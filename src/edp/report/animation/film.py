@@ -19,6 +19,7 @@ from edp.storage import replacing
 WIDTH, HEIGHT = 960, 600
 FILMS = {
     ".mp4": ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart", "-f", "mp4"),
+    # GIF counts delays in hundredths of a second: 12.5 frames a second are exactly eight of them.
     ".gif": ("-vf", "fps=12.5,split[a][b];[a]palettegen=max_colors=64[p];[b][p]paletteuse", "-f", "gif"),
 }
 """Options of ffmpeg, by file ending."""
@@ -50,6 +51,7 @@ def write_film(scene: Scene, output: str | Path) -> Path:
             try:
                 for frame in frames(scene):
                     running.stdin.write(frame.tobytes())  # type: ignore[union-attr]
+            # ffmpeg ended early; its own message says why.
             except BrokenPipeError as error:
                 broken = str(error)
             _, error_output = running.communicate()
@@ -151,6 +153,7 @@ class _Front:
         lug = complex(arm_l + link.lug * np.exp(1j * (psi + link.lug_angle)))
         across = lug - pivot
         along = 0.5 * (1.0 + (link.rocker**2 - link.link**2) / abs(across) ** 2)
+        # Rounding at the end of a stroke may put the circles apart by a hair.
         aside = math.sqrt(max((link.rocker / abs(across)) ** 2 - along**2, 0.0))
         return pivot + across * complex(along, aside), lug, pivot, complex(*link.cylinder_pin)
 

@@ -82,6 +82,7 @@ def scene_of(
         )
     length = min(seconds or LONGEST_S, LONGEST_S, recording.duration_s - start_s)
     when = start_s + np.arange(max(2, math.floor(length * FRAMES_PER_S))) / FRAMES_PER_S
+    # Rounding at the end may point one sample beyond the recording.
     rows = np.minimum(np.round(when * recording.rate_hz).astype(int), recording.samples - 1)
     shown = _Columns(recording, rows)
     strokes_per_s = recording.rate_hz
@@ -214,6 +215,7 @@ def _plain(scene: Scene) -> dict[str, Any]:
             "bucket": asdict(machine.bucket),
             "foot": machine.chassis.boom_foot_height,
         },
+        # Decimals finer than a pixel would only enlarge the page.
         "angles": np.round(scene.angles.T, 4).tolist(),
         "velocity": np.round(scene.velocity.T, 1).tolist(),
         "pressure": np.round(scene.pressure.T, 1).tolist(),
@@ -230,4 +232,5 @@ def _asset(name: str) -> str:
 
 def _script_json(value: Any) -> str:
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    # A text in the data must not end the script element.
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

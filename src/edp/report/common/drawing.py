@@ -67,6 +67,7 @@ def _write(folder: Path, name: str, draw: Callable[[Figure], None]) -> list[Path
         if layout is not None:
             layout.execute(figure)
             figure.set_layout_engine("none")  # laid out once, not for every format
+        # No program name and no date: equal content gives equal bytes.
         bitmap.print_png(bytes_of, metadata={"Software": None})
         FigureCanvasSVG(figure).print_svg(vector, metadata={"Date": None})
     write_bytes(folder / f"{name}.svg", NOT_XML.sub("\ufffd", vector.getvalue()).encode())
@@ -81,4 +82,5 @@ def printable_lines(text: str) -> str:
 
 def file_name(target: str) -> str:
     """A name that any file system takes."""
+    # 80 characters stay within the limit of every file system, with a suffix behind them.
     return "".join(c if c.isalnum() or c in "-_" else "_" for c in target)[:80] or "target"

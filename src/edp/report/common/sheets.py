@@ -37,6 +37,7 @@ def chance(value: Value) -> str:
     """A p-value: three decimals, and what is smaller as a bound."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         return plainly(value if isinstance(value, str) else None)
+    # A p-value of zero or one would claim certainty that no test has.
     return "< 0.001" if value < 0.0005 else "> 0.999" if 0.9995 < value < 1 else f"{value:.3f}"
 
 

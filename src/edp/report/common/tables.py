@@ -131,6 +131,7 @@ def budget_checks(facts: Facts) -> list[Check]:
     checks = []
     for row in (facts.footprint or {}).get("verdict", []):
         value, limit = row.get("value"), row.get("limit")
+        # No share of a limit that is zero or unknown.
         share = value / limit if value is not None and limit else None
         checks.append(
             Check(

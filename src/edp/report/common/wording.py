@@ -29,6 +29,7 @@ def number(value: float | None, decimals: int | None = None, signed: bool = Fals
         return MISSING
     places = decimals_for([value]) if decimals is None else decimals
     text = f"{value:{'+' if signed else ''},.{places}f}"
+    # A rounded zero must not carry a sign.
     if float(text.replace(",", "")) == 0:
         text = text.lstrip("+-")
     return text.replace("-", "−")
@@ -38,6 +39,7 @@ def percent(share: float | None, signed: bool = False) -> str:
     """A share of one as a percentage: one decimal below ten percent, none above."""
     if share is None or not math.isfinite(share):
         return MISSING
+    # 0.0995 is where one decimal would round up to ten percent.
     return number(100 * share, 1 if abs(share) < 0.0995 else 0, signed) + " %"
 
 
@@ -65,6 +67,7 @@ def short_labels(names: Iterable[str]) -> tuple[str, ...]:
 
 def in_cell(text: str) -> str:
     """Text as a cell of a CSV file: what a spreadsheet would take for a formula has an apostrophe in front."""
+    # Numbers with a sign stay numbers; only text can be a formula.
     try:
         float(text)
     except ValueError:

@@ -146,6 +146,7 @@ def _ticks(facts: CompressionFacts) -> list[float]:
     for horizon in facts.horizons:
         values = [facts.mae(row, horizon) for row in facts.rows]
         low, high = min(values), max(values)
+        # A perfect error of zero has no place on a logarithmic axis.
         ticks |= {float(f"{low * (high / low) ** (step / 4):.2g}") for step in range(5)} if low > 0 else set()
     return sorted(ticks)
 

@@ -44,6 +44,7 @@ def spectrum_plot(coverage: Coverage) -> Plot | None:
         peak = inputs.density[:, i].max()
         if not peak > 0:
             continue
+        # -90 dB: the floor keeps the logarithm finite where a bin is empty.
         level = 10.0 * np.log10(np.maximum(inputs.density[:, i] / peak, 1e-9))
         figure.add_scatter(
             x=inputs.frequency_hz.astype(np.float32),
@@ -185,6 +186,7 @@ def joint_plot(coverage: Coverage, group: str) -> Plot | None:
 
 def _inked(share: NDArray[np.float64], top: float) -> list[list[float | None]]:
     """Decades above a ten-thousandth of the fullest cell; None, left white, where nothing was."""
+    # Four decades: below it a cell is as good as empty.
     floor = top * 1e-4
     level = np.log10(np.maximum(share, floor) / max(floor, 1e-30))
     return [[None if s <= 0 else round(float(v), 3) for s, v in zip(*row, strict=True)] for row in zip(share, level)]

@@ -55,6 +55,7 @@ def channels_table(quality: DataQuality) -> TextTable:
     for name in names[:SHOWN_CHANNELS]:
         facts = [channel for report in quality.reports for channel in report.channels if channel.name == name]
         snr = [channel.snr_db for channel in facts if channel.snr_db is not None]
+        # The worst verdict of any recording counts for the channel.
         worst = next(v for v in ("unusable", "check", "good") if any(channel.verdict == v for channel in facts))
         rows.append(
             (

@@ -146,6 +146,7 @@ def _unit(channel: Channel) -> tuple[str, float]:
     """The unit of reports and its factor; the SI unit where a factor alone does not lead there (degrees Celsius)."""
     facts = KINDS[channel.kind]
     unit = UNITS.get(facts.report_unit)
+    # A factor alone does not lead from kelvin to degrees Celsius.
     shifted = unit is not None and unit.offset != 0
     return (facts.si_unit, 1.0) if shifted else (facts.report_unit, facts.report_factor)
 

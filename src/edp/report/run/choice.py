@@ -55,6 +55,7 @@ def candidates_table(content: Mapping[str, Any]) -> TextTable:
     chosen = content["chosen"]
     rows = []
     for name, one in content["candidates"].items():
+        # expm1: excess is a difference of logarithms, and the share is its exponential less one.
         share = math.expm1(float(content["excess"][name]) - float(content["excess"][chosen]))
         parameters = one.get("parameters")
         count = f"{parameters:,}" if isinstance(parameters, int) else MISSING
