@@ -1,6 +1,7 @@
 """The preset auto: what it chooses, what it promises, what it writes and refuses."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
+from edp.report import build_report
 from edp.training import load_bundle
 from edp.workflows.auto import load_auto, train_auto
 from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half, spans_by_two
@@ -91,6 +93,38 @@ def test_settings_that_cannot_be_are_one_error(tmp_path, settings, message):
     with pytest.raises((ConfigError, DataError), match=message):
         train_auto(source, load_auto(None, [*SET, *settings]), tmp_path / "run")
     assert not (tmp_path / "run" / "run.json").exists()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"candidates": []},
+        {"candidates": {"linear": 5}},
+        {"chosen": ["linear"]},
+        {"sentence": 5},
+        {"excess": {"linear": "x"}},
+        {"minutes": None},
+        {"persistence": {"1": 5}},
+        {"key": 5},
+    ],
+)
+def test_a_changed_file_is_refused(result, tmp_path, change):
+    source, folder, _ = result
+    copied = shutil.copytree(folder, tmp_path / "run")
+    facts = json.loads((copied / "auto.json").read_text())
+    (copied / "auto.json").write_text(json.dumps(facts | change))
+    with pytest.raises(StorageError, match=r"auto\.json"):
+        train_auto(source, load_auto(None, SET), copied)
+    with pytest.raises(StorageError, match=r"auto\.json"):
+        build_report(copied)
+
+
+def test_the_report_says_why(result):
+    _, folder, found = result
+    page = build_report(folder).read_text()
+    assert "Why this model" in page
+    assert "What left-out data promised" in page
+    assert found.sentence[:40].replace(" ", "") in "".join(page.split())
 
 
 def test_a_target_that_never_moves_is_refused(tmp_path):

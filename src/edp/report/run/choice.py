@@ -25,14 +25,17 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
     path = folder / FILE
     if not path.is_file():
         return None
-    content = read_object(path, ("sentence", "chosen", "candidates", "excess", "persistence"))
+    content = read_object(path, ("key", "sentence", "minutes", "chosen", "candidates", "excess", "persistence"))
     candidates, excess = content["candidates"], content["excess"]
     sound = (
         isinstance(content["sentence"], str)
+        and isinstance(content["key"], str)
+        and isinstance(content["minutes"], int | float)
         and isinstance(candidates, dict)
         and isinstance(excess, dict)
+        and isinstance(content["chosen"], str)
         and content["chosen"] in candidates
-        and all(isinstance(one, dict) and isinstance(one.get("label"), str) for one in candidates.values())
+        and all(_is_candidate(one) for one in candidates.values())
         and all(isinstance(excess.get(name), int | float) for name in candidates)
         and all(_is_promise(one.get("promise")) for one in candidates.values())
         and _is_promise(content["persistence"])
@@ -40,6 +43,16 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
     if not sound:
         raise StorageError(f"'{path}' does not hold what edp train --preset auto writes; train again in another folder")
     return content
+
+
+def _is_candidate(value: Any) -> bool:
+    """Whether a value is what is known of a candidate."""
+    return (
+        isinstance(value, dict)
+        and isinstance(value.get("label"), str)
+        and isinstance(value.get("parameters"), int)
+        and isinstance(value.get("seconds"), int | float)
+    )
 
 
 def _is_promise(value: Any) -> bool:
@@ -57,9 +70,7 @@ def candidates_table(content: Mapping[str, Any]) -> TextTable:
     for name, one in content["candidates"].items():
         # expm1: excess is a difference of logarithms, and the share is its exponential less one.
         share = math.expm1(float(content["excess"][name]) - float(content["excess"][chosen]))
-        parameters = one.get("parameters")
-        count = f"{parameters:,}" if isinstance(parameters, int) else MISSING
-        rows.append((one["label"], count, "kept" if name == chosen else percent(share, signed=True)))
+        rows.append((one["label"], f"{one['parameters']:,}", "kept" if name == chosen else percent(share, signed=True)))
     marked = frozenset(row for row, name in enumerate(content["candidates"]) if name == chosen)
     columns = (("Model", ""), ("Parameters", ""), ("Error on left-out data", "against the one kept"))
     return TextTable("The models that were tried", columns, tuple(rows), marked)

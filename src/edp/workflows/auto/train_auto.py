@@ -17,7 +17,8 @@ from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.recording import Recording
-from edp.storage import make_folder, read_object, write_json
+from edp.report.run.choice import FILE, read_choice
+from edp.storage import make_folder, write_json
 from edp.storage.runs import RunFolder, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
 from edp.training.bagging import fit_bagged
@@ -37,7 +38,6 @@ from edp.workflows.auto.promise import (
 from edp.workflows.auto.settings import AutoSettings
 from edp.workflows.train_evaluate import keep_fitted, prepare_data
 
-FILE = "auto.json"
 USUAL = "FG2"
 """The feature set that is taken without a word where the recordings have its channels."""
 MOST_LISTED = 20
@@ -126,12 +126,10 @@ def _finished(folder: Path, key: str) -> AutoResult | None:
     Raises:
         StorageError: the folder holds another run.
     """
-    file = folder / FILE
-    if file.is_file():
-        facts = read_object(file, ("key", "sentence", "chosen"))
-        if facts["key"] == key:
-            return AutoResult(load_bundle(folder), facts)
-    if file.is_file() or (folder / "run.json").exists():
+    facts = read_choice(folder)
+    if facts is not None and facts["key"] == key:
+        return AutoResult(load_bundle(folder), dict(facts))
+    if facts is not None or (folder / "run.json").exists():
         raise StorageError(
             f"run folder '{folder}' holds another run (other settings, data or version); nothing was changed. Choose "
             "another folder with --out, or remove this one"
