@@ -1,7 +1,11 @@
 """Recordings in and out: readers and writers, units, time stamps, repairs and quality reports."""
 
 from edp.logs.detect import format_for, known_suffixes, open_log
-from edp.logs.formats import csv, mat, mdf, parquet, rosbag
+from edp.logs.formats import csv as csv
+from edp.logs.formats import mat as mat
+from edp.logs.formats import mdf as mdf
+from edp.logs.formats import parquet as parquet
+from edp.logs.formats import rosbag as rosbag
 from edp.logs.formats.base import FORMATS, TRUTH_PLACES, LogFormat, RawLog, RawSignal, WriteOptions
 from edp.logs.formats.mat_layouts import LAYOUTS
 from edp.logs.quality.checks import Finding
@@ -39,7 +43,6 @@ __all__ = [
     "WriteOptions",
     "common_channels",
     "compare",
-    "csv",
     "find_recordings",
     "find_repeats",
     "format_for",
@@ -47,15 +50,11 @@ __all__ = [
     "inspect_log",
     "known_suffixes",
     "look_into",
-    "mat",
-    "mdf",
     "open_log",
-    "parquet",
     "read_data_set",
     "read_parts",
     "read_recording",
     "read_truth",
-    "rosbag",
     "sketch",
     "split_at_gaps",
     "truth_path",

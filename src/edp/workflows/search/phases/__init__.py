@@ -3,26 +3,18 @@
 The order of the imports is the order in which they run.
 """
 
-from edp.workflows.search.phases import isolation  # isort: skip
-from edp.workflows.search.phases import calibration  # isort: skip
-from edp.workflows.search.phases import screening  # isort: skip
-from edp.workflows.search.phases import planning  # isort: skip
-from edp.workflows.search.phases import confirmation  # isort: skip
-from edp.workflows.search.phases import synthesis  # isort: skip
-from edp.workflows.search.phases import exploration  # isort: skip
-from edp.workflows.search.phases import compression  # isort: skip
+from edp.workflows.search.phases import isolation as isolation  # isort: skip
+from edp.workflows.search.phases import calibration as calibration  # isort: skip
+from edp.workflows.search.phases import screening as screening  # isort: skip
+from edp.workflows.search.phases import planning as planning  # isort: skip
+from edp.workflows.search.phases import confirmation as confirmation  # isort: skip
+from edp.workflows.search.phases import synthesis as synthesis  # isort: skip
+from edp.workflows.search.phases import exploration as exploration  # isort: skip
+from edp.workflows.search.phases import compression as compression  # isort: skip
 from edp.workflows.search.phases.base import PHASES, Course, PhaseSpec
 
 __all__ = [
     "PHASES",
     "Course",
     "PhaseSpec",
-    "calibration",
-    "compression",
-    "confirmation",
-    "exploration",
-    "isolation",
-    "planning",
-    "screening",
-    "synthesis",
 ]
