@@ -14,7 +14,7 @@ import resource
 import subprocess
 import tokenize
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -83,7 +83,8 @@ def measure(package: Path = PACKAGE) -> House:
     house = House(modules=len(files))
     folders = (entry for entry in package.iterdir() if entry.suffix == ".py" or (entry / "__init__.py").exists())
     house.siblings = sorted(entry.stem for entry in folders if not entry.stem.startswith("__"))
-    imports = {name: _imports(name, tree, set(trees)) for name, tree in trees.items()}
+    nodes = {name: list(ast.walk(tree)) for name, tree in trees.items()}
+    imports = {name: _imports(name, nodes[name], trees.keys()) for name in trees}
     rooms: dict[str, set[str]] = {room: set() for room in house.siblings}
     for name, targets in imports.items():
         for target in targets:
@@ -102,25 +103,25 @@ def measure(package: Path = PACKAGE) -> House:
         comments += sum(
             token.type == tokenize.COMMENT for token in tokenize.generate_tokens(io.StringIO(text).readline)
         )
-        comments += sum(map(_constant_docstrings, ast.walk(tree)))
+        comments += sum(map(_constant_docstrings, nodes[name]))
         where = files[name].relative_to(package.parent)
         if count > LONG_FILE:
             house.long_files.append(f"{where} {count}")
-        for node in ast.walk(tree):
+        for node in nodes[name]:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Module):
                 docstrings += ast.get_docstring(node) is not None
             if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - _first_line(node) + 1 > LONG_FUNCTION:
                 house.long_functions.append(f"{where}:{node.lineno} {node.name}")
         classes.update(node.name for node in tree.body if isinstance(node, ast.ClassDef) and node.name[0] != "_")
-        house.banned += [f"{where}:{line} {variable}" for variable, line in assigned(tree) if variable in BANNED]
+        house.banned += [f"{where}:{line} {variable}" for variable, line in assigned(nodes[name]) if variable in BANNED]
     house.comments, house.docstrings = 100 * comments / lines, 100 * docstrings / lines
     house.duplicates = {name: count for name, count in sorted(classes.items()) if count > 1}
     return house
 
 
-def assigned(tree: ast.AST) -> Iterator[tuple[str, int]]:
+def assigned(nodes: Iterable[ast.AST]) -> Iterator[tuple[str, int]]:
     """Names of variables that are assigned, with their lines: by ``=``, ``for``, ``with``, ``:=`` and as parameters."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.id, node.lineno
         elif isinstance(node, ast.arg):
@@ -154,16 +155,16 @@ def _room(module: str) -> str:
     return module.split(".")[1] if "." in module else ""
 
 
-def _imports(name: str, tree: ast.Module, modules: set[str]) -> set[str]:
+def _imports(name: str, nodes: Iterable[ast.AST], modules: Collection[str]) -> set[str]:
     """Modules of the package that a module imports, at its top or deferred; not for types alone."""
     targets: set[str] = set()
     typing_only = {
         id(inner)
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
         for inner in ast.walk(node)
     }
-    for node in ast.walk(tree):
+    for node in nodes:
         if id(node) in typing_only:
             continue
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -67,6 +67,12 @@ REFUSED = [
         with_physics("force"),
         "predicts CylVels_1.*targets are v_1, v_2",
     ),
+    (
+        "linear",
+        TASK,
+        replace(with_blocks("cross_cylinder_attention"), head=HEADS["linear"]()),
+        "no hidden features for the block CrossCylinderAttention",
+    ),
     ("hybrid", reads("hybrid"), with_physics("hybrid", "linear_bypass"), "start = 'zero'"),
 ]
 ALONE = {name: make() for registry in REGISTRIES for name, make in registry.items() if issubclass(make, HasConflicts)}
