@@ -22,15 +22,18 @@ from pathlib import Path
 from typing import Any
 
 from common import Verdict, finish, parser, table, verdict
+from edp.config.experiment import load_experiment
 from edp.settings.tree import read_toml
 from edp.storage import read_json
-from edp.workflows.auto import load_auto, train_auto
-from edp.workflows.train_evaluate import DataSource, evaluate
+from edp.workflows.auto import load_auto, train_auto, usual_preset
+from edp.workflows.train_evaluate import DataSource, evaluate, train
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples" / "real"
 VARIABLE = "EDP_SHARED_DATA"
 PRESET = "auto"
+OWN_NETWORK = "small"
+"""Preset under settings that name a network of their own."""
 BASELINES = ("persistence", "ridge_arx")
 QUICK_SETS = ("sjoberg.toml", "tanks.toml")
 QUICK = ("auto.minutes=0.05",)
@@ -61,7 +64,11 @@ class Row:
 def scores_of(data: str, settings: str, out: Path, changes: Sequence[str]) -> tuple[dict[str, Any], float]:
     """Train and judge by a data-set file and a settings file; the content of scores.json, and seconds."""
     began = time.perf_counter()
-    train_auto(DataSource.of(EXAMPLES / data), load_auto(EXAMPLES / settings, changes), out)
+    source, file = DataSource.of(EXAMPLES / data), EXAMPLES / settings
+    if usual_preset(file, changes) == PRESET:
+        train_auto(source, load_auto(file, changes), out)
+    else:  # settings of the network: those of free runs lie over the preset for little data
+        train(source, load_experiment(file, OWN_NETWORK, changes), out)
     folder = evaluate(out, baselines=BASELINES)
     return read_json(folder / "scores.json"), time.perf_counter() - began
 

@@ -26,7 +26,7 @@ from edp.logs import write_recording
 from edp.storage import make_folder
 from edp.workflows.train_evaluate import DataSource, train
 from edp.workflows.transfer import METHODS, FinetuneRequest, FinetuneSpec, finetune
-from real_recordings import EXAMPLES, PRESET, QUICK, shared_folder
+from real_recordings import EXAMPLES, OWN_NETWORK, shared_folder
 
 OURS, NONE = "full", "direct"
 RIVALS = (NONE, "scratch", "ridge_arx", "rehearsal")
@@ -65,8 +65,8 @@ def transferred(regimes: Regimes, work: Path, quick: bool, seed: int) -> dict[st
     first, second = DataSource.of(EXAMPLES / regimes.data).read()
     for name, recording in (("source", first), ("target", second)):
         write_recording(recording, make_folder(work / name) / f"{recording.name}.parquet")
-    changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(QUICK if quick else ())]
-    experiment = load_experiment(EXAMPLES / regimes.settings, PRESET, changes)
+    changes = [f"training.seed={seed}", "training.threads=1", *CHANGES, *(["training.epochs=2"] if quick else [])]
+    experiment = load_experiment(EXAMPLES / regimes.settings, OWN_NETWORK, changes)
     train(DataSource.of(work / "source"), experiment, work / "run")
     specs = [replace(SPEC, rounds=2)] if quick else [replace(SPEC, rate=rate) for rate in RATES]
     logs = DataSource.of(work / "target")

@@ -109,7 +109,7 @@ class Reference:
         spool, conflux = spools[i], spools[i + 3]
         main, second, drain, regen = self.openings(i, spool, conflux, stroke)
         q, drawn = np.zeros(2), np.zeros(2)
-        for k, s, pump in ((main, spool, v.primary_pump[i] - 1), (second, conflux, v.conflux_pump[i] - 1)):
+        for k, s, pump in ((main, spool, int(v.primary_pump[i]) - 1), (second, conflux, int(v.conflux_pump[i]) - 1)):
             side = 0 if s > 0 else 1
             flow = k * self.check(p[2 + pump] - p[side])
             q[side] += flow

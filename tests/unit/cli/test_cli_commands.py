@@ -65,7 +65,8 @@ def test_whole_path_from_the_simulator_to_the_page(edp, tmp_path, small):
 
     page = edp("report", run, "--json").json
     assert (run / "report.html").read_text(encoding="utf-8").lower().startswith("<!doctype html>")
-    assert "ahead" in page["headline"]
+    # Five updates make a network that may lose to a line, which the headline then says.
+    assert "ahead" in page["headline"] or "less error than the network" in page["headline"]
 
     counts = edp("footprint", run / "bundle", "--json").json
     assert counts["parameters"] == trained["parameters"]
