@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
+PumpNumbers = tuple[int, int, int]
+"""Pump 1 or 2 of each cylinder; integers, since they index pumps."""
 Rating = tuple[float, float]
 """A flow in L/min at a pressure difference in bar."""
 Ratings = tuple[Rating, Rating, Rating]
@@ -126,8 +128,8 @@ class Valves:
     conflux_retract: Triple
     pump_demand_extend: Triple
     pump_demand_retract: Triple
-    primary_pump: Triple
-    conflux_pump: Triple
+    primary_pump: PumpNumbers
+    conflux_pump: PumpNumbers
     meter_in_extend: Ratings
     meter_in_retract: Ratings
     conflux_in_extend: Ratings

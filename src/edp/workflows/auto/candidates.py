@@ -17,7 +17,7 @@ Changes over longer spans say less and less about the present: ten ticks after a
 later on measured recordings. A longer gap would throw away what lies nearest to the test."""
 STRETCH_SHARE = 8
 """The longest change is at most an eighth of the shortest stretch, so that most of its rows are full."""
-OPERATIONS_PER_S = 1.2e10
+OPERATIONS_PER_S = 1.6e10
 """Floating-point operations that training is taken to do in a second of one core: measured, rounded down.
 
 Sizes follow from this constant and not from a clock: the same settings give the same network on every machine.
@@ -28,7 +28,7 @@ MEMBERS, UNITS, GROUPS = 10, 64, 2
 BATCH = 256
 SHARE = {"committee": 0.2, "long_committee": 0.2, "recurrent": 0.6}
 """Of the budget, by candidate; a linear model takes seconds."""
-LEAST_STEPS, USUAL_STEPS, MOST_STEPS = 300, 1500, 4000
+LEAST_STEPS, USUAL_STEPS, MOST_STEPS = 300, 2500, 5000
 """Updates of a member: fewer learn nothing, more than `USUAL_STEPS` pay where rows are many."""
 ROW_PASSES = 20
 """How often a row may be seen before further updates only fit its noise."""
