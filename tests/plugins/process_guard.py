@@ -54,6 +54,7 @@ TRAINING = frozenset(
             "test_ridge_start",
         ),
         *("report/study/test_study_page", "screening/test_screening_figures", "stats/test_null_calibration"),
+        *("screening/test_screening_verdicts", "report/study/test_study_in_notebook", "report/test_report_page"),
         *("report/test_screening_page", "report/test_transfer_page", "test_compress_search", "test_downsizing"),
     )
 )
