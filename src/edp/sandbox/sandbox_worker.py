@@ -95,12 +95,21 @@ def main(serve: Serve) -> None:
     poll = select.poll()
     poll.register(orders, select.POLLIN)
     poll.register(waking, select.POLLIN)
-    inherited = [orders.fileno(), waking, woken]
+    inherited, ending = [orders.fileno(), waking, woken], False
     try:
         while True:
             ready = dict(poll.poll(1000 * IDLE_S))
             if not ready and not forks.pids:
-                break
+                # An order that came since would be lost with this process: none is taken in any more, so that its
+                # sender learns of it and starts another worker, and what had arrived before is still obeyed.
+                orders.shutdown(socket.SHUT_RD)
+                while _obey(orders, forks, serve, inherited, poll):
+                    pass
+                poll.unregister(orders)
+                if not forks.pids:
+                    break
+                ending = True
+                continue
             with contextlib.suppress(BlockingIOError):
                 os.read(waking, 4096)
             for number, pipe in list(forks.pipes.items()):
@@ -113,7 +122,9 @@ def main(serve: Serve) -> None:
             for pipe in forks.reap():
                 poll.unregister(pipe)
                 os.close(pipe)
-            if orders.fileno() in ready and not _obey(orders, forks, serve, inherited, poll):
+            if not ending and orders.fileno() in ready and not _obey(orders, forks, serve, inherited, poll):
+                break
+            if ending and not forks.pids:
                 break
     finally:
         for pid in forks.pids.values():
