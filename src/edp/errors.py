@@ -22,7 +22,7 @@ class EdpError(Exception):
     exit_code = 1
 
     def __init__(self, message: str = "", *others: object) -> None:
-        half = MOST_CHARACTERS // 2
+        message, half = str(message), MOST_CHARACTERS // 2
         if len(message) > MOST_CHARACTERS:
             message = f"{message[:half]} ... ({len(message) - 2 * half:,} characters left out) ... {message[-half:]}"
         super().__init__(message, *others)

@@ -95,6 +95,16 @@ def test_settings_that_cannot_be_are_one_error(tmp_path, settings, message):
     assert not (tmp_path / "run" / "run.json").exists()
 
 
+def test_a_run_that_was_killed_while_it_was_written_is_made_again(result, tmp_path):
+    source, folder, found = result
+    copied = shutil.copytree(folder, tmp_path / "run")
+    (copied / "status.json").unlink()
+    shutil.rmtree(copied / "bundle")
+    again = train_auto(source, load_auto(None, SET), copied)
+    assert again.facts["excess"] == found.facts["excess"]
+    assert (copied / "bundle").is_dir()
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -159,6 +169,8 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     assert spans_by_two(replace(amount, horizon=100))[-1] == 256
     assert spans_by_two(replace(amount, shortest=80))[-1] == 8
     assert CANDIDATES["recurrent"].tables(replace(amount, rows=5000)) is None
+    assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140)) is not None
+    assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140, horizon=100)) is None
     steps = [
         CANDIDATES["committee"].tables(replace(amount, minutes=minutes))["training"]["bagging"]["steps"]
         for minutes in (0.01, 1.0, 100.0)

@@ -1,6 +1,6 @@
 """Errors: messages are bounded, whatever a file puts into them."""
 
-import pickle
+import copy
 
 from edp.errors import MOST_CHARACTERS, DataError, EdpError
 
@@ -15,4 +15,4 @@ def test_a_message_keeps_its_beginning_and_its_end():
 
 def test_a_usual_message_is_kept_as_it_is():
     assert str(EdpError("what came")) == "what came"
-    assert str(pickle.loads(pickle.dumps(EdpError("what came")))) == "what came"
+    assert str(copy.copy(EdpError("what came"))) == "what came"

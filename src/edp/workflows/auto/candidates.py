@@ -160,7 +160,9 @@ CANDIDATES.register("long_committee")(
 
 def _recurrent(amount: Amount) -> Table | None:
     """The network of the preset ``quick``, as many updates as the budget holds."""
-    if amount.rows < RECURRENT_ROWS or amount.shortest < RECURRENT_CHUNK:
+    # Its trainer refuses validation stretches that end within burn-in and horizon.
+    shortest = max(RECURRENT_CHUNK, RECURRENT_BURN_IN + amount.horizon + 1)
+    if amount.rows < RECURRENT_ROWS or amount.shortest < shortest:
         return None
     epochs = 12
     tick = PASSES * RECURRENT_TICK * RECURRENT_LANES * RECURRENT_CHUNK

@@ -18,7 +18,7 @@ from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
 from edp.recording import Recording
 from edp.report.run.choice import FILE, read_choice
-from edp.storage import make_folder, write_json
+from edp.storage import make_folder, read_object, write_json
 from edp.storage.runs import RunFolder, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
 from edp.training.bagging import fit_bagged
@@ -115,8 +115,9 @@ def train_auto(
     choice = choose({name: one.promise for name, one in trained.items()})
     facts = _facts(choice, trained, failed, data, settings, amount, key)
     winner = trained[choice.name]
-    bundle = keep_fitted(folder, (source, winner.experiment, data), winner.fitted, {"auto": facts["sentence"]})
+    # First the choice, whose key tells a folder that a kill left between the two from one of another run.
     write_json(folder / FILE, facts)
+    bundle = keep_fitted(folder, (source, winner.experiment, data), winner.fitted, {"auto": facts["sentence"]})
     return AutoResult(bundle, facts)
 
 
@@ -128,7 +129,9 @@ def _finished(folder: Path, key: str) -> AutoResult | None:
     """
     facts = read_choice(folder)
     if facts is not None and facts["key"] == key:
-        return AutoResult(load_bundle(folder), dict(facts))
+        status = folder / "status.json"
+        finished = status.is_file() and read_object(status).get("status") == "finished"
+        return AutoResult(load_bundle(folder), dict(facts)) if finished else None
     if facts is not None or (folder / "run.json").exists():
         raise StorageError(
             f"run folder '{folder}' holds another run (other settings, data or version); nothing was changed. Choose "
@@ -182,7 +185,18 @@ def _prepare(source: _ReadOnce, settings: AutoSettings) -> tuple[Prepared, Amoun
     def cut(window: int) -> tuple[Prepared, Amount]:
         model = {"model": {"window": window, "backbone": {"kind": "committee"}, "head": {"kind": "linear"}}}
         data = prepare_data(source, settings.experiment(model))
-        parts = [*data.train, *data.validation]
+        reach = data.task.max_horizon
+        # A stretch that ends within the horizon holds nothing to predict; the digest stays that of all recordings.
+        train, validation = (
+            [part for part in stretches if part.samples > reach] for stretches in (data.train, data.validation)
+        )
+        if not train or not validation:
+            raise DataError(
+                f"automatic choice: no stretch of the training or of the validation part is longer than the largest "
+                f"horizon of {reach} ticks; give longer recordings or a shorter horizon"
+            )
+        data = replace(data, train=train, validation=validation)
+        parts = [*train, *validation]
         auto = settings.auto
         return data, Amount(
             rows=sum(part.samples for part in parts),
@@ -315,7 +329,7 @@ def sentence(choice: PortfolioChoice, trained: dict[str, _Trained], amount: Amou
     start = f"Of {len(trained)} models on {minutes:.1f} min of recordings, {label} is kept"
     others = [name for name in trained if name != choice.name]
     if not others:
-        return f"{start}: no other one suits so few data."
+        return f"{start}: no other one was tried, or all others diverged."
     if choice.name != choice.best:
         gain = 100 * (1 - np.exp(-choice.excess[choice.name]))
         best = CANDIDATES[choice.best].label
