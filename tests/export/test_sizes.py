@@ -72,7 +72,7 @@ class Compiled:
 
     def runtime(self, model, folder: Path) -> list[Path]:
         """Its objects for the controller."""
-        kept = self.folder / ("whole" if model.whole else "float")
+        kept = self.folder / ("whole" if model.integer else "float")
         if not kept.exists():
             kept.mkdir()
             sources = [folder / name for name in model.runtime if name.endswith(".c") and "adaptation" not in name]

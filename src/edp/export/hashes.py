@@ -19,7 +19,7 @@ def model_hash(graph: Graph) -> str:
         arrays = layer.tensors()
         # Arrays are hashed by their bytes, everything else by its text: `repr` of an array is cut off.
         rest = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in arrays}
-        state.update(repr((type(layer).__name__, rest)).encode())
+        state.update(repr((layer.kind, rest)).encode())
         for name, values in arrays.items():
             state.update(repr((name, values.shape)).encode() + little_endian(values))
     for key, values in graph.initial.items():

@@ -71,6 +71,11 @@ class Layer(ABC):
         """Numbers that it gives."""
 
     @property
+    def kind(self) -> str:
+        """The word for it in exported files and in their hash of the network."""
+        return type(self).__name__
+
+    @property
     def number(self) -> Number:
         """What its value is made of."""
         return Number.FLOAT

@@ -107,8 +107,8 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
         BundleError: the network computes with other numbers, which a bundle would not tell.
     """
     predictor, form = bundle.predictor, bundle.predictor.number_format
-    whole = isinstance(predictor, IntegerPredictor)
-    if form != "float32" and not whole:
+    integer = isinstance(predictor, IntegerPredictor)
+    if form != "float32" and not integer:
         raise BundleError(
             f"a network in {form} cannot be saved as a bundle, which would be read as one in float32; save the network "
             "that it was made of, and quantise that after loading"
@@ -121,7 +121,7 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     write_bytes(path / weights, data)
     task = bundle.task
     header: dict[str, Any] = {
-        "schema": INTEGER_SCHEMA if whole else SCHEMA,
+        "schema": INTEGER_SCHEMA if integer else SCHEMA,
         "edp": __version__,
         "task": task_to_plain(task),
         "model": model_to_plain(bundle.predictor.spec),

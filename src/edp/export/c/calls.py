@@ -12,7 +12,7 @@ from edp.export.escape import c_comment
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import INPUT, Number
 from edp.ir.layers import runs as neighbours
-from edp.ir.w8a16.layers import WGather
+from edp.ir.w8a16.layers import QGather
 
 WORK = {Number.FLOAT: "work", Number.INT16: "work16", Number.INT32: "work32"}
 """Work memories."""
@@ -83,7 +83,7 @@ def ring(layer: Layer) -> str:
     return f"&s->{identifier(layer.name)}_ring_at"
 
 
-def runs(calls: Calls, layer: layers.Gather | WGather) -> list[tuple[str, int, int]]:
+def runs(calls: Calls, layer: layers.Gather | QGather) -> list[tuple[str, int, int]]:
     """Runs of neighbouring columns: the value they come from, the first column in it, their number."""
     widths = [calls.graph.width_of(name) for name in layer.inputs]
     return [(layer.inputs[which], first, length) for which, first, length in neighbours(layer.columns, widths)]
@@ -91,7 +91,7 @@ def runs(calls: Calls, layer: layers.Gather | WGather) -> list[tuple[str, int, i
 
 def needs_columns(calls: Calls, layer: Layer) -> bool:
     """Whether a layer's columns are written as a table."""
-    if not isinstance(layer, layers.Gather | WGather):
+    if not isinstance(layer, layers.Gather | QGather):
         return False
     # Columns of several inputs have no common address, so a table cannot reach them.
     return len(layer.inputs) == 1 and len(runs(calls, layer)) > MOST_COPIES
@@ -237,4 +237,4 @@ def describe(layer: Layer) -> str:
     """A comment on what a layer is: its name, kind and shapes."""
     shapes = [f"{name} {' x '.join(map(str, values.shape))}" for name, values in layer.tensors().items()]
     size = f"{layer.width} numbers" if layer.width else "no value"
-    return f"/* {c_comment(layer.name)}: {type(layer).__name__}, {'; '.join([size, *shapes])} */"
+    return f"/* {c_comment(layer.name)}: {layer.kind}, {'; '.join([size, *shapes])} */"

@@ -11,20 +11,20 @@ from edp.export.c.calls import CALLS, Calls, Write, constant, needs_columns, rin
 from edp.export.c.text import array, call, identifier, number
 from edp.ir import Layer
 from edp.ir.layers import Function
-from edp.ir.w8a16 import arithmetic as whole
-from edp.ir.w8a16 import layers as made
+from edp.ir.w8a16 import arithmetic as fixed
+from edp.ir.w8a16 import layers as quantised
 
 FILES = ("edp_integer.h", "edp_integer.c", "edp_integer_memory.c")
 """Of the runtime, with the tables of `tables_header`."""
 
 
-def _quantise(calls: Calls, x: made.Quantise) -> list[str]:
+def _quantise(calls: Calls, x: quantised.Quantise) -> list[str]:
     source, scale = calls.value(x.inputs[0]), number(2.0**x.frac)
     made_call = call("edp_q_from_float", source, x.size, scale, calls.value(x.name))
     return [f"s->clipped += {made_call}"]
 
 
-def _gather(calls: Calls, x: made.WGather) -> list[str]:
+def _gather(calls: Calls, x: quantised.QGather) -> list[str]:
     if needs_columns(calls, x):
         source = calls.value(x.inputs[0])
         return [call("edp_q_gather", source, constant(x, "columns"), x.width, x.shifts[0], calls.value(x.name))]
@@ -36,14 +36,14 @@ def _gather(calls: Calls, x: made.WGather) -> list[str]:
     return lines
 
 
-def _sum(calls: Calls, x: made.WSum) -> list[str]:
+def _sum(calls: Calls, x: quantised.QSum) -> list[str]:
     a, b = (calls.value(name) for name in x.inputs)
     # A difference is a sum with a negative factor: one function less in the runtime.
     factors = (str(2 ** x.lefts[0]), str((-1 if x.minus else 1) * 2 ** x.lefts[1]))
     return [call("edp_q_sum", a, b, x.size, *factors, x.right, calls.value(x.name))]
 
 
-def _activate(calls: Calls, x: made.WActivate) -> list[str]:
+def _activate(calls: Calls, x: quantised.QActivate) -> list[str]:
     sizes: list[object] = [x.size]
     if x.function is not Function.RELU:
         sizes.append(str(x.input_frac))
@@ -58,7 +58,7 @@ def _linear(calls: Calls, x: Any, function: str, *sizes: int) -> list[str]:
     return [call(function, source, matrix, constant(x, "bias"), *sizes, *rest)]
 
 
-def _convolution(calls: Calls, x: made.WConvolution) -> list[str]:
+def _convolution(calls: Calls, x: quantised.QConvolution) -> list[str]:
     out, taps, into = x.weight.shape
     if taps == 1:
         return _linear(calls, x, "edp_q_dense", 1, out, into)
@@ -67,8 +67,8 @@ def _convolution(calls: Calls, x: made.WConvolution) -> list[str]:
     return [call("edp_q_convolution", source, matrix, constant(x, "bias"), out, taps, into, x.dilation, *state)]
 
 
-def _recurrent(calls: Calls, x: made.WLstm | made.WGru) -> list[str]:
-    lstm = isinstance(x, made.WLstm)
+def _recurrent(calls: Calls, x: quantised.QLstm | quantised.QGru) -> list[str]:
+    lstm = isinstance(x, quantised.QLstm)
     states = (slot(x, "h"), slot(x, "c")) if lstm else (slot(x, "h"),)
     sizes = (x.weight_x.shape[1], x.width)
     weights = f"&{identifier(x.name)}_weights"
@@ -77,49 +77,49 @@ def _recurrent(calls: Calls, x: made.WLstm | made.WGru) -> list[str]:
     return [call(function, calls.value(x.inputs[0]), weights, *sizes, *states, *rest)]
 
 
-def _difference(calls: Calls, x: made.WDifference) -> list[str]:
+def _difference(calls: Calls, x: quantised.QDifference) -> list[str]:
     kind = "true" if x.from_zero else "false"
     return calls.simple(x, "edp_q_difference", x.width, kind, x.right, slot(x, "before"), ring(x))
 
 
-def _pool(calls: Calls, x: made.WAttentionPool) -> list[str]:
+def _pool(calls: Calls, x: quantised.QAttentionPool) -> list[str]:
     source, matrix = calls.value(x.inputs[0]), f"&{identifier(x.name)}_matrix"
     state = (slot(x, "ring"), slot(x, "scores"), ring(x), calls.scratch(x), calls.value(x.name))
     return [call("edp_q_attention_pool", source, matrix, x.width, x.window, *state)]
 
 
-def _mean(calls: Calls, x: made.WTrailingMean) -> list[str]:
+def _mean(calls: Calls, x: quantised.QTrailingMean) -> list[str]:
     return calls.simple(x, "edp_q_trailing_mean", x.size, x.window, slot(x, "ring"), ring(x))
 
 
-def _dequantise(calls: Calls, x: made.Dequantise) -> list[str]:
+def _dequantise(calls: Calls, x: quantised.Dequantise) -> list[str]:
     return calls.simple(x, "edp_q_to_float", x.size, number(2.0**-x.frac))
 
 
 INTEGER_CALLS: dict[type[Layer], Write] = {
-    made.Quantise: _quantise,
-    made.Dequantise: _dequantise,
-    made.WGather: _gather,
-    made.WSum: _sum,
-    made.WMultiply: lambda c, x: c.simple(x, "edp_q_multiply", x.size, x.right),
-    made.WScaleShift: lambda c, x: c.simple(x, "edp_q_scale_shift", x.width, x.right),
-    made.WActivate: _activate,
-    made.WGlu: lambda c, x: c.simple(x, "edp_q_glu", x.rows, x.size // 2, str(x.frac)),
-    made.WDense: lambda c, x: _linear(c, x, "edp_q_dense", x.rows, *x.weight.shape),
-    made.WGroupedDense: lambda c, x: _linear(c, x, "edp_q_grouped_dense", *x.weight.shape),
-    made.WConvolution: _convolution,
-    made.WLstm: _recurrent,
-    made.WGru: _recurrent,
-    made.WMinGru: lambda c, x: c.simple(x, "edp_q_min_gru", x.units, str(x.frac), slot(x, "h")),
-    made.WRotation: lambda c, x: c.simple(x, "edp_q_rotation", len(x.factor), x.left, x.right, slot(x, "h")),
-    made.WDifference: _difference,
-    made.WTrailingMean: _mean,
-    made.WAttentionPool: _pool,
+    quantised.Quantise: _quantise,
+    quantised.Dequantise: _dequantise,
+    quantised.QGather: _gather,
+    quantised.QSum: _sum,
+    quantised.QMultiply: lambda c, x: c.simple(x, "edp_q_multiply", x.size, x.right),
+    quantised.QScaleShift: lambda c, x: c.simple(x, "edp_q_scale_shift", x.width, x.right),
+    quantised.QActivate: _activate,
+    quantised.QGlu: lambda c, x: c.simple(x, "edp_q_glu", x.rows, x.size // 2, str(x.frac)),
+    quantised.QDense: lambda c, x: _linear(c, x, "edp_q_dense", x.rows, *x.weight.shape),
+    quantised.QGroupedDense: lambda c, x: _linear(c, x, "edp_q_grouped_dense", *x.weight.shape),
+    quantised.QConvolution: _convolution,
+    quantised.QLstm: _recurrent,
+    quantised.QGru: _recurrent,
+    quantised.QMinGru: lambda c, x: c.simple(x, "edp_q_min_gru", x.units, str(x.frac), slot(x, "h")),
+    quantised.QRotation: lambda c, x: c.simple(x, "edp_q_rotation", len(x.factor), x.left, x.right, slot(x, "h")),
+    quantised.QDifference: _difference,
+    quantised.QTrailingMean: _mean,
+    quantised.QAttentionPool: _pool,
 }
 """By kind of integer layer."""
 CALLS |= INTEGER_CALLS
 
-COUNTED = (made.WDifference, made.WConvolution, made.WTrailingMean, made.WAttentionPool)
+COUNTED = (quantised.QDifference, quantised.QConvolution, quantised.QTrailingMean, quantised.QAttentionPool)
 """Layers with a ring or a counter."""
 
 
@@ -131,14 +131,14 @@ def structs(layer: Layer) -> list[str]:
         parts = (f"{weight}{suffix}", f"multiplier{suffix}", f"shift{suffix}")
         return "{" + ", ".join(constant(layer, part) for part in parts) + "}"
 
-    if isinstance(layer, made.WDense | made.WGroupedDense | made.WConvolution):
+    if isinstance(layer, quantised.QDense | quantised.QGroupedDense | quantised.QConvolution):
         return [f"static const edp_q_matrix {name}_matrix = {matrix('')};"]
-    if isinstance(layer, made.WAttentionPool):
+    if isinstance(layer, quantised.QAttentionPool):
         return [f"static const edp_q_matrix {name}_matrix = {matrix('', 'score')};"]
-    if isinstance(layer, made.WLstm):
+    if isinstance(layer, quantised.QLstm):
         members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias')}, {constant(layer, 'bias')}, {layer.share}"
         return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
-    if isinstance(layer, made.WGru):
+    if isinstance(layer, quantised.QGru):
         # A GRU has no zoneout; 32768 is 1 in 2^-15.
         members = f"{matrix('_x')}, {matrix('_h')}, {constant(layer, 'bias_x')}, {constant(layer, 'bias_h')}, 32768"
         return [f"static const edp_q_recurrent {name}_weights = {{{members}}};"]
@@ -149,7 +149,7 @@ def laid_out(layer: Layer, values: NDArray[Any]) -> NDArray[Any]:
     """A constant in the order in which the runtime reads it: see ``edp_q_products``."""
     if values.dtype != np.int8 or values.ndim < 2:
         return values
-    if isinstance(layer, made.WConvolution):
+    if isinstance(layer, quantised.QConvolution):
         # Taps first: the runtime multiplies one tick of the ring after the other.
         values = values.transpose(1, 0, 2)
     matrices = values.reshape(-1, *values.shape[-2:])
@@ -173,12 +173,12 @@ def _in_order(matrix: NDArray[Any]) -> NDArray[Any]:
 def tables_header() -> str:
     """The file of the runtime's tables."""
     parts = ["/* Functions at even distances, in 2^-16; see edp_integer.h. */", "#ifndef EDP_TABLES_H"]
-    parts += ["#define EDP_TABLES_H", "", "#include <stdint.h>", "", f"#define EDP_TABLE {whole.TABLE}u", ""]
+    parts += ["#define EDP_TABLES_H", "", "#include <stdint.h>", "", f"#define EDP_TABLE {fixed.TABLE}u", ""]
     for name, values, note in (
-        ("tanh", whole.TANH, "tanh on [0, 8]"),
-        ("exp", whole.EXP, "exp(-x) on [0, 16]"),
-        ("log1p_exp", whole.LOG1P_EXP, "log(1 + exp(-x)) on [0, 16]"),
-        ("normal", whole.NORMAL, "cumulated normal distribution on [0, 8]"),
+        ("tanh", fixed.TANH, "tanh on [0, 8]"),
+        ("exp", fixed.EXP, "exp(-x) on [0, 16]"),
+        ("log1p_exp", fixed.LOG1P_EXP, "log(1 + exp(-x)) on [0, 16]"),
+        ("normal", fixed.NORMAL, "cumulated normal distribution on [0, 8]"),
     ):
         parts.append(array("uint16_t", f"edp_table_{name}", (f"{v}u" for v in values), note))
     return "\n".join([*parts, "", "#endif", ""])

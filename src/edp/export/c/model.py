@@ -63,14 +63,14 @@ class Model:
     adapts: bool = False
 
     @property
-    def whole(self) -> bool:
+    def integer(self) -> bool:
         """Whether it computes in integer arithmetic."""
         return isinstance(self.bundle.predictor, IntegerPredictor)
 
     @property
     def runtime(self) -> tuple[str, ...]:
         """Files of the runtime that it needs."""
-        more: tuple[str, ...] = integer_calls.FILES if self.whole else ()
+        more: tuple[str, ...] = integer_calls.FILES if self.integer else ()
         more += () if self.changes is None else tangents.FILES
         return RUNTIME + more + (adaptation.FILES if self.adapts else ())
 
@@ -119,9 +119,9 @@ class Model:
             "format": self.bundle.predictor.number_format,
             "flash": total_bytes(constants_of(self.graph, self.plan)),
             "ram": self.state_bytes(),
-            "runtime": "edp_integer.h" if self.whole else "edp_runtime.h",
-            "counters": CLIPPED if self.whole else "",
-            "clear_counters": Code("    s->clipped = 0u;\n") if self.whole else "",
+            "runtime": "edp_integer.h" if self.integer else "edp_runtime.h",
+            "counters": CLIPPED if self.integer else "",
+            "clear_counters": Code("    s->clipped = 0u;\n") if self.integer else "",
             "sources": " ".join(self.sources),
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
@@ -208,7 +208,7 @@ class Model:
         rings = sum(has_ring(layer) for layer in self.graph.layers)
         work = sum(size * kind.bytes for kind, size in self.plan.sizes.items())
         # Seven words: counters, marker, age and holding; rings have a place and a count.
-        return 4 * (7 + self.whole + self.graph.inputs + 2 * rings) + slots + work
+        return 4 * (7 + self.integer + self.graph.inputs + 2 * rings) + slots + work
 
     def _code(self) -> dict[str, str]:
         members = []
@@ -284,8 +284,8 @@ def make_model(name: str, bundle: Bundle, tangent: bool = False, adapts: bool = 
             beyond the numbers of C.
     """
     predictor = bundle.predictor
-    whole = isinstance(predictor, IntegerPredictor)
-    if whole and tangent:
+    integer = isinstance(predictor, IntegerPredictor)
+    if integer and tangent:
         raise ExportError("a network in integer arithmetic is a staircase and has no tangent; export the float run")
     graph = predictor.integers if isinstance(predictor, IntegerPredictor) else predictor.graph()
     changes = plan(graph, tangents.tangent_scratch_of) if tangent else None

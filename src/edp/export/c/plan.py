@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import Number
-from edp.ir.w8a16 import layers as whole
+from edp.ir.w8a16 import layers as quantised
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,19 @@ def scratch_of(layer: Layer) -> int:
     if isinstance(layer, memory.PrefixCorrection):
         hidden, seen = layer.first_weight.shape
         return int(seen + hidden + len(layer.second_bias))
-    return _scratch_of_whole(layer)
+    return _integer_scratch(layer)
 
 
-def _scratch_of_whole(layer: Layer) -> int:
-    if isinstance(layer, whole.WDense | whole.WConvolution):
+def _integer_scratch(layer: Layer) -> int:
+    if isinstance(layer, quantised.QDense | quantised.QConvolution):
         return len(layer.bias)
-    if isinstance(layer, whole.WGroupedDense):
+    if isinstance(layer, quantised.QGroupedDense):
         return int(layer.bias.shape[1])
-    if isinstance(layer, whole.WLstm):
+    if isinstance(layer, quantised.QLstm):
         return 8 * layer.width
-    if isinstance(layer, whole.WGru):
+    if isinstance(layer, quantised.QGru):
         return 6 * layer.width
-    return layer.window if isinstance(layer, whole.WAttentionPool) else 0
+    return layer.window if isinstance(layer, quantised.QAttentionPool) else 0
 
 
 def scratch_number(layer: Layer) -> Number:

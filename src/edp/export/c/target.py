@@ -70,7 +70,7 @@ def core_files(model: Model) -> dict[str, str]:
         files |= {f"{name}_tangent.{end}": model.fill(f"model_tangent.{end}.in") for end in ("h", "c")}
     if model.adapts:
         files |= {f"{name}_adaptation.{end}": model.fill(f"model_adaptation.{end}.in") for end in ("h", "c")}
-    if model.whole:
+    if model.integer:
         files["edp_tables.h"] = tables_header()
     for file in model.runtime:
         files[file] = resources.files("edp.export.c").joinpath(f"runtime/{file}").read_text()

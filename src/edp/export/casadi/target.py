@@ -101,7 +101,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
         )
     constants = list(layer.tensors())
     options = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in constants}
-    return {"kind": type(layer).__name__, "constants": constants} | options
+    return {"kind": layer.kind, "constants": constants} | options
 
 
 def packed(data: dict[str, np.ndarray]) -> bytes:

@@ -80,7 +80,7 @@ class Folder:
     @property
     def native(self) -> Native | None:
         """The network as MATLAB code; there is none in integer arithmetic."""
-        return None if self.model.whole else Native(self.model.graph)
+        return None if self.model.integer else Native(self.model.graph)
 
     def content(self) -> dict[str, Any]:
         """The description as plain values."""
@@ -202,7 +202,7 @@ class Folder:
             "forms": Code(" or ".join(f"'{form}'" for form in forms)),
             "form_names": ", ".join(forms),
             "first_form": FIRST[self.native is not None],
-            "exact": "Integers must be the same." if self.model.whole else "",
+            "exact": "Integers must be the same." if self.model.integer else "",
             "layout": Code(
                 "; ".join(f"{meaning} {r} x {c} (horizons by targets)" for meaning, (r, c) in shapes.items())
             ),
@@ -240,7 +240,7 @@ class Folder:
         if self.native is not None:
             checked += f", and `{name}_golden('native')` the plain MATLAB code"
         missing = "" if self.window else "\n\nThe ONNX window is not in this folder."
-        if self.model.whole:
+        if self.model.integer:
             missing = "\n\nThe network computes in integer arithmetic: C code only, no plain MATLAB code and no ONNX."
         first = f" `{name}_golden` then compares the plain MATLAB code with PyTorch."
         return {

@@ -119,7 +119,7 @@ class Native:
                     f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in MATLAB; these have: "
                     f"{', '.join(sorted(kind.__name__ for kind in WRITERS))}"
                 )
-            lines.append(f"% {matlab_comment(layer.name)}: {type(layer).__name__}, {layer.width or 'no'} numbers")
+            lines.append(f"% {matlab_comment(layer.name)}: {layer.kind}, {layer.width or 'no'} numbers")
             lines += write(self, layer, [self.value(name) for name in layer.inputs])
         return Code("\n".join(lines))
 

@@ -51,7 +51,7 @@ class SimulinkTarget:
             )
         model = make_model(name, bundle)
         # There is no ONNX form in integer arithmetic.
-        window = self.window and not model.whole
+        window = self.window and not model.integer
         written = Folder(model, window)
         files: dict[str, bytes] = {file: text.encode() for file, text in written.texts().items()}
         files[f"{name}.json"] = as_json(written.content())

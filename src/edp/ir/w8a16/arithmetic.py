@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edp.errors import ExportError
 
-Whole = NDArray[np.int64]
+Fixed = NDArray[np.int64]
 """Integers of any width; NumPy computes with 64 bits, and `saturated` keeps them in theirs."""
 
 LARGEST = 32767
@@ -43,7 +43,7 @@ def frac_for(largest: float, bits: int = 15) -> int:
     return max(-bits, min(2 * bits, frac))
 
 
-def rounded_shift(x: Any, bits: int) -> Whole:
+def rounded_shift(x: Any, bits: int) -> Fixed:
     """``x 2^-bits``, rounded half up."""
     # Half up rather than half to even: one addition and a shift in C.
     x = np.asarray(x, dtype=np.int64)
@@ -52,13 +52,13 @@ def rounded_shift(x: Any, bits: int) -> Whole:
     return np.asarray((x + (1 << (bits - 1))) >> bits)
 
 
-def saturated(x: Any, largest: int = LARGEST) -> Whole:
+def saturated(x: Any, largest: int = LARGEST) -> Fixed:
     """Kept in [-largest, largest]."""
     return np.clip(np.asarray(x, dtype=np.int64), -largest, largest)
 
 
-def to_fixed(values: Any, frac: int, largest: int = LARGEST) -> Whole:
-    """Real numbers as whole ones, rounded and kept in range."""
+def to_fixed(values: Any, frac: int, largest: int = LARGEST) -> Fixed:
+    """Real numbers as integers, rounded half up and kept in range."""
     scaled = np.floor(np.asarray(values, dtype=np.float64) * 2.0**frac + 0.5)
     return np.clip(scaled, -largest, largest).astype(np.int64)
 
@@ -84,7 +84,7 @@ def factor(real: Any) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
     return np.where(small, 0, multiplier).astype(np.int32), np.where(small, 62, shift).astype(np.uint8)
 
 
-def scaled(accumulator: Any, multiplier: Any, shift: Any) -> Whole:
+def scaled(accumulator: Any, multiplier: Any, shift: Any) -> Fixed:
     """``accumulator multiplier 2^-shift`` rounded half up; accumulators of 32 bits."""
     shift = np.asarray(shift, dtype=np.int64)
     product = np.asarray(accumulator, dtype=np.int64) * np.asarray(multiplier, dtype=np.int64)
@@ -110,48 +110,48 @@ NORMAL = _table(lambda x: 0.5 * (1.0 + math.erf(x / math.sqrt(2.0))), 8.0)
 """Cumulated normal distribution on [0, 8], in 2^-16."""
 
 
-def looked_up(table: NDArray[np.uint16], x: Whole, step: int) -> Whole:
+def looked_up(table: NDArray[np.uint16], x: Fixed, step: int) -> Fixed:
     """A table at x >= 0, `2^step` apart, interpolated; beyond its end its last entries."""
     # The last entry has no neighbour to interpolate to; x stays just below it.
     x = np.minimum(x, ((TABLE - 1) << step) - 1)
     at, rest = x >> step, x & ((1 << step) - 1)
     low = table[at].astype(np.int64)
     high = table[at + 1].astype(np.int64)
-    result: Whole = low + rounded_shift((high - low) * rest, step)
+    result: Fixed = low + rounded_shift((high - low) * rest, step)
     return result
 
 
-def tanh(x: Whole, frac: int) -> Whole:
+def tanh(x: Fixed, frac: int) -> Fixed:
     """In 2^-15, of x in ``2^-frac``, `frac` at least 6."""
     size = looked_up(TANH, np.abs(x), frac - 6)
-    result: Whole = np.where(x < 0, -1, 1) * np.minimum((size + 1) >> 1, LARGEST)
+    result: Fixed = np.where(x < 0, -1, 1) * np.minimum((size + 1) >> 1, LARGEST)
     return result
 
 
-def sigmoid(x: Whole) -> Whole:
+def sigmoid(x: Fixed) -> Fixed:
     """In 2^-15, of x in 2^-16: ``(1 + tanh(x / 2)) / 2``."""
     # A half of x: one bit less of the step, instead of a shift that would lose that bit.
     half = looked_up(TANH, np.abs(x), GATE_FRAC - 5)
     return np.minimum(rounded_shift(65536 + np.where(x < 0, -1, 1) * half, 2), LARGEST)
 
 
-def exp(x: Whole) -> Whole:
+def exp(x: Fixed) -> Fixed:
     """In 2^-16, of x <= 0 in 2^-16."""
     return looked_up(EXP, -x, GATE_FRAC - 5)
 
 
-def softplus(x: Whole) -> Whole:
+def softplus(x: Fixed) -> Fixed:
     """In 2^-16, of x in 2^-16."""
     return np.maximum(x, 0) + looked_up(LOG1P_EXP, np.abs(x), GATE_FRAC - 5)
 
 
-def normal(x: Whole) -> Whole:
+def normal(x: Fixed) -> Fixed:
     """Cumulated normal distribution in 2^-16, of x in 2^-16."""
     above = looked_up(NORMAL, np.abs(x), GATE_FRAC - 6)
     return np.where(x < 0, 65536 - above, above)
 
 
-def softmax(scores: Whole) -> Whole:
+def softmax(scores: Fixed) -> Fixed:
     # Differences to the largest score are never positive, which is the half that the table covers.
     """Weights in 2^-15 over the last axis, of scores in 2^-16."""
     raised = exp(scores - scores.max(axis=-1, keepdims=True))

@@ -2,11 +2,12 @@
 
 A value is ``q 2^-frac``. A weight is ``q scale`` with a scale for each output; the scale is in the `multiplier` and
 `shift` that take an accumulator to its output's format (see `edp.ir.w8a16.arithmetic`), biases are in units of the
-accumulator. Otherwise each layer means what its namesake in `edp.ir` means.
+accumulator. ``QDense`` is the integer form of `edp.ir.layers.Dense`, and so are the others.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ Shifts = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Whole(Layer):
+class FixedLayer(Layer):
     """A layer whose value is integers.
 
     Attributes:
@@ -32,12 +33,17 @@ class Whole(Layer):
     frac: int
 
     @property
+    def kind(self) -> str:
+        # Hashes of exported networks are taken over this word, and a state that a controller saved bears the hash.
+        return re.sub("^Q(?=[A-Z])", "W", super().kind)
+
+    @property
     def number(self) -> Number:
         return Number.INT16
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Sized(Whole):
+class _Sized(FixedLayer):
     """One that gives `size` numbers."""
 
     size: int
@@ -48,7 +54,7 @@ class _Sized(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Weighted(Whole):
+class _Weighted(FixedLayer):
     """One with a matrix, and for each of its outputs a bias and the way from the sum to the value's format."""
 
     weight: Bytes
@@ -63,12 +69,12 @@ class _Weighted(Whole):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Quantise(_Sized):
-    """Real numbers to whole ones, rounded half away from nought; those beyond the range are clipped and counted."""
+    """Floats to integers, rounded half away from zero; those beyond the range are clipped and counted."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Dequantise(Layer):
-    """Integers of `frac` fractional bits to real ones, exactly."""
+    """Integers of `frac` fractional bits to floats, exactly."""
 
     frac: int
     size: int
@@ -79,7 +85,7 @@ class Dequantise(Layer):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WGather(Whole):
+class QGather(FixedLayer):
     """Chosen numbers of the inputs, which are laid end to end; those of input i lose `shifts[i]` bits."""
 
     columns: tuple[int, ...]
@@ -91,7 +97,7 @@ class WGather(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WSum(_Sized):
+class QSum(_Sized):
     """``a + b`` or ``a - b`` of `size` numbers; they are shifted left by `lefts`, the sum right by `right`."""
 
     lefts: tuple[int, int]
@@ -100,14 +106,14 @@ class WSum(_Sized):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WMultiply(_Sized):
+class QMultiply(_Sized):
     """``a b`` of `size` numbers, shifted right by `right`."""
 
     right: int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WScaleShift(Whole):
+class QScaleShift(FixedLayer):
     """``gain x + offset``, shifted right by `right`; `gain` 16-bit, `offset` 32-bit."""
 
     gain: Halves
@@ -120,7 +126,7 @@ class WScaleShift(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WActivate(_Sized):
+class QActivate(_Sized):
     """A function of each number, which has `input_frac` fractional bits."""
 
     function: Function
@@ -128,7 +134,7 @@ class WActivate(_Sized):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WGlu(Whole):
+class QGlu(FixedLayer):
     """Each row's first half times the sigmoid of its second; the value has the input's format."""
 
     rows: int
@@ -140,7 +146,7 @@ class WGlu(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WDense(_Weighted):
+class QDense(_Weighted):
     """``W x + b`` on each row; `weight` ``(out, in)``, the others ``(out,)``."""
 
     rows: int = 1
@@ -155,7 +161,7 @@ class WDense(_Weighted):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WGroupedDense(_Weighted):
+class QGroupedDense(_Weighted):
     """``W_i x_i + b_i``; `weight` ``(rows, out, in)``, the others ``(rows, out)``."""
 
     @property
@@ -164,7 +170,7 @@ class WGroupedDense(_Weighted):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WConvolution(_Weighted):
+class QConvolution(_Weighted):
     """Causal convolution; `weight` ``(out, tap, in)``, the last tap is the present. Slot: ring of past inputs."""
 
     dilation: int = 1
@@ -181,8 +187,8 @@ class WConvolution(_Weighted):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _WRecurrent(Whole):
-    """Two matrices into gates of `GATE_FRAC` fractional bits; multipliers and shifts as for `WDense`."""
+class _QRecurrent(FixedLayer):
+    """Two matrices into gates of `GATE_FRAC` fractional bits; multipliers and shifts as for `QDense`."""
 
     weight_x: Bytes
     multiplier_x: Words
@@ -201,7 +207,7 @@ class _WRecurrent(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WLstm(_WRecurrent):
+class QLstm(_QRecurrent):
     """LSTM; `bias` in gates, ``(4 units,)``; `share` in 2^-15, 32768 without zoneout. Slots: h in 2^-15, c in 2^-20."""
 
     bias: Words
@@ -214,7 +220,7 @@ class WLstm(_WRecurrent):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WGru(_WRecurrent):
+class QGru(_QRecurrent):
     """GRU; `bias_x`, `bias_h` in gates, ``(3 units,)``. Slot: h in 2^-15."""
 
     bias_x: Words
@@ -226,7 +232,7 @@ class WGru(_WRecurrent):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WMinGru(Whole):
+class QMinGru(FixedLayer):
     """``h = h + z (c - h)`` of an input ``[z' ; c]``. Slot: h with `EXTRA` more bits than the input."""
 
     units: int
@@ -244,7 +250,7 @@ class WMinGru(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WRotation(Whole):
+class QRotation(FixedLayer):
     """Complex ``h = factor h + x``; `factor` in 2^-30. Slot: h, `left` more bits than x, `right` more than y."""
 
     factor: Words
@@ -261,7 +267,7 @@ class WRotation(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WDifference(Whole):
+class QDifference(FixedLayer):
     """``factor (x - before)``, shifted right by `right`. Slots: `before`, and whether there was a tick."""
 
     factor: Halves
@@ -278,7 +284,7 @@ class WDifference(Whole):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WTrailingMean(_Sized):
+class QTrailingMean(_Sized):
     """Mean of the last `window` inputs. Slots: ring, and ticks seen up to `window`."""
 
     window: int
@@ -289,7 +295,7 @@ class WTrailingMean(_Sized):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WAttentionPool(Whole):
+class QAttentionPool(FixedLayer):
     """Softmax-weighted mean of the last `window` inputs, the bias of its scores left out: it changes nothing.
 
     Slots: rings of inputs and of scores, and ticks seen.

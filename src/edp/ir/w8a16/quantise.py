@@ -17,8 +17,8 @@ from edp.errors import ExportError
 from edp.ir import layers, memory
 from edp.ir.base import INPUT, Graph, Layer, Number
 from edp.ir.layers import Function
-from edp.ir.w8a16 import arithmetic as whole
-from edp.ir.w8a16 import layers as made
+from edp.ir.w8a16 import arithmetic as fixed
+from edp.ir.w8a16 import layers as quantised
 from edp.ir.w8a16.rounding import WeightRounding
 from edp.ir.w8a16.rows import halves, rows, to_gates
 
@@ -49,9 +49,9 @@ class Formats:
 # A quarter more than calibration has seen; one more bit would cost half of the resolution.
 def formats(ranges: Ranges, margin: float = 1.25) -> Formats:
     """The finest format of each value that holds `margin` times its largest magnitude."""
-    fracs = {name: whole.frac_for(margin * size) for name, size in ranges.items() if "/" not in name}
+    fracs = {name: fixed.frac_for(margin * size) for name, size in ranges.items() if "/" not in name}
     # The state of a rotation is 32-bit, and half of what it may grow to is kept free.
-    wide = {name: whole.frac_for(2.0 * margin * size, 29) for name, size in ranges.items() if "/" in name}
+    wide = {name: fixed.frac_for(2.0 * margin * size, 29) for name, size in ranges.items() if "/" in name}
     return Formats(fracs | wide)
 
 
@@ -75,30 +75,30 @@ class _Work:
     def gates(self, layer: Any, input_frac: int) -> dict[str, Any]:
         """Integer matrices of a recurrent layer."""
         gate_constants: dict[str, Any] = {}
-        for side, frac in (("x", input_frac), ("h", whole.UNIT_FRAC)):
+        for side, frac in (("x", input_frac), ("h", fixed.UNIT_FRAC)):
             made_of = to_gates(f"{layer.name}/{side}", getattr(layer, f"weight_{side}"), frac, self.rounding)
             gate_constants |= {f"{key}_{side}": values for key, values in made_of.items()}
         return gate_constants
 
-    def whole(self, value: str) -> str:
+    def as_fixed(self, value: str) -> str:
         """The name of a value as integers."""
         if value in self.integer_fracs:
             return value
         name = f"{value}.whole"
         if name not in self.integer_fracs:
             size = self.graph.width_of(value)
-            self.out.append(made.Quantise(name=name, inputs=(value,), frac=self.frac(value), size=size))
+            self.out.append(quantised.Quantise(name=name, inputs=(value,), frac=self.frac(value), size=size))
             self.integer_fracs[name] = self.frac(value)
         return name
 
-    def real(self, value: str) -> str:
-        """The name of a value as real numbers."""
+    def as_float(self, value: str) -> str:
+        """The name of a value as floats."""
         if value not in self.integer_fracs:
             return value
         name = f"{value}.real"
         if not any(layer.name == name for layer in self.out):
             size, frac = self.graph.width_of(value), self.integer_fracs[value]
-            self.out.append(made.Dequantise(name=name, inputs=(value,), frac=frac, size=size))
+            self.out.append(quantised.Dequantise(name=name, inputs=(value,), frac=frac, size=size))
         return name
 
     def frac(self, value: str) -> int:
@@ -129,14 +129,14 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
                 f"layer '{layer.name}' is a {kind.__name__}, which has no form in integer arithmetic; {REFUSED[kind]}"
             )
         if layer.name not in inside:
-            work.out.append(replace(layer, inputs=tuple(work.real(name) for name in layer.inputs)))
+            work.out.append(replace(layer, inputs=tuple(work.as_float(name) for name in layer.inputs)))
             continue
-        inputs = tuple(work.whole(name) for name in layer.inputs)
+        inputs = tuple(work.as_fixed(name) for name in layer.inputs)
         # Inputs are brought into integers first, since a layer's own format depends on theirs.
         done = LOWER[kind](work, layer, [work.integer_fracs[name] for name in inputs])
         work.out.append(replace(done, inputs=inputs))
         work.integer_fracs[layer.name] = done.frac
-    results = {meaning: work.real(value) for meaning, value in graph.results.items()}
+    results = {meaning: work.as_float(value) for meaning, value in graph.results.items()}
     finished = Graph(graph.inputs, tuple(work.out), results, {}, graph.window)
     return replace(finished, initial=_initial(graph, finished, work))
 
@@ -168,8 +168,8 @@ def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str]
             start[key] = values
         else:
             small = numbers[key] is Number.INT16
-            largest = whole.LARGEST if small else whole.CELL_LIMIT
-            fixed_values = whole.to_fixed(values, work.slots[key], largest)
+            largest = fixed.LARGEST if small else fixed.CELL_LIMIT
+            fixed_values = fixed.to_fixed(values, work.slots[key], largest)
             start[key] = fixed_values.astype(np.int16 if small else np.int32)
     return start
 
@@ -205,124 +205,126 @@ def _within(frac: int, finest: int) -> int:
     return min(max(frac, finest - 31), finest)
 
 
-Lower = Callable[[_Work, Any, list[int]], made.Whole]
+Lower = Callable[[_Work, Any, list[int]], quantised.FixedLayer]
 
 
-def _gather(work: _Work, x: layers.Gather, input_fracs: list[int]) -> made.Whole:
+def _gather(work: _Work, x: layers.Gather, input_fracs: list[int]) -> quantised.FixedLayer:
     # The coarsest format of the inputs: a shift left could overflow, a shift right only loses bits.
     frac = min(input_fracs)
     shifts = tuple(own - frac for own in input_fracs)
-    return made.WGather(name=x.name, inputs=(), frac=frac, columns=x.columns, shifts=shifts)
+    return quantised.QGather(name=x.name, inputs=(), frac=frac, columns=x.columns, shifts=shifts)
 
 
-def _sum(work: _Work, x: layers.Add | layers.Subtract, input_fracs: list[int]) -> made.Whole:
+def _sum(work: _Work, x: layers.Add | layers.Subtract, input_fracs: list[int]) -> quantised.FixedLayer:
     """The finer of two formats is the common one, as far as 32 bits reach."""
     frac, (a, b) = work.frac(x.name), input_fracs
     # 14 bits of difference: 16-bit values shifted by more would leave 32 bits.
     common = min(max(a, b), min(a, b) + 14)
     lefts, minus = (common - a, common - b), isinstance(x, layers.Subtract)
     frac = _within(frac, common)
-    return made.WSum(name=x.name, inputs=(), frac=frac, size=x.size, lefts=lefts, right=common - frac, minus=minus)
+    return quantised.QSum(name=x.name, inputs=(), frac=frac, size=x.size, lefts=lefts, right=common - frac, minus=minus)
 
 
-def _multiply(work: _Work, x: layers.Multiply, input_fracs: list[int]) -> made.Whole:
+def _multiply(work: _Work, x: layers.Multiply, input_fracs: list[int]) -> quantised.FixedLayer:
     frac = _within(work.frac(x.name), sum(input_fracs))
-    return made.WMultiply(name=x.name, inputs=(), frac=frac, size=x.size, right=sum(input_fracs) - frac)
+    return quantised.QMultiply(name=x.name, inputs=(), frac=frac, size=x.size, right=sum(input_fracs) - frac)
 
 
-def _scale_shift(work: _Work, x: layers.ScaleShift, input_fracs: list[int]) -> made.Whole:
+def _scale_shift(work: _Work, x: layers.ScaleShift, input_fracs: list[int]) -> quantised.FixedLayer:
     # The offset is in the format of the product, 32-bit.
     # Product and offset share the accumulator; 30 bits leave one for their sum.
-    most = whole.frac_for(float(np.abs(x.shift).max()), 30) - input_fracs[0]
+    most = fixed.frac_for(float(np.abs(x.shift).max()), 30) - input_fracs[0]
     gain, bits = halves(x.gain, most)
     frac = _within(work.frac(x.name), input_fracs[0] + bits)
-    offset = whole.to_fixed(x.shift, input_fracs[0] + bits, 2**30 - 1).astype(np.int32)
+    offset = fixed.to_fixed(x.shift, input_fracs[0] + bits, 2**30 - 1).astype(np.int32)
     right = input_fracs[0] + bits - frac
-    return made.WScaleShift(name=x.name, inputs=(), frac=frac, gain=gain, offset=offset, right=right)
+    return quantised.QScaleShift(name=x.name, inputs=(), frac=frac, gain=gain, offset=offset, right=right)
 
 
-def _activate(work: _Work, x: layers.Activate, input_fracs: list[int]) -> made.Whole:
+def _activate(work: _Work, x: layers.Activate, input_fracs: list[int]) -> quantised.FixedLayer:
     frac = input_fracs[0]
     # Results of tanh and sigmoid lie between -1 and 1: their format needs no calibration.
     if x.function in (Function.SIGMOID, Function.TANH):
-        frac = whole.UNIT_FRAC
+        frac = fixed.UNIT_FRAC
     elif x.function is Function.SOFTPLUS:
         # Finer than its table of 2^-16 a softplus cannot be.
-        frac = min(work.frac(x.name), whole.GATE_FRAC)
-    return made.WActivate(
+        frac = min(work.frac(x.name), fixed.GATE_FRAC)
+    return quantised.QActivate(
         name=x.name, inputs=(), frac=frac, function=x.function, size=x.size, input_frac=input_fracs[0]
     )
 
 
-def _glu(work: _Work, x: layers.Glu, input_fracs: list[int]) -> made.Whole:
-    return made.WGlu(name=x.name, inputs=(), frac=input_fracs[0], rows=x.rows, size=x.size)
+def _glu(work: _Work, x: layers.Glu, input_fracs: list[int]) -> quantised.FixedLayer:
+    return quantised.QGlu(name=x.name, inputs=(), frac=input_fracs[0], rows=x.rows, size=x.size)
 
 
-def _dense(work: _Work, x: layers.Dense, input_fracs: list[int]) -> made.Whole:
-    return made.WDense(name=x.name, inputs=(), frac=work.frac(x.name), rows=x.rows, **work.rows(x, input_fracs[0]))
+def _dense(work: _Work, x: layers.Dense, input_fracs: list[int]) -> quantised.FixedLayer:
+    return quantised.QDense(name=x.name, inputs=(), frac=work.frac(x.name), rows=x.rows, **work.rows(x, input_fracs[0]))
 
 
-def _grouped(work: _Work, x: layers.GroupedDense, input_fracs: list[int]) -> made.Whole:
-    return made.WGroupedDense(name=x.name, inputs=(), frac=work.frac(x.name), **work.rows(x, input_fracs[0]))
+def _grouped(work: _Work, x: layers.GroupedDense, input_fracs: list[int]) -> quantised.FixedLayer:
+    return quantised.QGroupedDense(name=x.name, inputs=(), frac=work.frac(x.name), **work.rows(x, input_fracs[0]))
 
 
-def _convolution(work: _Work, x: memory.Convolution, input_fracs: list[int]) -> made.Whole:
+def _convolution(work: _Work, x: memory.Convolution, input_fracs: list[int]) -> quantised.FixedLayer:
     frac = work.frac(x.name)
     work.slots[x.name, "ring"] = input_fracs[0]
-    return made.WConvolution(name=x.name, inputs=(), frac=frac, dilation=x.dilation, **work.rows(x, input_fracs[0]))
+    return quantised.QConvolution(
+        name=x.name, inputs=(), frac=frac, dilation=x.dilation, **work.rows(x, input_fracs[0])
+    )
 
 
-def _lstm(work: _Work, x: memory.Lstm, input_fracs: list[int]) -> made.Whole:
-    work.slots |= {(x.name, "h"): whole.UNIT_FRAC, (x.name, "c"): whole.CELL_FRAC}
+def _lstm(work: _Work, x: memory.Lstm, input_fracs: list[int]) -> quantised.FixedLayer:
+    work.slots |= {(x.name, "h"): fixed.UNIT_FRAC, (x.name, "c"): fixed.CELL_FRAC}
     # A share of 1 is 32768, which fits since it is held in 32 bits.
-    share = round(x.share * 2**whole.UNIT_FRAC)
-    bias = whole.to_fixed(x.bias, whole.GATE_FRAC, whole.GATE_LIMIT).astype(np.int32)
+    share = round(x.share * 2**fixed.UNIT_FRAC)
+    bias = fixed.to_fixed(x.bias, fixed.GATE_FRAC, fixed.GATE_LIMIT).astype(np.int32)
     matrices = work.gates(x, input_fracs[0])
-    return made.WLstm(name=x.name, inputs=(), frac=whole.UNIT_FRAC, bias=bias, share=share, **matrices)
+    return quantised.QLstm(name=x.name, inputs=(), frac=fixed.UNIT_FRAC, bias=bias, share=share, **matrices)
 
 
-def _gru(work: _Work, x: memory.Gru, input_fracs: list[int]) -> made.Whole:
-    work.slots[x.name, "h"] = whole.UNIT_FRAC
+def _gru(work: _Work, x: memory.Gru, input_fracs: list[int]) -> quantised.FixedLayer:
+    work.slots[x.name, "h"] = fixed.UNIT_FRAC
     biases: dict[str, Any] = {
-        name: whole.to_fixed(values, whole.GATE_FRAC, whole.GATE_LIMIT).astype(np.int32)
+        name: fixed.to_fixed(values, fixed.GATE_FRAC, fixed.GATE_LIMIT).astype(np.int32)
         for name, values in (("bias_x", x.bias_x), ("bias_h", x.bias_h))
     }
-    return made.WGru(name=x.name, inputs=(), frac=whole.UNIT_FRAC, **work.gates(x, input_fracs[0]), **biases)
+    return quantised.QGru(name=x.name, inputs=(), frac=fixed.UNIT_FRAC, **work.gates(x, input_fracs[0]), **biases)
 
 
-def _min_gru(work: _Work, x: memory.MinGru, input_fracs: list[int]) -> made.Whole:
-    work.slots[x.name, "h"] = input_fracs[0] + made.WMinGru.EXTRA
-    return made.WMinGru(name=x.name, inputs=(), frac=input_fracs[0], units=x.units)
+def _min_gru(work: _Work, x: memory.MinGru, input_fracs: list[int]) -> quantised.FixedLayer:
+    work.slots[x.name, "h"] = input_fracs[0] + quantised.QMinGru.EXTRA
+    return quantised.QMinGru(name=x.name, inputs=(), frac=input_fracs[0], units=x.units)
 
 
-def _rotation(work: _Work, x: memory.Rotation, input_fracs: list[int]) -> made.Whole:
+def _rotation(work: _Work, x: memory.Rotation, input_fracs: list[int]) -> quantised.FixedLayer:
     # The state must not be coarser than its input, which is shifted left to it.
     state_frac = max(work.frac(f"{x.name}/h"), input_fracs[0])
     frac = _within(work.frac(x.name), state_frac)
     work.slots[x.name, "h"] = state_frac
-    factor = whole.to_fixed(x.factor, 30, 2**30).astype(np.int32)
-    return made.WRotation(
+    factor = fixed.to_fixed(x.factor, 30, 2**30).astype(np.int32)
+    return quantised.QRotation(
         name=x.name, inputs=(), frac=frac, factor=factor, left=state_frac - input_fracs[0], right=state_frac - frac
     )
 
 
-def _difference(work: _Work, x: memory.Difference, input_fracs: list[int]) -> made.Whole:
+def _difference(work: _Work, x: memory.Difference, input_fracs: list[int]) -> quantised.FixedLayer:
     factor, bits = halves(x.factor)
     frac = _within(work.frac(x.name), input_fracs[0] + bits)
     work.slots[x.name, "before"] = input_fracs[0]
     right = input_fracs[0] + bits - frac
-    return made.WDifference(name=x.name, inputs=(), frac=frac, factor=factor, from_zero=x.from_zero, right=right)
+    return quantised.QDifference(name=x.name, inputs=(), frac=frac, factor=factor, from_zero=x.from_zero, right=right)
 
 
-def _mean(work: _Work, x: memory.TrailingMean, input_fracs: list[int]) -> made.Whole:
+def _mean(work: _Work, x: memory.TrailingMean, input_fracs: list[int]) -> quantised.FixedLayer:
     work.slots[x.name, "ring"] = input_fracs[0]
-    return made.WTrailingMean(name=x.name, inputs=(), frac=input_fracs[0], size=x.size, window=x.window)
+    return quantised.QTrailingMean(name=x.name, inputs=(), frac=input_fracs[0], size=x.size, window=x.window)
 
 
-def _pool(work: _Work, x: memory.AttentionPool, input_fracs: list[int]) -> made.Whole:
-    work.slots |= {(x.name, "ring"): input_fracs[0], (x.name, "scores"): whole.GATE_FRAC}
+def _pool(work: _Work, x: memory.AttentionPool, input_fracs: list[int]) -> quantised.FixedLayer:
+    work.slots |= {(x.name, "ring"): input_fracs[0], (x.name, "scores"): fixed.GATE_FRAC}
     numbers = to_gates(x.name, x.score[None], input_fracs[0], work.rounding)
-    return made.WAttentionPool(
+    return quantised.QAttentionPool(
         name=x.name,
         inputs=(),
         frac=input_fracs[0],

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from edp.ir.base import INPUT, Graph, Layer, Number
 from edp.ir.layers import Function
-from edp.ir.w8a16 import arithmetic as whole
-from edp.ir.w8a16 import layers as made
-from edp.ir.w8a16.arithmetic import GATE_FRAC, GATE_LIMIT, LARGEST, UNIT_FRAC, Whole, rounded_shift, saturated, scaled
+from edp.ir.w8a16 import arithmetic as fixed
+from edp.ir.w8a16 import layers as quantised
+from edp.ir.w8a16.arithmetic import GATE_FRAC, GATE_LIMIT, LARGEST, UNIT_FRAC, Fixed, rounded_shift, saturated, scaled
 from edp.ir.w8a16.single import OVER_TIME, flat, gather, split
 
 Memory = dict[str, Any]
@@ -57,15 +57,15 @@ class Integers:
         values: dict[str, Any] = {INPUT: np.asarray(inputs, dtype=np.float32)}
         for layer in self.graph.layers:
             layer_inputs = [values[name] for name in layer.inputs]
-            if isinstance(layer, made.Quantise):
+            if isinstance(layer, quantised.Quantise):
                 values[layer.name] = self._quantised(layer, layer_inputs[0])
                 continue
             kind = type(layer)
-            run = WHOLE[kind] if kind in WHOLE else OVER_TIME[kind]
+            run = INTEGER_STEPS[kind] if kind in INTEGER_STEPS else OVER_TIME[kind]
             values[layer.name] = run(layer, self.memory[layer.name], *layer_inputs)
         return values
 
-    def _quantised(self, layer: made.Quantise, x: NDArray[np.float32]) -> Whole:
+    def _quantised(self, layer: quantised.Quantise, x: NDArray[np.float32]) -> Fixed:
         wide = x * np.float32(2.0**layer.frac)
         top = np.float32(LARGEST)
         self.clipped += int((~((wide >= -top) & (wide <= top))).sum())
@@ -75,64 +75,64 @@ class Integers:
         return np.trunc(np.where(limited >= 0, limited + np.float32(0.5), limited - np.float32(0.5))).astype(np.int64)
 
 
-def matrix(x: Whole, weight: NDArray[np.int8]) -> Whole:
+def matrix(x: Fixed, weight: NDArray[np.int8]) -> Fixed:
     """``x W'`` of integers: double precision holds the sums exactly, and is fast."""
     # Sums of 16 by 8-bit products stay far below 2^53.
     return np.asarray(x.astype(np.float64) @ weight.T.astype(np.float64)).astype(np.int64)
 
 
-def _gates(x: Whole, weight: NDArray[np.int8], multiplier: Any, shift: Any) -> Whole:
+def _gates(x: Fixed, weight: NDArray[np.int8], multiplier: Any, shift: Any) -> Fixed:
     return saturated(scaled(matrix(x, weight), multiplier, shift), GATE_LIMIT)
 
 
-def _to_gate(x: Whole, frac: int) -> Whole:
+def _to_gate(x: Fixed, frac: int) -> Fixed:
     return saturated(rounded_shift(x, frac - GATE_FRAC), GATE_LIMIT)
 
 
-def _dequantise(layer: made.Dequantise, m: Memory, x: Whole) -> NDArray[np.float32]:
+def _dequantise(layer: quantised.Dequantise, m: Memory, x: Fixed) -> NDArray[np.float32]:
     return np.asarray(x.astype(np.float32) * np.float32(2.0**-layer.frac))
 
 
-def _gather(layer: made.WGather, m: Memory, *parts: Whole) -> Whole:
+def _gather(layer: quantised.QGather, m: Memory, *parts: Fixed) -> Fixed:
     return np.asarray(gather(layer, m, *map(rounded_shift, parts, layer.shifts)))
 
 
-def _sum(layer: made.WSum, m: Memory, a: Whole, b: Whole) -> Whole:
+def _sum(layer: quantised.QSum, m: Memory, a: Fixed, b: Fixed) -> Fixed:
     a, b = a << layer.lefts[0], b << layer.lefts[1]
     return saturated(rounded_shift(a - b if layer.minus else a + b, layer.right))
 
 
-def _activate(layer: made.WActivate, m: Memory, x: Whole) -> Whole:
+def _activate(layer: quantised.QActivate, m: Memory, x: Fixed) -> Fixed:
     gate = _to_gate(x, layer.input_frac)
     if layer.function is Function.RELU:
         return np.maximum(x, 0)
     if layer.function is Function.SIGMOID:
-        return whole.sigmoid(gate)
+        return fixed.sigmoid(gate)
     if layer.function is Function.TANH:
-        return whole.tanh(gate, GATE_FRAC)
+        return fixed.tanh(gate, GATE_FRAC)
     if layer.function is Function.GELU:
-        return saturated(rounded_shift(x * whole.normal(gate), 16))
-    return saturated(rounded_shift(whole.softplus(gate), GATE_FRAC - layer.frac))
+        return saturated(rounded_shift(x * fixed.normal(gate), 16))
+    return saturated(rounded_shift(fixed.softplus(gate), GATE_FRAC - layer.frac))
 
 
-def _glu(layer: made.WGlu, m: Memory, x: Whole) -> Whole:
+def _glu(layer: quantised.QGlu, m: Memory, x: Fixed) -> Fixed:
     halves = x.reshape(*x.shape[:-1], layer.rows, 2, -1)
-    gate = whole.sigmoid(_to_gate(halves[..., 1, :], layer.frac))
+    gate = fixed.sigmoid(_to_gate(halves[..., 1, :], layer.frac))
     return np.asarray(flat(rounded_shift(halves[..., 0, :] * gate, UNIT_FRAC)))
 
 
-def _dense(layer: made.WDense, m: Memory, x: Whole) -> Whole:
+def _dense(layer: quantised.QDense, m: Memory, x: Fixed) -> Fixed:
     sums = matrix(split(x, layer.rows), layer.weight) + layer.bias
     return np.asarray(flat(saturated(scaled(sums, layer.multiplier, layer.shift))))
 
 
-def _grouped(layer: made.WGroupedDense, m: Memory, x: Whole) -> Whole:
+def _grouped(layer: quantised.QGroupedDense, m: Memory, x: Fixed) -> Fixed:
     rows = split(x, len(layer.bias))
     sums = np.einsum("roi,tbri->tbro", layer.weight.astype(np.int64), rows) + layer.bias
     return np.asarray(flat(saturated(scaled(sums, layer.multiplier, layer.shift))))
 
 
-def _convolution(layer: made.WConvolution, m: Memory, x: Whole) -> Whole:
+def _convolution(layer: quantised.QConvolution, m: Memory, x: Fixed) -> Fixed:
     _, taps, into = layer.weight.shape
     history = np.concatenate([m["ring"], x]) if taps > 1 else x
     if taps > 1:
@@ -142,17 +142,17 @@ def _convolution(layer: made.WConvolution, m: Memory, x: Whole) -> Whole:
     return saturated(scaled(sums, layer.multiplier, layer.shift))
 
 
-def _lstm(layer: made.WLstm, m: Memory, x: Whole) -> Whole:
+def _lstm(layer: quantised.QLstm, m: Memory, x: Fixed) -> Fixed:
     driven = _gates(x, layer.weight_x, layer.multiplier_x, layer.shift_x) + layer.bias
     h, c = m["h"], m["c"]
     out = np.empty((*x.shape[:-1], layer.width), dtype=np.int64)
     for tick, ahead in enumerate(driven):
         gates = split(ahead + _gates(h, layer.weight_h, layer.multiplier_h, layer.shift_h), 4)
-        i, f, o = np.moveaxis(whole.sigmoid(gates[..., [0, 1, 3], :]), -2, 0)
+        i, f, o = np.moveaxis(fixed.sigmoid(gates[..., [0, 1, 3], :]), -2, 0)
         # Both terms in the format of the product, so that one rounding remains.
-        product = f * c + ((i * whole.tanh(gates[..., 2, :], GATE_FRAC)) << (whole.CELL_FRAC - UNIT_FRAC))
-        fresh = saturated(rounded_shift(product, UNIT_FRAC), whole.CELL_LIMIT)
-        shown = rounded_shift(o * whole.tanh(fresh, whole.CELL_FRAC), UNIT_FRAC)
+        product = f * c + ((i * fixed.tanh(gates[..., 2, :], GATE_FRAC)) << (fixed.CELL_FRAC - UNIT_FRAC))
+        fresh = saturated(rounded_shift(product, UNIT_FRAC), fixed.CELL_LIMIT)
+        shown = rounded_shift(o * fixed.tanh(fresh, fixed.CELL_FRAC), UNIT_FRAC)
         c = c + rounded_shift(layer.share * (fresh - c), UNIT_FRAC)
         h = h + rounded_shift(layer.share * (shown - h), UNIT_FRAC)
         out[tick] = h
@@ -160,22 +160,22 @@ def _lstm(layer: made.WLstm, m: Memory, x: Whole) -> Whole:
     return out
 
 
-def _gru(layer: made.WGru, m: Memory, x: Whole) -> Whole:
+def _gru(layer: quantised.QGru, m: Memory, x: Fixed) -> Fixed:
     driven = _gates(x, layer.weight_x, layer.multiplier_x, layer.shift_x) + layer.bias_x
     h = m["h"]
     out = np.empty((*x.shape[:-1], layer.width), dtype=np.int64)
     for tick, ahead in enumerate(split(driven, 3)):
         back = split(_gates(h, layer.weight_h, layer.multiplier_h, layer.shift_h) + layer.bias_h, 3)
-        r, z = np.moveaxis(whole.sigmoid(ahead[..., :2, :] + back[..., :2, :]), -2, 0)
-        n = whole.tanh(ahead[..., 2, :] + rounded_shift(r * back[..., 2, :], UNIT_FRAC), GATE_FRAC)
+        r, z = np.moveaxis(fixed.sigmoid(ahead[..., :2, :] + back[..., :2, :]), -2, 0)
+        n = fixed.tanh(ahead[..., 2, :] + rounded_shift(r * back[..., 2, :], UNIT_FRAC), GATE_FRAC)
         h = n + rounded_shift(z * (h - n), UNIT_FRAC)
         out[tick] = h
     m["h"] = h
     return out
 
 
-def _min_gru(layer: made.WMinGru, m: Memory, x: Whole) -> Whole:
-    z = whole.sigmoid(_to_gate(x[..., : layer.units], layer.frac))
+def _min_gru(layer: quantised.QMinGru, m: Memory, x: Fixed) -> Fixed:
+    z = fixed.sigmoid(_to_gate(x[..., : layer.units], layer.frac))
     fresh, h = x[..., layer.units :] << layer.EXTRA, m["h"]
     out = np.empty_like(fresh)
     for tick in range(len(x)):
@@ -185,27 +185,27 @@ def _min_gru(layer: made.WMinGru, m: Memory, x: Whole) -> Whole:
     return saturated(rounded_shift(out, layer.EXTRA))
 
 
-def _rotation(layer: made.WRotation, m: Memory, x: Whole) -> Whole:
+def _rotation(layer: quantised.QRotation, m: Memory, x: Fixed) -> Fixed:
     a, b = layer.factor.astype(np.int64).T
     driven = split(x << layer.left, len(a))
     re, im = m["h"][..., 0], m["h"][..., 1]
     out = np.empty_like(driven)
     for tick, add in enumerate(driven):
         turned = rounded_shift(a * re - b * im, 30), rounded_shift(a * im + b * re, 30)
-        re, im = (saturated(turned[i] + add[..., i], whole.CELL_LIMIT) for i in (0, 1))
+        re, im = (saturated(turned[i] + add[..., i], fixed.CELL_LIMIT) for i in (0, 1))
         out[tick, ..., 0], out[tick, ..., 1] = re, im
     m["h"] = np.stack([re, im], axis=-1)
     return saturated(rounded_shift(out.reshape(x.shape), layer.right))
 
 
-def _difference(layer: made.WDifference, m: Memory, x: Whole) -> Whole:
+def _difference(layer: quantised.QDifference, m: Memory, x: Fixed) -> Fixed:
     before = m["before"] if layer.from_zero or m["age"][0] > 0 else x[0]
     change = x - np.concatenate([before[None], x[:-1]])
     m["before"], m["age"] = x[-1], np.ones_like(m["age"])
     return saturated(rounded_shift(layer.factor * change, layer.right))
 
 
-def _mean(layer: made.WTrailingMean, m: Memory, x: Whole) -> Whole:
+def _mean(layer: quantised.QTrailingMean, m: Memory, x: Fixed) -> Fixed:
     age = int(m["age"][0])
     history = np.concatenate([m["ring"], x])
     total = np.concatenate([np.zeros_like(history[:1]), history.cumsum(axis=0)])
@@ -216,7 +216,7 @@ def _mean(layer: made.WTrailingMean, m: Memory, x: Whole) -> Whole:
     return np.asarray(np.sign(sums) * ((np.abs(sums) + count // 2) // count))
 
 
-def _pool(layer: made.WAttentionPool, m: Memory, x: Whole) -> Whole:
+def _pool(layer: quantised.QAttentionPool, m: Memory, x: Fixed) -> Fixed:
     own = _gates(x, layer.score[None], layer.multiplier, layer.shift)[..., 0]
     age, window = int(m["age"][0]), layer.window
     ring, scores = np.concatenate([m["ring"], x]), np.concatenate([m["scores"], own])
@@ -224,7 +224,7 @@ def _pool(layer: made.WAttentionPool, m: Memory, x: Whole) -> Whole:
     for tick in range(len(x)):
         # Only ticks since the reset: hidden scores have no integer value.
         first, stop = tick + window - min(age + tick + 1, window), tick + window
-        weights = whole.softmax(scores[first:stop].T).astype(np.float64)
+        weights = fixed.softmax(scores[first:stop].T).astype(np.float64)
         sums = np.einsum("bs,sbn->bn", weights, ring[first:stop].astype(np.float64))
         out[tick] = rounded_shift(sums.astype(np.int64), UNIT_FRAC)
     m["ring"], m["scores"] = ring[len(x) :], scores[len(x) :]
@@ -232,23 +232,23 @@ def _pool(layer: made.WAttentionPool, m: Memory, x: Whole) -> Whole:
     return saturated(out)
 
 
-WHOLE: dict[type[Layer], Callable[..., Any]] = {
-    made.Dequantise: _dequantise,
-    made.WGather: _gather,
-    made.WSum: _sum,
-    made.WMultiply: lambda layer, m, a, b: saturated(rounded_shift(a * b, layer.right)),
-    made.WScaleShift: lambda layer, m, x: saturated(rounded_shift(x * layer.gain + layer.offset, layer.right)),
-    made.WActivate: _activate,
-    made.WGlu: _glu,
-    made.WDense: _dense,
-    made.WGroupedDense: _grouped,
-    made.WConvolution: _convolution,
-    made.WLstm: _lstm,
-    made.WGru: _gru,
-    made.WMinGru: _min_gru,
-    made.WRotation: _rotation,
-    made.WDifference: _difference,
-    made.WTrailingMean: _mean,
-    made.WAttentionPool: _pool,
+INTEGER_STEPS: dict[type[Layer], Callable[..., Any]] = {
+    quantised.Dequantise: _dequantise,
+    quantised.QGather: _gather,
+    quantised.QSum: _sum,
+    quantised.QMultiply: lambda layer, m, a, b: saturated(rounded_shift(a * b, layer.right)),
+    quantised.QScaleShift: lambda layer, m, x: saturated(rounded_shift(x * layer.gain + layer.offset, layer.right)),
+    quantised.QActivate: _activate,
+    quantised.QGlu: _glu,
+    quantised.QDense: _dense,
+    quantised.QGroupedDense: _grouped,
+    quantised.QConvolution: _convolution,
+    quantised.QLstm: _lstm,
+    quantised.QGru: _gru,
+    quantised.QMinGru: _min_gru,
+    quantised.QRotation: _rotation,
+    quantised.QDifference: _difference,
+    quantised.QTrailingMean: _mean,
+    quantised.QAttentionPool: _pool,
 }
 """Many ticks of a kind of integer layer."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.ir.w8a16 import arithmetic as whole
+from edp.ir.w8a16 import arithmetic as fixed
 
 Array = NDArray[np.floating]
 DAMPING = 0.01
@@ -57,7 +57,7 @@ class WeightRounding:
 def nearest(weight: Array, scale: Array) -> NDArray[np.int8]:
     """Rounded half to even."""
     wide = scale.reshape(scale.shape + (1,) * (weight.ndim - scale.ndim))
-    return np.clip(np.rint(weight / wide), -whole.WEIGHT, whole.WEIGHT).astype(np.int8)
+    return np.clip(np.rint(weight / wide), -fixed.WEIGHT, fixed.WEIGHT).astype(np.int8)
 
 
 def least_error(weight: Array, scale: Array, moments: Array) -> NDArray[np.int8]:
