@@ -193,7 +193,7 @@ def test_constants_that_cannot_be_are_refused(change, reason):
         replace(law(), **change)
 
 
-@pytest.mark.parametrize("options", [{"rank": 65}, {"noise": 0.0}, {"forgetting_s": np.inf}, {"rest": -1.0}])
+@pytest.mark.parametrize("options", [{"rank": 65}, {"noise": 0.0}, {"forgetting_s": np.inf}, {"dead_zone": -1.0}])
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(ConfigError, match=next(iter(options))):
         AdaptationSpec(**options)
@@ -204,3 +204,11 @@ def test_plain_values_and_arrays_give_the_same_adaptation():
     again = Adaptation.from_plain(held.to_plain(), held.arrays())
     assert again.digest == held.digest
     assert replace(held, rate_hz=50.0).digest != held.digest
+
+
+def test_the_digest_stays_from_version_to_version():
+    """A state that a controller saved bears it; the number is that of the version before bundles of schema 8."""
+    names = {"offset": 2, "scale": 2, "directions": (1, 2), "middle": 1, "spread": 1, "change": (1, 1), "unit": (1, 1)}
+    halves = {name: np.full(shape, 0.5, dtype=np.float32) for name, shape in names.items()}
+    adaptation = Adaptation(spec=AdaptationSpec(rank=1), rate_hz=100.0, horizons=(3,), columns=(0,), **halves)
+    assert adaptation.digest == "885583896a91c3a2d884207efe9c5b9e"

@@ -20,6 +20,8 @@ from edp.signals import Channel, Kind
 from edp.training.bundle import (
     HASH,
     HEADER,
+    REWORDED,
+    SCHEMA,
     UNHASHED,
     Bundle,
     blank_scaler,
@@ -27,6 +29,7 @@ from edp.training.bundle import (
     load_bundle,
     save_bundle,
     upgrade_bundle,
+    weights_digest,
 )
 
 NAMES = ("lever", "pressure", "speed")
@@ -265,7 +268,7 @@ def test_a_bundle_from_before_the_hash_is_upgraded_when_asked(folder, schema):
     changed(folder, older, hashed=False)
     before = (folder / HEADER).read_bytes()
     refused(folder, rf"schema {schema}, .*upgrade_bundle")
-    if UNHASHED[schema] != 5:  # says that it has integers or an adaptation, and has none
+    if UNHASHED[schema] != SCHEMA:  # says that it has integers or an adaptation, and has none
         with pytest.raises(BundleError, match="it lacks"):
             upgrade_bundle(folder)
         assert (folder / HEADER).read_bytes() == before
@@ -274,3 +277,37 @@ def test_a_bundle_from_before_the_hash_is_upgraded_when_asked(folder, schema):
     assert load_bundle(folder).task == whole.task
     with pytest.raises(BundleError, match="nothing to upgrade"):
         upgrade_bundle(folder)
+
+
+@pytest.mark.parametrize("schema", REWORDED)
+def test_a_bundle_of_the_former_words_says_how_it_is_upgraded(folder, schema):
+    def older(header):
+        header["schema"] = schema
+        header["provenance"] = {"seconds": 1.0, "lesson": {"kind": "few"}, "by": {"lesson": "of another kind"}}
+
+    weights = weights_digest(load_bundle(folder).predictor)
+    changed(folder, older, hashed=True)
+    refused(folder, rf"schema {schema}, .*upgrade_bundle with the folder, which renames keys")
+    before = (folder / HEADER).read_bytes()
+    if REWORDED[schema] != SCHEMA:  # says that it has integers or an adaptation, and has none
+        with pytest.raises(BundleError, match="it lacks"):
+            upgrade_bundle(folder)
+        assert (folder / HEADER).read_bytes() == before
+        return
+    upgrade_bundle(folder)
+    bundle = load_bundle(folder)
+    assert weights_digest(bundle.predictor) == weights
+    assert bundle.provenance == {"seconds": 1.0, "strategy": {"kind": "few"}, "by": {"lesson": "of another kind"}}
+    with pytest.raises(BundleError, match="nothing to upgrade"):
+        upgrade_bundle(folder)
+
+
+def test_a_bundle_of_the_former_words_that_was_edited_is_not_upgraded(folder):
+    changed(folder, put("schema", 5), hashed=True)
+    changed(folder, put("provenance", "lesson", {}), hashed=False)
+    header = header_of(folder)
+    (folder / HEADER).write_text(json.dumps(header | {HASH: "0" * 32}))
+    before = (folder / HEADER).read_bytes()
+    with pytest.raises(BundleError, match="does not match its hash"):
+        upgrade_bundle(folder)
+    assert (folder / HEADER).read_bytes() == before

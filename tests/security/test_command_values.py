@@ -34,7 +34,7 @@ ALWAYS_WRONG = {
     ("finetune", "--inner-rate"): ("-1", "nan", "inf"),
     ("adapt", "--rank"): ("-1", "1000000000000"),
     ("adapt", "--noise"): ("-1", "nan", "inf"),
-    ("adapt", "--rest"): ("-1", "nan", "inf"),
+    ("adapt", "--dead-zone"): ("-1", "nan", "inf"),
     ("quantise", "--ticks"): ("-1", "0", "1000000000000"),
     ("compress", "--units"): ("-1", "0", "1000000000000"),
     ("search run", "--workers"): ("-1", "1000000000000"),

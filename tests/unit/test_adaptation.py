@@ -17,7 +17,7 @@ from edp.errors import BundleError, ConfigError, ExportError
 from edp.ir.rls import AdaptationSpec, RlsStatus
 from edp.networks import AdaptedStream
 from edp.storage import read_json, write_json
-from edp.training import load_bundle, save_bundle
+from edp.training import load_bundle, save_bundle, upgrade_bundle
 from edp.training.bundle import ADAPTED_SCHEMA, HASH, SCHEMA, header_digest
 from edp.workflows.adaptation import adapt, fit_adaptation, replay
 from edp.workflows.deployment import footprint_of
@@ -88,6 +88,20 @@ def test_a_bundle_keeps_it_and_a_damaged_one_is_refused(run, adapted, tmp_path):
         load_bundle(copy)
     save_bundle(dataclasses.replace(bundle, adaptation=None), copy)
     assert not list(copy.glob("adaptation-*"))
+
+
+def test_an_adapted_bundle_of_the_former_words_is_upgraded_and_keeps_its_digest(adapted, tmp_path):
+    folder, made, _ = adapted
+    copy = save_bundle(load_bundle(folder), tmp_path / "copy")
+    held = read_json(copy / "bundle.json") | {"schema": 7}
+    spec = held["adaptation"]["spec"]
+    spec["rest"] = spec.pop("dead_zone")
+    write_json(copy / "bundle.json", held | {HASH: header_digest(held)})
+    with pytest.raises(BundleError, match=r"schema 7, .*upgrade_bundle"):
+        load_bundle(copy)
+    upgrade_bundle(copy)
+    adaptation = load_bundle(copy).adaptation
+    assert (adaptation.spec, adaptation.digest) == (made.spec, made.digest)
 
 
 def test_a_stream_and_a_replay_give_the_same_numbers(run, adapted):

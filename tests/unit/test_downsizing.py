@@ -63,7 +63,7 @@ def test_a_student_is_a_run_that_goes_on_after_a_stop(run, tmp_path):
     assert whole.predictor.spec.backbone.units == 4
     assert whole.predictor.spec.backbone.channels == (4,)
     provenance = read_json(tmp_path / "whole" / "provenance.json")
-    assert provenance["lesson"]["teachers"] == [weights_digest(load_bundle(run).predictor)]
+    assert provenance["strategy"]["teachers"] == [weights_digest(load_bundle(run).predictor)]
     scores = read_json(evaluate(tmp_path / "whole") / "scores.json")
     assert set(scores["models"]) == {"network", "persistence"}
 
@@ -81,8 +81,8 @@ def test_pruned_starts_further_recordings_and_teachers_take_part(run, lever_sess
     assert not same(pruned, plain)
     spec = DistilSpec(units=4, levels=2, teachers=(str(tmp_path / "plain"),), further=lever_sessions)
     taught = distil(run / "bundle", spec, tmp_path / "taught")
-    assert len(taught.provenance["lesson"]["teachers"]) == 2
-    assert len(taught.provenance["lesson"]["further"]) == 5
+    assert len(taught.provenance["strategy"]["teachers"]) == 2
+    assert len(taught.provenance["strategy"]["further"]) == 5
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ def adapt(
     ] = 100.0,
     prior: Annotated[float, typer.Option(help="Spread of coefficients, in units of the network's errors.")] = 0.3,
     limit: Annotated[float, typer.Option(help="Largest correction, in units of the network's errors.")] = 3.0,
-    rest: Annotated[
-        float, typer.Option(help="Dead zone: share of the targets' spread below which the machine counts as at rest.")
+    dead_zone: Annotated[
+        float, typer.Option(help="Share of the targets' spread below which the machine counts as at rest.")
     ] = 0.05,
     judged: Annotated[float, typer.Option(help="Seconds of motion over which the correction is judged.")] = 10.0,
     margin: Annotated[
@@ -45,7 +45,7 @@ def adapt(
         noise=noise,
         prior=prior,
         limit=limit,
-        rest=rest,
+        dead_zone=dead_zone,
         judged_s=judged,
         margin=margin,
     )

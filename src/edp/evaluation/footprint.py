@@ -134,7 +134,7 @@ def _sizes(predictor: Predictor, adaptation: Adaptation | None) -> tuple[dict[st
 
 def adaptation_cost(adaptation: Adaptation) -> Cost:
     """What an adaptation costs: constants, and multiply-accumulates of a tick that learns."""
-    constants = sum(values.size for values in adaptation.arrays().values()) + adaptation.rest.size
+    constants = sum(values.size for values in adaptation.arrays().values()) + adaptation.dead_zone.size
     return Cost(
         f"adaptation, {adaptation.features} features",
         constants,

@@ -33,13 +33,15 @@ from edp.networks.predictor import Predictor
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_bytes, read_json, write_bytes, write_json
 
-SCHEMA = 5
-INTEGER_SCHEMA = 6
+SCHEMA = 8
+INTEGER_SCHEMA = 9
 """Of an integer bundle, which older versions would read as one in float32."""
-ADAPTED_SCHEMA = 7
+ADAPTED_SCHEMA = 10
 """Of a bundle with an adaptation, which older versions would leave out; its network may be an integer one."""
 UNHASHED = {2: SCHEMA, 3: INTEGER_SCHEMA, 4: ADAPTED_SCHEMA}
 """Schemas from before the header had a hash, and what they became."""
+REWORDED = {5: SCHEMA, 6: INTEGER_SCHEMA, 7: ADAPTED_SCHEMA}
+"""Schemas with the keys `lesson` for ``strategy`` and `rest` for ``dead_zone``, and what they became."""
 WEIGHTS_BYTES = 2**30
 """Most that a file of arrays has; the weights of 250 million parameters."""
 HASH = "blake2b"
@@ -186,30 +188,52 @@ def load_bundle(folder: str | Path) -> Bundle:
     with _as_damage(path):
         header = _read_header(path)
         _check_schema(header, path)
-        # The hash protects against damage and stray edits, not against an attacker: it has no key.
-        if header.get(HASH) != header_digest(header):
-            raise BundleError(
-                f"'{path / HEADER}' does not match its hash: it was cut off or changed by hand; restore the bundle"
-            )
+        _check_hash(header, path)
         return _assembled(header, path)
 
 
+def _check_hash(header: Mapping[str, Any], path: Path) -> None:
+    # The hash protects against damage and stray edits, not against an attacker: it has no key.
+    if header.get(HASH) != header_digest(header):
+        raise BundleError(
+            f"'{path / HEADER}' does not match its hash: it was cut off or changed by hand; restore the bundle"
+        )
+
+
 def upgrade_bundle(folder: str | Path) -> Path:
-    """Hash the header of a bundle of an earlier version, whose content the caller vouches for.
+    """Give a bundle of an earlier version the keys of this one.
+
+    Where its header had no hash, the caller vouches for its content.
 
     Raises:
-        BundleError: not a bundle of a version before headers were hashed, or a damaged one; it is left as it is.
+        BundleError: not a bundle of an earlier version, or a damaged one; it is left as it is.
     """
     path = _bundle_folder(folder)
     with _as_damage(path):
         header = _read_header(path)
-        if header.get("schema") not in UNHASHED:
-            raise BundleError(f"bundle '{path}' has schema {header.get('schema')}; there is nothing to upgrade")
-        upgraded = header | {"schema": UNHASHED[header["schema"]]}
+        schema = header["schema"]
+        if schema not in UNHASHED | REWORDED:
+            raise BundleError(f"bundle '{path}' has schema {schema}; there is nothing to upgrade")
+        if schema in REWORDED:
+            _check_hash(header, path)
+        upgraded = _reworded(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
         _assembled(upgraded, path)
     write_json(path / HEADER, upgraded | {HASH: header_digest(upgraded)})
     return path
+
+
+def _reworded(header: Mapping[str, Any]) -> dict[str, Any]:
+    """An earlier header with the keys of this version."""
+    reworded = {**header, "provenance": _renamed(header["provenance"], "lesson", "strategy")}
+    if "adaptation" in header:
+        entry = header["adaptation"]
+        reworded["adaptation"] = {**entry, "spec": _renamed(entry["spec"], "rest", "dead_zone")}
+    return reworded
+
+
+def _renamed(table: Mapping[str, Any], old: str, new: str) -> dict[str, Any]:
+    return {new if key == old else key: value for key, value in table.items()}
 
 
 def _bundle_folder(folder: str | Path) -> Path:
@@ -331,16 +355,18 @@ def _check_schema(header: Mapping[str, Any], path: Path) -> None:
     # 1.0 and true equal 1 in Python; neither is a schema.
     if schema in (SCHEMA, INTEGER_SCHEMA, ADAPTED_SCHEMA) and not isinstance(schema, bool | float):
         return
-    whole = isinstance(schema, int) and not isinstance(schema, bool)
-    if whole and schema > ADAPTED_SCHEMA:
+    integer = isinstance(schema, int) and not isinstance(schema, bool)
+    if integer and schema > ADAPTED_SCHEMA:
         advice = "install a newer EDP"
-    elif whole and schema in UNHASHED:
+    elif integer and schema in UNHASHED:
         advice = (
             "its header has no hash yet: train again, or, where you know that nobody changed it, call "
             "edp.training.upgrade_bundle with the folder"
         )
+    elif integer and schema in REWORDED:
+        advice = "call edp.training.upgrade_bundle with the folder, which renames keys and leaves the network as it is"
     else:
-        advice = "train again" if whole and 0 < schema < SCHEMA else "the header is not that of a bundle"
+        advice = "train again" if integer and 0 < schema < SCHEMA else "the header is not that of a bundle"
     raise BundleError(
         f"bundle '{path}' has schema {str(schema)[:40]}, this version of EDP ({__version__}) reads {SCHEMA} to "
         f"{ADAPTED_SCHEMA}; {advice}"

@@ -138,7 +138,7 @@ def train(
     if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read
         # The machine's numbers are part of the key: its file may change under the same name.
         settings["machine"] = experiment.model.physics.digest()
-    taught = {} if strategy_factory is None else {"lesson": dict(strategy_factory.facts)}
+    taught = {} if strategy_factory is None else {"strategy": dict(strategy_factory.facts)}
     frozen = {} if strategy_factory is None else strategy_factory.frozen
     data = data or prepare_data(source, experiment, frozen)
     key = run_key(settings | taught, data.digest)

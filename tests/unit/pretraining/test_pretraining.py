@@ -51,7 +51,7 @@ def episode(prepared_machines, experiment):
     return net, objective, tuple(p[:2] for p in parts), tuple(p[2:4] for p in parts)
 
 
-def lesson_of(method, net, experiment, meta=META):
+def strategy_of(method, net, experiment, meta=META):
     strategy = PRETRAININGS[method]().strategy(meta, None)
     strategy.begin(net, experiment.training)
     return strategy
@@ -130,7 +130,7 @@ def test_few_steps_take_rate_and_head_of_the_meta_learning(machines, experiment,
 def test_second_order_gradient_is_that_of_the_error_after_adaptation(episode, experiment):
     """Held to differences of the cost itself, along a random direction of all weights."""
     net, objective, support, query = episode
-    strategy = lesson_of("maml", net, experiment)
+    strategy = strategy_of("maml", net, experiment)
     _, found = gradient(strategy, episode)
     torch.manual_seed(0)
     way = {name: torch.randn_like(p) for name, p in net.named_parameters()}
@@ -147,7 +147,7 @@ def test_second_order_gradient_is_that_of_the_error_after_adaptation(episode, ex
         return value
 
     assert slope == pytest.approx((cost(1e-7) - cost(-1e-7)) / 2e-7, rel=1e-5)
-    _, first = gradient(lesson_of("fomaml", net, experiment), episode)
+    _, first = gradient(strategy_of("fomaml", net, experiment), episode)
     assert any((found[name] - first[name]).abs().max() > 1e-6 for name in found)
 
 
@@ -174,7 +174,7 @@ def put(net, weights):
 
 def test_first_order_gradient_is_the_querys_at_the_adapted_weights(episode, experiment):
     net, objective, support, query = episode
-    cost, found = gradient(lesson_of("fomaml", net, experiment), episode)
+    cost, found = gradient(strategy_of("fomaml", net, experiment), episode)
     kept, came = by_hand(net, objective, [support, support], META.steps)
     put(net, came)
     answer, features, _, _ = net.forward_features(query[0], net.initial_state(2, query[0]))
@@ -188,7 +188,7 @@ def test_first_order_gradient_is_the_querys_at_the_adapted_weights(episode, expe
 
 def test_reptile_goes_the_way_to_the_adapted_weights(episode, experiment):
     net, objective, support, query = episode
-    _, found = gradient(lesson_of("reptile", net, experiment), episode)
+    _, found = gradient(strategy_of("reptile", net, experiment), episode)
     kept, came = by_hand(net, objective, [support, query], META.steps)
     put(net, kept)
     for name in kept:
@@ -197,7 +197,7 @@ def test_reptile_goes_the_way_to_the_adapted_weights(episode, experiment):
 
 def test_with_the_head_alone_the_backbone_learns_but_does_not_adapt(episode, experiment):
     net = episode[0]
-    strategy = lesson_of("maml", net, experiment, dataclasses.replace(META, head_only=True))
+    strategy = strategy_of("maml", net, experiment, dataclasses.replace(META, head_only=True))
     assert set(strategy.start_of(net)) == set(decompose(net).head)
     _, found = gradient(strategy, episode)
     assert all(found[name].abs().max() > 0 for name in decompose(net).encoding)
@@ -216,7 +216,7 @@ def test_an_epoch_is_chosen_by_the_error_after_adaptation(prepared_machines, exp
     """The judgement is that of a network that was adapted by hand to the first half of each series."""
     net = build_model(prepared_machines.task, experiment.model, prepared_machines.scaler(), 3).eval()
     objective = Objective(experiment.training, net.code)
-    strategy = lesson_of("fomaml", net, experiment)
+    strategy = strategy_of("fomaml", net, experiment)
     assert isinstance(strategy, EpisodicStrategy)
     before = {name: p.detach().clone() for name, p in net.named_parameters()}
     found = strategy.judge(net, objective, prepared_machines)
@@ -237,7 +237,7 @@ def test_a_start_is_a_candidate_and_another_start_another_run(machines, experime
     for method in ("joint", "fomaml"):
         order = Pretrain(method=method, meta=META, start=tmp_path / "first")
         pretrain(machines, still, order, tmp_path / method)
-        facts = read_json(tmp_path / method / "provenance.json")["lesson"]
+        facts = read_json(tmp_path / method / "provenance.json")["strategy"]
         assert facts["method"] == method
         assert len(facts["start"]) > 10
         ends = [load_bundle(tmp_path / name).predictor.state_dict() for name in ("first", method)]

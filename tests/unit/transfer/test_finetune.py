@@ -164,7 +164,7 @@ def test_the_run_can_be_judged_like_any_other(tuned):
     scores = read_json(evaluate(folder) / "scores.json")
     mine = scores["models"]["network"]["overall"]["5"]["rise"]["mae"]
     assert mine == pytest.approx(found["methods"]["two_phase"]["domains"]["target"]["5"]["rise"]["mae"], rel=1e-6)
-    assert read_json(folder / "provenance.json")["lesson"]["method"] == "two_phase"
+    assert read_json(folder / "provenance.json")["strategy"]["method"] == "two_phase"
 
 
 def test_a_bundle_alone_is_enough_but_its_world_is_not_judged(run, target, small, tmp_path):

@@ -10,7 +10,7 @@ from edp.export.escape import Code
 from edp.ir.rls import Adaptation
 
 FILES = ("edp_adaptation.h", "edp_adaptation.c")
-POINTERS = ("offset", "scale", "directions", "middle", "spread", "rest", "change", "unit")
+POINTERS = ("offset", "scale", "directions", "middle", "spread", "dead_zone", "change", "unit")
 NUMBERS = ("keep", "keep_squared", "refresh", "prior", "noise", "limit", "bound", "rate", "worse", "better")
 
 FUNCTIONS = ("edp_adapt_forget", "edp_adapt_directions", "edp_adapt_error", "edp_adapt_due", "edp_adapt_correct")

@@ -38,7 +38,7 @@ class AdaptationSpec:
             large, because errors of neighbouring ticks are nearly the same one: it sets how fast is learned.
         prior: spread of the coefficients, in units for one standard width of a feature.
         limit: largest correction, in units.
-        rest: share of the targets' spread from the middle within which nothing is moving.
+        dead_zone: share of the targets' spread from the middle within which the machine counts as at rest.
         judged_s: seconds of motion over which the correction is judged against the prediction without it.
         margin: share by which it must be worse to be taken back.
 
@@ -54,13 +54,13 @@ class AdaptationSpec:
     prior: float = 0.3
     limit: float = 3.0
     # At rest nothing is judged, and corrections learned in motion would stay in the output (decision 31).
-    rest: float = 0.05
+    dead_zone: float = 0.05
     judged_s: float = 10.0
     margin: float = 0.05
 
     def __post_init__(self) -> None:
         reals = {entry.name: span(1e-3, 1e6) for entry in fields(self)[1:]}
-        check_bounds("adaptation", self, rank=whole(0, 64), **(reals | {"rest": span(0.0, 1e6)}))
+        check_bounds("adaptation", self, rank=whole(0, 64), **(reals | {"dead_zone": span(0.0, 1e6)}))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -158,9 +158,9 @@ class Adaptation:
         return {name: np.float32(value) for name, value in numbers.items()}
 
     @property
-    def rest(self) -> Array:
+    def dead_zone(self) -> Array:
         """Distance of each target from its middle beyond which the machine moves ``(J,)``, SI units."""
-        return np.asarray(np.float32(self.spec.rest) * self.spread, dtype=np.float32)
+        return np.asarray(np.float32(self.spec.dead_zone) * self.spread, dtype=np.float32)
 
     def arrays(self) -> dict[str, Array]:
         """Its arrays by name."""
@@ -188,7 +188,10 @@ class Adaptation:
     def digest(self) -> str:
         # Sorted, so that the digest depends on the content and not on the order of fields.
         """Content address."""
-        state = hashlib.blake2b(repr(sorted(self.to_plain().items())).encode(), digest_size=16)
+        plain = self.to_plain()
+        # The word before bundles of schema 8: a state that a controller saved bears the digest.
+        plain["spec"] = {"rest" if key == "dead_zone" else key: value for key, value in plain["spec"].items()}
+        state = hashlib.blake2b(repr(sorted(plain.items())).encode(), digest_size=16)
         for name, values in sorted(self.arrays().items()):
             state.update(repr((name, values.shape)).encode() + values.astype("<f4").tobytes())
         return state.hexdigest()

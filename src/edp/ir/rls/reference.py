@@ -169,7 +169,7 @@ class RlsCorrector:
 
     def _moves(self, values: Array) -> bool:
         """Whether one of the targets is farther from its middle than at rest."""
-        return bool((np.abs(values - self.adaptation.middle) > self.adaptation.rest).any())
+        return bool((np.abs(values - self.adaptation.middle) > self.adaptation.dead_zone).any())
 
     def _error(self, h: int, measured: Array) -> Array:
         """Error in units ``(J,)`` of the prediction that comes due."""

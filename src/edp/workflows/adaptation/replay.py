@@ -103,7 +103,7 @@ class Replay:
 
 def motion_s(adaptation: Adaptation, targets: Rows) -> NDArray[np.float64]:
     """Seconds of motion before each tick ``(time,)``, as the adaptation counts motion."""
-    moving = (np.abs(targets - adaptation.middle) > adaptation.rest).any(axis=1)
+    moving = (np.abs(targets - adaptation.middle) > adaptation.dead_zone).any(axis=1)
     return np.concatenate([[0.0], np.cumsum(moving)[:-1]]) / adaptation.rate_hz
 
 

@@ -121,7 +121,7 @@ class DiskBench(Bench):
         status = read_object(run / "status.json", ("status",))["status"] if (run / "status.json").is_file() else ""
         if status == "finished":
             bundle = load_bundle(run)
-            if bundle.provenance.get("lesson") == facts:
+            if bundle.provenance.get("strategy") == facts:
                 return bundle.predictor
 
         def strategy(data: Prepared) -> TrainingStrategy:

@@ -22,12 +22,12 @@ static float dot(const float *a, const float *b, uint32_t n) {
     return sum;
 }
 
-/* True if a target, as measured or as predicted, is farther from its middle than it is at rest. */
+/* True if a target, as measured or as predicted, is farther from its middle than its dead zone. */
 static bool moves(const edp_adapt_law *law, const float *in, const float *y) {
     bool moving = false;
     for (uint32_t j = 0; j < law->targets; j++) {
-        if ((magnitude(in[law->columns[j]] - law->middle[j]) > law->rest[j]) ||
-            (magnitude(y[j] - law->middle[j]) > law->rest[j])) {
+        if ((magnitude(in[law->columns[j]] - law->middle[j]) > law->dead_zone[j]) ||
+            (magnitude(y[j] - law->middle[j]) > law->dead_zone[j])) {
             moving = true;
         }
     }

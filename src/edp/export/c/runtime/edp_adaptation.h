@@ -28,7 +28,7 @@ typedef struct {
     const float *directions;  /* (rank, inputs) */
     const float *middle;      /* (targets) */
     const float *spread;      /* (targets) */
-    const float *rest;        /* (targets) */
+    const float *dead_zone;   /* (targets) */
     const float *change;      /* (horizons, targets) */
     const float *unit;        /* (horizons, targets) */
     const uint16_t *columns;  /* (targets): input that measures each of them */

@@ -29,7 +29,7 @@ class FewSteps:
     def make(self, case: TransferCase) -> Made:
         """Take the steps; what did not adapt in the meta-learning does not here."""
         spec, source = case.spec, case.source
-        meta: Mapping[str, Any] = (source.bundle.provenance.get("lesson") or {}).get("meta") or {}
+        meta: Mapping[str, Any] = (source.bundle.provenance.get("strategy") or {}).get("meta") or {}
         rate = spec.inner_rate or float(meta.get("inner_rate", RATE))
         frozen = decompose(source.predictor).encoding if meta.get("head_only") else ()
         training = replace(
