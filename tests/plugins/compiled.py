@@ -37,7 +37,7 @@ def warm_numba(cache: Path) -> None:
 
 
 def _state() -> str:
-    """Of the simulator's sources and of numba's cache (`edp.sim.physics.jit.cache_folder`)."""
+    """Of the simulator's sources and of numba's cache (`edp.storage.machine_code`)."""
     digest = hashlib.sha256(sys.version.encode())
     for path in sorted(SOURCES.rglob("*.py")):
         digest.update(f"{path}\0".encode() + path.read_bytes())

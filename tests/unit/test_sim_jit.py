@@ -3,50 +3,77 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import pytest
 from numba.core.dispatcher import Dispatcher
 
+from edp.data.screening import compiled as screening
 from edp.sim import scenario_file
 from edp.sim.physics import jit
+from edp.storage import machine_code
+from edp.storage.machine_code import Compiler, files_with
 
 
-def test_compiles_without_a_writable_cache(monkeypatch, tmp_path):
+@pytest.fixture
+def compiler(tmp_path, monkeypatch):
+    """A compiler of one source file in a package of its own, with its cache below ``cache``."""
+    (tmp_path / "package").mkdir()
+    source = tmp_path / "package" / "a.py"
+    source.write_text("a = 1")
+    monkeypatch.setattr(machine_code, "PACKAGE", tmp_path)
+    monkeypatch.setattr(machine_code, "__file__", str(source))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    return lambda facts="": Compiler("part", lambda: (source,), {}, facts)
+
+
+def double(x: float) -> float:
+    return 2.0 * x
+
+
+def test_compiles_without_a_writable_cache(compiler, monkeypatch, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(blocked))
-    jit.cache_folder.cache_clear()
-    try:
-        assert jit.cache_folder() is None
-
-        @jit.compiled
-        def double(x: float) -> float:
-            return 2.0 * x
-
-        assert double(1.5) == 3.0
-    finally:
-        monkeypatch.undo()
-        jit.cache_folder.cache_clear()
+    without = compiler()
+    assert without.folder is None
+    assert without.compiled(double)(1.5) == 3.0
 
 
-def test_cache_folder_is_keyed_to_the_sources(monkeypatch, tmp_path):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    jit.cache_folder.cache_clear()
-    try:
-        folder = jit.cache_folder()
-        assert folder is not None
-        assert folder.parent == tmp_path
-        assert folder.is_dir()
-    finally:
-        monkeypatch.undo()
-        jit.cache_folder.cache_clear()
+def test_code_is_kept_in_the_cache_folder_and_nowhere_else(compiler, tmp_path):
+    assert compiler().compiled(double)(1.5) == 3.0
+    (folder,) = (tmp_path / "cache").iterdir()
+    assert folder.name.startswith("part-")
+    assert list(folder.rglob("*.nbi"))
+    assert not list(Path(__file__).parent.rglob("test_sim_jit.double*.nbi"))
 
 
-def test_compiled_code_uses_nothing_outside_the_files_of_the_fingerprint():
-    known = {path.resolve() for path in jit.fingerprinted()}
-    assert {path.name for path in known} >= {"jit.py", "layout.py", "integrator.py", "plant.py", "terramechanics.py"}
+def test_cache_folder_is_keyed_to_the_sources(compiler, tmp_path):
+    first = compiler().folder
+    assert first == compiler().folder
+    assert first != compiler("a constant").folder
+    (tmp_path / "package" / "a.py").write_text("a = 2")
+    assert first != compiler().folder
+
+
+def test_files_are_found_by_a_line_of_code(tmp_path):
+    (tmp_path / "room").mkdir()
+    for name in ("room/b.py", "a.py"):
+        (tmp_path / name).write_text("from x import y\n")
+    (tmp_path / "c.py").write_text("from x import z\n")
+    assert files_with(tmp_path, "from x import y") == (tmp_path / "a.py", tmp_path / "room" / "b.py")
+
+
+SIMULATOR = {"jit.py", "layout.py", "integrator.py", "plant.py", "terramechanics.py"}
+SCREENING = {"compiled.py", "forest.py", "information.py", "ranks.py"}
+
+
+@pytest.mark.parametrize(("part", "names"), [(jit, SIMULATOR), (screening, SCREENING)])
+def test_compiled_code_uses_nothing_outside_the_files_of_the_fingerprint(part, names):
+    known = {path.resolve() for path in part.compiler.sources()}
+    assert {path.name for path in known} >= names
     assert Path(scenario_file.__file__) not in known
-    root = Path(jit.__file__).resolve().parents[1]
+    root = Path(machine_code.__file__).resolve().parents[2]
     for path in known:
-        module = importlib.import_module(".".join(["edp.sim", *path.relative_to(root).with_suffix("").parts]))
+        module = importlib.import_module(".".join(path.relative_to(root).with_suffix("").parts))
         for function in vars(module).values():
             if not isinstance(function, Dispatcher):
                 continue

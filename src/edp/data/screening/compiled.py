@@ -5,25 +5,25 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import TypeVar
 
-import numba
 from threadpoolctl import threadpool_limits
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+from edp.storage.machine_code import Compiler, files_with
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def compiled(function: Function) -> Function:
-    """Compile with Numba, without the interpreter's lock; the machine code is cached where a folder is writable."""
-    # Without the interpreter's lock, threads run the loops side by side; divisions follow NumPy's rules.
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    try:
-        fast: Any = numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder that can be written
-        fast = numba.njit(**options)(function)
-    return fast  # type: ignore[no-any-return]
+def sources() -> tuple[Path, ...]:
+    """The source files that compiled code comes from, and this one."""
+    return (*files_with(Path(__file__).parent, "from edp.data.screening.compiled import compiled"), Path(__file__))
+
+
+# Without the interpreter's lock, threads run the loops side by side; divisions follow NumPy's rules.
+compiler = Compiler("screening", sources, {"nogil": True, "error_model": "numpy"})
+compiled = compiler.compiled
 
 
 def threads() -> int:

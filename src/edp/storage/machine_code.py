@@ -1,0 +1,82 @@
+"""Machine code by Numba, kept on disk by the sources that it comes from.
+
+Numba's own cache lies beside the sources, where a user may not write. It knows a function by its own file, not by the
+files of the functions it calls: after an edit to one file, callers elsewhere would keep running the old code. The
+folder of a `Compiler` therefore carries a fingerprint of every source file that its code comes from; edits to other
+files keep the cache.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+PACKAGE = Path(__file__).parents[1]
+
+
+class Compiler:
+    """Compiles the functions of one part of EDP alike, and keeps their code in one folder.
+
+    Args:
+        part: name of the part, with which the folder's name begins.
+        sources: gives the source files that compiled code comes from.
+        options: of ``numba.njit``.
+        facts: what compiled code contains besides, from files that are not among the sources.
+    """
+
+    def __init__(
+        self, part: str, sources: Callable[[], Sequence[Path]], options: Mapping[str, Any], facts: str = ""
+    ) -> None:
+        self.part, self.sources, self.options, self.facts = part, sources, options, facts
+
+    @cached_property
+    def folder(self) -> Path | None:
+        """Where code is kept: below NUMBA_CACHE_DIR or the user's cache folder; None where neither is writable."""
+        state = hashlib.blake2b(digest_size=8)
+        state.update(self.facts.encode())
+        for source in (*self.sources(), Path(__file__)):
+            # The zero byte separates name and content, so that no other split of the same bytes has this hash.
+            state.update(source.relative_to(PACKAGE).as_posix().encode() + b"\0" + source.read_bytes())
+        chosen = os.environ.get("NUMBA_CACHE_DIR")
+        try:
+            base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "edp"
+            folder = base / f"{self.part}-{state.hexdigest()}"
+            folder.mkdir(parents=True, exist_ok=True)
+        except (OSError, RuntimeError):  # read-only, or a user without a home
+            return None
+        return folder if os.access(folder, os.W_OK) else None
+
+    def compiled(self, function: Function) -> Function:
+        """Compile with Numba; cache the machine code on disk, or do without where no folder is writable."""
+        return self._compile(function, {**self.options})
+
+    def inlined(self, function: Function) -> Function:
+        """Like `compiled`, and part of every caller's own code, so that results which a caller drops cost nothing."""
+        return self._compile(function, {**self.options, "forceinline": True})
+
+    def _compile(self, function: Function, options: dict[str, Any]) -> Function:
+        if self.folder is None:
+            plain: Any = numba.njit(**options)(function)
+            return plain  # type: ignore[no-any-return]
+        config: Any = numba.config
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(self.folder)
+        try:
+            fast: Any = numba.njit(cache=True, **options)(function)
+        finally:
+            # Restored at once: other users of Numba in this process keep their own cache folder.
+            config.CACHE_DIR = before
+        return fast  # type: ignore[no-any-return]
+
+
+def files_with(folder: Path, line: str) -> tuple[Path, ...]:
+    """Python files of a folder and of those in it that contain a line of code, sorted."""
+    return tuple(file for file in sorted(folder.rglob("*.py")) if line.encode() in file.read_bytes())
