@@ -39,12 +39,12 @@ def test_names_are_unique_and_values_are_made_before_they_are_read(structure, pr
 
 def met(graph):
     """Kinds of layers with their options, and which kind reads which."""
-    kinds = {layer.name: type(layer) for layer in graph.layers}
+    kinds = {layer.name: layer.kind for layer in graph.layers}
     found = set()
     for layer in graph.layers:
         values = ((field.name, getattr(layer, field.name)) for field in fields(layer) if field.name != "name")
-        found.add((type(layer), *((name, value) for name, value in values if isinstance(value, str | bool))))
-        found |= {(type(layer), kinds.get(name)) for name in layer.inputs}
+        found.add((layer.kind, *((name, value) for name, value in values if isinstance(value, str | bool))))
+        found |= {(layer.kind, kinds.get(name)) for name in layer.inputs}
     return found
 
 

@@ -5,8 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edp.errors import ExportError
+from edp.ir import Builder
+from edp.ir.base import INPUT
+from edp.ir.layers import BinaryOperation, Dense, Standardise
 from edp.ir.w8a16 import calibrate
 from edp.ir.w8a16.calibration import finer
+from edp.ir.w8a16.quantise import outline
 from edp.networks.integer import integer_predictor, spread
 from edp.networks.running import mean_error, stream_predictions
 from edp.training import fit
@@ -66,3 +71,13 @@ def test_series_are_taken_at_even_distances(tiny):
     total = sum(part.samples for part in tiny.train)
     assert spread(tiny.train, total) == tiny.train
     assert spread(tiny.train, 1) == tiny.train[:1]
+
+
+def test_an_operation_without_an_integer_form_is_refused_by_its_word():
+    """A quotient between the scaled inputs and weights; those of the physics bases lie behind the last weights."""
+    build, ones = Builder(2), np.ones(2)
+    scaled = build.add(Standardise, "scaled", INPUT, offset=0 * ones, scale=ones)
+    quotient = build.combine("quotient", BinaryOperation.DIVIDE, scaled, scaled)
+    result = build.add(Dense, "result", quotient, weight=ones[None], bias=ones[:1])
+    with pytest.raises(ExportError, match="layer 'quotient' is a Divide, which has no form in integer arithmetic"):
+        outline(build.graph({"prediction": result}, 1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import fields
 from typing import Any
 
 from numpy.typing import NDArray
@@ -16,11 +15,9 @@ def model_hash(graph: Graph) -> str:
     """Content address of layers, options and constants."""
     state = hashlib.blake2b(digest_size=16)
     for layer in graph.layers:
-        arrays = layer.tensors()
         # Arrays are hashed by their bytes, everything else by its text: `repr` of an array is cut off.
-        rest = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in arrays}
-        state.update(repr((layer.kind, rest)).encode())
-        for name, values in arrays.items():
+        state.update(repr((layer.kind, layer.options())).encode())
+        for name, values in layer.tensors().items():
             state.update(repr((name, values.shape)).encode() + little_endian(values))
     for key, values in graph.initial.items():
         state.update(repr(key).encode() + little_endian(values))

@@ -95,6 +95,11 @@ class Layer(ABC):
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
+    def options(self) -> dict[str, Any]:
+        """What it is besides its kind and its constant arrays, by name."""
+        arrays = self.tensors()
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in arrays}
+
 
 @dataclass(frozen=True, eq=False)
 class Graph:

@@ -11,7 +11,7 @@ import numpy as np
 
 from edp.errors import ExportError
 from edp.ir.base import INPUT, Array, Graph, Layer, Slot
-from edp.ir.layers import Gather
+from edp.ir.layers import BinaryOperation, Elementwise, Gather
 
 
 def constant(values: Any) -> Array:
@@ -65,6 +65,10 @@ class Builder:
         layer_options = {key: constant(value) if hasattr(value, "shape") else value for key, value in options.items()}
         self.layers.append(kind(name=full, inputs=inputs, **layer_options))
         return full
+
+    def combine(self, name: str, operation: BinaryOperation, a: str, b: str) -> str:
+        """Two values of the same width, number by number."""
+        return self.add(Elementwise, name, a, b, operation=operation, size=self.width(a))
 
     def pick(self, name: str, x: str, columns: Sequence[int]) -> str:
         """Chosen numbers of a value; the value itself where they are all of it in order."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from edp.ir.base import Array, Layer
 
@@ -26,6 +27,17 @@ class Function(StrEnum):
     COSINE = "cosine"
     POSITIVE = "positive"
     """1 where a number is above 0, else 0."""
+
+
+class BinaryOperation(StrEnum):
+    """What two numbers become; the first one comes first."""
+
+    ADD = "add"
+    SUBTRACT = "subtract"
+    MULTIPLY = "multiply"
+    DIVIDE = "divide"
+    MINIMUM = "minimum"
+    MAXIMUM = "maximum"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,65 +90,19 @@ class ScaleShift(Layer):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Add(Layer):
-    """Sum of two values of `size` numbers."""
+class Elementwise(Layer):
+    """An operation on each pair of numbers of two values of `size` numbers."""
 
+    operation: BinaryOperation
     size: int
 
     @property
-    def width(self) -> int:
-        return self.size
+    def kind(self) -> str:
+        return self.operation.capitalize()
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Subtract(Layer):
-    """First value less the second, of `size` numbers each."""
-
-    size: int
-
-    @property
-    def width(self) -> int:
-        return self.size
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Multiply(Layer):
-    """Product of two values of `size` numbers, element by element."""
-
-    size: int
-
-    @property
-    def width(self) -> int:
-        return self.size
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Divide(Layer):
-    """First value over the second, of `size` numbers each, element by element."""
-
-    size: int
-
-    @property
-    def width(self) -> int:
-        return self.size
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Minimum(Layer):
-    """The smaller one of each pair of two values of `size` numbers."""
-
-    size: int
-
-    @property
-    def width(self) -> int:
-        return self.size
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Maximum(Layer):
-    """The larger one of each pair of two values of `size` numbers."""
-
-    size: int
+    def options(self) -> dict[str, Any]:
+        # `kind` says which operation it is.
+        return {name: value for name, value in super().options().items() if name != "operation"}
 
     @property
     def width(self) -> int:

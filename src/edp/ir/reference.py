@@ -124,6 +124,16 @@ FUNCTIONS: Mapping[plain.Function, Callable[[Values], Values]] = {
 }
 
 
+OPERATIONS: Mapping[plain.BinaryOperation, Callable[[Values, Values], Values]] = {
+    plain.BinaryOperation.ADD: np.add,
+    plain.BinaryOperation.SUBTRACT: np.subtract,
+    plain.BinaryOperation.MULTIPLY: np.multiply,
+    plain.BinaryOperation.DIVIDE: np.divide,
+    plain.BinaryOperation.MINIMUM: np.minimum,
+    plain.BinaryOperation.MAXIMUM: np.maximum,
+}
+
+
 @_step(plain.Gather)
 def _gather(layer: plain.Gather, w: Weights, m: Memory, *parts: Values) -> Values:
     return np.concatenate(parts)[list(layer.columns)]
@@ -139,34 +149,9 @@ def _scale_shift(layer: Any, w: Weights, m: Memory, x: Values) -> Values:
     return np.asarray(w["gain"] * x + w["shift"])
 
 
-@_step(plain.Add)
-def _add(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
-    return np.asarray(a + b)
-
-
-@_step(plain.Subtract)
-def _subtract(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
-    return np.asarray(a - b)
-
-
-@_step(plain.Multiply)
-def _multiply(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
-    return np.asarray(a * b)
-
-
-@_step(plain.Divide)
-def _divide(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
-    return np.asarray(a / b)
-
-
-@_step(plain.Minimum)
-def _minimum(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
-    return np.minimum(a, b)
-
-
-@_step(plain.Maximum)
-def _maximum(layer: Any, w: Weights, m: Memory, a: Values, b: Values) -> Values:
-    return np.maximum(a, b)
+@_step(plain.Elementwise)
+def _elementwise(layer: plain.Elementwise, w: Weights, m: Memory, a: Values, b: Values) -> Values:
+    return np.asarray(OPERATIONS[layer.operation](a, b))
 
 
 @_step(plain.Activate)

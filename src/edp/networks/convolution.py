@@ -9,7 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from edp.ir import Builder
-from edp.ir.layers import Activate, Add, Dense, Function
+from edp.ir.layers import Activate, BinaryOperation, Dense, Function
 from edp.ir.memory import Convolution
 from edp.networks.streaming import Cost, Operation, State, Streaming
 
@@ -98,7 +98,7 @@ class TemporalBlock(Streaming):
                 y = build.add(Activate, "relu", part.lower(build, y), function=Function.RELU, size=size)
         if self.shortcut is not None:
             x = build.add(Dense, "shortcut", x, weight=self.shortcut.weight, bias=self.shortcut.bias)
-        return build.add(Add, "sum", y, x, size=size)
+        return build.combine("sum", BinaryOperation.ADD, y, x)
 
     def costs(self) -> list[Cost]:
         rows = self.first.costs() + self.second.costs()

@@ -10,7 +10,7 @@ from edp.data.scaling import Scaler
 from edp.data.task import Task
 from edp.errors import ExportError
 from edp.ir import Builder
-from edp.ir.layers import Add, ScaleShift, Standardise, Subtract
+from edp.ir.layers import BinaryOperation, ScaleShift, Standardise
 from edp.ir.memory import Difference, Starting
 from edp.networks.streaming import Cost, State, Streaming
 
@@ -144,7 +144,7 @@ class TargetTransform(nn.Module):
     def lower_encode(self, build: Builder, future: str, base: str | None) -> str:
         """Standardised targets from future SI values."""
         if base is not None:
-            future = build.add(Subtract, "change", future, base, size=self.width.numel())
+            future = build.combine("change", BinaryOperation.SUBTRACT, future, base)
         return build.add(Standardise, "encoded", future, offset=self.offset.flatten(), scale=self.width.flatten())
 
     def lower_decode(self, build: Builder, name: str, code: str, base: str | None) -> str:
@@ -157,4 +157,4 @@ class TargetTransform(nn.Module):
         if base is None:
             return value
         bases = build.pick(f"{name}.present", base, list(range(one)) * sets)
-        return build.add(Add, name, value, bases, size=one * sets)
+        return build.combine(name, BinaryOperation.ADD, value, bases)

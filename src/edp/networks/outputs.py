@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from edp.errors import ConfigError, ExportError
 from edp.ir import Builder
-from edp.ir.layers import Accumulate, Activate, Add, Function, ScaleShift, Subtract
+from edp.ir.layers import Accumulate, Activate, BinaryOperation, Function, ScaleShift
 from edp.networks.losses import Prediction
 from edp.networks.streaming import Operation
 from edp.registry import Registry
@@ -96,14 +96,13 @@ class Output(nn.Module):
             return None
         with build.inside("interval"):
             below, above = self.lower_reach(build, y)
-            size, stretch = self.stretch.numel(), self.stretch.flatten()
+            stretch = self.stretch.flatten()
             centers = build.pick("center", center, list(range(build.width(center))) * len(self.coverages))
             zeros = torch.zeros_like(stretch)
             down = build.add(ScaleShift, "below", below, gain=stretch, shift=zeros)
             up = down if above == below else build.add(ScaleShift, "above", above, gain=stretch, shift=zeros)
-            return build.add(Subtract, "lower", centers, down, size=size), build.add(
-                Add, "upper", centers, up, size=size
-            )
+            lower = build.combine("lower", BinaryOperation.SUBTRACT, centers, down)
+            return lower, build.combine("upper", BinaryOperation.ADD, centers, up)
 
     def lower_reach(self, build: Builder, y: str) -> tuple[str, str]:
         """`reach` of all coverages as layers, ``coverage * horizon * output`` numbers below and above."""

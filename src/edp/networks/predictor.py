@@ -12,7 +12,7 @@ from edp.data.task import Task
 from edp.errors import ConfigError, ExportError
 from edp.ir import Builder, Graph
 from edp.ir.base import INPUT
-from edp.ir.layers import Add, ScaleShift
+from edp.ir.layers import BinaryOperation, ScaleShift
 from edp.networks.activations import ACTIVATIONS, ActivationSpec, Identity
 from edp.networks.backbones import BACKBONES, BackboneSpec, HybridSpec, in_slot
 from edp.networks.blocks.base import BLOCKS, OUTPUT_SLOTS, SHARED_SLOTS, BlockSlot, HasConflicts, OutputSpace
@@ -239,12 +239,12 @@ class Predictor(Streaming):
         center: str = act(build, build.pick("center", y, first))
         if self.bypass is not None:
             direct = self.bypass.lower(build, scaled)
-            center = build.add(Add, "with_bypass", center, direct, size=horizons * outputs)
+            center = build.combine("with_bypass", BinaryOperation.ADD, center, direct)
         if self.physics is not None:
             ahead = self.code.lower_encode(build, self.physics.lower(build, x), base)
             is_velocity = self.physics.is_velocity.repeat(horizons)
             ahead = build.add(ScaleShift, "known", ahead, gain=is_velocity, shift=torch.zeros_like(is_velocity))
-            center = build.add(Add, "with_physics", center, ahead, size=horizons * outputs)
+            center = build.combine("with_physics", BinaryOperation.ADD, center, ahead)
         return center
 
     def costs(self) -> list[Cost]:

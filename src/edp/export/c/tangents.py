@@ -11,6 +11,7 @@ from edp.export.c.plan import MemoryPlan, scratch_of
 from edp.export.c.text import call, identifier, number
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import INPUT
+from edp.ir.layers import BinaryOperation
 
 FILES = ("edp_tangent.h", "edp_tangent.c", "edp_tangent_memory.c")
 """Of the runtime."""
@@ -98,11 +99,11 @@ def _linear(function: str, *constants: str) -> Write:
     return write
 
 
-def _pair(function: str) -> Write:
-    def write(t: Tangents, layer: Layer) -> list[str]:
-        return t.before(layer, function, *t.values(layer), *t.changes(layer), layer.width)
-
-    return write
+def _elementwise(t: Tangents, layer: layers.Elementwise) -> list[str]:
+    # Sums change with their inputs alone, at whatever values these are.
+    linear = layer.operation in (BinaryOperation.ADD, BinaryOperation.SUBTRACT)
+    values = () if linear else t.values(layer)
+    return t.before(layer, f"edp_{layer.operation}_tangent", *values, *t.changes(layer), layer.width)
 
 
 def _gather(t: Tangents, layer: layers.Gather) -> list[str]:
@@ -254,12 +255,7 @@ TANGENTS: dict[type[Layer], Write] = {
     layers.Gather: _gather,
     layers.Standardise: _linear("edp_standardise_tangent", "scale"),
     layers.ScaleShift: _linear("edp_scale_tangent", "gain"),
-    layers.Add: _linear("edp_add_tangent"),
-    layers.Subtract: _linear("edp_subtract_tangent"),
-    layers.Multiply: _pair("edp_multiply_tangent"),
-    layers.Divide: _pair("edp_divide_tangent"),
-    layers.Minimum: _pair("edp_minimum_tangent"),
-    layers.Maximum: _pair("edp_maximum_tangent"),
+    layers.Elementwise: _elementwise,
     layers.Activate: _activate,
     layers.Glu: _glu,
     layers.Accumulate: lambda t, x: t.before(x, "edp_accumulate_tangent", *t.changes(x), x.rows, x.size),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -99,9 +99,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
             f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in CasADi; "
             f"these have: {', '.join(sorted(kind.__name__ for kind in KNOWN))}"
         )
-    constants = list(layer.tensors())
-    options = {entry.name: getattr(layer, entry.name) for entry in fields(layer) if entry.name not in constants}
-    return {"kind": layer.kind, "constants": constants} | options
+    return {"kind": layer.kind, "constants": list(layer.tensors())} | layer.options()
 
 
 def packed(data: dict[str, np.ndarray]) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 
 from edp.export.onnx.nodes import Nodes
 from edp.ir import Layer, layers
-from edp.ir.layers import Function, runs
+from edp.ir.layers import BinaryOperation, Function, runs
 
 MOST_PIECES = 12
 """Runs of neighbouring columns up to which numbers are moved by splitting and joining; beyond, by a 0/1 matrix."""
@@ -50,6 +50,21 @@ def normed(nodes: Nodes, x: str, epsilon: float) -> str:
     middle = nodes.less(x, nodes.mean(x, 1))
     spread = nodes.plus(nodes.mean(nodes.add("Mul", middle, middle), 1), np.float32(epsilon))
     return nodes.add("Div", middle, nodes.add("Sqrt", spread))
+
+
+BINARY_OPERATORS = {
+    BinaryOperation.ADD: "Add",
+    BinaryOperation.MULTIPLY: "Mul",
+    BinaryOperation.DIVIDE: "Div",
+    BinaryOperation.MINIMUM: "Min",
+    BinaryOperation.MAXIMUM: "Max",
+}
+"""ONNX's; `Nodes.less` writes a difference."""
+
+
+def combine(nodes: Nodes, operation: BinaryOperation, a: str, b: str) -> str:
+    """Two values, number by number."""
+    return nodes.less(a, b) if operation is BinaryOperation.SUBTRACT else nodes.add(BINARY_OPERATORS[operation], a, b)
 
 
 def _rows(nodes: Nodes, x: str, ticks: int, rows: int, size: int) -> str:
@@ -141,12 +156,7 @@ PLAIN: dict[type[Layer], Plain] = {
     layers.Gather: _gather,
     layers.Standardise: _standardise,
     layers.ScaleShift: _scale_shift,
-    layers.Add: lambda nodes, layer, ticks, values, widths: nodes.add("Add", *values),
-    layers.Subtract: lambda nodes, layer, ticks, values, widths: nodes.less(*values),
-    layers.Multiply: lambda nodes, layer, ticks, values, widths: nodes.add("Mul", *values),
-    layers.Divide: lambda nodes, layer, ticks, values, widths: nodes.add("Div", *values),
-    layers.Minimum: lambda nodes, layer, ticks, values, widths: nodes.add("Min", *values),
-    layers.Maximum: lambda nodes, layer, ticks, values, widths: nodes.add("Max", *values),
+    layers.Elementwise: lambda nodes, layer, ticks, values, widths: combine(nodes, layer.operation, *values),
     layers.Activate: lambda nodes, layer, ticks, values, widths: activate(nodes, layer.function, values[0]),
     layers.Glu: _glu,
     layers.Accumulate: _accumulate,

@@ -6,23 +6,25 @@ recurrence for which ONNX has no operator is written tick by tick.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from edp.errors import ExportError
 from edp.export.onnx.memory import STEPS, attend, correct, shape_of
 from edp.export.onnx.nodes import DEFAULT_OPSET, Nodes
-from edp.export.onnx.plain import PLAIN, activate
+from edp.export.onnx.plain import PLAIN, activate, combine
 from edp.export.onnx.sequence import Sequences
 from edp.export.onnx.step import INPUTS, add_results, corrections, plain_name, refuse, spoil
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import INPUT
+from edp.ir.layers import BinaryOperation
 from edp.ir.memory import UNSEEN
 
 TRAILING = (memory.TrailingMean, memory.AttentionPool, memory.WindowAttention)
-ELEMENTWISE = (layers.Activate, layers.Add, layers.Multiply)
-"""Work on channels first, as convolutions do."""
+CHANNELS_FIRST = (BinaryOperation.ADD, BinaryOperation.MULTIPLY)
+"""Operations that are written for channels first, as convolutions are, where an input is."""
 
 
 def rows_before(layer: Layer, rows: int, ticks: int) -> int:
@@ -82,13 +84,11 @@ class Window:
         write = getattr(self, f"_{WINDOWS[type(layer)]}") if type(layer) in WINDOWS else None
         if write is not None:
             write(layer, rows)
-        elif isinstance(layer, ELEMENTWISE) and any(self.values.in_columns(name, rows) for name in layer.inputs):
+        elif (number_by_number := self._on_channels(layer)) and any(
+            self.values.in_columns(name, rows) for name in layer.inputs
+        ):
             input_names = [self.values.columns(name, rows) for name in layer.inputs]
-            operator = "Add" if isinstance(layer, layers.Add) else "Mul"
-            activated = (
-                activate(self.nodes, layer.function, input_names[0]) if isinstance(layer, layers.Activate) else ""
-            )
-            self.values.give_columns(layer.name, activated or self.nodes.add(operator, *input_names), rows, layer.width)
+            self.values.give_columns(layer.name, number_by_number(*input_names), rows, layer.width)
         elif type(layer) in PLAIN:
             widths = [self.graph.width_of(name) for name in layer.inputs]
             input_names = [self.values.rows(name, rows) for name in layer.inputs]
@@ -99,6 +99,14 @@ class Window:
             self._recurrence(layer)
         else:
             raise refuse(layer)
+
+    def _on_channels(self, layer: Layer) -> Callable[..., str] | None:
+        """Writes a layer whose result does not depend on how its numbers are laid out; None for another one."""
+        if isinstance(layer, layers.Activate):
+            return partial(activate, self.nodes, layer.function)
+        if isinstance(layer, layers.Elementwise) and layer.operation in CHANNELS_FIRST:
+            return partial(combine, self.nodes, layer.operation)
+        return None
 
     def _give(self, layer: Layer, value: str, rows: int) -> None:
         self.values.give(layer.name, value, rows, layer.width)

@@ -15,7 +15,7 @@ from edp.errors import ExportError
 from edp.export.escape import Code, matlab_comment, matlab_names
 from edp.ir import Array, Graph, Layer, layers, memory
 from edp.ir.base import INPUT
-from edp.ir.layers import Function, runs
+from edp.ir.layers import BinaryOperation, Function, runs
 
 # 47 characters, a part behind them and a number stay within MATLAB's 63.
 LONGEST_LAYER = 47
@@ -227,16 +227,20 @@ def _layer_norm_lstm(native: Native, layer: memory.LayerNormLstm, x: Sequence[st
     return [f"norms = struct({named});", *_simple(call)(native, layer, x), *_simple("{y} = {s_h};")(native, layer, x)]
 
 
+OPERATIONS = {
+    BinaryOperation.ADD: "{y} = {0} + {1};",
+    BinaryOperation.SUBTRACT: "{y} = {0} - {1};",
+    BinaryOperation.MULTIPLY: "{y} = {0} .* {1};",
+    BinaryOperation.DIVIDE: "{y} = {0} ./ {1};",
+    BinaryOperation.MINIMUM: "{y} = min({0}, {1});",
+    BinaryOperation.MAXIMUM: "{y} = max({0}, {1});",
+}
+
 WRITERS: dict[type[Layer], Write] = {
     layers.Gather: _gather,
     layers.Standardise: _simple("{y} = ({0} - {offset}) ./ {scale};"),
     layers.ScaleShift: _simple("{y} = {gain} .* {0} + {shift};"),
-    layers.Add: _simple("{y} = {0} + {1};"),
-    layers.Subtract: _simple("{y} = {0} - {1};"),
-    layers.Multiply: _simple("{y} = {0} .* {1};"),
-    layers.Divide: _simple("{y} = {0} ./ {1};"),
-    layers.Minimum: _simple("{y} = min({0}, {1});"),
-    layers.Maximum: _simple("{y} = max({0}, {1});"),
+    layers.Elementwise: lambda native, layer, x: _simple(OPERATIONS[layer.operation])(native, layer, x),
     layers.Activate: _activate,
     layers.Glu: _simple("{y} = glu({0}, {rows});"),
     layers.Accumulate: _simple("{y} = accumulate({0}, {rows});"),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edp.errors import ExportError
 from edp.ir import layers, memory
 from edp.ir.base import INPUT, Graph, Layer, Number
-from edp.ir.layers import Function
+from edp.ir.layers import BinaryOperation, Function
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
 from edp.ir.w8a16.rounding import WeightRounding
@@ -215,17 +215,25 @@ def _gather(work: _Work, x: layers.Gather, input_fracs: list[int]) -> quantised.
     return quantised.QGather(name=x.name, inputs=(), frac=frac, columns=x.columns, shifts=shifts)
 
 
-def _sum(work: _Work, x: layers.Add | layers.Subtract, input_fracs: list[int]) -> quantised.FixedLayer:
+def _elementwise(work: _Work, x: layers.Elementwise, input_fracs: list[int]) -> quantised.FixedLayer:
+    if x.operation in (BinaryOperation.ADD, BinaryOperation.SUBTRACT):
+        return _sum(work, x, input_fracs)
+    if x.operation is BinaryOperation.MULTIPLY:
+        return _multiply(work, x, input_fracs)
+    raise ExportError(f"layer '{x.name}' is a {x.kind}, which has no form in integer arithmetic; export in float32")
+
+
+def _sum(work: _Work, x: layers.Elementwise, input_fracs: list[int]) -> quantised.FixedLayer:
     """The finer of two formats is the common one, as far as 32 bits reach."""
     frac, (a, b) = work.frac(x.name), input_fracs
     # 14 bits of difference: 16-bit values shifted by more would leave 32 bits.
     common = min(max(a, b), min(a, b) + 14)
-    lefts, minus = (common - a, common - b), isinstance(x, layers.Subtract)
+    lefts, minus = (common - a, common - b), x.operation is BinaryOperation.SUBTRACT
     frac = _within(frac, common)
     return quantised.QSum(name=x.name, inputs=(), frac=frac, size=x.size, lefts=lefts, right=common - frac, minus=minus)
 
 
-def _multiply(work: _Work, x: layers.Multiply, input_fracs: list[int]) -> quantised.FixedLayer:
+def _multiply(work: _Work, x: layers.Elementwise, input_fracs: list[int]) -> quantised.FixedLayer:
     frac = _within(work.frac(x.name), sum(input_fracs))
     return quantised.QMultiply(name=x.name, inputs=(), frac=frac, size=x.size, right=sum(input_fracs) - frac)
 
@@ -346,9 +354,7 @@ def weights_of(graph: Graph) -> dict[str, NDArray[np.int8]]:
 
 LOWER: dict[type[Layer], Lower] = {
     layers.Gather: _gather,
-    layers.Add: _sum,
-    layers.Subtract: _sum,
-    layers.Multiply: _multiply,
+    layers.Elementwise: _elementwise,
     layers.ScaleShift: _scale_shift,
     layers.Activate: _activate,
     layers.Glu: _glu,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edp.ir import layers, memory
 from edp.ir.base import Layer
-from edp.ir.layers import Function
+from edp.ir.layers import BinaryOperation, Function
 
 Rows = NDArray[np.float32]
 Memory = dict[str, Any]
@@ -114,6 +114,17 @@ FUNCTIONS: dict[Function, Callable[[Rows], Rows]] = {
 }
 
 
+OPERATIONS: dict[BinaryOperation, Callable[[Rows, Rows], Rows]] = {
+    BinaryOperation.ADD: np.add,
+    BinaryOperation.SUBTRACT: np.subtract,
+    BinaryOperation.MULTIPLY: np.multiply,
+    BinaryOperation.DIVIDE: np.divide,
+    # As in C, where a comparison with NaN is false: the first number stays.
+    BinaryOperation.MINIMUM: lambda a, b: np.where(a > b, b, a),
+    BinaryOperation.MAXIMUM: lambda a, b: np.where(a < b, b, a),
+}
+
+
 def _sum(x: Rows, axis: int = -1) -> Rows:
     """Sum one after the other, as a loop does; NumPy's own sum adds in pairs."""
     return np.asarray(np.take(np.add.accumulate(x, axis=axis, dtype=np.float32), -1, axis=axis))
@@ -204,12 +215,7 @@ OVER_TIME: dict[type[Layer], Run] = {
     layers.Gather: gather,
     layers.Standardise: lambda layer, m, x: (x - layer.offset) / layer.scale,
     layers.ScaleShift: lambda layer, m, x: x * layer.gain + layer.shift,
-    layers.Add: lambda layer, m, a, b: a + b,
-    layers.Subtract: lambda layer, m, a, b: a - b,
-    layers.Multiply: lambda layer, m, a, b: a * b,
-    layers.Divide: lambda layer, m, a, b: a / b,
-    layers.Minimum: lambda layer, m, a, b: np.where(a > b, b, a),
-    layers.Maximum: lambda layer, m, a, b: np.where(a < b, b, a),
+    layers.Elementwise: lambda layer, m, a, b: OPERATIONS[layer.operation](a, b),
     layers.Activate: lambda layer, m, x: FUNCTIONS[layer.function](x),
     layers.Glu: _glu,
     layers.Accumulate: _accumulate,

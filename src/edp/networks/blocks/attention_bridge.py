@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from edp.errors import ConfigError
 from edp.ir import Builder
-from edp.ir.layers import Activate, Add, Dense, Function, LayerNorm
+from edp.ir.layers import Activate, BinaryOperation, Dense, Function, LayerNorm
 from edp.ir.memory import UNSEEN, WindowAttention
 from edp.networks.blocks.base import BLOCKS, BlockSlot
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
@@ -122,12 +122,12 @@ class _Bridge(Streaming):
             qkv = [build.add(Dense, names[i], calm, weight=w, bias=b) for i, (w, b) in enumerate(parts)]
             seen = build.add(WindowAttention, "attention", *qkv, size=wide, heads=self.heads, window=self.window)
             seen = build.add(Dense, "gather", seen, weight=self.gather.weight, bias=self.gather.bias)
-            y = build.add(Add, "sum1", x, seen, size=wide)
+            y = build.combine("sum1", BinaryOperation.ADD, x, seen)
             fed = _norm(build, "norm2", y, self.norm_feed)
             fed = build.add(Dense, "widen", fed, weight=self.widen.weight, bias=self.widen.bias)
             fed = build.add(Activate, "gelu", fed, function=Function.GELU, size=2 * wide)
             fed = build.add(Dense, "narrow", fed, weight=self.narrow.weight, bias=self.narrow.bias)
-            return build.add(Add, "sum2", y, fed, size=wide)
+            return build.combine("sum2", BinaryOperation.ADD, y, fed)
 
     def costs(self) -> list[Cost]:
         """Scores and weighted values cost ``2 W C`` a tick; a window of W ticks costs the thesis's ``2 W^2 C``."""

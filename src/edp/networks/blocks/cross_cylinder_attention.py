@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from torch import Tensor, nn
 
 from edp.ir import Builder
-from edp.ir.layers import Add, Dense, LayerNorm, RowAttention
+from edp.ir.layers import BinaryOperation, Dense, LayerNorm, RowAttention
 from edp.networks.blocks.base import BLOCKS, BlockSlot, ModelView, TaskView
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
 
@@ -62,7 +62,6 @@ class _Across(Streaming):
 
     def lower(self, build: Builder, x: str) -> str:
         rows, wide = self.outputs, self.hidden
-        size = rows * wide
         with build.inside("across"):
             qkv = [
                 build.add(Dense, name, x, weight=weight, bias=bias, rows=rows)
@@ -72,7 +71,7 @@ class _Across(Streaming):
             ]
             seen = build.add(RowAttention, "attention", *qkv, rows=rows, size=wide)
             seen = build.add(Dense, "gather", seen, weight=self.gather.weight, bias=self.gather.bias, rows=rows)
-            total = build.add(Add, "sum", x, seen, size=size)
+            total = build.combine("sum", BinaryOperation.ADD, x, seen)
             gain, shift, epsilon = self.norm.weight, self.norm.bias, self.norm.eps
             return build.add(LayerNorm, "norm", total, gain=gain, shift=shift, epsilon=epsilon, rows=rows)
 

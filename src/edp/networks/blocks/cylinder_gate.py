@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from edp.errors import ConfigError, closest
 from edp.ir import Builder
-from edp.ir.layers import Activate, Dense, Function, Multiply, ScaleShift
+from edp.ir.layers import Activate, BinaryOperation, Dense, Function, ScaleShift
 from edp.networks.blocks.base import BLOCKS, BlockSlot
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
 
@@ -67,7 +67,7 @@ class _DiagonalGate(Streaming):
             every = build.pick("repeated", x, list(range(width)) * outputs)
             gate = build.add(ScaleShift, "scaled", every, gain=self.scale.flatten(), shift=self.bias.flatten())
             gate = build.add(Activate, "sigmoid", gate, function=Function.SIGMOID, size=wide)
-            return build.add(Multiply, "gated", gate, every, size=wide)
+            return build.combine("gated", BinaryOperation.MULTIPLY, gate, every)
 
     def costs(self) -> list[Cost]:
         outputs, width = self.scale.shape
@@ -97,7 +97,7 @@ class _LinearGate(Streaming):
             gate = build.add(Dense, "linear", x, weight=self.gate.weight, bias=self.gate.bias)
             gate = build.add(Activate, "sigmoid", gate, function=Function.SIGMOID, size=wide)
             every = build.pick("repeated", x, list(range(self.width)) * self.outputs)
-            return build.add(Multiply, "gated", gate, every, size=wide)
+            return build.combine("gated", BinaryOperation.MULTIPLY, gate, every)
 
     def costs(self) -> list[Cost]:
         wide = self.outputs * self.width

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from edp.ir import Builder
-from edp.ir.layers import Activate, Dense, Function, Multiply
+from edp.ir.layers import Activate, BinaryOperation, Dense, Function
 from edp.networks.blocks.base import BLOCKS, BlockSlot
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
 from edp.networks.trailing import StreamingTrailingMean
@@ -69,7 +69,7 @@ class _SqueezeExcitation(Streaming):
             s = build.add(Activate, "relu", s, function=Function.RELU, size=len(down))
             s = build.add(Dense, "excite", s, weight=up, bias=up.new_zeros(len(up)))
             s = build.add(Activate, "sigmoid", s, function=Function.SIGMOID, size=self.width)
-            return build.add(Multiply, "weighted", s, x, size=self.width)
+            return build.combine("weighted", BinaryOperation.MULTIPLY, s, x)
 
     def costs(self) -> list[Cost]:
         """Per column, because every tick has its own weights."""

@@ -12,18 +12,7 @@ from torch import Tensor
 
 from edp.errors import ExportError
 from edp.ir import Builder
-from edp.ir.layers import (
-    Activate,
-    Add,
-    Divide,
-    Function,
-    Maximum,
-    Minimum,
-    Multiply,
-    ScaleShift,
-    Standardise,
-    Subtract,
-)
+from edp.ir.layers import Activate, BinaryOperation, Function, ScaleShift, Standardise
 
 
 class Symbol:
@@ -159,10 +148,10 @@ def _array(value: Any) -> np.ndarray:
     return np.asarray(value.detach().cpu().numpy() if isinstance(value, Tensor) else value, dtype=np.float32)
 
 
-def _both(kind: type, a: Symbol, b: Symbol) -> Symbol:
+def _both(operation: BinaryOperation, a: Symbol, b: Symbol) -> Symbol:
     shape = np.broadcast_shapes(a.shape, b.shape)
     a, b = a.spread(shape), b.spread(shape)
-    return a.layer(kind, kind.__name__.lower(), a.value, b.value, shape=shape, size=int(np.prod(shape)))
+    return Symbol(a.build, a.build.combine(operation.value, operation, a.value, b.value), shape)
 
 
 def _meet(a: Any, b: Any) -> tuple[Symbol, np.ndarray]:
@@ -182,7 +171,7 @@ def _constant(like: Symbol, numbers: np.ndarray) -> Symbol:
 def add(a: Any, b: Any) -> Symbol:
     """Sum, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
-        return _both(Add, a, b)
+        return _both(BinaryOperation.ADD, a, b)
     value, constant = _meet(a, b)
     return value.affine(1.0, constant)
 
@@ -190,7 +179,7 @@ def add(a: Any, b: Any) -> Symbol:
 def subtract(a: Any, b: Any) -> Symbol:
     """Difference, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
-        return _both(Subtract, a, b)
+        return _both(BinaryOperation.SUBTRACT, a, b)
     value, constant = _meet(a, b)
     return value.affine(1.0, -constant) if isinstance(a, Symbol) else value.affine(-1.0, constant)
 
@@ -198,7 +187,7 @@ def subtract(a: Any, b: Any) -> Symbol:
 def multiply(a: Any, b: Any) -> Symbol:
     """Product, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
-        return _both(Multiply, a, b)
+        return _both(BinaryOperation.MULTIPLY, a, b)
     value, constant = _meet(a, b)
     return value.affine(constant, 0.0)
 
@@ -206,24 +195,24 @@ def multiply(a: Any, b: Any) -> Symbol:
 def divide(a: Any, b: Any) -> Symbol:
     """Quotient, of which one may be known numbers."""
     if isinstance(a, Symbol) and isinstance(b, Symbol):
-        return _both(Divide, a, b)
+        return _both(BinaryOperation.DIVIDE, a, b)
     value, constant = _meet(a, b)
     if isinstance(b, Symbol):
-        return _both(Divide, _constant(value, constant), value)
+        return _both(BinaryOperation.DIVIDE, _constant(value, constant), value)
     constant, zero = constant.ravel(), np.zeros(constant.size, np.float32)
     return value.layer(Standardise, "divided", value.value, shape=value.shape, offset=zero, scale=constant)
 
 
 def maximum(a: Any, b: Any) -> Symbol:
     """The larger one of each pair; one side may be known numbers."""
-    return _extreme(Maximum, a, b)
+    return _extreme(BinaryOperation.MAXIMUM, a, b)
 
 
-def _extreme(kind: type, a: Any, b: Any) -> Symbol:
+def _extreme(operation: BinaryOperation, a: Any, b: Any) -> Symbol:
     if isinstance(a, Symbol) and isinstance(b, Symbol):
-        return _both(kind, a, b)
+        return _both(operation, a, b)
     value, constant = _meet(a, b)
-    return _both(kind, value, _constant(value, constant))
+    return _both(operation, value, _constant(value, constant))
 
 
 def positive(a: Symbol) -> Symbol:
@@ -264,7 +253,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sin": lambda a: a.activate(Function.SINE),
     "clamp": lambda a, min: maximum(a, min),
     "maximum": maximum,
-    "minimum": lambda a, b: _extreme(Minimum, a, b),
+    "minimum": lambda a, b: _extreme(BinaryOperation.MINIMUM, a, b),
     # Known zeros need no layer.
     "zeros_like": lambda a: torch.zeros(a.shape),
     "stack": stack,
