@@ -29,7 +29,14 @@ from common import Verdict, finish, parser, table, verdict
 from edp.config.experiment import Experiment, load_experiment
 from edp.evaluation.controller import Budget
 from edp.training import load_bundle
-from edp.workflows.compression import FORMATS, CompressionResult, CompressionSearchSpec, Judged, search
+from edp.workflows.compression import (
+    FORMATS,
+    CompressionResult,
+    CompressionSearchRequest,
+    CompressionSearchSpec,
+    Judged,
+    search,
+)
 from edp.workflows.compression.planning import RECIPES
 from edp.workflows.compression.quantise import quantise
 from edp.workflows.train_evaluate import DataSource, SimulationOrder, simulate_data_set, train
@@ -59,7 +66,7 @@ def one(source: DataSource, horizon: int, seed: int, folder: Path, arguments: ar
         recipes=tuple(arguments.recipes),
         thesis=seed == 0 and not arguments.quick,
     )
-    return search(run / "teacher", spec, run / "small")
+    return search(run / "teacher", CompressionSearchRequest(spec=spec), run / "small")
 
 
 def rows_of(found: CompressionResult, horizon: int) -> list[list[object]]:

@@ -1,7 +1,6 @@
 """What the README and the examples show is run as it stands there."""
 
 import dataclasses
-import inspect
 import re
 import runpy
 import sys
@@ -14,8 +13,6 @@ import pytest
 
 from edp.cli import app
 from edp.cli.console import run_app
-from edp.cli.finetune import finetune
-from edp.cli.pretrain import pretrain
 from edp.config.experiment import SETTINGS as TREE
 from edp.config.experiment import FeatureSettings, TaskSettings, load_experiment
 from edp.data.chunks import ChunkSpec
@@ -23,6 +20,7 @@ from edp.data.features import Derived
 from edp.data.screening import ForestSpec, ScreeningSpec
 from edp.evaluation.controller import Budget
 from edp.evaluation.judge import JudgeSpec
+from edp.ir.rls import AdaptationSpec
 from edp.logs import write_recording
 from edp.logs.source import RecordingEntry, load_data_set, load_signal_map
 from edp.networks.losses import AdaptiveWeights
@@ -31,7 +29,8 @@ from edp.recording import Recording
 from edp.signals import TABLE_A1
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import TrainingSpec
-from edp.workflows.compression import DistillationSpec
+from edp.workflows.compression import CompressionSearchSpec, DistillationSpec, DistilSpec
+from edp.workflows.feature_selection.trials import TrialSpec
 from edp.workflows.pretraining import PRETRAININGS, MetaSpec
 from edp.workflows.search.context import SearchContext
 from edp.workflows.search.phases import PHASES
@@ -124,50 +123,49 @@ def test_rows_of_tables_stand_in_tables():
                 assert re.fullmatch(r"\|[-:| ]+\|", lines[1]), f"{page.name}: {lines[1]}"
 
 
-def test_screening_page_names_every_option_and_its_default():
-    page = (ROOT / "docs" / "screening.md").read_text(encoding="utf-8").split("## Options")[1]
-    shown = re.findall(r"^\| `(\w+)` \| (.+?) \|", page, re.MULTILINE)
-    entries = [*dataclasses.fields(ScreeningSpec), *dataclasses.fields(ForestSpec)]
-    assert [name for name, _ in shown] == [entry.name for entry in entries]
-    for (name, text), entry in zip(shown, entries):
-        if entry.default not in (dataclasses.MISSING, ()):
-            assert text == f"`{round(entry.default, 3)}`", name
+COMMAND_TABLES = {
+    "finetune": FinetuneSpec,
+    "adapt": AdaptationSpec,
+    "pretrain": MetaSpec,
+    "distil": DistilSpec,
+    "distil.objective": DistillationSpec,
+    "compress": CompressionSearchSpec,
+    "screen": ScreeningSpec,
+    "screen.forest": ForestSpec,
+    "trials": TrialSpec,
+}
+
+
+@pytest.mark.parametrize("table", list(COMMAND_TABLES))
+def test_settings_page_names_every_key_of_a_command_and_its_default(table):
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    section = page.split(f"# `[{table}]`\n")[1].split("\n#")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \|", section, re.MULTILINE)
+    entries = dataclasses.fields(COMMAND_TABLES[table])
+    assert [name for name, _ in rows] == [entry.name for entry in entries]
+    for (name, text), entry in zip(rows, entries):
+        if isinstance(entry.default, int | float):
+            value = tomllib.loads(f"value = {text.strip('`')}")["value"]
+            assert value == pytest.approx(entry.default, rel=2e-3), name
 
 
 def test_compression_page_names_every_option_and_shows_the_budget_of_the_examples():
     page = (ROOT / "docs" / "compress.md").read_text(encoding="utf-8")
     shown = re.findall(r"^\| `(\w+)` \| (.+?) \|", page, re.MULTILINE)
-    entries = [*dataclasses.fields(Budget), *dataclasses.fields(DistillationSpec)]
+    entries = dataclasses.fields(Budget)
     assert [name for name, _ in shown] == [entry.name for entry in entries]
     for (name, text), entry in zip(shown, entries):
-        if name not in ("name", "soft"):
+        if name != "name":
             assert text.strip("`") == str(entry.default).removesuffix(".0"), name
     (example,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     whole = (EXAMPLES / "budgets" / "small_controller.toml").read_text(encoding="utf-8")
     assert whole.endswith(example)
 
 
-def test_finetune_page_names_every_option_with_its_default_and_every_method():
-    page = (ROOT / "docs" / "finetune.md").read_text(encoding="utf-8")
-    shown = re.findall(r"^\| `(\w+)` \| `(.+?)` \|", page, re.MULTILINE)
-    assert shown == [(entry.name, str(entry.default)) for entry in dataclasses.fields(FinetuneSpec)]
-    named = re.findall(r"^\| `(\w+)` \| (?!`)", page.split("## Methods")[1], re.MULTILINE)
-    assert set(named) == set(METHODS)
-    options = inspect.signature(finetune).parameters
-    for entry in dataclasses.fields(FinetuneSpec):
-        if entry.name != "check_signs":
-            assert options[entry.name].default == entry.default, entry.name
-
-
-def test_foundation_page_names_every_option_with_its_default_and_every_method():
-    page = (ROOT / "docs" / "foundation.md").read_text(encoding="utf-8")
-    shown = re.findall(r"^\| `(\w+)` \| `(.+?)` \|", page, re.MULTILINE)
-    assert shown == [(entry.name, str(entry.default)) for entry in dataclasses.fields(MetaSpec)]
-    named = re.findall(r"^\| `(\w+)` \| (?!`)", page, re.MULTILINE)
-    assert set(named) == set(PRETRAININGS)
-    options = inspect.signature(pretrain).parameters
-    for entry in dataclasses.fields(MetaSpec):
-        assert options[entry.name].default == entry.default, entry.name
+@pytest.mark.parametrize(("page", "registry"), [("finetune", METHODS), ("foundation", PRETRAININGS)])
+def test_pages_of_methods_name_every_one(page, registry):
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8").split("## Methods")[1]
+    assert set(re.findall(r"^\| `(\w+)` \| (?!`)", text, re.MULTILINE)) == set(registry)
 
 
 def test_search_page_names_every_phase_and_key_and_shows_the_examples():

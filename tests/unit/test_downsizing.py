@@ -13,7 +13,7 @@ from edp.errors import ConfigError, EdpError, StorageError
 from edp.storage import read_json
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
-from edp.workflows.compression import DistillationSpec, DistilSpec, distil
+from edp.workflows.compression import DistillationSpec, DistilRequest, DistilSpec, distil
 from edp.workflows.compression.distil import read_run
 from edp.workflows.train_evaluate import DataSource, evaluate, train
 
@@ -55,7 +55,7 @@ def same(one, other):
 
 
 def test_a_student_is_a_run_that_goes_on_after_a_stop(run, tmp_path):
-    spec = DistilSpec(units=4)
+    spec = DistilRequest(spec=DistilSpec(units=4))
     whole = distil(run, spec, tmp_path / "whole")
     with pytest.raises(Pulled):
         distil(run, spec, tmp_path / "stopped", on_event=pull)
@@ -69,31 +69,37 @@ def test_a_student_is_a_run_that_goes_on_after_a_stop(run, tmp_path):
 
 
 def test_another_lesson_is_another_run(run, tmp_path):
-    distil(run, DistilSpec(units=4), tmp_path / "run")
+    distil(run, DistilRequest(spec=DistilSpec(units=4)), tmp_path / "run")
     with pytest.raises(StorageError, match="holds another run"):
-        distil(run, DistilSpec(units=4, distillation=DistillationSpec(truth=0.2)), tmp_path / "run")
+        distil(run, DistilRequest(spec=DistilSpec(units=4, objective=DistillationSpec(truth=0.2))), tmp_path / "run")
 
 
 def test_pruned_starts_further_recordings_and_teachers_take_part(run, lever_sessions, tmp_path):
-    plain = distil(run, DistilSpec(units=4, levels=2), tmp_path / "plain")
-    pruned = distil(run, DistilSpec(units=4, pruned=True), tmp_path / "pruned")
+    plain = distil(run, DistilRequest(spec=DistilSpec(units=4, levels=2)), tmp_path / "plain")
+    pruned = distil(run, DistilRequest(spec=DistilSpec(units=4, pruned=True)), tmp_path / "pruned")
     assert pruned.predictor.spec == plain.predictor.spec
     assert not same(pruned, plain)
-    spec = DistilSpec(units=4, levels=2, teachers=(str(tmp_path / "plain"),), further=lever_sessions)
+    spec = DistilRequest(
+        spec=DistilSpec(units=4, levels=2), teachers=(str(tmp_path / "plain"),), further=lever_sessions
+    )
     taught = distil(run / "bundle", spec, tmp_path / "taught")
     assert len(taught.provenance["strategy"]["teachers"]) == 2
     assert len(taught.provenance["strategy"]["further"]) == 5
 
 
+def test_a_pruned_student_has_no_levels_of_its_own():
+    with pytest.raises(ConfigError, match="leave out the levels"):
+        DistilSpec(units=4, levels=1, pruned=True)
+
+
 @pytest.mark.parametrize(
     ("spec", "reason"),
     [
-        (DistilSpec(units=9), "units = 9; 1 <= units <= 8"),
-        (DistilSpec(units=8, levels=2), "is the teacher itself"),
-        (DistilSpec(units=4, levels=3), "levels = 3"),
-        (DistilSpec(units=4, levels=1, pruned=True), "leave out the levels"),
-        (DistilSpec(units=4, changes=("model.window=20",)), "those of its teacher"),
-        (DistilSpec(units=4, changes=("training.epoch=20",)), "training.epoch"),
+        (DistilRequest(spec=DistilSpec(units=9)), "units = 9; 1 <= units <= 8"),
+        (DistilRequest(spec=DistilSpec(units=8, levels=2)), "is the teacher itself"),
+        (DistilRequest(spec=DistilSpec(units=4, levels=3)), "levels = 3"),
+        (DistilRequest(spec=DistilSpec(units=4), changes=("model.window=20",)), "those of its teacher"),
+        (DistilRequest(spec=DistilSpec(units=4), changes=("training.epoch=20",)), "training.epoch"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_written(run, tmp_path, spec, reason):
@@ -115,7 +121,9 @@ def test_a_bundle_without_its_run_is_refused(run, tmp_path):
 
 def test_other_recordings_can_be_learned_on(run, lever_sessions, tmp_path):
     source = DataSource.of(lever_sessions.path)
-    bundle = distil(run, DistilSpec(units=4, changes=("training.epochs=1",)), tmp_path / "other", source)
+    bundle = distil(
+        run, DistilRequest(spec=DistilSpec(units=4), changes=("training.epochs=1",)), tmp_path / "other", source
+    )
     assert dataclasses.is_dataclass(bundle)
     assert bundle.provenance["data"]["source"] == str(lever_sessions.path)
 

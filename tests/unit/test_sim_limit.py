@@ -86,7 +86,10 @@ def test_it_is_kept_beside_the_logs_until_something_changes(tmp_path):
     ("change", "message"),
     [
         ({"horizons": (5, 2)}, r"horizons = \[5, 2\] must rise"),
-        ({"horizons": ()}, "must rise"),
+        ({"horizons": ()}, "horizons has 0 entries"),
+        ({"horizons": (0, 2)}, "1 <= horizons <= 2,000"),
+        ({"recordings": 0}, "recordings = 0"),
+        ({"seed": -1}, "seed = -1"),
         ({"branches": 7}, "branches = 7 must be even"),
         ({"moments": 1}, "moments = 1"),
     ],

@@ -8,26 +8,17 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
+from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, source_of
 
 
 def adapt(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train, finetune, distil, compress or quantise.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder of the new run.")],
-    rank: Annotated[int, typer.Option(help="Directions of the inputs that corrections may use.")] = 18,
-    forgetting: Annotated[float, typer.Option(help="Time constant of forgetting, in seconds of motion.")] = 60.0,
-    noise: Annotated[
-        float, typer.Option(help="Variance of the unexplained error; smaller values learn faster.")
-    ] = 100.0,
-    prior: Annotated[float, typer.Option(help="Spread of coefficients, in units of the network's errors.")] = 0.3,
-    limit: Annotated[float, typer.Option(help="Largest correction, in units of the network's errors.")] = 3.0,
-    dead_zone: Annotated[
-        float, typer.Option(help="Share of the targets' spread below which the machine counts as at rest.")
-    ] = 0.05,
-    judged: Annotated[float, typer.Option(help="Seconds of motion over which the correction is judged.")] = 10.0,
-    margin: Annotated[
-        float, typer.Option(help="Relative increase of the error at which the correction is switched off.")
-    ] = 0.05,
+    config: SettingsOption = None,
+    changes: Annotated[
+        list[str], typer.Option("--set", help="One setting of the correction, for example adapt.forgetting_s=30.")
+    ] = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
     """Add a small, bounded correction to a run that is learned on board; export and replay include it.
@@ -35,20 +26,14 @@ def adapt(
     Its limits and directions are fitted to the run's own recordings; the network stays as it is.
 
     Example: `edp adapt runs/first --out runs/first_adapted`
+
+    Example: `edp adapt runs/first --out runs/first_adapted --set adapt.rank=12`
     """
+    from edp.config.commands import command_settings
     from edp.ir.rls import AdaptationSpec
     from edp.workflows.adaptation import adapt as make
 
-    spec = AdaptationSpec(
-        rank=rank,
-        forgetting_s=forgetting,
-        noise=noise,
-        prior=prior,
-        limit=limit,
-        dead_zone=dead_zone,
-        judged_s=judged,
-        margin=margin,
-    )
+    spec, _ = command_settings("adapt", AdaptationSpec, config, changes)
     correction, facts = make(run, folder, spec)
 
     def show() -> None:

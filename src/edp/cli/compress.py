@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, progress, table
+from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 
 if TYPE_CHECKING:
@@ -23,18 +25,12 @@ def compress(
     budget: Annotated[
         Path | None, typer.Option("--budget", help="Limits of the controller (TOML); by default those of the thesis.")
     ] = None,
-    units: Annotated[
-        list[int], typer.Option(help="Width of a network to train; may be repeated. Default: planned from the budget.")
-    ] = [],  # noqa: B006
-    formats: Annotated[
-        list[str], typer.Option("--format", help="float32, dynamic_int8 or w8a16; may be repeated. Default: all.")
-    ] = [],  # noqa: B006
-    thesis: Annotated[bool, typer.Option(help="Also train the variants of the thesis's Table 4.9.")] = False,
     again: Annotated[
         bool, typer.Option(help="Open the sealed test set again for another choice; the opening is recorded.")
     ] = False,
+    config: SettingsOption = None,
     changes: Annotated[
-        list[str], typer.Option("--set", help="One setting of the trainings, for example training.epochs=10.")
+        list[str], typer.Option("--set", help="One setting, for example compress.units=[24] or training.epochs=10.")
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -47,18 +43,19 @@ def compress(
 
     Example: `edp compress runs/first --budget examples/budgets/small_controller.toml --out runs/small`
     """
-    from edp.evaluation.controller import Budget, load_budget
+    from edp.config.commands import TRAINING_TABLES, command_settings
+    from edp.evaluation.controller import load_budget
     from edp.report import read_compression, write_compression_page
-    from edp.workflows.compression import CompressionCallbacks, CompressionSearchSpec, search
-
-    spec = CompressionSearchSpec(
-        budget=Budget() if budget is None else load_budget(budget),
-        units=tuple(units),
-        formats=tuple(formats),
-        thesis=thesis,
-        again=again,
-        changes=tuple(changes),
+    from edp.workflows.compression import (
+        CompressionCallbacks,
+        CompressionSearchRequest,
+        CompressionSearchSpec,
+        search,
     )
+
+    own = [] if budget is None else [{"compress": {"budget": asdict(load_budget(budget))}}]
+    spec, others = command_settings("compress", CompressionSearchSpec, config, [*changes, *own], TRAINING_TABLES)
+    request = CompressionSearchRequest(spec=spec, again=again, changes=others)
     source = None if data is None else source_of(data, signal_map, repair)
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "compress", "network")
@@ -68,7 +65,7 @@ def compress(
             display.done, display.count = done, max(1, count)
             display.on_training(name, event)
 
-        compression = search(bundle, spec, folder, source, CompressionCallbacks(display.on_note, on_training))
+        compression = search(bundle, request, folder, source, CompressionCallbacks(display.on_note, on_training))
     page = write_compression_page(folder)
     facts = read_compression(folder)
     best = compression.best

@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from edp.cli.ending import memory_message, out_of_memory, stopped_code
+from edp.cli.settings import setting_of
 from edp.errors import ConfigError, EdpError
 
 KEPT_BREAK = re.compile(r"\n(?=  - )")
@@ -241,4 +242,5 @@ def _say_usage(error: Any) -> None:
     if context is not None:
         err.print(" ".join(context.get_usage().split()))
         err.print(f"Try '{context.command_path} --help' for help.", style="dim")
-    _say_error(error.format_message())
+    setting = setting_of(str(getattr(context, "info_name", "")), str(getattr(error, "option_name", "")))
+    _say_error(error.format_message() if setting is None else f"{error.option_name} is a setting now: give {setting}")

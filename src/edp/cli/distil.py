@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
+
+if TYPE_CHECKING:
+    from edp.settings.tree import Change
 
 
 def distil(
     run: Annotated[Path, typer.Argument(help="Run folder of the teacher.")],
-    units: Annotated[int, typer.Option(help="Width of the student: recurrent units, or channels of the first level.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
+    units: Annotated[
+        int | None,
+        typer.Option(help="Width of the student (distil.units): recurrent units, or channels of the first level."),
+    ] = None,
     data: Annotated[
         Path | None, typer.Option(help="A log, a folder of logs, or a data-set file; default: those of the run.")
     ] = None,
-    levels: Annotated[int | None, typer.Option(help="Convolution levels; default: one less than the teacher.")] = None,
-    pruned: Annotated[
-        bool, typer.Option(help="Initialise with the teacher's most important channels and units.")
-    ] = False,
-    truth: Annotated[
-        float, typer.Option(help="Weight of the measured targets beside the teachers' predictions; 0: teachers only.")
-    ] = 0.5,
-    hint: Annotated[float, typer.Option(help="Weight of the hidden-feature hint.")] = 0.0,
     teachers: Annotated[list[Path], typer.Option("--teacher", help="A further teacher; may be repeated.")] = [],  # noqa: B006
     further: Annotated[
         Path | None,
         typer.Option(help="Recordings without measured targets; the student learns the teachers' predictions on them."),
     ] = None,
+    config: SettingsOption = None,
     changes: Annotated[
-        list[str], typer.Option("--set", help="One setting of the training, for example training.epochs=10.")
+        list[str], typer.Option("--set", help="One setting, such as distil.pruned=true or training.epochs=10.")
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -44,24 +44,24 @@ def distil(
 
     Example: `edp distil runs/first --units 32 --out runs/small`
     """
+    from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.evaluation.footprint import footprint
     from edp.training import load_bundle
-    from edp.workflows.compression import DistillationSpec, DistilSpec
+    from edp.workflows.compression import DISTIL_SETTINGS, DistilRequest, DistilSpec
     from edp.workflows.compression import distil as make
 
-    spec = DistilSpec(
-        units=units,
-        levels=levels,
-        pruned=pruned,
-        distillation=DistillationSpec(truth=truth, hint=hint),
-        teachers=tuple(str(path) for path in teachers),
+    layers: list[Change] = [*changes] if units is None else [*changes, {"distil": {"units": units}}]
+    spec, others = command_settings("distil", DistilSpec, config, layers, TRAINING_TABLES, DISTIL_SETTINGS)
+    request = DistilRequest(
+        spec=spec,
+        teachers=tuple(map(str, teachers)),
         further=None if further is None else source_of(further, signal_map, repair),
-        changes=tuple(changes),
+        changes=others,
     )
     source = None if data is None else source_of(data, signal_map, repair)
     with progress(as_json) as shown:
         display = TrainingDisplay(shown, Steps(as_json))
-        bundle = make(run, spec, folder, source, display.on_event)
+        bundle = make(run, request, folder, source, display.on_event)
     counts = {"teacher": footprint(load_bundle(run).predictor), "student": footprint(bundle.predictor)}
     facts = {
         "run": str(folder),

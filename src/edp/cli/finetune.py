@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from edp.cli.console import JsonFlag, emit, out, progress, table
+from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def finetune(
-    context: typer.Context,
     bundle: Annotated[Path, typer.Argument(help="Run folder of the source, or its bundle.")],
     logs: Annotated[Path, typer.Argument(help="Logs of the target: a log, a folder of logs, or a data-set file.")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
@@ -24,37 +23,9 @@ def finetune(
     baselines: Annotated[
         str, typer.Option(help="Comma-separated methods to compare with, 'all' or 'none'.")
     ] = "ridge_arx",
-    head_epochs: Annotated[int, typer.Option(help="Epochs of phase 1, in which only the head is trained.")] = 15,
-    epochs: Annotated[int, typer.Option(help="Epochs of phase 2, in which all weights are trained.")] = 25,
-    head_rate: Annotated[float, typer.Option(help="Learning rate of the head in both phases.")] = 3e-4,
-    backbone_rate: Annotated[float, typer.Option(help="Learning rate of the backbone in phase 2.")] = 1e-5,
-    depth_decay: Annotated[
-        float, typer.Option(help="Ratio of the learning rates of consecutive parts of the backbone.")
-    ] = 1.0,
-    rounds: Annotated[int, typer.Option(help="Epochs of methods without phases.")] = 10,
-    rate: Annotated[float, typer.Option(help="Learning rate of methods without phases.")] = 3e-3,
-    batch: Annotated[int, typer.Option(help="Batch size: parallel chunks, or windows, of an update.")] = 32,
-    smoothness: Annotated[float, typer.Option(help="Weight of the smoothness penalty on predictions; 0: none.")] = 0.05,
-    weight_decay: Annotated[float, typer.Option(help="Weight decay.")] = 1e-4,
-    patience: Annotated[int, typer.Option(help="Epochs without improvement before a phase ends; 0: no limit.")] = 8,
-    rank: Annotated[int, typer.Option(help="Rank of the low-rank adapters.")] = 8,
-    source_weight: Annotated[
-        float, typer.Option(help="Weight of the loss on source recordings (rehearsal methods).")
-    ] = 1.0,
-    soft: Annotated[
-        float, typer.Option(help="Share of that loss computed against predictions of the source network.")
-    ] = 0.5,
-    reversal: Annotated[float, typer.Option(help="Weight of the reversed gradient (method adversarial).")] = 0.1,
-    inner_rate: Annotated[
-        float, typer.Option(help="Learning rate of method few_steps; 0: that of the source's meta-learning.")
-    ] = 0.0,
-    inner_steps: Annotated[int, typer.Option(help="Maximum number of steps of method few_steps.")] = 30,
-    center: Annotated[
-        bool, typer.Option(help="Remove the mean error over the training logs from the output bias.")
-    ] = True,
-    any_sign: Annotated[bool, typer.Option("--any-sign", help="Accept logs of another sign convention.")] = False,
+    config: SettingsOption = None,
     changes: Annotated[
-        list[str], typer.Option("--set", help="One setting of the trainings, for example training.updates=100.")
+        list[str], typer.Option("--set", help="One setting, for example finetune.rate=1e-3 or training.updates=100.")
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -67,16 +38,16 @@ def finetune(
     continues.
 
     Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --baselines all`
+
+    Example: `edp finetune runs/m22 logs/c14 --out runs/c14 --set finetune.rounds=20 --set finetune.batch=16`
     """
+    from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.report import read_transfer, write_transfer_page
     from edp.workflows.transfer import METHODS, FinetuneCallbacks, FinetuneRequest, FinetuneSpec
     from edp.workflows.transfer import finetune as make
 
-    named = [field.name for field in fields(FinetuneSpec) if field.name in context.params]
-    spec = FinetuneSpec(**{name: context.params[name] for name in named}, check_signs=not any_sign)
-    order = FinetuneRequest(
-        spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=tuple(changes)
-    )
+    spec, others = command_settings("finetune", FinetuneSpec, config, changes, TRAINING_TABLES)
+    order = FinetuneRequest(spec=spec, method=method, baselines=_named(baselines, tuple(METHODS)), changes=others)
     source = source_of(logs, signal_map, repair)
     with progress(as_json) as shown:
         display = SeriesDisplay(shown, as_json, "finetune", "method")

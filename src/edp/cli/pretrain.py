@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from edp.cli.console import JsonFlag, Steps, emit, out, progress, table
+from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
 
 
@@ -18,16 +19,10 @@ def pretrain(
     start: Annotated[
         Path | None, typer.Option(help="Run folder or bundle of the initial weights; default: random.")
     ] = None,
-    inner_rate: Annotated[float, typer.Option(help="Learning rate of an adaptation step (meta-learners).")] = 0.5,
-    inner_steps: Annotated[int, typer.Option(help="Number of adaptation steps for each machine.")] = 3,
-    shots: Annotated[
-        int, typer.Option(help="Number of stretches of a machine to adapt on, and as many to judge on.")
-    ] = 4,
-    head_only: Annotated[bool, typer.Option("--head-only", help="Adapt only the head (ANIL).")] = False,
-    config: Annotated[Path | None, typer.Option(help="Settings (TOML) that override the preset.")] = None,
+    config: SettingsOption = None,
     preset: Annotated[str, typer.Option(help="quick, small, standard or thesis.")] = "standard",
     changes: Annotated[
-        list[str], typer.Option("--set", help="One setting, for example split.test_masses=[12,17].")
+        list[str], typer.Option("--set", help="One setting, such as split.test_masses=[12,17] or pretrain.shots=8.")
     ] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -41,14 +36,15 @@ def pretrain(
     Example: `edp simulate data/many --scenario examples/scenarios/many_machines.toml`, then
     `edp pretrain data/many --out runs/foundation --set split.test_masses=[12,17]`
     """
+    from edp.config.commands import TRAINING_TABLES, command_settings
     from edp.config.experiment import load_experiment
     from edp.workflows.pretraining import MetaSpec, Pretrain
     from edp.workflows.pretraining import pretrain as make
 
-    meta = MetaSpec(inner_rate=inner_rate, inner_steps=inner_steps, shots=shots, head_only=head_only)
+    meta, _ = command_settings("pretrain", MetaSpec, config, changes, TRAINING_TABLES)
     order = Pretrain(method=method, meta=meta, start=start)
     # Other splits are refused; the default makes the usual call short.
-    experiment = load_experiment(config, preset, ['split.kind="machines"', *changes])
+    experiment = load_experiment(config, preset, ['split.kind="machines"', *changes], aside=("pretrain",))
     with progress(as_json) as shown:
         steps = Steps(as_json)
         display = TrainingDisplay(shown, steps)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,8 @@ from edp.cli.train import MapOption, RepairOption, source_of
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from edp.config.experiment import FeatureSettings
+    from edp.settings.tree import Change
     from edp.training import TrainingProgress
     from edp.workflows.feature_selection.select import Selection, SelectionOrder
 
@@ -30,29 +33,28 @@ def screen(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for page, pictures, feature sets and figures.")],
     targets: Annotated[str, typer.Option(help="Channels to predict: a,b. Default: the velocities.")] = "",
-    horizon: Annotated[int, typer.Option(help="How many samples ahead the model will predict.")] = 10,
+    horizon: Annotated[
+        int | None, typer.Option(help="How many samples ahead the model will predict; default: 10.")
+    ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     exclude: Annotated[str, typer.Option(help="Channels to leave out of the candidates: a,b.")] = "",
-    trusted: Annotated[
-        str, typer.Option(help="Channels known to be measured (no leak of the future), above all commands: a,b.")
-    ] = "",
     truth: Annotated[bool, typer.Option(help="Accept channels that exist only in a simulation as candidates.")] = False,
     changes: Annotated[
-        list[str], typer.Option("--set", help="An option of the screening, for example max_lag=200 or forest.trees=60.")
+        list[str], typer.Option("--set", help='One setting, such as screen.max_lag=200 or screen.trusted=["lever"].')
     ] = [],  # noqa: B006
     pictures: Annotated[bool, typer.Option(help="Write the pictures as SVG and PNG too.")] = True,
     trials: Annotated[
         bool, typer.Option(help="Also train a network on each set, and compare their held-out errors.")
     ] = False,
     config: Annotated[
-        Path | None, typer.Option(help="With --trials: settings (TOML) that override the preset.")
+        Path | None,
+        typer.Option(help="Settings (TOML): [screen], and with --trials [trials] and what overrides the preset."),
     ] = None,
     preset: Annotated[str, typer.Option(help="With --trials: quick, small, standard or thesis.")] = "quick",
     own: Annotated[
         list[Path], typer.Option("--features", help="With --trials: further feature-set file; may be repeated.")
     ] = [],  # noqa: B006
-    random: Annotated[int, typer.Option(help="With --trials: number of random sets of the proposed size.")] = 3,
     as_json: JsonFlag = False,
 ) -> None:
     """Screen recordings for the channels a model needs: a ranked, reasoned proposal with its evidence.
@@ -61,15 +63,29 @@ def screen(
 
     Example: `edp screen logs/ --out screen --targets v_boom,v_arm --horizon 10`
 
+    Example: `edp screen logs/ --out screen --set 'screen.trusted=["lever"]' --set screen.forest.trees=60`
+
     Example: `edp train logs/ --config screen/settings.toml --out runs/first`
     """
+    from edp.config.commands import TRAINING_TABLES, command_settings
+    from edp.config.experiment import load_experiment
+    from edp.data.screening import ScreeningSpec
+    from edp.workflows.feature_selection.select import SelectionOrder
+    from edp.workflows.feature_selection.trials import TrialSpec
+
+    asked = {"targets": _names(targets) or None, "horizon": horizon}
+    layers: list[Change] = [*changes, {"screen": {key: value for key, value in asked.items() if value is not None}}]
+    spec, others = command_settings("screen", ScreeningSpec, config, layers, ("trials", *TRAINING_TABLES))
+    trial_spec, _ = command_settings("trials", TrialSpec, None, others, TRAINING_TABLES)
+    order = SelectionOrder(spec=spec, exclude=tuple(_names(exclude)), truth=truth, pictures=pictures)
+    if trials:
+        order = replace(
+            order,
+            experiment=load_experiment(config, preset, changes, aside=("screen", "trials")),
+            trials=trial_spec,
+            sets=_own_sets(own),
+        )
     source = source_of(data, signal_map, repair)
-    order = _order(
-        {"targets": _names(targets), "trusted": _names(trusted), "horizon": horizon},
-        changes,
-        (_names(exclude), truth, pictures),
-        _trials(config, preset, own, random) if trials else {},
-    )
     selection = run_screening(source, folder, order, as_json)
     command = next_command(data, signal_map, repair, selection)
 
@@ -217,30 +233,10 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _order(
-    arguments: dict[str, Any], changes: Sequence[str], others: tuple[list[str], bool, bool], trials: dict[str, Any]
-) -> SelectionOrder:
-    """What the options ask for."""
-    from edp.config.experiment import build, merged, override
-    from edp.data.screening import ScreeningSpec
-    from edp.workflows.feature_selection.select import SelectionOrder
-
-    options = arguments
-    for text in changes:
-        options = merged(options, override(text))
-    exclude, truth, pictures = others
-    spec = build(ScreeningSpec, options, "of the screening (--set)")
-    return SelectionOrder(spec=spec, exclude=tuple(exclude), truth=truth, pictures=pictures, **trials)
-
-
-def _trials(config: Path | None, preset: str, own: Sequence[Path], random: int) -> dict[str, Any]:
-    """What the trials are made with."""
-    from edp.config.experiment import FeatureSettings, build, load_experiment
+def _own_sets(paths: Sequence[Path]) -> dict[str, FeatureSettings]:
+    """Feature sets of files, by name."""
+    from edp.config.experiment import FeatureSettings, build
     from edp.data.feature_files import read_set_table
-    from edp.workflows.feature_selection.trials import TrialSpec
 
-    sets = {}
-    for path in own:
-        features = build(FeatureSettings, read_set_table(path), f"'{path}'")
-        sets[features.name] = features
-    return {"experiment": load_experiment(config, preset), "trials": TrialSpec(random=random), "sets": sets}
+    sets = (build(FeatureSettings, read_set_table(path), f"'{path}'") for path in paths)
+    return {features.name: features for features in sets}

@@ -54,12 +54,12 @@ def run(
     data: Annotated[Path, typer.Argument(help="A folder of logs, or a data-set file (.toml); each log is a session.")],
     study: Annotated[Path, typer.Option("--study", help="Folder of the study; an unfinished study continues.")],
     preset: Annotated[str, typer.Option(help="Extent of the search: quick, standard or thesis.")] = "quick",
-    mode: Annotated[str | None, typer.Option(help="Tests and decision rules: sound, or thesis.")] = None,
     config: Annotated[
         Path | None, typer.Option(help="Settings (TOML) that override the preset, with [search].")
     ] = None,
     changes: Annotated[
-        list[str], typer.Option("--set", help="One setting, for example search.trials=30 or model.window=40.")
+        list[str],
+        typer.Option("--set", help="One setting, such as search.trials=30, search.mode=thesis or model.window=40."),
     ] = [],  # noqa: B006
     phase: Annotated[str | None, typer.Option(help="Last phase to run; default: all.")] = None,
     budget: Annotated[
@@ -91,7 +91,6 @@ def run(
     from edp.workflows.search.plan import load_plan
     from edp.workflows.search.runner import Resources, SearchCallbacks, run_search
 
-    changes = [*changes, f"search.mode={mode}"] if mode is not None else changes
     # JSON quotes the path as TOML wants it.
     changes = [*changes, f"search.compression.budget={json.dumps(str(budget))}"] if budget is not None else changes
     plan = load_plan(config, preset, changes)

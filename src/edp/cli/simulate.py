@@ -34,10 +34,6 @@ def simulate(
         int | None,
         typer.Option(help="Number of random machines, scaled and scattered from M22, in place of one machine."),
     ] = None,
-    masses: Annotated[str | None, typer.Option(help="With --family: range of masses in t; default: 10-50.")] = None,
-    scatter: Annotated[
-        float | None, typer.Option(help="With --family: scatter of machine parameters beside size; default: 1.")
-    ] = None,
     material: Annotated[
         list[str] | None,
         typer.Option(
@@ -49,17 +45,14 @@ def simulate(
         str | None,
         typer.Option("--format", help="Ending of the logs, of any format that EDP writes (default: parquet)."),
     ] = None,
-    layout: Annotated[str | None, typer.Option(help="Layout of MAT files: simulink, speedgoat, struct, ...")] = None,
-    truth: Annotated[
-        str | None, typer.Option(help="Channels that exist only in a simulation: with, apart or without.")
-    ] = None,
+    changes: Annotated[
+        list[str],
+        typer.Option("--set", help="One key of a scenario file, such as masses=[12,30] or files.layout=speedgoat."),
+    ] = [],  # noqa: B006
     workers: Annotated[int, typer.Option(help="Number of processes; 0: one for each core.")] = 0,
     limit: Annotated[
         bool, typer.Option("--limit", help="Also compute the limit of predictability: limit.json.")
     ] = False,
-    moments: Annotated[int, typer.Option(help="With --limit: number of branching moments.")] = 240,
-    branches: Annotated[int, typer.Option(help="With --limit: number of futures from each moment.")] = 32,
-    horizons: Annotated[str, typer.Option(help="With --limit: horizons in samples.")] = "1,2,5,10,20,50",
     as_json: JsonFlag = False,
 ) -> None:
     """Simulate recordings of an excavator: M22 in free air, or what a scenario file describes.
@@ -68,26 +61,34 @@ def simulate(
 
     Example: `edp simulate data/c14 --scenario examples/scenarios/c14_soil.toml`
 
-    Example: `edp simulate data/many --family 8 --masses 12-30 --material clay`
+    Example: `edp simulate data/many --family 8 --set masses=[12,30] --material clay`
+
+    Example: `edp simulate data/m22 --limit --set limit.moments=60 --set limit.horizons=[1,10]`
 
     With --limit, moments of the recordings are branched with fresh randomness of operator, soil and sensors. Of each
     later velocity the least mean absolute error follows that any predictor could reach: one that knows the true state
     and all laws, but neither the operator's future choices nor, in the second column, anything but them.
     """
     from edp.sim.data_set import SimulationOrder, suffix_of
+    from edp.sim.scenario_file import limit_settings
 
-    arguments = {"machine": machine, "minutes": minutes, "recordings": recordings, "seed": seed, "family": family}
-    arguments["scatter"] = scatter
-    tables = {
-        "masses": None if masses is None else _range(masses),
+    order = SimulationOrder.of(
+        scenario,
+        _note,
+        changes,
+        machine=machine,
+        minutes=minutes,
+        recordings=recordings,
+        seed=seed,
+        family=family,
         # Equal shares of several soils.
-        "materials": dict.fromkeys(material, 1.0) if material else None,
-    }
-    suffix = None if form is None else suffix_of(form)
-    order = SimulationOrder.of(scenario, _note, **arguments, **tables, suffix=suffix, layout=layout, truth=truth)
-    spec = _limit_spec(moments, branches, horizons) if limit else None
+        materials=dict.fromkeys(material, 1.0) if material else None,
+        suffix=None if form is None else suffix_of(form),
+    )
+    # Settings of the limit are checked even where it is not asked for.
+    spec = limit_settings(scenario, changes)
     paths = run(folder, order, workers, as_json)
-    limit_facts = None if spec is None else run_limit(folder, order, spec, workers, as_json)
+    limit_facts = run_limit(folder, order, spec, workers, as_json) if limit else None
     what_simulated = f"{order.family} machines" if order.family else order.machine
     facts: dict[str, Any] = {"folder": str(folder), "recordings": len(paths), "minutes": order.minutes}
     facts |= {"machine": what_simulated, "seed": order.seed} | ({} if limit_facts is None else {"limit": limit_facts})
@@ -160,25 +161,3 @@ def limit_table(limit: dict[str, Any]) -> None:
 
 def _note(text: str) -> None:
     err.print(f"note: {text}")
-
-
-def _range(text: str) -> tuple[float, float]:
-    from edp.errors import ConfigError
-
-    low, dash, high = text.partition("-")
-    try:
-        # A single mass is a range of one.
-        return float(low), float(high if dash else low)
-    except ValueError as error:
-        raise ConfigError(f"--masses {text}: give the lightest and the heaviest in t, such as 10-50") from error
-
-
-def _limit_spec(moments: int, branches: int, horizons: str) -> LimitSpec:
-    from edp.errors import ConfigError
-    from edp.sim.predictability import LimitSpec
-
-    try:
-        ahead = tuple(int(part) for part in horizons.split(",") if part.strip())
-    except ValueError as error:
-        raise ConfigError(f"--horizons {horizons}: give integers (samples), such as 1,10") from error
-    return LimitSpec(horizons=ahead, moments=moments, branches=branches)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
@@ -22,7 +22,7 @@ from edp.networks.losses import LOSSES, TERMS
 from edp.networks.physics import PhysicsSpec
 from edp.networks.plain import NETWORK_PARTS, USUAL_KINDS
 from edp.networks.predictor import ModelSpec
-from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+from edp.settings.tree import Change, SettingsTree, Table, merged, override, read_toml
 from edp.training.averages import AVERAGES
 from edp.training.fit import TrainingSpec
 from edp.training.optimizers import OPTIMIZERS
@@ -31,6 +31,7 @@ from edp.training.schedules import SCHEDULES
 __all__ = [
     "PRESETS",
     "SETTINGS",
+    "Change",
     "Experiment",
     "FeatureSettings",
     "Table",
@@ -42,6 +43,7 @@ __all__ = [
     "override",
     "plain_tree",
     "preset_table",
+    "read_layers",
     "read_toml",
     "with_set_file",
 ]
@@ -144,33 +146,48 @@ class Experiment:
 
 
 def load_experiment(
-    path: str | Path | None = None, preset: str | None = "standard", overrides: Sequence[str] = ()
+    path: str | Path | None = None,
+    preset: str | None = "standard",
+    overrides: Sequence[Change] = (),
+    aside: Collection[str] = (),
 ) -> Experiment:
-    """Settings from a preset, changed by a TOML file, changed by ``key.path=value`` overrides.
+    """Settings from a preset, changed by a TOML file, changed by overrides.
 
     Without a preset the file is taken as it stands, over the defaults of the specs: what a run folder keeps is whole.
+
+    Args:
+        path: settings file.
+        preset: name of a preset; None for none.
+        overrides: each ``key.path=value``, or a table.
+        aside: tables of the file and the overrides that are a command's own (`edp.config.commands`).
 
     Raises:
         ConfigError: names every unknown key, wrong type and impossible value at once.
     """
-    table: Table = {}
     where = f"preset '{preset}'"
     if preset == AUTO:
         raise ConfigError(
             f"the preset '{AUTO}' chooses a network by the recordings; only edp train does so. Here name one of "
             f"{', '.join(PRESETS)}"
         )
-    if preset is not None:
-        table = preset_table(preset)
+    table = {} if preset is None else preset_table(preset)
     if path is not None:
-        # Files named in settings lie beside the settings file.
-        table = merged(table, with_set_file(read_toml(path), Path(path).parent))
         where = f"'{path}'"
-    for text in overrides:
-        # Files named on the command line lie in the working directory.
-        table = merged(table, with_set_file(override(text), Path()))
+    for layer in read_layers(path, overrides):
+        table = merged(table, {key: value for key, value in layer.items() if key not in aside})
     where += " with --set" if overrides else ""
     return build(Experiment, table, where)
+
+
+def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()) -> list[Table]:
+    """The table of a settings file and those of overrides, in the order in which they are laid over settings.
+
+    Raises:
+        ConfigError: a file or an override that cannot be read.
+    """
+    # Files named in settings lie beside the settings file, files named on the command line in the working directory.
+    first = [] if path is None else [with_set_file(read_toml(path), Path(path).parent)]
+    return first + [with_set_file(override(change), Path()) for change in overrides]
 
 
 def preset_table(name: str) -> Table:

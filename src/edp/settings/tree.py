@@ -22,6 +22,8 @@ from edp.registry import Registry
 from edp.settings.bounds import shown
 
 Table = dict[str, Any]
+Change = str | Mapping[str, Any]
+"""A change of settings: ``key.path=value``, or a table."""
 Parts = Mapping[str, Registry[type]]
 """Registries by the name of the field that holds one of their parts."""
 T = typing.TypeVar("T")
@@ -65,12 +67,15 @@ def merged(base: Table, change: Mapping[str, Any]) -> Table:
     return result
 
 
-def override(text: str) -> Table:
-    """The table that one ``key.path=value`` stands for; a value that is no TOML is a string.
+def override(change: Change) -> Table:
+    """The table that one ``key.path=value`` stands for; a value that is no TOML is a string. A table stands for itself.
 
     Raises:
         ConfigError: not of this form.
     """
+    if not isinstance(change, str):
+        return dict(change)
+    text = change
     key, sign, value = text.partition("=")
     if not sign or not key.strip():
         raise ConfigError(f"--set '{text}': write key.path=value, for example training.epochs=10")
@@ -125,19 +130,20 @@ class SettingsTree:
         values = {entry.name: getattr(spec, entry.name) for entry in fields(spec)}
         return {name: self.plain(value, name) for name, value in values.items() if value is not None}
 
-    def build(self, cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    def build(self, cls: type[T], table: Mapping[str, Any], where: str, path: str = "") -> T:
         """A spec tree from a table; what the table leaves out has its default.
 
         Args:
             cls: dataclass of the tree's root.
             table: nested plain values.
-            where: how messages call the table.
+            where: how messages call the file or the changes that the table is of.
+            path: key of the table in that file; empty for the whole file.
 
         Raises:
             ConfigError: every problem found, with its key path and the closest known key.
         """
         problems: list[str] = []
-        spec = self._build(cls, table, "", problems)
+        spec = self._build(cls, table, path, problems)
         if problems:
             more = [f"and {len(problems) - MOST_LISTED:,} more"] if len(problems) > MOST_LISTED else []
             listed = "\n  - ".join(problems[:MOST_LISTED] + more)
@@ -170,7 +176,9 @@ class SettingsTree:
         try:
             return cls(**values)
         except ConfigError as error:
-            problems.append(f"{path}: {error}" if path else str(error))
+            # Many specs begin their messages with the name of their table already.
+            reason = str(error).removeprefix(f"{path.rpartition('.')[2]}: ")
+            problems.append(f"{path}: {reason}" if path else reason)
             return None
 
     def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:

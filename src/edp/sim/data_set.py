@@ -20,7 +20,7 @@ from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
 from edp.sim.plan import DataSetSpec, simulate_many
 from edp.sim.predictability import LimitJob, LimitSpec, find_limit, plan_limit
 from edp.sim.scenario import Scenario, plain
-from edp.sim.scenario_file import read_scenario_file
+from edp.sim.scenario_file import read_scenario_file, scenario_changes
 from edp.storage import (
     check_held,
     check_writable,
@@ -56,9 +56,14 @@ class SimulationOrder(DataSetSpec):
 
     @staticmethod
     def of(
-        scenario: str | Path | None = None, note: Callable[[str], None] | None = None, **changes: Any
+        scenario: str | Path | None = None,
+        note: Callable[[str], None] | None = None,
+        overrides: Sequence[str] = (),
+        **changes: Any,
     ) -> SimulationOrder:
-        """The order of a scenario file, or the default one; `changes` that are not None replace its values.
+        """The order of a scenario file, or the default one; overrides and `changes` replace its values.
+
+        Overrides are ``key.path=value`` in the keys of the file; `changes` that are not None go before them.
 
         What a change makes void in the file goes with it, and `note` is called with a sentence that says so: a layout
         of MAT files once another format is asked for, a family once a machine is.
@@ -68,11 +73,9 @@ class SimulationOrder(DataSetSpec):
         """
         values: dict[str, Any] = {}
         if scenario is not None:
-            values, files = read_scenario_file(scenario)
-            values |= {key: value for key, value in files.items() if key != "format"}
-            if "format" in files:
-                values["suffix"] = suffix_of(files["format"])
-        stated_changes = {key: value for key, value in changes.items() if value is not None}
+            values = _flat(*read_scenario_file(scenario))
+        stated_changes = _flat(*scenario_changes(overrides))
+        stated_changes |= {key: value for key, value in changes.items() if value is not None}
         if stated_changes.get("family") and "machine" in stated_changes:
             raise ConfigError(
                 f"machine = {stated_changes['machine']} and family = {stated_changes['family']}: a family takes "
@@ -105,6 +108,12 @@ class SimulationOrder(DataSetSpec):
                 raise ConfigError(f"layout '{self.layout}' is one of MAT files, not of '{self.suffix}'; ask for mat")
         truth = self.truth or ("apart" if self.layout else "with")
         return WriteOptions(mat_layout=self.layout or WriteOptions.mat_layout, truth=truth)
+
+
+def _flat(values: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
+    """Values of a data set and of how it is written, by the attributes of an order."""
+    suffix = {"suffix": suffix_of(files["format"])} if "format" in files else {}
+    return values | {key: value for key, value in files.items() if key != "format"} | suffix
 
 
 def _leave_out(values: dict[str, Any], changes: dict[str, Any]) -> Iterator[str]:

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
+from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, SEED, check_bounds, check_count, shown, whole
 from edp.signals import TABLE_A1
 from edp.sim.machine import layout as at
 from edp.sim.plan import ordered
@@ -34,6 +36,8 @@ RESAMPLES = 2000
 CONFIDENCE = 0.95
 MOST_BRANCHES, MOST_MOMENTS = 4096, 100_000
 """Bounds; the usual 32 branches of 240 moments take minutes."""
+MOST_AHEAD = 2000
+"""Samples, 20 s at 100 Hz."""
 KINDS = ("commands_unknown", "commands_known", "persistence")
 
 
@@ -59,16 +63,20 @@ class LimitSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        rising = all(a < b for a, b in zip(self.horizons, self.horizons[1:], strict=False))
-        if not self.horizons or self.horizons[0] < 1 or not rising or self.horizons[-1] > 2000:
-            raise ConfigError(f"limit: horizons = {list(self.horizons)} must rise from at least 1 to at most 2000")
-        if not 4 <= self.branches <= MOST_BRANCHES or self.branches % 2:
-            raise ConfigError(f"limit: branches = {self.branches} must be even, from 4 to {MOST_BRANCHES}")
-        if not 2 <= self.moments <= MOST_MOMENTS or self.recordings < 1:
-            raise ConfigError(
-                f"limit: moments = {self.moments} must be from 2 to {MOST_MOMENTS}, "
-                f"recordings = {self.recordings} at least 1"
-            )
+        check_count("limit", "horizons", self.horizons, MOST_HORIZONS, least=1)
+        check_bounds(
+            "limit",
+            self,
+            horizons=whole(1, MOST_AHEAD),
+            moments=whole(2, MOST_MOMENTS),
+            branches=whole(4, MOST_BRANCHES),
+            recordings=whole(1, MOST_NAMES),
+            seed=SEED,
+        )
+        if any(a >= b for a, b in pairwise(self.horizons)):
+            raise ConfigError(f"limit: horizons = {shown(self.horizons)} must rise")
+        if self.branches % 2:
+            raise ConfigError(f"limit: branches = {self.branches} must be even")
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from edp.errors import ConfigError
-from edp.settings.tree import SettingsTree, Table
+from edp.settings.tree import SettingsTree, Table, merged, override
 from edp.sim.plan import DataSetSpec
+from edp.sim.predictability import LimitSpec
 from edp.storage import read_toml
 
 
@@ -29,9 +31,10 @@ class LogFileSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioFile(DataSetSpec):
-    """What a scenario file holds: the data set, and in ``[files]`` how it is written."""
+    """What a scenario file holds: the data set, in ``[files]`` how it is written, in ``[limit]`` how that is found."""
 
     files: LogFileSettings = field(default_factory=LogFileSettings)
+    limit: LimitSpec = field(default_factory=LimitSpec)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -39,6 +42,9 @@ class ScenarioFile(DataSetSpec):
 
 
 SCENARIO_FILE = SettingsTree(what="scenario file")
+_HINTS = get_type_hints(ScenarioFile)
+_CHANGES = make_dataclass("ScenarioChanges", [(entry.name, _HINTS[entry.name], None) for entry in fields(ScenarioFile)])
+"""Some keys of a scenario file, without the checks of what belongs together: the file may hold the rest."""
 
 
 def read_scenario_file(path: str | Path) -> tuple[dict[str, Any], dict[str, str]]:
@@ -49,11 +55,47 @@ def read_scenario_file(path: str | Path) -> tuple[dict[str, Any], dict[str, str]
     Raises:
         ConfigError: not readable, not TOML, or a key or value that cannot be: file, key, value and bound are named.
     """
+    table = _table(path)
+    settings = SCENARIO_FILE.build(ScenarioFile, table, str(path))
+    return _stated(settings, table)
+
+
+def scenario_changes(overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Values of ``key.path=value`` overrides of a scenario file, in the form of `read_scenario_file`.
+
+    Raises:
+        ConfigError: a key that a scenario file does not have, or a value of another kind.
+    """
+    table = _merged(overrides)
+    return _stated(SettingsTree().build(_CHANGES, table, "--set"), table)
+
+
+def limit_settings(path: str | Path | None, overrides: Sequence[str]) -> LimitSpec:
+    """How the limit of predictability is found: the table ``[limit]`` of a scenario file, changed by overrides.
+
+    Raises:
+        ConfigError: a key or value that cannot be.
+    """
+    table = merged({} if path is None else _table(path), _merged(overrides))
+    return SettingsTree().build(LimitSpec, table.get("limit", {}), "[limit]", "limit")
+
+
+def _table(path: str | Path) -> Table:
     source = Path(path)
-    table = _resolved(read_toml(source, f"scenario file {source}", ConfigError), source.parent)
-    settings = SCENARIO_FILE.build(ScenarioFile, table, str(source))
-    values = {key: getattr(settings, key) for key in table if key != "files"}
-    return values, SCENARIO_FILE.plain(settings.files)
+    return _resolved(read_toml(source, f"scenario file {source}", ConfigError), source.parent)
+
+
+def _merged(overrides: Sequence[str]) -> Table:
+    table: Table = {}
+    for text in overrides:
+        table = merged(table, override(text))
+    return table
+
+
+def _stated(settings: Any, table: Table) -> tuple[dict[str, Any], dict[str, str]]:
+    """What the table states of a data set, and of how it is written."""
+    values = {key: getattr(settings, key) for key in table if key not in ("files", "limit")}
+    return values, SCENARIO_FILE.plain(settings.files) if settings.files is not None else {}
 
 
 def _resolved(table: Table, folder: Path) -> Table:

@@ -13,6 +13,7 @@ from edp.cli.console import duration
 from edp.signals import TABLE_A1
 from edp.storage import read_json
 
+LIMIT = [w for s in ("moments=4", "branches=4", "horizons=[1,10]") for w in ("--set", f"limit.{s}")]
 COMMANDS = [command.name for command in app.registered_commands]
 EXPECTED = [
     *("demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "distil", "compress", "footprint"),
@@ -170,7 +171,7 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     file = tmp_path / "set.toml"
     file.write_text('minutes = 5\nrecordings = 2\nseed = 4\n[mix]\nisolated = 1\n[files]\nformat = "csv"\n')
     command = ("simulate", tmp_path / "data", "--scenario", file, "--minutes", 0.4, "--workers", 1)
-    asked = ("--limit", "--moments", 4, "--branches", 4, "--horizons", "1,10")
+    asked = ("--limit", *LIMIT)
     made = edp(*command, *asked, "--json").json
     assert (made["minutes"], made["seed"], made["recordings"]) == (0.4, 4, 2)
     assert len(list((tmp_path / "data").glob("*.csv"))) == 2
@@ -179,15 +180,16 @@ def test_a_scenario_file_and_its_limit_of_predictability(edp, tmp_path):
     shown = edp(*command, *asked).out
     assert "10 (100 ms)" in shown
     assert "commands known" in shown
-    assert "give integers" in edp(*command, "--limit", "--horizons", "1,x").err
-    assert "must be even" in edp(*command, "--limit", "--branches", 3).err
+    assert "write it without quotes" in edp(*command, "--set", "limit.horizons=[1,x]").err
+    assert "must be even" in edp(*command, "--set", "limit.branches=5").err
+    assert "unknown key 'limit.branch'" in edp(*command, "--set", "limit.branch=5").err
 
 
 def test_soil_family_and_format_of_the_command_line_go_before_the_scenario_file(edp, tmp_path):
     file = tmp_path / "set.toml"
     text = 'machine = "C14"\nminutes = 5\nrecordings = 2\n[mix]\ndig = 1\n[materials]\nclay = 1\n'
     file.write_text(text + '[files]\nformat = "mat"\nlayout = "speedgoat"\n')
-    options = ("--family", 2, "--masses", "12-20", "--material", "gravel", "--format", "parquet", "--workers", 1)
+    options = ("--family", 2, "--set", "masses=[12,20]", "--material", "gravel", "--format", "parquet", "--workers", 1)
     made = edp("simulate", tmp_path / "data", "--scenario", file, "--minutes", 0.2, *options, "--json")
     assert made.json["machine"] == "2 machines"
     assert "note: layout 'speedgoat' is one of MAT files, and format parquet was asked for" in made.err
@@ -215,7 +217,7 @@ def test_inspect_shows_and_draws_what_the_data_cover(edp, logs, tmp_path):
 
 def test_the_report_says_the_limit_of_a_simulated_data_set(edp, tmp_path, small):
     data, run = tmp_path / "data", tmp_path / "run"
-    asked = ("--limit", "--moments", 4, "--branches", 4, "--horizons", "1,10")
+    asked = ("--limit", *LIMIT)
     edp("simulate", data, "--minutes", 0.8, "--recordings", 4, "--seed", 3, "--workers", 1, *asked)
     edp("train", data, "--out", run, *small)
     edp("evaluate", run, "--baselines", "persistence")

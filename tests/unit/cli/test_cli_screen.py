@@ -27,7 +27,7 @@ QUICK = [
         "forest.tests=400",
         "forest.repeats=2",
     )
-    for word in ("--set", change)
+    for word in ("--set", f"screen.{change}")
 ]
 
 
@@ -59,7 +59,8 @@ def logs(tmp_path_factory):
 
 def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
     out = tmp_path / "screen"
-    ended = edp("screen", logs, "--out", out, "--horizon", "5", "--trusted", "lever", "--no-pictures", *QUICK)
+    options = ["--horizon", "5", "--set", "screen.trusted=['lever']", "--no-pictures"]
+    ended = edp("screen", logs, "--out", out, *options, *QUICK)
     assert ended.code == 0, ended.err
     assert "read: drive_0.csv" in ended.err
     assert "screen: " in ended.err
@@ -100,11 +101,11 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     )
     out = tmp_path / "screen"
     trials = [
-        "--trusted",
-        "lever",
+        "--set",
+        "screen.trusted=['lever']",
         "--trials",
-        "--random",
-        "1",
+        "--set",
+        "trials.random=1",
         "--config",
         tmp_path / "tiny.toml",
         "--features",
@@ -188,10 +189,11 @@ def test_time_left_is_told_once_there_is_something_to_judge_it_by(monkeypatch):
     [
         (["--targets", "sped"], "did you mean 'speed'"),
         (["--exclude", "levr"], "cannot exclude 'levr'"),
-        (["--set", "max_lags=3"], "unknown key 'max_lags'; did you mean 'max_lag'"),
-        (["--set", "forest.trees=0"], "1 <= trees <= 10,000 must hold"),
+        (["--set", "screen.max_lags=3"], "unknown key 'screen.max_lags'; did you mean 'max_lag'"),
+        (["--set", "max_lag=3"], "unknown key 'max_lag'; did you mean 'screen.max_lag'"),
+        (["--set", "screen.forest.trees=0"], "1 <= trees <= 10,000 must hold"),
         (["--horizon", "200"], "beyond max_lag"),
-        (["--set", "max_lag"], "write key.path=value"),
+        (["--set", "screen.max_lag"], "write key.path=value"),
     ],
 )
 def test_mistakes_are_told(edp, logs, tmp_path, args, says):

@@ -18,7 +18,15 @@ from edp.storage.ledger import Ledger
 from edp.training import load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.fit import Loop
-from edp.workflows.compression import CompressionSearchSpec, DistilSpec, distil, resource_usage, search
+from edp.workflows.compression import (
+    CompressionSearchRequest,
+    CompressionSearchSpec,
+    DistilRequest,
+    DistilSpec,
+    distil,
+    resource_usage,
+    search,
+)
 from edp.workflows.compression.quantise import quantise
 from edp.workflows.search.phases.compression import order_of, recipe_of, teacher_settings
 from edp.workflows.search.plan import load_plan
@@ -168,10 +176,10 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
         assert [one.test_set for one in ledger.openings()] == ["test sessions", SECOND_TEST_SET]
     need = resource_usage(load_bundle(run).predictor, "float32", Budget())
     budget = Budget(name="tight", parameter_bytes=need.parameter_bytes - 1)
-    spec = CompressionSearchSpec(budget=budget, units=(2,), formats=("float32",), again=True)
+    spec = CompressionSearchSpec(budget=budget, units=(2,), formats=("float32",))
     with watching(seen):
-        found = search(run, spec, tmp_path / "small")
-        distil(run, DistilSpec(units=2), tmp_path / "student")
+        found = search(run, CompressionSearchRequest(spec=spec, again=True), tmp_path / "small")
+        distil(run, DistilRequest(spec=DistilSpec(units=2)), tmp_path / "student")
     quantise(run, tmp_path / "w8a16", ticks=50)
     assert len(seen) > 10
     assert not set(seen) & sealed(study, six_sessions)
@@ -186,7 +194,7 @@ def test_no_frozen_session_trains_or_chooses_from_the_study_to_the_compressed_ne
     with Ledger(study.folder / "ledger") as ledger:
         assert len(ledger.openings(SECOND_TEST_SET)) == 2
     with pytest.raises(ConfigError, match="was opened on"):
-        search(run, replace(spec, again=False, units=(1,)), tmp_path / "other")
+        search(run, CompressionSearchRequest(spec=replace(spec, units=(1,))), tmp_path / "other")
 
 
 def test_the_networks_of_phase_6_are_runs_like_any_other(study, tmp_path):
@@ -213,7 +221,7 @@ def test_a_frozen_session_under_another_name_is_still_frozen(study, run, six_ses
     with pytest.raises(DataError, match=f"'a_new_day' .* is the frozen session '{test}'"):
         finetune(run, source, FinetuneRequest(spec=FinetuneSpec()), tmp_path / "fine")
     with pytest.raises(DataError, match=f"is the frozen session '{test}'.*learn from it"):
-        distil(run, DistilSpec(units=2, further=source), tmp_path / "student")
+        distil(run, DistilRequest(spec=DistilSpec(units=2), further=source), tmp_path / "student")
     assert not (tmp_path / "student").exists()
 
 
@@ -250,7 +258,7 @@ def test_other_data_are_drawn_only_when_that_is_said(study, run, six_sessions, t
     drawn = prepare_data(other, load_experiment(study.teacher, "quick", ["split.missing=draw"]))
     assert (len(drawn.train), len(drawn.validation), len(drawn.test)) == (4, 1, 1)
     with pytest.raises(ConfigError, match="lets go of 2 of its frozen sessions"):
-        distil(run, DistilSpec(units=2, changes=("split.kind=time",)), tmp_path / "student")
+        distil(run, DistilRequest(spec=DistilSpec(units=2), changes=("split.kind=time",)), tmp_path / "student")
 
 
 @pytest.mark.parametrize("harm", ["none", "states are lost"])

@@ -203,9 +203,10 @@ def test_an_epoch_is_a_pass_over_the_logs_unless_said_otherwise(run):
     [
         ("model.window=20", "keeps task and network of its source"),
         ("task.horizons=[1]", "keeps task and network"),
-        ("training.epochs=3", "options of its own"),
-        ("training.optimizer.learning_rate=1", "options of its own"),
-        ("training={}", "options of its own"),
+        ("training.epochs=3", "settings of its own"),
+        ("training.optimizer.learning_rate=1", "settings of its own"),
+        ("training.chunks={batch=3}", "settings of its own"),
+        ("finetune.rounds=3", "keeps task and network"),
         ("training.clipnorm=1", "unknown key 'training.clipnorm'"),
     ],
 )
@@ -307,13 +308,17 @@ def test_skew_and_squares_are_those_of_scipy(tiny):
 
 
 def test_the_command_tunes_prints_and_writes_a_report(run, target, tmp_path):
-    options = ["--rounds", "2", "--batch", "4", "--baselines", "direct, ridge_arx", "--set", "training.updates=3"]
+    file = tmp_path / "tuning.toml"
+    file.write_text("[finetune]\nrounds = 2\nbatch = 8\n[training]\nupdates = 3\n")
+    options = ["--config", str(file), "--set", "finetune.batch=4", "--baselines", "direct, ridge_arx"]
     call = ["finetune", str(run), str(target.path), "--out", str(tmp_path / "run"), *options]
     told = CliRunner().invoke(app, call)
     assert told.exit_code == 0, told.output
     assert "next: edp evaluate" in told.output
     facts = read_json(tmp_path / "run" / "transfer.json")
     assert set(facts["methods"]) == {"full", "direct", "ridge_arx"}
+    assert facts["settings"] == dataclasses.asdict(FinetuneSpec(rounds=2, batch=4))
+    assert load_experiment(tmp_path / "run" / "config.toml", None).training.updates == 3
     assert math.isfinite(facts["methods"]["direct"]["domains"]["target"]["2"]["mean"]["mse"])
     page = (tmp_path / "run" / "transfer.html").read_text(encoding="utf-8")
     assert "Before and after" in page

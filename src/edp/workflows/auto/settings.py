@@ -13,7 +13,7 @@ from edp.config.experiment import (
     build,
     plain_tree,
     preset_table,
-    with_set_file,
+    read_layers,
 )
 from edp.data.splits import ByRecording, SplitSpec
 from edp.errors import ConfigError
@@ -82,10 +82,9 @@ def load_auto(path: str | Path | None = None, overrides: Sequence[str] = ()) -> 
     table = preset_table("auto")
     where = "preset 'auto'"
     if path is not None:
-        table = merged(table, with_set_file(read_toml(path), Path(path).parent))
         where = f"'{path}' with preset 'auto'"
-    for text in overrides:
-        table = merged(table, with_set_file(override(text), Path()))
+    for layer in read_layers(path, overrides):
+        table = merged(table, layer)
     return auto_settings(table, where)
 
 

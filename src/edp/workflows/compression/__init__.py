@@ -1,7 +1,7 @@
 """Make a trained network smaller: students, distillation, pruning, dynamic INT8, quantisation-aware training."""
 
 from edp.workflows.compression.bench import Bench, CompressionRequest, tuning
-from edp.workflows.compression.distil import DistilSpec, distil
+from edp.workflows.compression.distil import DISTIL_SETTINGS, DistilRequest, DistilSpec, distil
 from edp.workflows.compression.distillation import Distillation, DistillationSpec, SoftmaxDivergence
 from edp.workflows.compression.formats import FORMATS, Deployed, ResourceUsage, deploy, resource_usage
 from edp.workflows.compression.int8 import Quantised, dynamic_int8
@@ -9,11 +9,17 @@ from edp.workflows.compression.judged import CompressionResult, Judged
 from edp.workflows.compression.pruning import prune
 from edp.workflows.compression.qat import QuantisationAware, RoundingSpec
 from edp.workflows.compression.rounding import NetworkRounding, weight_levels
-from edp.workflows.compression.searching import CompressionCallbacks, CompressionSearchSpec, search
+from edp.workflows.compression.searching import (
+    CompressionCallbacks,
+    CompressionSearchRequest,
+    CompressionSearchSpec,
+    search,
+)
 from edp.workflows.compression.taylor import FeatureImportance, importance
 from edp.workflows.compression.variants import VARIANTS, CompressedCandidate
 
 __all__ = [
+    "DISTIL_SETTINGS",
     "FORMATS",
     "VARIANTS",
     "Bench",
@@ -21,8 +27,10 @@ __all__ = [
     "CompressionCallbacks",
     "CompressionRequest",
     "CompressionResult",
+    "CompressionSearchRequest",
     "CompressionSearchSpec",
     "Deployed",
+    "DistilRequest",
     "DistilSpec",
     "Distillation",
     "DistillationSpec",

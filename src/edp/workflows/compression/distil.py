@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from edp.config.experiment import Experiment, load_experiment, plain_tree
+from edp.config.experiment import Change, Experiment, load_experiment, plain_tree
 from edp.data.frozen import frozen_before, frozen_of, keep_frozen, refuse_frozen
 from edp.data.prepared import Prepared
 from edp.data.series import Series
@@ -17,6 +17,7 @@ from edp.logs.source import DataSource
 from edp.networks.losses import LOSSES
 from edp.networks.predictor import Predictor
 from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, whole
+from edp.settings.tree import SettingsTree
 from edp.storage.runs import read_provenance
 from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
@@ -26,36 +27,55 @@ from edp.workflows.compression.distillation import DistillationSpec
 from edp.workflows.compression.qat import RoundingSpec
 from edp.workflows.train_evaluate import StrategyFactory, train
 
+DISTIL_SETTINGS = SettingsTree({"soft": LOSSES})
+"""Reads the table ``[distil]``, whose objective holds a registered loss."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DistilSpec:
-    """What is made of a run.
+    """The table ``[distil]``: a student, and how it is taught.
 
     Attributes:
         units: width of the student.
         levels: convolution levels; None for one less than the teacher has.
         pruned: begin with what pruning leaves of the teacher.
-        distillation: the objective.
-        teachers: run folders or bundles of further teachers.
-        further: where recordings without truth are; the student learns what the teachers say of them.
-        changes: settings of the training that differ from the run's, as ``key.path=value``.
+        objective: what is minimised.
+
+    Raises:
+        ConfigError: a value out of range, or a pruned student with levels of its own.
     """
 
     units: int
     levels: int | None = None
     pruned: bool = False
-    distillation: DistillationSpec = field(default_factory=DistillationSpec)
-    teachers: tuple[str, ...] = ()
-    further: DataSource | None = None
-    changes: tuple[str, ...] = ()
+    objective: DistillationSpec = field(default_factory=DistillationSpec)
 
     def __post_init__(self) -> None:
         check_bounds("distil", self, units=whole(1, MOST_UNITS), levels=whole(1, MOST_LEVELS))
+        if self.pruned and self.levels is not None:
+            raise ConfigError("a pruned student keeps all levels of its teacher; leave out the levels, or the pruning")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistilRequest:
+    """What is made of a run.
+
+    Attributes:
+        spec: the student, and how it is taught.
+        teachers: run folders or bundles of further teachers.
+        further: where recordings without truth are; the student learns what the teachers say of them.
+        changes: settings of the training that differ from the run's: ``key.path=value``, or tables.
+    """
+
+    spec: DistilSpec
+    teachers: tuple[str, ...] = ()
+    further: DataSource | None = None
+    changes: tuple[Change, ...] = ()
 
 
 def distil(
     run: str | Path,
-    spec: DistilSpec,
+    request: DistilRequest,
     out: str | Path,
     source: DataSource | None = None,
     on_event: Callable[[TrainingProgress], None] | None = None,
@@ -64,7 +84,7 @@ def distil(
 
     Args:
         run: run folder of the teacher.
-        spec: what is made of it.
+        request: what is made of it.
         out: run folder of the student.
         source: recordings to learn on; by default those of the run.
         on_event: called with progress.
@@ -73,19 +93,18 @@ def distil(
         EdpError: not a run, a student that is no smaller, teachers that contradict one another, other data or settings
             in `out`.
     """
-    teacher, experiment, own = read_run(run, spec.changes)
-    if spec.pruned and spec.levels is not None:
-        raise ConfigError("a pruned student keeps all levels of its teacher; leave out the levels, or the pruning")
+    spec = request.spec
+    teacher, experiment, own = read_run(run, request.changes)
     order = CompressionRequest(
-        name="student", units=spec.units, levels=spec.levels, pruned=spec.pruned, distillation=spec.distillation
+        name="student", units=spec.units, levels=spec.levels, pruned=spec.pruned, distillation=spec.objective
     )
     model = order.model(teacher.spec)
     # The teacher under another name would train for nothing.
     if model == teacher.spec:
         raise ConfigError(f"a student of {spec.units} units is the teacher itself; take fewer units or levels")
-    teachers = [teacher, *(load_bundle(path).predictor for path in spec.teachers)]
+    teachers = [teacher, *(load_bundle(path).predictor for path in request.teachers)]
     frozen = frozen_sessions(run, experiment)
-    series, digests = _unlabelled(teacher, spec.further, frozen)
+    series, digests = _unlabelled(teacher, request.further, frozen)
     facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
 
     def strategy(data: Prepared) -> TrainingStrategy:
@@ -95,7 +114,7 @@ def distil(
     return train(source or own, student_experiment, out, on_event, StrategyFactory(facts, strategy, frozen))
 
 
-def read_run(run: str | Path, changes: Sequence[str] = ()) -> tuple[Predictor, Experiment, DataSource]:
+def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor, Experiment, DataSource]:
     """Network, settings and recordings of a run, or of the run that a bundle lies in.
 
     Raises:

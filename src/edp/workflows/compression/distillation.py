@@ -80,6 +80,11 @@ class DistillationSpec:
             raise ConfigError(
                 f"distillation: truth = {self.truth}; 0 <= truth < 1 must hold (with 1 there is no teacher: train)"
             )
+        if POINT not in self.soft.outputs:
+            raise ConfigError(
+                f"distillation: soft = {type(self.soft).__name__}, a loss of outputs {', '.join(self.soft.outputs)}; a "
+                "loss of point predictions must hold: teachers say one number of each target"
+            )
         check_bounds("distillation", self, hint=span(0.0, MOST_WEIGHT), components=whole(1, MOST_UNITS))
 
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from edp.config.experiment import Experiment, experiment_toml, plain_tree
+from edp.config.experiment import Change, Experiment, experiment_toml, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.data.prepared import Prepared
-from edp.errors import ExportError
+from edp.errors import ConfigError, ExportError, closest
 from edp.evaluation.controller import Budget
 from edp.logs.source import DataSource
 from edp.networks.narrow import width_of
 from edp.networks.predictor import Predictor
-from edp.settings.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_NAMES, MOST_UNITS, check_bounds, check_count, shown, whole
 from edp.signals import KINDS
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.ledger import Ledger
@@ -47,7 +47,7 @@ RESULT = "compression.json"
 
 @dataclass(frozen=True, kw_only=True)
 class CompressionSearchSpec:
-    """What is searched.
+    """The table ``[compress]``: what is searched.
 
     Attributes:
         budget: what the controller grants.
@@ -55,21 +55,40 @@ class CompressionSearchSpec:
         formats: number formats; none given, all.
         recipes: how each width is made, some of `edp.workflows.compression.planning.RECIPES`.
         thesis: also make the variants of Table 4.9 that are narrower than the teacher.
-        again: open the sealed test set again for another choice, which weakens what it can show; it is recorded.
-        changes: settings of the trainings that differ from the run's, as ``key.path=value``.
+
+    Raises:
+        ConfigError: a value out of range, or an unknown format or recipe.
     """
 
-    budget: Budget
+    budget: Budget = field(default_factory=Budget)
     units: tuple[int, ...] = ()
     formats: tuple[str, ...] = ()
     recipes: tuple[str, ...] = RECIPES
     thesis: bool = False
-    again: bool = False
-    changes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_count("compress", "units", self.units, MOST_NAMES)
         check_bounds("compress", self, units=whole(1, MOST_UNITS))
+        check_count("compress", "recipes", self.recipes, len(RECIPES), least=1)
+        for key, names, known_names in (("formats", self.formats, FORMATS), ("recipes", self.recipes, RECIPES)):
+            for name in names:
+                if name not in known_names:
+                    raise ConfigError(f"compress: {key} = {shown(name)}{closest(name, known_names)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompressionSearchRequest:
+    """What is made of a run.
+
+    Attributes:
+        spec: what is searched.
+        again: open the sealed test set again for another choice, which weakens what it can show; it is recorded.
+        changes: settings of the trainings that differ from the run's: ``key.path=value``, or tables.
+    """
+
+    spec: CompressionSearchSpec = field(default_factory=CompressionSearchSpec)
+    again: bool = False
+    changes: tuple[Change, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -143,7 +162,7 @@ class DiskBench(Bench):
 
 def search(
     run: str | Path,
-    spec: CompressionSearchSpec,
+    request: CompressionSearchRequest,
     out: str | Path,
     source: DataSource | None = None,
     callbacks: CompressionCallbacks | None = None,
@@ -156,7 +175,7 @@ def search(
 
     Args:
         run: run folder of the teacher.
-        spec: what is searched.
+        request: what is made of it.
         out: folder of the search, with a run for each network.
         source: recordings to learn, choose and judge on; by default those of the run.
         callbacks: called on the way.
@@ -165,7 +184,8 @@ def search(
         EdpError: not a run, a budget that no network meets, other settings or data in `out`, or a test set that was
             opened for another choice.
     """
-    teacher, experiment, own = read_run(run, spec.changes)
+    spec = request.spec
+    teacher, experiment, own = read_run(run, request.changes)
     plan = make_plan(teacher, spec.budget, spec.units, spec.formats, spec.recipes)
     callbacks = callbacks or CompressionCallbacks()
     for note in plan.notes:
@@ -186,7 +206,7 @@ def search(
         front, chosen = choose(rows)
         result = CompressionResult(evaluator.teacher, rows, front, chosen, notes=[*plan.notes, *notes])
         if result.best is not None:
-            result = replace(result, held_out_test=_judge_held_out(result, evaluator, folder, held_out, spec.again))
+            result = replace(result, held_out_test=_judge_held_out(result, evaluator, folder, held_out, request.again))
         seen = held_out.seen(result.held_out_test.get("openings", ())) or _seen(Path(run), source, own, held_out)
         write_json(folder.file(RESULT), _plain(result, spec, data, seen, len(held_out.data.test)))
     return result

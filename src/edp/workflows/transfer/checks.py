@@ -186,8 +186,8 @@ def check_signs(data: Prepared, source: Prepared | None) -> list[str]:
         )
         raise DataError(
             f"the logs have another sign convention than the source: {differences}. Turn the column in the signal map "
-            "(scale = -1.0), or exchange the two pilot pressures if they are mixed up; --any-sign takes the logs as "
-            "they are"
+            "(scale = -1.0), or exchange the two pilot pressures if they are mixed up; "
+            "finetune.check_signs = false takes the logs as they are"
         )
     blind = [t for t in data.task.targets if not any(p.target == t for p in sure)]
     if blind:

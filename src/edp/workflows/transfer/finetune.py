@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from edp import __version__
-from edp.config.experiment import Experiment
+from edp.config.experiment import Change, Experiment
 from edp.data.frozen import refuse_frozen
 from edp.data.prepared import Prepared, prepare
 from edp.errors import ConfigError
@@ -58,16 +58,16 @@ class FinetuneRequest:
         spec: phases, rates and regularisers.
         method: name of the method whose network is kept as the run.
         baselines: names of further methods; direct transfer is always among them.
-        changes: settings of the trainings that differ from those of the source, as ``key.path=value``.
+        changes: settings of the trainings that differ from those of the source: ``key.path=value``, or tables.
 
     Raises:
         ConfigError: an unknown method, a former name of one, or one that leaves no network as `method`.
     """
 
-    spec: FinetuneSpec
+    spec: FinetuneSpec = field(default_factory=FinetuneSpec)
     method: str = "full"
     baselines: tuple[str, ...] = ()
-    changes: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
 
     def __post_init__(self) -> None:
         for name in (self.method, *self.baselines):

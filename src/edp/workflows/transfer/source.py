@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from edp.config.experiment import (
+    Change,
     Experiment,
     FeatureSettings,
+    Table,
     TaskSettings,
     build,
     load_experiment,
@@ -29,7 +31,7 @@ from edp.training.bundle import weights_digest
 from edp.workflows.train_evaluate import trained_run
 
 OWN = ("training.epochs", "training.optimizer", "training.patience", "training.refit", "training.chunks.batch")
-"""Settings that a fine-tuning has options of its own for."""
+"""Settings that a fine-tuning has others for, in the table ``[finetune]``."""
 PLACES = ("training", "split", "judge")
 
 
@@ -94,33 +96,41 @@ def read_source(path: str | Path) -> SourceModel:
         return SourceModel(bundle, experiment, None, str(error))
 
 
-def target_experiment(source: SourceModel, changes: Sequence[str] = ()) -> Experiment:
+def target_experiment(source: SourceModel, changes: Sequence[Change] = ()) -> Experiment:
     """Settings for logs of a target: the source's task and network, each log divided by time, then `changes`.
 
     An epoch is a pass over the training parts, however long the source's epochs were, unless a change says otherwise.
 
     Raises:
-        ConfigError: a change of what a transfer keeps, or of what it has options of its own for.
+        ConfigError: a change of what a transfer keeps, or of what the table ``[finetune]`` settles.
     """
-    for text in changes:
-        key = text.partition("=")[0].strip()
-        # Task and network decide what the weights mean; changed ones would not fit them.
-        if key.partition(".")[0] not in PLACES:
-            raise ConfigError(
-                f"--set {key}: a transfer keeps task and network of its source; settings of "
-                f"{', '.join(PLACES)} can be changed"
-            )
-        own = next((name for name in OWN if f"{key}.".startswith(f"{name}.")), None)
-        if own or key in ("training", "training.chunks"):
-            raise ConfigError(f"--set {key}: a fine-tuning has options of its own for it; see edp finetune --help")
+    layers = [override(change) for change in changes]
+    for layer in layers:
+        _check_kept(layer)
     task = task_settings(source.bundle.task)
     # Zero: passes over the target's logs, not the number of updates that suited the source.
     training = replace(source.experiment.training, updates=0)
     experiment = replace(source.experiment, task=task, split=ByTime(), model=source.predictor.spec, training=training)
     table = plain_tree(experiment)
-    for text in changes:
-        table = merged(table, override(text))
+    for layer in layers:
+        table = merged(table, layer)
     return build(Experiment, table, "of the source with --set")
+
+
+def _check_kept(layer: Table) -> None:
+    """Refuse changes of task and network, which decide what the weights mean, and of what ``[finetune]`` settles."""
+    for name in layer:
+        if name not in PLACES:
+            raise ConfigError(
+                f"{name}: a transfer keeps task and network of its source; settings of {', '.join(PLACES)} can be "
+                "changed, and those of finetune"
+            )
+    for path in OWN:
+        value: object = layer
+        for key in path.split("."):
+            value = value.get(key) if isinstance(value, dict) else None
+        if value is not None:
+            raise ConfigError(f"{path}: a fine-tuning has settings of its own for it, in its table [finetune]")
 
 
 def task_settings(task: Task) -> TaskSettings:
