@@ -14,7 +14,7 @@ from edp.data.feature_files import read_set_table
 from edp.errors import ConfigError, DataError, EdpError, StorageError
 from edp.evaluation.controller import load_budget
 from edp.logs.source import load_data_set, load_signal_map
-from edp.report import read_facts, read_study
+from edp.report import read_facts
 from edp.report.compression.facts import read_compression
 from edp.report.run.predictability import read_limit
 from edp.report.transfer.facts import read_transfer
@@ -23,6 +23,7 @@ from edp.sim.physics.soil import load_material
 from edp.sim.scenario_file import read_scenario_file
 from edp.storage.ledger import Ledger, read_records
 from edp.storage.runs import RunFolder, read_provenance
+from edp.storage.study_file import read_study
 from edp.training import load_bundle
 from edp.workflows.search.plan import load_plan
 

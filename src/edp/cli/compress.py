@@ -14,6 +14,7 @@ from edp.cli.train import MapOption, RepairOption, SeriesDisplay, source_of
 
 if TYPE_CHECKING:
     from edp.training import TrainingProgress
+    from edp.workflows.compression import Judged
 
 
 def compress(
@@ -68,18 +69,21 @@ def compress(
         compression = search(bundle, request, folder, source, CompressionCallbacks(display.on_note, on_training))
     page = write_compression_page(folder)
     facts = read_compression(folder)
-    best = compression.best
 
     def show() -> None:
         _tables(facts)
-        if best is not None:
-            # An integer network leaves its run in float; quantising it is the next step.
-            whole = best.number_format == "w8a16"
-            then = f"edp quantise {best.run} --out {folder / 'w8a16'}" if whole else f"edp evaluate {best.run}"
-            out.print(f"next: {then}, or edp footprint {best.run}")
+        if compression.best is not None:
+            _show_next(compression.best, folder)
         out.print(f"report: {page}")
 
     emit(as_json, dict(facts.content) | {"report": str(page)}, show)
+
+
+def _show_next(best: Judged, folder: Path) -> None:
+    # An integer network leaves its run in float; quantising it is the next step.
+    whole = best.number_format == "w8a16"
+    then = f"edp quantise {best.run} --out {folder / 'w8a16'}" if whole else f"edp evaluate {best.run}"
+    out.print(f"next: {then}, or edp footprint {best.run}")
 
 
 def _tables(facts: Any) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +13,7 @@ from edp.cli.settings import SettingsOption
 from edp.cli.train import MapOption, RepairOption, TrainingDisplay, source_of
 
 if TYPE_CHECKING:
+    from edp.evaluation.footprint import Footprint
     from edp.settings.tree import Change
 
 
@@ -70,12 +72,13 @@ def distil(
         "validation_mae": display.best,
         **{name: {"parameters": count.parameters, "macs_tick": count.macs_tick} for name, count in counts.items()},
     }
+    emit(as_json, facts, lambda: _show(counts, facts))
 
-    def show() -> None:
-        rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
-        table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
-        tail = "" if display.best is None else f", validation MAE {display.best:.4g} (report units)"
-        out.print(f"distilled in {duration(bundle.provenance['seconds'])}{tail}; bundle in {folder / 'bundle'}")
-        out.print(f"next: edp evaluate {folder}")
 
-    emit(as_json, facts, show)
+def _show(counts: Mapping[str, Footprint], facts: Mapping[str, Any]) -> None:
+    rows = [(name, count.parameters, count.macs_tick, count.macs_window) for name, count in counts.items()]
+    table("", ["network", "parameters", "MACs per tick", "MACs per window"], rows)
+    error = facts["validation_mae"]
+    tail = "" if error is None else f", validation MAE {error:.4g} (report units)"
+    out.print(f"distilled in {duration(facts['seconds'])}{tail}; bundle in {facts['bundle']}")
+    out.print(f"next: edp evaluate {facts['run']}")

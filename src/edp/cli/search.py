@@ -208,7 +208,8 @@ class SearchDisplay:
 
 
 def _write_report(study: Path, output: Path | None, pictures: bool) -> Path:
-    from edp.report import read_study, write_study_page
+    from edp.report import write_study_page
+    from edp.storage.study_file import read_study
 
     return write_study_page(read_study(study), study if output is None else output, pictures).page
 

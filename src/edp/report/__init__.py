@@ -7,7 +7,6 @@ from edp.report.run.facts import Facts, comparison_rows, headline, read_facts
 from edp.report.run.page import build_report
 from edp.report.screening.page import build_screening_page
 from edp.report.screening.pictures import write_pictures
-from edp.report.search.facts import read_study
 from edp.report.search.page import StudyReport, write_study_page
 from edp.report.transfer.facts import Transfer, read_transfer
 from edp.report.transfer.page import write_transfer_page
@@ -24,7 +23,6 @@ __all__ = [
     "headline",
     "read_compression",
     "read_facts",
-    "read_study",
     "read_transfer",
     "write_compression_page",
     "write_pictures",

@@ -11,7 +11,7 @@ import pytest
 import edp.storage
 from edp.config.experiment import load_experiment
 from edp.errors import LostError, StorageError
-from edp.report import read_study, write_study_page
+from edp.report import write_study_page
 from edp.storage.ledger import (
     Ledger,
     Record,
@@ -22,6 +22,7 @@ from edp.storage.ledger import (
     left_state,
     read_state,
 )
+from edp.storage.study_file import read_study
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.export import export_study
 from edp.workflows.search.jobs import job_of as job_of_order

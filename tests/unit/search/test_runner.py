@@ -9,8 +9,8 @@ from edp.config.experiment import load_experiment
 from edp.errors import BusyError, ConfigError, DataError, LostError, StorageError
 from edp.logs import read_recording, write_recording
 from edp.logs.source import DataSource
-from edp.report import read_study
 from edp.storage.ledger import Ledger, TrainingStatus
+from edp.storage.study_file import read_study
 from edp.workflows.search.executor import ended
 from edp.workflows.search.plan import SearchPlan, load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search

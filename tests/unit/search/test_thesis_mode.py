@@ -6,8 +6,9 @@ import json
 import pytest
 
 from edp.config.experiment import load_experiment
-from edp.report import read_study, write_study_page
+from edp.report import write_study_page
 from edp.storage.ledger import Ledger
+from edp.storage.study_file import read_study
 from edp.training.parts import fit_part
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.plan import load_plan

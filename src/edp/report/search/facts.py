@@ -1,4 +1,4 @@
-"""A model search as its folder's `study.json` holds it, checked: what the pages, pictures and tables of it read."""
+"""A model search as its `study.json` holds it (`edp.storage.study_file`): what the pages, pictures and tables read."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ from typing import Any, TypeVar
 
 from edp.data.frozen import SECOND_TEST_SET
 from edp.errors import StorageError
-from edp.storage import read_json
+from edp.storage.study_file import check_study
 
-SCHEMA = 2
-STATES = ("running", "stopped", "killed", "finished")
 TITLES = {
     "isolation": "isolation and variance",
     "calibration": "calibration",
@@ -95,7 +93,7 @@ class StudyFacts:
     """A study.
 
     Attributes:
-        state: one of `STATES`.
+        state: one of `edp.storage.study_file.STATES`.
         mode: ``sound`` or ``thesis``.
         preset: name of its settings.
         unit: of the scores.
@@ -140,35 +138,13 @@ class StudyFacts:
         return next((phase for phase in self.phases if phase.name == name), None)
 
 
-def read_study(path: str | Path) -> Mapping[str, Any]:
-    """The content of a study's file, for `facts_of` and `write_study_page`.
-
-    Args:
-        path: of ``study.json``, or of the folder that holds it.
-
-    Raises:
-        StorageError: missing, unreadable, of another schema, or no study.
-    """
-    file = Path(path)
-    if file.is_dir() or file.suffix != ".json":
-        file = file / "study.json"
-        if not file.is_file():
-            raise StorageError(
-                f"'{path}' holds no study (study.json is missing); give the folder of edp search --study"
-            )
-    study = read_json(file)
-    _check(study, str(file))
-    checked: Mapping[str, Any] = study
-    return checked
-
-
 def facts_of(study: Mapping[str, Any]) -> StudyFacts:
     """A study, checked.
 
     Raises:
         StorageError: of another schema, or with parts missing or of a wrong kind; the message names the part.
     """
-    _check(study, "study.json")
+    check_study(study)
     return reading("study.json", lambda: _facts_of(study))
 
 
@@ -306,21 +282,3 @@ def reading(where: str, read: Callable[[], Made]) -> Made:
             f"{where}: {what}; another version of EDP wrote it, or it was edited. Call `edp search` on the study "
             "again: it writes the file anew from its ledger"
         ) from error
-
-
-def _check(study: Any, where: str) -> None:
-    """Refuse what is no study of this schema.
-
-    Raises:
-        StorageError: with what to do.
-    """
-    if not isinstance(study, Mapping) or "schema" not in study:
-        raise StorageError(f"{where} is no study: it has no 'schema'; give the study.json that `edp search` wrote")
-    if study["schema"] != SCHEMA:
-        raise StorageError(
-            f"{where} has schema {study['schema']!r}, this version of EDP reads {SCHEMA}; use the version that wrote "
-            "it, or call `edp search` on the study again with this one"
-        )
-    for name, options in (("state", STATES), ("mode", ("sound", "thesis"))):
-        if study.get(name) not in options:
-            raise StorageError(f"{where}: {name} = {study.get(name)!r}; {', '.join(options)} are known")

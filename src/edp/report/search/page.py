@@ -44,7 +44,7 @@ def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool =
     A study that is not finished gets a report of what is decided and how far the rest is.
 
     Args:
-        study: content of ``study.json`` (`read_study`).
+        study: content of ``study.json`` (`edp.storage.study_file.read_study`).
         out: folder; it is made.
         pictures: whether to write them, which takes most of the time.
 

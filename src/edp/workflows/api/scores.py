@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from edp.report import Facts, headline, read_study
+from edp.report import Facts, headline
 from edp.report.common.tables import TextTable
 from edp.report.notebook import html_of, score_figure, score_tables, study_figure, study_html, text_of
 from edp.report.run.facts import comparison_rows
 from edp.report.search import words
 from edp.report.search.facts import StudyFacts, facts_of
+from edp.storage.study_file import read_study
 from edp.workflows.api.frames import frame_of
 
 

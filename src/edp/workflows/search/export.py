@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edp.errors import StorageError
-from edp.report import read_study
+from edp.storage.study_file import read_study
 from edp.workflows.search.plan import space_of
 from edp.workflows.search.space import Choice, Range, Space
 from edp.workflows.search.study import FinishedStudy, FinishedTrial, write_journal

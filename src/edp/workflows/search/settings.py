@@ -22,13 +22,13 @@ from edp.settings.bounds import (
     span,
     whole,
 )
+from edp.storage.study_file import MODES
 from edp.workflows.compression import FORMATS
 from edp.workflows.compression.planning import SHARES
 from edp.workflows.search.modules import MODULES, TOGGLES
 from edp.workflows.search.space import ELASTIC, THESIS, WIDTHS, Space
 from edp.workflows.search.study import PRUNERS, SamplerSpec
 
-MODES = ("sound", "thesis")
 COSTS = ("parameters", "macs_tick")
 MOST_TRAININGS = 1_000_000
 """Of a phase, in runs, seeds, repeats or questions; of a second each they would take eleven days."""

@@ -9,16 +9,14 @@ from typing import Any
 
 from edp.config.experiment import Table
 from edp.errors import StorageError
-from edp.report import read_study
 from edp.storage import held_by, read_json, write_json
 from edp.storage.ledger import Opening, Record, digest_of
+from edp.storage.study_file import FILE, SCHEMA, read_study
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import MODULES, title_of
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.trainings import TrainingRequest
 
-SCHEMA = 2
-FILE = "study.json"
 # Two seconds: a viewer does not follow faster, and a record a second would cost more than it tells.
 EVERY_S = 2.0
 
@@ -225,7 +223,7 @@ def look_at(folder: str | Path) -> Table:
     """What a study has written down, and who works on it: ``holder`` (process, None for nobody), ``running``.
 
     Raises:
-        StorageError: as `edp.report.read_study`.
+        StorageError: as `edp.storage.study_file.read_study`.
     """
     study = dict(read_study(folder))
     ledger = Path(folder, "ledger")

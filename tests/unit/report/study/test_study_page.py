@@ -8,13 +8,14 @@ import random
 import pytest
 
 from edp.errors import EdpError, StorageError
-from edp.report import read_study, write_study_page
+from edp.report import write_study_page
 from edp.report.search.facts import NUMBERS, facts_of
 from edp.report.search.page import render_study, study_text
 from edp.report.search.plots import study_plots
 from edp.report.search.tables import identifiers, sheets
 from edp.report.search.views import PointView, arm_views, forests, front, point_views, top_of, tracks
 from edp.report.search.words import caveats, decided, headline, missing, tiles, verdict
+from edp.storage.study_file import read_study
 from edp.workflows.search.modules import MODULES
 
 PHASES = (
