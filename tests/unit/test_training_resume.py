@@ -14,7 +14,7 @@ from edp.networks.cells import CELLS
 from edp.networks.initial import INITIAL_STATES
 from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights
 from edp.networks.outputs import OUTPUTS
-from edp.storage.runs import RunFolder, run_key
+from edp.storage.runs import KeyedRun, RunFolder, run_key
 from edp.training.averages import AVERAGES
 from edp.training.checkpoint import FILE
 from edp.training.fit import fit
@@ -55,9 +55,9 @@ def uninterrupted(tiny, tiny_model, tiny_training):
 def test_a_stopped_training_goes_on_to_the_same_bits(stops, tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
     for epoch in stops:
         with RunFolder(tmp_path) as folder, pytest.raises(Stop):
-            fit(tiny, tiny_model, tiny_training, (folder, KEY), stop_after(epoch))
+            fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY), stop_after(epoch))
     with RunFolder(tmp_path) as folder:
-        resumed = fit(tiny, tiny_model, tiny_training, (folder, KEY))
+        resumed = fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
     assert resumed.resumed_at == stops[-1]
     assert_same(resumed, uninterrupted)
     assert len((tmp_path / "history.jsonl").read_text().splitlines()) == tiny_training.epochs
@@ -73,9 +73,9 @@ def test_optimizers_schedules_with_memory_and_fixed_by_passes_go_on_too(
         tiny_training, optimizer=OPTIMIZERS[optimizer](), schedule=Plateau(patience=0, threshold=0.5), epochs=4
     )
     with RunFolder(tmp_path) as folder, pytest.raises(Stop):
-        fit(tiny, model, spec, (folder, KEY), stop_after(2))
+        fit(tiny, model, spec, KeyedRun(folder, KEY), stop_after(2))
     with RunFolder(tmp_path) as folder:
-        assert_same(fit(tiny, model, spec, (folder, KEY)), fit(tiny, model, spec))
+        assert_same(fit(tiny, model, spec, KeyedRun(folder, KEY)), fit(tiny, model, spec))
 
 
 RECURRENT = {
@@ -89,9 +89,9 @@ def test_recurrent_layers_learn_and_go_on_to_the_same_bits(name, tmp_path, tiny,
     model = dataclasses.replace(tiny_model, backbone=dataclasses.replace(tiny_model.backbone, **RECURRENT[name]))
     spec = dataclasses.replace(tiny_training, epochs=3)
     with RunFolder(tmp_path) as folder, pytest.raises(Stop):
-        fit(tiny, model, spec, (folder, KEY), stop_after(1))
+        fit(tiny, model, spec, KeyedRun(folder, KEY), stop_after(1))
     with RunFolder(tmp_path) as folder:
-        resumed, whole = fit(tiny, model, spec, (folder, KEY)), fit(tiny, model, spec)
+        resumed, whole = fit(tiny, model, spec, KeyedRun(folder, KEY)), fit(tiny, model, spec)
     assert_same(resumed, whole)
     losses = [row["train_loss"] for row in whole.history]
     assert losses[-1] < losses[0]
@@ -113,9 +113,9 @@ KINDS = {
 def test_every_way_to_train_goes_on_to_the_same_bits(kind, tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
     spec = dataclasses.replace(tiny_training, epochs=3, updates=10, **KINDS[kind])
     with RunFolder(tmp_path) as folder, pytest.raises(Stop):
-        fit(tiny, tiny_model, spec, (folder, KEY), stop_after(2))
+        fit(tiny, tiny_model, spec, KeyedRun(folder, KEY), stop_after(2))
     with RunFolder(tmp_path) as folder:
-        resumed = fit(tiny, tiny_model, spec, (folder, KEY))
+        resumed = fit(tiny, tiny_model, spec, KeyedRun(folder, KEY))
     assert resumed.resumed_at == 2
     whole = fit(tiny, tiny_model, spec)
     assert_same(resumed, whole)
@@ -132,7 +132,7 @@ def test_calibration_is_repeated_to_the_same_bits(output, tmp_path, tiny, tiny_m
     found = []
     for _ in range(2):
         with RunFolder(tmp_path) as folder:
-            found.append(fit(tiny, model, spec, (folder, KEY)).predictor.output.stretch)
+            found.append(fit(tiny, model, spec, KeyedRun(folder, KEY)).predictor.output.stretch)
     assert torch.equal(*found)
     assert not torch.equal(found[0], torch.ones_like(found[0]))
 
@@ -140,7 +140,7 @@ def test_calibration_is_repeated_to_the_same_bits(output, tmp_path, tiny, tiny_m
 def test_a_finished_training_is_not_done_again(tmp_path, tiny, tiny_model, tiny_training, uninterrupted):
     for _ in range(2):
         with RunFolder(tmp_path) as folder:
-            again = fit(tiny, tiny_model, tiny_training, (folder, KEY))
+            again = fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
     assert again.resumed_at == tiny_training.epochs
     assert_same(again, uninterrupted)
 
@@ -148,7 +148,7 @@ def test_a_finished_training_is_not_done_again(tmp_path, tiny, tiny_model, tiny_
 KILLED = """
 import os, runpy, signal, sys
 tiny = runpy.run_path(sys.argv[1])
-from edp.storage.runs import RunFolder
+from edp.storage.runs import KeyedRun, RunFolder
 from edp.training.fit import fit
 fsync, writes = os.fsync, []
 def die(handle):
@@ -159,7 +159,7 @@ def die(handle):
         os.kill(os.getpid(), signal.SIGKILL)
     fsync(handle)
 os.fsync = die
-fit(tiny["prepared"](), tiny["MODEL"], tiny["TRAINING"], (RunFolder(sys.argv[2]), "k" * 32))
+fit(tiny["prepared"](), tiny["MODEL"], tiny["TRAINING"], KeyedRun(RunFolder(sys.argv[2]), "k" * 32))
 """
 
 
@@ -170,7 +170,7 @@ def test_a_process_killed_while_it_writes_a_checkpoint_goes_on_to_the_same_bits(
     done = subprocess.run([sys.executable, "-c", KILLED, helper, tmp_path], check=False, capture_output=True)
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
     with RunFolder(tmp_path) as folder:
-        resumed = fit(tiny, tiny_model, tiny_training, (folder, KEY))
+        resumed = fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
     assert resumed.resumed_at == 2
     assert_same(resumed, uninterrupted)
 
@@ -178,7 +178,7 @@ def test_a_process_killed_while_it_writes_a_checkpoint_goes_on_to_the_same_bits(
 @pytest.fixture
 def half_done(tmp_path, tiny, tiny_model, tiny_training):
     with RunFolder(tmp_path) as folder, pytest.raises(Stop):
-        fit(tiny, tiny_model, tiny_training, (folder, KEY), stop_after(1))
+        fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY), stop_after(1))
     return tmp_path
 
 
@@ -188,12 +188,12 @@ def test_a_truncated_checkpoint_is_refused(kept, half_done, tiny, tiny_model, ti
     data = file.read_bytes()
     file.write_bytes(data[: kept if isinstance(kept, int) else int(kept * len(data))])
     with RunFolder(half_done) as folder, pytest.raises(StorageError, match=r"is damaged .* remove it to train"):
-        fit(tiny, tiny_model, tiny_training, (folder, KEY))
+        fit(tiny, tiny_model, tiny_training, KeyedRun(folder, KEY))
 
 
 def test_a_checkpoint_of_another_run_is_refused(half_done, tiny, tiny_model, tiny_training):
     with RunFolder(half_done) as folder, pytest.raises(StorageError, match="belongs to another run"):
-        fit(tiny, tiny_model, tiny_training, (folder, "other"))
+        fit(tiny, tiny_model, tiny_training, KeyedRun(folder, "other"))
 
 
 def test_a_locked_run_folder_names_its_holder(tmp_path):
@@ -240,6 +240,6 @@ def test_a_stopped_refit_goes_on_to_the_same_bits(refit, stop, tmp_path, tiny, t
             raise Stop
 
     with RunFolder(tmp_path) as folder, pytest.raises(Stop):
-        fit(tiny, tiny_model, spec, (folder, KEY), on_event)
+        fit(tiny, tiny_model, spec, KeyedRun(folder, KEY), on_event)
     with RunFolder(tmp_path) as folder:
-        assert_same(fit(tiny, tiny_model, spec, (folder, KEY)), fit(tiny, tiny_model, spec))
+        assert_same(fit(tiny, tiny_model, spec, KeyedRun(folder, KEY)), fit(tiny, tiny_model, spec))

@@ -99,7 +99,7 @@ def ridge_solution(
             best[better], penalty[better], history[better] = loss[better], relative, samples
             weights[:, better] = 0.0
             weights[: samples * inputs, better] = candidate[:, better]
-    return _physical(weights, fitted, standard, task, (penalty, history))
+    return _physical(weights, fitted, standard, task, penalty, history)
 
 
 def crossed_solution(
@@ -149,7 +149,7 @@ def crossed_solution(
                 weights[: samples * inputs, better] = solved[:, better]
     # Intercepts come from the rows that all histories share.
     longest = _sum([moments_of(fold, task, standard) for fold in _folds(parts, task, folds)])
-    return _physical(weights, longest, standard, task, (penalty, history))
+    return _physical(weights, longest, standard, task, penalty, history)
 
 
 def _folds(parts: Sequence[Series], task: LagTask, folds: int) -> list[list[Series]]:
@@ -208,9 +208,10 @@ def _physical(
     fitted: RidgeMoments,
     standard: Standard,
     task: LagTask,
-    chosen: tuple[DoubleArray, NDArray[np.int64]],
+    penalty: DoubleArray,
+    history: NDArray[np.int64],
 ) -> RidgeSolution:
-    """Undo the standardisation and add the anchors; `chosen` is penalty and history per output."""
+    """Undo the standardisation and add the anchors; penalty and history are per output."""
     shape = (len(task.horizons), len(task.present))
     offset = (fitted.y - fitted.x @ weights) / fitted.rows
     maps = weights.reshape(task.history, len(standard.centre), task.outputs) / standard.scale[:, None]
@@ -222,4 +223,4 @@ def _physical(
         else:
             # The map was fitted to the change from the present value, which is added here.
             maps[0, column, :, target] += 1.0
-    return RidgeSolution(maps, intercept, chosen[0].reshape(shape), chosen[1].reshape(shape))
+    return RidgeSolution(maps, intercept, penalty.reshape(shape), history.reshape(shape))

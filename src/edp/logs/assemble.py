@@ -229,10 +229,10 @@ def assemble(
     sources: Sequence[ChannelSource],
     signal_map: SignalMap,
     repair: Repair,
-    naming: tuple[str | None, tuple[int, int | None] | None] = (None, None),
+    name: str | None = None,
+    rows: tuple[int, int | None] | None = None,
 ) -> tuple[Recording, list[Clock]]:
     """Bring the chosen channels to one grid; also returns the clocks of the file's time columns."""
-    name, rows = naming
     assembly = prepare(raw, sources, signal_map, repair, rows)
     recording = assembly.recording(0, assembly.samples, name)
     if assembly.untouched and raw.digest is not None and recording.digest != raw.digest:
@@ -267,6 +267,14 @@ def _clock_key(signal: RawSignal) -> int:
     return 0 if signal.time_s is None else id(signal.time_s)
 
 
+@dataclass(frozen=True)
+class _Stamps:
+    """A clock, and the order that its rows are brought into; None where they are in order."""
+
+    clock: Clock
+    order: Rows | None
+
+
 def _timelines(
     raw: RawLog, sources: Sequence[ChannelSource], signal_map: SignalMap, repair: Repair
 ) -> tuple[dict[int, _Timeline], Grid, list[dict[str, Any]]]:
@@ -275,16 +283,16 @@ def _timelines(
     signals = [entry.signal for entry in sources if entry.signal is not None]
     if not signals:
         raise DataError(f"'{raw.path}': no channel is read from the file; map at least one to a column")
-    judged: dict[int, tuple[Clock, Rows | None]] = {}
+    stamps: dict[int, _Stamps] = {}
     repairs: list[dict[str, Any]] = []
     for signal in signals:
         key = _clock_key(signal)
-        if key in judged:
-            _check_length(raw, signal, judged[key], signals[0])
+        if key in stamps:
+            _check_length(raw, signal, stamps[key].clock, signals[0])
             continue
         stated = _stated_clock(raw, signal, signal_map)
         if stated is not None:
-            judged[key] = (stated, None)
+            stamps[key] = _Stamps(stated, None)
             continue
         if signal.time_s is None:
             signal_names = ", ".join(list(raw.signals)[:12])
@@ -294,16 +302,16 @@ def _timelines(
             )
         where = f"'{raw.path}', time of '{signal.name}'"
         clock, order, repaired = repair_stamps(signal.time_s, repair, where)
-        judged[key] = (clock, order)
+        stamps[key] = _Stamps(clock, order)
         repairs += repaired
-    grid = common_grid([clock for clock, _ in judged.values()], signal_map.rate_hz, f"'{raw.path}'")
+    grid = common_grid([each.clock for each in stamps.values()], signal_map.rate_hz, f"'{raw.path}'")
     check_memory(
         raw.path,
-        _TICK_BYTES * grid.count * (1 + sum(not clock.uniform for clock, _ in judged.values())),
+        _TICK_BYTES * grid.count * (1 + sum(not each.clock.uniform for each in stamps.values())),
         f"{grid.count} samples from {grid.start_s:g} s on at {grid.rate_hz:g} Hz",
         "check the time column for a stamp that is far off, or set a lower rate_hz in the signal map",
     )
-    lines = {key: _Timeline(clock, order, *hold_rows(clock, grid)) for key, (clock, order) in judged.items()}
+    lines = {key: _Timeline(each.clock, each.order, *hold_rows(each.clock, grid)) for key, each in stamps.items()}
     return lines, grid, repairs
 
 
@@ -326,8 +334,8 @@ def _stated_clock(raw: RawLog, signal: RawSignal, signal_map: SignalMap) -> Cloc
     return uniform_clock(signal.samples, rate)
 
 
-def _check_length(raw: RawLog, signal: RawSignal, judged: tuple[Clock, Rows | None], first: RawSignal) -> None:
-    if signal.time_s is None and signal.samples != len(judged[0].stamps):
+def _check_length(raw: RawLog, signal: RawSignal, clock: Clock, first: RawSignal) -> None:
+    if signal.time_s is None and signal.samples != len(clock.stamps):
         raise DataError(
             f"'{raw.path}': column '{signal.name}' has {signal.samples} rows, '{first.name}' has {first.samples}; "
             "map columns of one length, or give each its own time"

@@ -50,7 +50,7 @@ def read_recording(
     """
     signal_map, repair = signal_map or SignalMap(), repair or Repair()
     raw, sources = _opened(path, signal_map)
-    return assemble(raw, sources, signal_map, repair, (name, rows))[0]
+    return assemble(raw, sources, signal_map, repair, name, rows)[0]
 
 
 def read_parts(

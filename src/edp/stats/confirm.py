@@ -123,15 +123,24 @@ def confirm(
         part = mask[:runs]
         # A module that was dropped early may not have met every session.
         seen = part.any(axis=0)
-        cells = (filled[1 + index, :runs][:, seen], filled[0, :runs][:, seen], part[:, seen])
+        cells = _Cells(filled[1 + index, :runs][:, seen], filled[0, :runs][:, seen], part[:, seen])
         evidence[name] = _evidence(name, cells, dropped, adjusted[name], rule)
     absent = "stopped by the screening, counted with p = 1"
     return tuple(evidence.get(name, ModuleEvidence(name, False, absent)) for name in registered)
 
 
-def _evidence(name: str, cells: tuple[Array, Array, Mask], dropped: int, adjusted: float, rule: Rule) -> ModuleEvidence:
-    """All figures on one module from its scores, the baseline's and the cells that exist."""
-    module, baseline, mask = cells
+@dataclass(frozen=True)
+class _Cells:
+    """Scores of a module and of the baseline, and which of them exist; each ``(run, session)``."""
+
+    module: Array
+    baseline: Array
+    mask: Mask
+
+
+def _evidence(name: str, cells: _Cells, dropped: int, adjusted: float, rule: Rule) -> ModuleEvidence:
+    """All figures on one module."""
+    module, baseline, mask = cells.module, cells.baseline, cells.mask
     difference = module - baseline
     reference = float(baseline[mask].mean())
     if reference <= 0.0:

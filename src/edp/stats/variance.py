@@ -73,7 +73,7 @@ def split_variance(scores: ArrayLike, level: float = 0.95) -> SplitVariance:
         return SplitVariance(mean, float(np.sqrt(between)), None, (bounds[0], bounds[1]))
     df2 = splits * (seeds - 1)
     within = float(array.var(axis=1, ddof=1).mean())
-    low, high = _difference_interval((between, df1), (within, df2), tail)
+    low, high = _difference_interval(_MeanSquare(between, df1), _MeanSquare(within, df2), tail)
     seed = [float(np.sqrt(df2 * within / chdtri(df2, p))) for p in (tail, 1.0 - tail)]
     return SplitVariance(
         mean,
@@ -84,9 +84,17 @@ def split_variance(scores: ArrayLike, level: float = 0.95) -> SplitVariance:
     )
 
 
-def _difference_interval(first: tuple[float, int], second: tuple[float, int], tail: float) -> tuple[float, float]:
-    """Interval for the difference of two expected mean squares, each given with its degrees of freedom."""
-    (between, df1), (within, df2) = first, second
+@dataclass(frozen=True)
+class _MeanSquare:
+    """A mean square with its degrees of freedom."""
+
+    value: float
+    freedom: int
+
+
+def _difference_interval(first: _MeanSquare, second: _MeanSquare, tail: float) -> tuple[float, float]:
+    """Interval for the difference of two expected mean squares."""
+    between, df1, within, df2 = first.value, first.freedom, second.value, second.freedom
     g1, h1 = 1.0 - df1 / chdtri(df1, tail), df1 / chdtri(df1, 1.0 - tail) - 1.0
     g2, h2 = 1.0 - df2 / chdtri(df2, tail), df2 / chdtri(df2, 1.0 - tail) - 1.0
     upper, lower = (float(f_distribution.isf(p, df1, df2)) for p in (tail, 1.0 - tail))

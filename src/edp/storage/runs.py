@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
@@ -113,6 +114,19 @@ class RunFolder:
         """Write all epochs so far, a JSON line each."""
         check_held(self.file(".lock"), self._lock)
         write_bytes(self.file("history.jsonl"), "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+@dataclass(frozen=True)
+class KeyedRun:
+    """A run folder with the key of the training in it, by which its checkpoints are known.
+
+    Attributes:
+        folder: where the training writes.
+        key: of the training, see `run_key`.
+    """
+
+    folder: RunFolder
+    key: str
 
 
 def read_provenance(folder: str | Path) -> dict[str, Any]:

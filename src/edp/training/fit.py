@@ -19,7 +19,7 @@ from edp.data.series import Series
 from edp.errors import ConfigError, DataError
 from edp.networks.predictor import ModelSpec, build_model, trainable
 from edp.networks.streaming import State, detach_state, reset_where
-from edp.storage.runs import RunFolder
+from edp.storage.runs import KeyedRun
 from edp.training.bagging import fit_in_folds
 from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, damaged, load_checkpoint, save_checkpoint
 from edp.training.memory import check_training_memory
@@ -35,7 +35,7 @@ def fit(
     data: Prepared,
     model: ModelSpec,
     spec: TrainingSpec,
-    run: tuple[RunFolder, str] | None = None,
+    run: KeyedRun | None = None,
     on_event: Callable[[TrainingProgress], None] | None = None,
     strategy: TrainingStrategy | None = None,
 ) -> Fitted:
@@ -45,7 +45,7 @@ def fit(
         data: prepared series.
         model: the network.
         spec: how to train.
-        run: folder and key of the run; where given, a checkpoint after each epoch makes it resumable.
+        run: where the training writes; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
         strategy: weights to begin with, or a teacher; it is part of what the key of `run` must tell apart.
 
@@ -57,7 +57,7 @@ def fit(
     torch.set_num_threads(thread_count(spec))
     tell = on_event or (lambda event: None)
     if spec.bagging is not None:
-        return fit_in_folds(data, model, spec, run[0] if run else None, tell, strategy)
+        return fit_in_folds(data, model, spec, run.folder if run else None, tell, strategy)
     fitted = Loop(data, model, spec, run, strategy).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:
@@ -95,14 +95,14 @@ class Loop:
         data: Prepared,
         model: ModelSpec,
         spec: TrainingSpec,
-        run: tuple[RunFolder, str] | None,
+        run: KeyedRun | None,
         strategy: TrainingStrategy | None = None,
         refitted: list[dict[str, Any]] | None = None,
         windowed: bool = False,
     ) -> None:
         self.data, self.spec, self.run, self.strategy, self.refitted = data, spec, run, strategy, refitted
         self.epochs = spec.epochs if refitted is None else len(refitted)
-        self.file = run[0].path / (FILE if refitted is None else REFIT) if run else None
+        self.file = run.folder.path / (FILE if refitted is None else REFIT) if run else None
         self.device = _device(spec.device)
         check_training(data.task, model, spec)
         self.net = build_model(data.task, model, data.scaler(), spec.seed)
@@ -201,7 +201,7 @@ class Loop:
         )
 
     def _resume(self) -> None:
-        checkpoint = load_checkpoint(self.file, self.run[1]) if self.run and self.file else None
+        checkpoint = load_checkpoint(self.file, self.run.key) if self.run and self.file else None
         if checkpoint is None:
             return
         self.progress, weights, optimizer = checkpoint
@@ -321,9 +321,9 @@ class Loop:
             progress.history.append(row)
         if self.run and self.file:
             weights = Weights(dict(self.net.named_parameters()), self.average, self.best, self.objective.running)
-            save_checkpoint(self.file, self.run[1], progress, weights, self.optimizer)
+            save_checkpoint(self.file, self.run.key, progress, weights, self.optimizer)
             if row is not None:
-                self.run[0].write_history(progress.history)
+                self.run.folder.write_history(progress.history)
         return row
 
     def _judge_epoch(self, loss: float) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from edp.recording import Recording
 from edp.report import build_report
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import check_writable, make_folder, read_object, write_bytes, write_json
-from edp.storage.runs import RunFolder, command_line, environment, read_provenance, run_key
+from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import weights_digest
 from edp.training.fit import fit, thread_count
@@ -148,7 +148,7 @@ def train(
         run.write_status("running")
         try:
             strategy = None if strategy_factory is None else strategy_factory.strategy(data)
-            fitted = fit(data, experiment.model, experiment.training, (run, key), on_event, strategy)
+            fitted = fit(data, experiment.model, experiment.training, KeyedRun(run, key), on_event, strategy)
         except Diverged as end:
             if end.fitted is not None:
                 # Without weights from before the divergence there is nothing to keep.
@@ -162,20 +162,21 @@ def train(
 
 
 def keep_fitted(
-    out: Path, made_of: tuple[DataSource, Experiment, Prepared], fitted: Fitted, facts: dict[str, Any]
+    out: Path, source: DataSource, experiment: Experiment, data: Prepared, fitted: Fitted, facts: dict[str, Any]
 ) -> Bundle:
     """Write the run folder of a training that was run elsewhere, as `train` would have.
 
     Args:
         out: run folder.
-        made_of: recordings, settings and what was prepared from both.
+        source: where the recordings are.
+        experiment: the settings.
+        data: what `prepare_data` gave for both.
         fitted: what the training gave.
         facts: further plain values of the provenance.
 
     Raises:
         StorageError: the folder holds another run.
     """
-    source, experiment, data = made_of
     settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
     with RunFolder(out) as run:
         run.claim(run_key(settings, data.digest), experiment_toml(experiment))

@@ -110,8 +110,19 @@ def _screen(recordings: Sequence[Recording], spec: ScreeningSpec, clock: _Clock)
         stable = stability.stability_of(names, targets, metrics, best)
     flagged = {flag.channel for flag in flags}
     used = [int(i) for i in live if table.names[i] not in flagged or i in table.targets]
-    evidence = _evidence(table, lagged, spec, (matrices.spearman, metrics, curves, used), clock)
-    return _concluded(recordings, table, spec, (matrices, curves, stable), (flags, evidence), clock.seconds)
+    measured = _Measured(matrices, metrics, curves, stable)
+    evidence = _evidence(table, lagged, spec, measured, used, clock)
+    return _concluded(recordings, table, spec, measured, flags, evidence, clock.seconds)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Figures of the live channels, flagged or not."""
+
+    matrices: Matrices
+    metrics: Metrics
+    curves: list[LagCurve]
+    stable: list[Stability]
 
 
 def _matrices(table: CandidateTable, spec: ScreeningSpec, clock: _Clock) -> Matrices:
@@ -178,14 +189,15 @@ def _evidence(
     table: CandidateTable,
     lagged: Lagged,
     spec: ScreeningSpec,
-    measured: tuple[Array, Metrics, list[LagCurve], list[int]],
+    measured: _Measured,
+    used: list[int],
     clock: _Clock,
 ) -> ScreeningEvidence:
     """Multivariate figures of the channels without a flag, and the tests of all live ones."""
-    spearman, metrics, curves, used = measured
+    spearman = measured.matrices.spearman
     columns = np.array(used, dtype=np.int64)
     targets = np.searchsorted(lagged.live, table.targets)
-    relations = stability.relations_of(lagged, targets, metrics, spec.level)
+    relations = stability.relations_of(lagged, targets, measured.metrics, spec.level)
     groups = clusters_of(spearman[np.ix_(columns, columns)], spec.collinear)
     held_out = values.held_out_pieces(len(table.pieces), spec.forest.held_out, spec.seed)
     read = columns if spec.horizon else columns[~np.isin(columns, table.targets)]
@@ -217,7 +229,7 @@ def _evidence(
     pieces = _at_best(lagged, targets, relations)
     correlations = lagged.pooled()
     return ScreeningEvidence(
-        table, lagged.live, correlations, relations, pieces, curves, importance, worth, clusters, history
+        table, lagged.live, correlations, relations, pieces, measured.curves, importance, worth, clusters, history
     )
 
 
@@ -258,13 +270,12 @@ def _concluded(
     recordings: Sequence[Recording],
     table: CandidateTable,
     spec: ScreeningSpec,
-    shown: tuple[Matrices, list[LagCurve], list[Stability]],
-    judged: tuple[list[Flag], ScreeningEvidence],
+    measured: _Measured,
+    flags: list[Flag],
+    evidence: ScreeningEvidence,
     seconds: dict[str, float],
 ) -> ScreeningResult:
     """The last flags, the proposal, and everything in one."""
-    matrices, curves, stable = shown
-    flags, evidence = judged
     targets = tuple(table.names[i] for i in table.targets)
     free = {name for name in table.names if name not in targets} - {flag.channel for flag in flags}
     flags = flags + noise_flags(evidence, sorted(free))
@@ -280,9 +291,9 @@ def _concluded(
         table.groups,
         targets,
         spec.horizon,
-        matrices,
-        tuple(curves),
-        tuple(stable),
+        measured.matrices,
+        tuple(measured.curves),
+        tuple(measured.stable),
         tuple(evidence.importance),
         tuple(evidence.values),
         tuple(evidence.clusters),

@@ -71,7 +71,7 @@ def look_into(
     findings += more
     try:
         clocks = _clocks(raw, usable, signal_map)
-        recording, _ = assemble(raw, usable, signal_map, _LENIENT, (name, rows))
+        recording, _ = assemble(raw, usable, signal_map, _LENIENT, name, rows)
     except DataError as error:
         findings.append(Finding("error", None, str(error)))
         empty = Recording(name or name_of_file(raw.path), (), np.empty((0, 0), dtype=np.float32), 1.0, str(raw.path))

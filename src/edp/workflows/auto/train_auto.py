@@ -19,7 +19,7 @@ from edp.networks.predictor import Predictor
 from edp.recording import Recording
 from edp.report.run.choice import FILE, read_choice
 from edp.storage import make_folder, read_object, write_json
-from edp.storage.runs import RunFolder, run_key
+from edp.storage.runs import KeyedRun, RunFolder, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
 from edp.training.bagging import fit_bagged
 from edp.training.fit import fit
@@ -117,7 +117,7 @@ def train_auto(
     winner = trained[choice.name]
     # First the choice, whose key tells a folder that a kill left between the two from one of another run.
     write_json(folder / FILE, facts)
-    bundle = keep_fitted(folder, (source, winner.experiment, data), winner.fitted, {"auto": facts["sentence"]})
+    bundle = keep_fitted(folder, source, winner.experiment, data, winner.fitted, {"auto": facts["sentence"]})
     return AutoResult(bundle, facts)
 
 
@@ -276,7 +276,7 @@ def _train(
         settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
         key = run_key(settings, data.digest)
         run.claim(key, experiment_toml(experiment))
-        fitted = fit(data, experiment.model, experiment.training, (run, key), on_event)
+        fitted = fit(data, experiment.model, experiment.training, KeyedRun(run, key), on_event)
     net = fitted.predictor
     return _Trained(experiment, fitted, promise_of(streamed(net, data), standard_truth(net, data), blocks))
 

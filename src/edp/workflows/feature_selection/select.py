@@ -124,7 +124,7 @@ def select_features(
     if needed is not None:
         files["map"] = folder / "map.toml"
         write_bytes(files["map"], needed.encode())
-    trials = _tried(mapped, folder, (order, screening, sets), listeners.on_trial)
+    trials = _tried(mapped, folder, order, screening, sets, listeners.on_trial)
     if trials is not None:
         files["trials"] = folder / "trials"
     if order.pictures:
@@ -274,10 +274,11 @@ def _needed_map(source: DataSource, screening: ScreeningResult, first: Recording
 def _tried(
     source: DataSource,
     folder: Path,
-    selected: tuple[SelectionOrder, ScreeningResult, Mapping[str, FeatureSettings]],
+    order: SelectionOrder,
+    screening: ScreeningResult,
+    sets: Mapping[str, FeatureSettings],
     on_trial: OnTrial | None,
 ) -> Trials | None:
-    order, screening, sets = selected
     if order.experiment is None:
         return None
     experiment = replace(order.experiment, task=trial_task(order.experiment.task, screening))

@@ -11,7 +11,7 @@ import os
 import socket
 import tempfile
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,7 @@ class RayPool(ClosedAtExit):
         # The ledger may not be reachable from a node, and only the coordinator writes it: states travel with the job.
         where = dict(job.where)
         file = Path(where.pop(START)) if START in where else None
-        start = None if file is None else (file.name, file.read_bytes())
+        start = None if file is None else _StateFile(file.name, file.read_bytes())
         sent = replace(job, folder=None, where=where)
         reference = self._function.options(name=job.key).remote(sent, self.threads, start)
         self._refs[reference] = job.key
@@ -169,13 +169,21 @@ class RayPool(ClosedAtExit):
             raise ConfigError("no node of the cluster answers; start one, then give the same command again")
 
 
-def _perform_there(job: Job, threads: int, start: tuple[str, bytes] | None) -> tuple[bytes, bytes | None]:
+@dataclass(frozen=True)
+class _StateFile:
+    """A file of the state that a training goes on from."""
+
+    name: str
+    content: bytes
+
+
+def _perform_there(job: Job, threads: int, start: _StateFile | None) -> tuple[bytes, bytes | None]:
     """Do a training in a process of Ray on some node: through a pool of one, whose process stays for the next.
 
     Args:
         job: to do.
         threads: of it.
-        start: name and content of the file of the state that it goes on from.
+        start: the state that it goes on from.
 
     Returns:
         The record, and the file of the state that it left, both as they are in a ledger.
@@ -187,8 +195,8 @@ def _perform_there(job: Job, threads: int, start: tuple[str, bytes] | None) -> t
     with tempfile.TemporaryDirectory(prefix="edp-training-") as folder:  # stands for the ledger
         where = dict(job.where)
         if start is not None:
-            file = Path(folder, start[0])
-            file.write_bytes(start[1])
+            file = Path(folder, start.name)
+            file.write_bytes(start.content)
             where[START] = str(file)
         pool.submit(replace(job, folder=folder, where=where))
         try:

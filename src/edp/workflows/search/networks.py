@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,12 +54,20 @@ def network_name(order: TrainingRequest) -> str:
     return TEACHER if (recipe.units, recipe.final) == (None, "float32") else CHOSEN
 
 
+@dataclass(frozen=True)
+class JudgedNetwork:
+    """A network that was judged on the second sealed test set: what was ordered, and the record's result."""
+
+    order: TrainingRequest
+    result: Mapping[str, Any]
+
+
 def write_networks(
     folder: Path,
     source: DataSource,
     context: SearchContext,
     split: ByFrozen,
-    networks: Mapping[str, tuple[TrainingRequest, Mapping[str, Any]]],
+    networks: Mapping[str, JudgedNetwork],
 ) -> dict[str, Path]:
     """Write the networks that were judged on the second sealed test set as runs, once phase 6 has decided.
 
@@ -68,7 +76,7 @@ def write_networks(
         source: where the recordings are.
         context: with the decisions.
         split: of the runs.
-        networks: order and result by name of the network.
+        networks: by name.
 
     Returns:
         Folder of each run; none before phase 6 has decided. Without one of its own the chosen network is the teacher.
@@ -80,14 +88,14 @@ def write_networks(
         return {}
     recordings = source.read()
     written: dict[str, Path] = {}
-    for name, (order, result) in networks.items():
-        recipe = Recipe.from_json(order.recipe or {})
-        experiment = replace(recipe.experiment(experiment_of(order)), split=split)
+    for name, judged in networks.items():
+        recipe = Recipe.from_json(judged.order.recipe or {})
+        experiment = replace(recipe.experiment(experiment_of(judged.order)), split=split)
         first = recordings[0]
         task = experiment.task.resolve(first.rate_hz, first.channel_names, experiment.model.physics)
         # Scaling follows from the training sessions, not from the second test set.
         data = prepare(recordings, task, split, experiment.model.window)
-        network = network_of(result["weights"], task, experiment.model)
+        network = network_of(judged.result["weights"], task, experiment.model)
         written[name] = folder / FOLDER / name
         _write_run(written[name], network, experiment, data, _provenance(source, experiment, data, recipe))
     return written

@@ -27,7 +27,7 @@ from edp.workflows.search.context import Decision, Outcome, SearchContext, set_a
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.executor import Executor
 from edp.workflows.search.local import LocalPool
-from edp.workflows.search.networks import frozen_split, network_name, write_networks
+from edp.workflows.search.networks import JudgedNetwork, frozen_split, network_name, write_networks
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.plan import SearchPlan, plain_spec
 from edp.workflows.search.run_phases import run_phases
@@ -243,7 +243,7 @@ class _Work:
     def __init__(self, ledger: Ledger, study_log: StudyLog, context: SearchContext, callbacks: SearchCallbacks) -> None:
         self.ledger, self.study_log, self.context, self.callbacks = ledger, study_log, context, callbacks
         self.orders: dict[str, TrainingRequest] = {}
-        self.judged_networks: dict[str, tuple[TrainingRequest, Mapping[str, Any]]] = {}
+        self.judged_networks: dict[str, JudgedNetwork] = {}
 
     def on_phase(self, name: str, context: SearchContext) -> None:
         self.study_log.on_phase(name, context)
@@ -276,7 +276,7 @@ class _Work:
     def on_record(self, record: Record, trained: bool) -> None:
         order = self.orders[record.key]
         if record.result is not None and set(order.judged) & set(self.context.second):
-            self.judged_networks[network_name(order)] = order, record.result
+            self.judged_networks[network_name(order)] = JudgedNetwork(order, record.result)
         self.study_log.on_record(record, order, trained)
         self.callbacks.on_progress(self.study_log)
 

@@ -12,7 +12,7 @@ from edp.stats.paired import fill_worst
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.modules import fitting, options_of, title_of
 from edp.workflows.search.phases.base import PHASES, Course, changed
-from edp.workflows.search.phases.joint import ask_together, winner_of
+from edp.workflows.search.phases.joint import JointStart, ask_together, winner_of
 from edp.workflows.search.phases.screening import baseline_of
 
 
@@ -32,7 +32,7 @@ class Exploration:
         free = fitting(base, context.channels, spec.modules)
         earlier = context.decided["synthesis"].facts
         # The winner of phase 4 is the warm start: phase 5 is to find at least that.
-        starts = [(earlier["values"], earlier["modules"])]
+        starts = [JointStart(earlier["values"], earlier["modules"])]
         options = {name: options_of(base, name, context.shaped) for name in free}
         switches = [*free, *spec.toggles]
         answers = yield from ask_together(context, "exploration", switches, spec.free_trials, starts, options)

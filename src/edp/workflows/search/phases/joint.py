@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from edp.config.experiment import Table
@@ -27,12 +28,20 @@ from edp.workflows.search.trainings import TrainingRequest
 Asked = Generator[list[TrainingRequest], list[Outcome], list[AnsweredQuestion]]
 
 
+@dataclass(frozen=True)
+class JointStart:
+    """A warm start: values, and the modules that are on."""
+
+    values: Candidate
+    modules: Sequence[str]
+
+
 def ask_together(
     context: SearchContext,
     name: str,
     modules: Sequence[str],
     trials: int,
-    starts: Sequence[tuple[Candidate, Sequence[str]]],
+    starts: Sequence[JointStart],
     options: Mapping[str, Mapping[str, Choice]] | None = None,
 ) -> Asked:
     """Questions about modules on or off, rates inside the window and what was deferred, with warm starts first.
@@ -42,7 +51,7 @@ def ask_together(
         name: of the phase.
         modules: and toggles that may be on.
         trials: how many questions, the warm starts among them.
-        starts: values and modules to begin with.
+        starts: what to begin with.
         options: what is varied of a module where it is on.
     """
     base, _, window = baseline_of(context)
@@ -50,10 +59,10 @@ def ask_together(
     space = {**window, **context.spec.deferred}
     study = new_study(context, name, space, modules, contradicting(base, modules, context.channels))
     study.options = options or {}
-    for values, flags in starts[:trials]:
+    for start in starts[:trials]:
         # Options of phase 4 stand at their present values, which phase 5 may change.
-        present = present_options(base, flags, context.shaped) if options else None
-        study.suggest(_inside(space, values), flags, present)
+        present = present_options(base, start.modules, context.shaped) if options else None
+        study.suggest(_inside(space, start.values), start.modules, present)
 
     def settings(trial: Trial) -> Table:
         return context.network(apply(base, trial.values), trial.flags, trial.options)

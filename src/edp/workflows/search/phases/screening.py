@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edp.config.experiment import Table
 from edp.stats.factorial import Factorial, least_runs, two_level_design
@@ -58,7 +58,7 @@ def _sound(context: SearchContext) -> Course:
             chosen = [name for name, on in zip(free, levels, strict=True) if on]
             settings = context.network(apply(base, values), chosen)
             orders += context.orders(settings, [repeat])
-            rows.append((levels, values, repeat))
+            rows.append(_DesignRow(levels, values, repeat))
     outcomes = yield orders
     return _passed_by_design(context, design, rows, outcomes)
 
@@ -83,10 +83,19 @@ def _drawn(context: SearchContext, window: Space, count: int) -> list[dict[str, 
     return candidates
 
 
+@dataclass(frozen=True)
+class _DesignRow:
+    """A training of the design: which modules are on, the values that were drawn for it, and its fold."""
+
+    levels: NDArray[np.bool_]
+    values: Mapping[str, float]
+    repeat: int
+
+
 def _passed_by_design(
     context: SearchContext,
     design: Factorial,
-    rows: Sequence[tuple[Any, dict[str, float], int]],
+    rows: Sequence[_DesignRow],
     outcomes: Sequence[Outcome],
 ) -> Decision:
     """Main effects by least squares, with the drawn values and the fold as covariates; what shows a sign passes."""
@@ -96,12 +105,12 @@ def _passed_by_design(
     if failed < len(scores):
         scores = np.where(np.isfinite(scores), scores, np.nanmax(scores))
     # Logarithms of rates are the covariates, since they were drawn so.
-    drawn = [[np.log10(v) if v > 0 and name != "dropout" else v for name, v in row[1].items()] for row in rows]
-    folds = [[float(row[2] == repeat) for repeat in range(1, context.spec.screening_repeats)] for row in rows]
+    drawn = [[np.log10(v) if v > 0 and name != "dropout" else v for name, v in row.values.items()] for row in rows]
+    folds = [[float(row.repeat == repeat) for repeat in range(1, context.spec.screening_repeats)] for row in rows]
     covariates = np.hstack([np.array(drawn), np.array(folds).reshape(len(rows), -1)])
     # A column that never changes would make the regression singular.
     covariates = covariates[:, covariates.std(axis=0) > 0]
-    levels = np.stack([row[0] for row in rows])
+    levels = np.stack([row.levels for row in rows])
     effects = main_effects(levels, design.factors, scores, covariates if covariates.size else None)
     mean = float(scores.mean())
     passed = [effect.factor for effect in effects if effect.passed]
