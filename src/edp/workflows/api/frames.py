@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from importlib import import_module
 from types import ModuleType
@@ -25,13 +26,37 @@ def frame_library(name: str) -> ModuleType:
         raise ConfigError(f"{name} is not installed; install it (pip install {name}), or use NumPy arrays") from error
 
 
-def frame_of(library: str, columns: Mapping[str, NDArray[Any] | list[str]]) -> Any:
+def frame_of(library: str, columns: Mapping[str, NDArray[Any] | list[Any]]) -> Any:
     """A frame of ``pandas`` or ``polars`` with these columns.
 
     Raises:
         ConfigError: the library is not installed.
     """
     return frame_library(library).DataFrame(dict(columns))
+
+
+class OneFrame(ABC):
+    """What is one table of columns: a frame of either library."""
+
+    @abstractmethod
+    def _columns(self) -> Mapping[str, NDArray[Any] | list[Any]]:
+        """Columns by name, all of one length."""
+
+    def to_pandas(self) -> Any:
+        """One pandas frame with the columns that the class lists.
+
+        Raises:
+            ConfigError: pandas is not installed.
+        """
+        return frame_of("pandas", self._columns())
+
+    def to_polars(self) -> Any:
+        """The same as a Polars frame.
+
+        Raises:
+            ConfigError: Polars is not installed.
+        """
+        return frame_of("polars", self._columns())
 
 
 def columns_of(frame: Any, where: str) -> dict[str, NDArray[Any]]:

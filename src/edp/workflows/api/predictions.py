@@ -14,12 +14,15 @@ from edp.report.common.tables import TextTable
 from edp.report.notebook import BandLine, html_of, prediction_figure, text_of
 from edp.report.run.figures import aligned
 from edp.signals import KINDS, Channel, Kind
-from edp.workflows.api.frames import frame_of
+from edp.workflows.api.frames import OneFrame
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Predictions:
+class Predictions(OneFrame):
     """What was predicted at every tick of some recordings, in SI units.
+
+    A frame has the columns ``recording``, ``time_s`` of the tick, and one for each target and horizon: it is called
+    ``TARGET+HORIZON``; bounds of an interval ``TARGET+HORIZON lower 0.9`` and ``... upper 0.9``.
 
     Attributes:
         recordings: that were read.
@@ -47,24 +50,6 @@ class Predictions:
     def to_numpy(self) -> list[FloatArray]:
         """For each recording float32 ``(time, horizon, target)``, SI units; row t was said at t."""
         return list(self.values)
-
-    def to_pandas(self) -> Any:
-        """One pandas frame: ``recording``, ``time_s`` of the tick, and a column for each target and horizon.
-
-        A column is called ``TARGET+HORIZON``; bounds of an interval ``TARGET+HORIZON lower 0.9`` and ``... upper 0.9``.
-
-        Raises:
-            ConfigError: pandas is not installed.
-        """
-        return frame_of("pandas", self._columns())
-
-    def to_polars(self) -> Any:
-        """The same as a Polars frame.
-
-        Raises:
-            ConfigError: Polars is not installed.
-        """
-        return frame_of("polars", self._columns())
 
     def plot(self, recording: int | str = 0, horizon: int | None = None) -> Any:
         """A Plotly figure: predictions, moved to the time that they speak of, over what was measured.

@@ -13,7 +13,7 @@ from edp.report.run.facts import comparison_rows
 from edp.report.search import words
 from edp.report.search.facts import StudyFacts, facts_of
 from edp.storage.study_file import read_study
-from edp.workflows.api.frames import frame_of
+from edp.workflows.api.frames import OneFrame
 
 
 class ShownTable:
@@ -35,8 +35,10 @@ class ShownTable:
         return html_of(self._tables)
 
 
-class JudgedScores:
+class JudgedScores(OneFrame):
     """Scores of a predictor and of its baselines on the same ticks, in the units of reports (mm/s, bar, ...).
+
+    A frame has a row for each model and horizon.
 
     Args:
         facts: what was judged.
@@ -57,22 +59,6 @@ class JudgedScores:
     def table(self) -> ShownTable:
         """A table for each horizon: every judged model, the best first."""
         return ShownTable(score_tables(self._facts))
-
-    def to_pandas(self) -> Any:
-        """One pandas frame, a row for each model and horizon.
-
-        Raises:
-            ConfigError: pandas is not installed.
-        """
-        return frame_of("pandas", self._columns())
-
-    def to_polars(self) -> Any:
-        """The same as a Polars frame.
-
-        Raises:
-            ConfigError: Polars is not installed.
-        """
-        return frame_of("polars", self._columns())
 
     def plot(self) -> Any:
         """A Plotly figure: mean absolute error of every judged model, against the horizon where there are several."""
