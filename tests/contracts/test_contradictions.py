@@ -73,6 +73,12 @@ REFUSED = [
         replace(with_blocks("cross_cylinder_attention"), head=HEADS["linear"]()),
         "no hidden features for the block CrossCylinderAttention",
     ),
+    (
+        "committee",
+        replace(TASK, features=FeatureSet("many", ("v_1", "v_2", *(f"x_{n}" for n in range(9_998))))),
+        ModelSpec(backbone=BACKBONES["committee"](trees=1)),
+        "would read 70,000 columns",
+    ),
     ("hybrid", reads("hybrid"), with_physics("hybrid", "linear_bypass"), "start = 'zero'"),
 ]
 ALONE = {name: make() for registry in REGISTRIES for name, make in registry.items() if issubclass(make, HasConflicts)}

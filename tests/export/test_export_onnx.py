@@ -217,7 +217,7 @@ def test_the_page_lists_the_operators(bundle_of):
     listed = page.partition("## Operators")[2].partition("and no others")[0]
     assert set(re.findall(r"[A-Z]\w+", listed)) == ALLOWED
     used = set()
-    for network in (*NETWORKS, "lstm+normal", "hybrid"):
+    for network in (*NETWORKS, "lstm+normal", "hybrid", "committee"):
         predictor = bundle_of(network).predictor
         for write in (step_model, window_model):
             model = onnx.load_from_string(write(predictor.graph(), len(predictor.task.targets), "graph", {}))

@@ -13,7 +13,7 @@ from safetensors.torch import load, save
 from edp.data.features import FeatureSet
 from edp.data.task import TargetMode, Task
 from edp.errors import BundleError
-from edp.networks.backbones import HybridSpec, TcnSpec
+from edp.networks.backbones import CommitteeSpec, HybridSpec, TcnSpec
 from edp.networks.heads import MlpHead
 from edp.networks.predictor import ModelSpec, build_model
 from edp.signals import Channel, Kind
@@ -210,6 +210,14 @@ def spoil(ending, value):
     return change
 
 
+def resize(ending, shape):
+    def change(tensors):
+        name = first(tensors, ending)
+        tensors[name] = torch.zeros(shape, dtype=tensors[name].dtype)
+
+    return change
+
+
 def replace(change_one):
     def change(tensors):
         name = first(tensors, "front.width")
@@ -236,6 +244,35 @@ def replace(change_one):
 def test_weights_that_are_not_those_of_the_header_are_refused(folder, change):
     reweighted(folder, change)
     refused(folder, "its weights are")
+
+
+@pytest.fixture
+def folder_with_trees(tmp_path):
+    return save_bundle(bundle_of(CommitteeSpec(lags=(1,), members=1, units=2, trees=2, tree_depth=2)), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (spoil("trees.feature", 6), "a node reads column 6; 0 to 5 must hold"),
+        (spoil("trees.feature", -1), "a node reads column -1; 0 to 5 must hold"),
+        (spoil("trees.feature", 2**40), "a node reads column 1099511627776; 0 to 5"),
+        (spoil("trees.threshold", float("nan")), "threshold' holds a number that is not finite"),
+        (spoil("trees.leaf", float("inf")), "leaf' holds a number that is not finite"),
+        (resize("trees.threshold", (2, 2, 7)), r"threshold' is \(2, 2, 7\) .*, not \(2, 2, 3\)"),
+        (resize("trees.leaf", (2, 1, 4)), r"leaf' is \(2, 1, 4\) .*, not \(2, 2, 4\)"),
+    ],
+)
+def test_tables_of_trees_that_cannot_be_are_refused(folder_with_trees, change, match):
+    assert load_bundle(folder_with_trees).predictor.backbone.trees.depth == 2
+    reweighted(folder_with_trees, change)
+    refused(folder_with_trees, match)
+
+
+@pytest.mark.parametrize(("key", "value"), [("trees", 2001), ("trees", -1), ("tree_depth", 9), ("tree_depth", 0)])
+def test_trees_beyond_their_bounds_are_refused(folder_with_trees, key, value):
+    changed(folder_with_trees, put("model", "backbone", key, value), hashed=True)
+    refused(folder_with_trees, f"{key} = {value}; integers, .* must hold")
 
 
 def test_a_safetensors_header_that_lies_is_refused(folder):

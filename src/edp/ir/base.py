@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
+Indices = NDArray[np.uint16]
 
 INPUT = "input"
 """The value that holds the inputs of the tick, SI units, in the order in which they are fed."""

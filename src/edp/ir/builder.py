@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ExportError
-from edp.ir.base import INPUT, Array, Graph, Layer, Slot
+from edp.ir.base import INPUT, Array, Graph, Indices, Layer, Slot
 from edp.ir.layers import BinaryOperation, Elementwise, Gather
 
 
@@ -27,6 +27,25 @@ def constant(values: Any) -> Array:
     if not np.isfinite(array).all():
         raise ExportError("a weight of the network is NaN or infinite; train again before exporting")
     return array
+
+
+MOST_INDEX = 2**16 - 1
+"""Largest index of a table: tables of 16 bits take half of the flash of tables of words."""
+
+
+def indices(values: Any) -> Indices:
+    """Integers, an array or a tensor as a uint16 array of its own.
+
+    Raises:
+        ExportError: one of them is not from 0 to `MOST_INDEX`.
+    """
+    array = np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
+    if array.size and not 0 <= array.min() <= array.max() <= MOST_INDEX:
+        raise ExportError(
+            f"an index of the network is {array.max() if array.min() >= 0 else array.min()}; 0 to {MOST_INDEX} must "
+            "hold: let it read fewer columns"
+        )
+    return np.array(array, dtype=np.uint16, order="C")
 
 
 class Builder:
@@ -52,7 +71,7 @@ class Builder:
             self._scope.pop()
 
     def add(self, kind: type[Layer], name: str, *inputs: str, **options: Any) -> str:
-        """Add a layer; arrays among `options` are taken as constants.
+        """Add a layer; arrays among `options` are taken as constants, those of `indices` as they are.
 
         Returns:
             The name of its value.
@@ -62,7 +81,7 @@ class Builder:
         if full in layer_names or full == INPUT:
             full = next(f"{full}_{n}" for n in range(2, len(layer_names) + 3) if f"{full}_{n}" not in layer_names)
         # Options with a shape are arrays or tensors; plain numbers and tuples are part of the layer's meaning.
-        layer_options = {key: constant(value) if hasattr(value, "shape") else value for key, value in options.items()}
+        layer_options = {key: constant(value) if _is_real(value) else value for key, value in options.items()}
         self.layers.append(kind(name=full, inputs=inputs, **layer_options))
         return full
 
@@ -114,3 +133,8 @@ class Builder:
         return Graph(
             self.inputs, tuple(replace(layer) for layer in reversed(used_layers)), results, self._initial, window
         )
+
+
+def _is_real(value: Any) -> bool:
+    """Whether an option is an array or a tensor of real numbers."""
+    return hasattr(value, "shape") and value.dtype != np.uint16

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from edp.ir.base import Array, Layer
+import numpy as np
+
+from edp.ir.base import Array, Indices, Layer
 
 
 class Function(StrEnum):
@@ -176,6 +178,44 @@ class GroupedDense(Layer):
     @property
     def macs(self) -> int:
         return self.weight.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TreeSums(Layer):
+    """Sums of regression trees, each a complete binary tree of depth D (Breiman et al., 1984).
+
+    Output o is the sum of ``leaf[o, t, i - (2^D - 1)]`` over its trees t, the first one first. Node i is reached from
+    node 0 by D steps ``i = 2 i + 1 + (x[feature[o, t, i]] > threshold[o, t, i])``, compared in single precision. A node
+    that does not split has `NEVER` as its threshold. A tick takes ``outputs trees D`` comparisons whatever it reads,
+    and no multiplication.
+
+    Attributes:
+        feature: numbers of the input, ``(output, tree, 2^D - 1)``, uint16.
+        threshold: ``(output, tree, 2^D - 1)``.
+        leaf: ``(output, tree, 2^D)``.
+    """
+
+    feature: Indices
+    threshold: Array
+    leaf: Array
+
+    @property
+    def width(self) -> int:
+        return len(self.leaf)
+
+    @property
+    def depth(self) -> int:
+        """Comparisons from the root to a leaf."""
+        return depth_of(self.leaf.shape[2])
+
+
+NEVER = float(np.finfo(np.float32).max)
+"""A threshold that no number of single precision exceeds, and that every target can write: it is no infinity."""
+
+
+def depth_of(leaves: int) -> int:
+    """Depth of a complete binary tree with so many leaves."""
+    return leaves.bit_length() - 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from edp.ir import layers as plain
 from edp.ir import memory
 from edp.ir.base import INPUT, Graph, Layer
+from edp.ir.descent import reached_leaves, summed
 
 Values = NDArray[np.floating]
 Memory = dict[str, Values]
@@ -179,6 +180,11 @@ def _dense(layer: plain.Dense, w: Weights, m: Memory, x: Values) -> Values:
 def _grouped(layer: Any, w: Weights, m: Memory, x: Values) -> Values:
     rows = x.reshape(len(w["bias"]), -1)
     return np.asarray((np.einsum("roi,ri->ro", w["weight"], rows) + w["bias"]).ravel())
+
+
+@_step(plain.TreeSums)
+def _trees(layer: plain.TreeSums, w: Weights, m: Memory, x: Values) -> Values:
+    return summed(reached_leaves(layer.feature, w["threshold"], w["leaf"], x))
 
 
 def _normed(x: Values, epsilon: float) -> Values:

@@ -9,8 +9,10 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from edp.data.task import Task
 from edp.errors import ConfigError, closest
 from edp.ir import Builder
+from edp.ir.builder import MOST_INDEX
 from edp.networks.blocks.base import BlockSlot, BranchMaker
 from edp.networks.cells import CellSpec, GruCell, LstmCell, Stack
 from edp.networks.cells.base import check_cell
@@ -20,6 +22,7 @@ from edp.networks.initial import InitialSpec, ZeroState
 from edp.networks.lag_bank import LagBank, check_lags
 from edp.networks.pooling import AttentionPooling
 from edp.networks.streaming import Chain, Cost, State, Streaming
+from edp.networks.trees import MOST_DEPTH, MOST_TREES, Trees
 from edp.registry import Registry
 from edp.settings.bounds import (
     MOST_CHANNELS,
@@ -40,8 +43,15 @@ Blocks = Sequence[object]
 class BackboneSpec(Protocol):
     """Options of a backbone."""
 
-    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
-        """The backbone and the width of its representation; `blocks` are the specs for its slots."""
+    def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
+        """The backbone and the width of its representation.
+
+        Args:
+            features: numbers that it reads.
+            window: samples of its pooling.
+            blocks: specs for its slots.
+            outputs: numbers that the network predicts, horizons times targets: for parts that answer for each of them.
+        """
         ...
 
     def slots(self) -> tuple[BlockSlot, ...]:
@@ -92,7 +102,7 @@ class LstmSpec:
         """The recurrent layers, then what reads their states."""
         return ("recurrent", "pooling", "extras")
 
-    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+    def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """The recurrent backbone on the scaled features."""
         stack = Stack(self.cell, features, self.units, self.layers, self.dropout, self.zoneout)
         net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
@@ -130,7 +140,7 @@ class GruSpec:
         """The recurrent layers, then what reads their states."""
         return ("recurrent", "pooling", "extras")
 
-    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+    def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """The recurrent backbone on the scaled features."""
         stack = Stack(self.cell, features, self.units, self.layers, self.dropout)
         net = RecurrentBackbone(None, self.initial.build(stack, features), self.units, self.dropout, window, blocks)
@@ -164,7 +174,7 @@ class TcnSpec:
         """One piece."""
         return ()
 
-    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+    def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """The convolution stack(s); refused where the receptive field is shorter than the window."""
         reach = receptive_field(len(self.channels), self.kernel)
         if reach < window:
@@ -217,7 +227,7 @@ class HybridSpec:
         """The convolutions, the recurrent layers, then what reads their states."""
         return ("encoder", "recurrent", "pooling", "extras")
 
-    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
+    def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """Convolutions and the recurrent backbone on their channels."""
         encoder, width = _convolutions(features, self.channels, self.kernel, self.dropout, window, blocks)
         stack = Stack(self.cell, width, self.units, self.layers, self.dropout, self.zoneout)
@@ -240,6 +250,9 @@ class CommitteeSpec:
         layers: hidden layers of a member.
         activations: ``tanh``, ``relu`` or both; each has its own group of members. None leaves the linear model.
         dropout: rate after each hidden layer, in training.
+        trees: regression trees for each predicted number; their sums join the representation. A training on folds
+            fits them.
+        tree_depth: comparisons from the root of a tree to a leaf.
     """
 
     # Spans in powers of two cover 0.01 to 0.32 s at 100 Hz with few columns.
@@ -249,18 +262,31 @@ class CommitteeSpec:
     layers: int = 2
     activations: tuple[str, ...] = ("tanh", "relu")
     dropout: float = 0.0
+    trees: int = 0
+    tree_depth: int = 4
 
     def __post_init__(self) -> None:
         check_count("backbone", "lags", self.lags, MOST_LEVELS, least=1)
         check_lags(self.lags)
         check_count("backbone", "activations", self.activations, len(NON_LINEAR))
         check_bounds("backbone", self, members=whole(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
+        check_bounds("backbone", self, trees=whole(0, MOST_TREES), tree_depth=whole(1, MOST_DEPTH))
         for name in self.activations:
             if name not in NON_LINEAR or self.activations.count(name) > 1:
                 raise ConfigError(
                     f"committee: activations = {list(self.activations)}; each of {', '.join(NON_LINEAR)} at most once "
                     f"must hold{closest(name, [*NON_LINEAR])}"
                 )
+
+    def conflicts(self, model: object, task: Task) -> str | None:
+        """Trees that read more columns than their tables can name."""
+        columns = len(task.features.features) * (1 + len(self.lags))
+        if self.trees and columns > MOST_INDEX + 1:
+            return (
+                f"committee: trees would read {columns:,} columns (features times 1 + lags); at most "
+                f"{MOST_INDEX + 1:,} must hold: give fewer channels or lags, or trees = 0"
+            )
+        return None
 
     def slots(self) -> tuple[BlockSlot, ...]:
         """None: the members are all there is."""
@@ -270,15 +296,15 @@ class CommitteeSpec:
         """The members; the changes have no weights."""
         return ("groups",)
 
-    def build(self, features: int, window: int, blocks: Blocks) -> tuple[Streaming, int]:
-        """The bank of changes and the members on it."""
+    def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
+        """The bank of changes, and the members and trees on it."""
         bank = LagBank(features, self.lags)
         groups = [
             Members(bank.columns, self.members, self.units, self.layers, name, self.dropout)
             for name in self.activations
         ]
-        net = Committee(bank, groups)
-        # Attention pooling and the last state each give `units` numbers.
+        trees = Trees(bank.columns, outputs, self.trees, self.tree_depth) if self.trees else None
+        net = Committee(bank, groups, trees)
         return net, net.width
 
 

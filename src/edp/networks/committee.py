@@ -1,4 +1,4 @@
-"""A committee: several small networks side by side on the same changes over several time spans."""
+"""A committee: several small networks, and regression trees, side by side on the same changes over time spans."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from edp.ir import Builder
 from edp.ir.layers import Activate, Dense, Function, GroupedDense
 from edp.networks.lag_bank import LagBank
 from edp.networks.streaming import Cost, Operation, State, Streaming
+from edp.networks.trees import Trees
 
 NON_LINEAR: dict[str, tuple[Callable[[Tensor], Tensor], Operation, Function]] = {
     "tanh": (torch.tanh, Operation.TANH, Function.TANH),
@@ -79,36 +80,51 @@ class Members(Streaming):
 
 
 class Committee(Streaming):
-    """``[bank ; members' hidden units]``: a linear head on it is a linear model plus a weighted mean of perceptrons."""
+    """``[bank ; members' hidden units ; trees' sums]``.
 
-    def __init__(self, bank: LagBank, groups: Sequence[Members]) -> None:
+    A linear head on it is a linear model plus a weighted mean of perceptrons plus weighted sums of trees.
+
+    Args:
+        bank: gives what the others read.
+        groups: of perceptrons.
+        trees: for each predicted number, horizons times targets; None for none.
+    """
+
+    def __init__(self, bank: LagBank, groups: Sequence[Members], trees: Trees | None = None) -> None:
         super().__init__()
         self.bank = bank
         self.groups = nn.ModuleList(groups)
+        self.trees = trees
 
     @property
     def width(self) -> int:
         """Numbers of the representation."""
-        return self.bank.columns + sum(group.members * group.units for group in self._members())
+        hidden = sum(group.members * group.units for group in self._members())
+        return self.bank.columns + hidden + (0 if self.trees is None else self.trees.outputs)
 
     def _members(self) -> list[Members]:
         return [group for group in self.groups if isinstance(group, Members)]
+
+    def _readers(self) -> dict[str, Members | Trees]:
+        """What reads the bank, in the order of the representation."""
+        readers: dict[str, Members | Trees] = {f"group{at}": group for at, group in enumerate(self._members())}
+        return readers if self.trees is None else readers | {"trees": self.trees}
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         return self.bank.initial_state(batch, like)
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         bank, state = self.bank(x, state)
-        return torch.cat([bank, *(group(bank, ())[0] for group in self._members())], dim=-1), state
+        return torch.cat([bank, *(part(bank, ())[0] for part in self._readers().values())], dim=-1), state
 
     def lower(self, build: Builder, x: str) -> str:
         with build.inside("bank"):
             bank = self.bank.lower(build, x)
-        hidden = []
-        for number, group in enumerate(self._members()):
-            with build.inside(f"group{number}"):
-                hidden.append(group.lower(build, bank))
-        return build.join("representation", bank, *hidden)
+        parts = []
+        for name, part in self._readers().items():
+            with build.inside(name):
+                parts.append(part.lower(build, bank))
+        return build.join("representation", bank, *parts)
 
     def costs(self) -> list[Cost]:
-        return self.bank.costs() + [cost for group in self._members() for cost in group.costs()]
+        return self.bank.costs() + [cost for part in self._readers().values() for cost in part.costs()]

@@ -100,7 +100,7 @@ class Predictor(Streaming):
         features, outputs, horizons = len(task.features.features), len(task.targets), len(task.horizons)
         self.front = FrontEnd(task, scaler)
         self.code = TargetTransform(task, scaler)
-        self.backbone, width = spec.backbone.build(features, spec.window, spec.blocks)
+        self.backbone, width = spec.backbone.build(features, spec.window, spec.blocks, horizons * outputs)
         self.gate = self._block(BlockSlot.GATE, width, outputs)
         mix = self._block(BlockSlot.MIX, spec.head.hidden, outputs)
         self.heads = spec.head.build(width, outputs, horizons * spec.output.values, mix)
@@ -272,7 +272,7 @@ def _check_size(task: Task, spec: ModelSpec, scaler: Scaler) -> None:
         return
     with torch.device("meta"), torch.random.fork_rng(devices=[]):  # shapes without numbers; takes seconds to load
         net = Predictor(task, replace(spec, physics=None), scaler)
-        parameters = sum(parameter.numel() for parameter in net.parameters())
+        parameters = sum(tensor.numel() for tensor in net.state_dict().values())  # tables of trees included
         state = state_numbers(net.initial_state(1, torch.zeros(())))
     if parameters > MOST_PARAMETERS or state > MOST_STATE:
         raise ConfigError(

@@ -34,7 +34,7 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
     spans = sum(key == "lags" for key, _ in options)
     if spans:  # the representation of a committee: changes over each span, and all members
         # Two groups of members at most: one for each of the two activations.
-        width = features * (1 + spans) + 2 * most("members") * most("units")
+        width = features * (1 + spans) + 2 * most("members") * most("units") + targets * len(task.horizons)
     levels = sum(key == "channels" for key, _ in options)
     stacks = max(1, sum(key == "first_dilations" for key, _ in options))
     layers = sum(value for key, value in options if key == "layers")
@@ -55,7 +55,9 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
         + most("ticks")
         + 2 * most("lags")
     )
-    return squares * width**2 + ends + small, 4 * reach * stacks * (levels + layers + 2) * width
+    # A tree has two numbers a node and one a leaf.
+    tables = targets * len(task.horizons) * max(0, most("trees")) * 3 * 2 ** most("tree_depth") if spans else 0
+    return squares * width**2 + ends + small + tables, 4 * reach * stacks * (levels + layers + 2) * width
 
 
 def _integers(parts: tuple[Any, ...] | list[Any], name: str = "") -> Iterator[tuple[str, int]]:

@@ -20,6 +20,7 @@ from edp.networks.blocks import BLOCKS
 from edp.networks.blocks.base import OUTPUT_SLOTS, BlockSlot, BlockSpec
 from edp.networks.heads import MlpHead
 from edp.networks.predictor import ModelSpec, Predictor, build_model, check_combination
+from edp.networks.trees import Trees
 from edp.registry import Registry
 from edp.testing.expectations import ContractError, expect
 from edp.testing.streaming import check_network
@@ -76,7 +77,17 @@ def small_network(model: ModelSpec, task: Task, shake: float = 0.2) -> Predictor
         for parameter in predictor.parameters():
             # Shaken weights: gates that start open and layers that start at zero would hide errors.
             parameter.add_(shake * torch.randn(parameter.shape, generator=draw))
+        for part in predictor.modules():
+            if isinstance(part, Trees):
+                _draw_tables(part, rng)
     return predictor.eval()
+
+
+def _draw_tables(trees: Trees, rng: np.random.Generator) -> None:
+    """Tables whose every node may go either way: those of a fresh network give zero."""
+    feature = rng.integers(0, trees.width, trees.feature.shape)
+    threshold, leaf = (rng.normal(size=table.shape).astype(np.float32) for table in (trees.threshold, trees.leaf))
+    trees.set_tables(feature, threshold, 0.1 * leaf)
 
 
 def check_spec(registry: Registry[Any], name: str) -> None:

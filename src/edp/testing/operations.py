@@ -37,6 +37,7 @@ FREE = {
     *("_reshape_alias", "_to_copy", "_unsafe_view", "alias", "cat", "clone", "constant_pad_nd", "copy", "detach"),
     *(
         "expand",
+        "gather",
         "index",
         "lift_fresh",
         "permute",

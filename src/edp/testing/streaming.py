@@ -24,6 +24,7 @@ from edp.networks.streaming import (
     reset_where,
     state_numbers,
 )
+from edp.networks.trees import Trees
 from edp.testing.expectations import ContractError, expect, expect_near
 from edp.testing.operations import check_operations
 
@@ -260,8 +261,10 @@ def check_graph_costs(predictor: Predictor) -> None:
     # A tenth more and eight numbers: counters that exports need and networks do not.
     expect(carried <= 1.1 * state + 8, f"the list carries {carried} numbers, the network {state}")
     machine = 0 if predictor.physics is None else MACHINE_CONSTANTS
+    trees = [part for part in predictor.modules() if isinstance(part, Trees)]
+    tables = sum(table.numel() for part in trees for table in part.buffers())
     # Constants of scaling and geometry are no parameters, but take memory.
-    most = parameters_of(predictor) * 1.1 + 200 + machine
+    most = parameters_of(predictor) * 1.1 + 200 + machine + tables
     expect(graph.parameters <= most, f"the list holds {graph.parameters} numbers; at most {most:.0f} must hold")
 
 

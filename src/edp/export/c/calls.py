@@ -188,6 +188,7 @@ CALLS: dict[type[Layer], Write] = {
     layers.Accumulate: lambda c, x: c.simple(x, "edp_accumulate", x.rows, x.size),
     layers.Dense: _dense,
     layers.GroupedDense: lambda c, x: c.simple(x, "edp_grouped_dense", *x.weight.shape),
+    layers.TreeSums: lambda c, x: c.simple(x, "edp_trees", *x.leaf.shape[:2], x.depth),
     layers.LayerNorm: _norm,
     layers.RowAttention: lambda c, x: c.simple(x, "edp_row_attention", x.rows, x.size, c.scratch(x)),
     memory.Difference: _difference,

@@ -107,6 +107,7 @@ INTEGER_CALLS: dict[type[Layer], Write] = {
     quantised.QGlu: lambda c, x: c.simple(x, "edp_q_glu", x.rows, x.size // 2, str(x.frac)),
     quantised.QDense: lambda c, x: _linear(c, x, "edp_q_dense", x.rows, *x.weight.shape),
     quantised.QGroupedDense: lambda c, x: _linear(c, x, "edp_q_grouped_dense", *x.weight.shape),
+    quantised.QTreeSums: lambda c, x: c.simple(x, "edp_q_trees", *x.leaf.shape[:2], x.depth, x.right),
     quantised.QConvolution: _convolution,
     quantised.QLstm: _recurrent,
     quantised.QGru: _recurrent,

@@ -261,6 +261,8 @@ TANGENTS: dict[type[Layer], Write] = {
     layers.Accumulate: lambda t, x: t.before(x, "edp_accumulate_tangent", *t.changes(x), x.rows, x.size),
     layers.Dense: _dense,
     layers.GroupedDense: _grouped,
+    # Between thresholds a sum of trees is constant.
+    layers.TreeSums: lambda t, x: t.before(x, "edp_fill_tangent", x.width),
     layers.LayerNorm: _norm,
     layers.RowAttention: _rows,
     memory.Difference: _difference,

@@ -226,6 +226,18 @@ def _grouped(p: _Part, x: Any) -> Any:
     return ca.vertcat(*(w @ column + b for w, column, b in zip(p.w["weight"], columns, p.w["bias"], strict=True)))
 
 
+def _trees(p: _Part, x: Any) -> Any:
+    outputs, trees, leaves = p.w["leaf"].shape
+    feature, threshold, leaf = (p.w[name].reshape(outputs * trees, -1) for name in ("feature", "threshold", "leaf"))
+    y, first = ca.MX(ca.DM(leaf)), leaves // 2
+    while first:  # from the leaves up each node hands on the number of its side
+        here = slice(first - 1, 2 * first - 1)
+        read = x[feature[:, here].astype(int).ravel(order="F").tolist()]
+        right = ca.reshape(read, outputs * trees, first) > ca.DM(threshold[:, here])
+        y, first = ca.if_else(right, y[:, 1::2], y[:, ::2]), first // 2
+    return _keep_nan(ca.sum1(x), ca.sum1(ca.reshape(y, trees, outputs)).T)
+
+
 def _normed(x: Any, epsilon: float) -> Any:
     count = x.shape[0]
     middle = x - ca.sum1(x) / count
@@ -366,6 +378,7 @@ LAYERS: dict[str, Callable[..., Any]] = {
     "Accumulate": _accumulate,
     "Dense": _dense,
     "GroupedDense": _grouped,
+    "TreeSums": _trees,
     "LayerNorm": _norm,
     "RowAttention": _row_attention,
     "Difference": _difference,

@@ -17,8 +17,8 @@ OPSETS = {9: 4, 11: 6, 13: 7, 17: 8, 21: 10}
 """IR version by opset: the one that was current when the opset came out, so that readers of that time take the file."""
 DEFAULT_OPSET = 13
 _NAMES = """
-Add Clip Concat Conv Cos Div Erf Exp GRU Gemm Identity LSTM Max Min Mul ReduceMean Relu Reshape Sigmoid Sign Sin Softmax
-Softplus Split Sqrt Sub Tanh Transpose
+Add Clip Concat Conv Cos Div Erf Exp GRU Gather Gemm Identity LSTM Max Min Mul ReduceMean Relu Reshape Sigmoid Sign Sin
+Softmax Softplus Split Sqrt Sub Tanh Transpose
 """
 OPTIONAL = ("LSTM", "GRU")
 """Operators whose outputs may be left out."""
@@ -128,6 +128,10 @@ class Nodes:
     def join(self, parts: Sequence[str], axis: int) -> str:
         """Values end to end; the value itself where there is one."""
         return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=axis)
+
+    def columns(self, x: str, chosen: NDArray[Any]) -> str:
+        """Chosen columns of a matrix."""
+        return self.add("Gather", x, self.constant(chosen.astype(np.int64), "columns"), axis=1)
 
     def shaped(self, x: str, *shape: int) -> str:
         """The numbers of a value in another shape, in the same order."""

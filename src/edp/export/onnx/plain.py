@@ -135,6 +135,33 @@ def _grouped(nodes: Nodes, layer: layers.GroupedDense, ticks: int, values: Seque
     return nodes.join(parts, 1)
 
 
+def _trees(nodes: Nodes, layer: layers.TreeSums, ticks: int, values: Sequence[str], *_: object) -> str:
+    """Every node compares at once, and from the leaves up each one hands on the number of its side."""
+    outputs, trees = layer.leaf.shape[:2]
+    levels = [[0]]
+    for _level in range(layer.depth):
+        # All left children, then all right ones: a side is one run of columns.
+        levels.append([2 * at + side for side in (1, 2) for at in levels[-1]])
+    order = np.concatenate(levels[:-1])
+    feature, threshold = (table[..., order].transpose(2, 0, 1).ravel() for table in (layer.feature, layer.threshold))
+    over = nodes.add("Sub", nodes.columns(values[0], feature), nodes.constant(threshold, "threshold"))
+    # 1 where a number is above its threshold, else 0; single precision never rounds a difference to nought.
+    right = nodes.split(
+        activate(nodes, Function.POSITIVE, over), [outputs * trees * len(level) for level in levels[:-1]], 1
+    )
+    leaf = layer.leaf[..., np.array(levels[-1]) - (len(order))].transpose(2, 0, 1).reshape(2, -1)
+    y = nodes.plus(nodes.times(right[-1], leaf[1] - leaf[0]), leaf[0])
+    for side in reversed(right[:-1]):
+        size = outputs * trees * 2 ** right.index(side)
+        low, high = nodes.split(y, [size, size], 1)
+        y = nodes.add("Add", low, nodes.add("Mul", side, nodes.less(high, low)))
+    sums = [
+        nodes.linear(part, np.ones((1, trees), np.float32), np.zeros(1, np.float32))
+        for part in nodes.split(y, [trees] * outputs, 1)
+    ]
+    return nodes.join(sums, 1)
+
+
 def _norm(nodes: Nodes, layer: layers.LayerNorm, ticks: int, values: Sequence[str], *_: object) -> str:
     rows = _rows(nodes, values[0], ticks, layer.rows, len(layer.gain))
     scaled = nodes.plus(nodes.times(normed(nodes, rows, layer.epsilon), layer.gain), layer.shift)
@@ -162,6 +189,7 @@ PLAIN: dict[type[Layer], Plain] = {
     layers.Accumulate: _accumulate,
     layers.Dense: _dense,
     layers.GroupedDense: _grouped,
+    layers.TreeSums: _trees,
     layers.LayerNorm: _norm,
     layers.RowAttention: _row_attention,
 }

@@ -69,6 +69,10 @@ class Native:
             tensors["weight"] = layer.weight.reshape(len(layer.weight), -1)
         elif isinstance(layer, layers.GroupedDense):
             tensors |= {"weight": layer.weight.transpose(1, 2, 0), "bias": layer.bias.T}
+        elif isinstance(layer, layers.TreeSums):
+            # A column a tree; columns of the input count from 1, as numbers that index.
+            tensors = {part: values.reshape(-1, values.shape[2]).T for part, values in tensors.items()}
+            tensors["feature"] = tensors["feature"] + 1.0
         elif isinstance(layer, memory.Rotation):
             tensors["factor"] = layer.factor.T
         elif isinstance(layer, layers.Gather) and len(self.runs(layer)) > MOST_PIECES:
@@ -202,6 +206,11 @@ def _convolution(native: Native, layer: memory.Convolution, x: Sequence[str]) ->
     return _simple("[{y}, {s_ring}] = convolution({0}, {weight}, {bias}, {dilation}, {s_ring});")(native, layer, x)
 
 
+def _trees(native: Native, layer: layers.TreeSums, x: Sequence[str]) -> list[str]:
+    pattern = f"{{y}} = trees({{0}}, {{feature}}, {{threshold}}, {{leaf}}, {layer.depth}, {layer.width});"
+    return _simple(pattern)(native, layer, x)
+
+
 def _prefix(native: Native, layer: memory.PrefixCorrection, x: Sequence[str]) -> list[str]:
     parts = ("first_weight", "first_bias", "second_weight", "second_bias")
     named = ", ".join(f"'{part}', {native.constant(layer, part)}" for part in parts)
@@ -246,6 +255,7 @@ WRITERS: dict[type[Layer], Write] = {
     layers.Accumulate: _simple("{y} = accumulate({0}, {rows});"),
     layers.Dense: _simple("{y} = dense({0}, {weight}, {bias}, {rows});"),
     layers.GroupedDense: _simple("{y} = grouped_dense({0}, {weight}, {bias});"),
+    layers.TreeSums: _trees,
     layers.LayerNorm: _simple("{y} = layer_norm({0}, {gain}, {shift}, {epsilon}, {rows});"),
     layers.RowAttention: _simple("{y} = row_attention({0}, {1}, {2}, {rows});"),
     memory.Difference: _simple(

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.ir.base import Layer, Number, Slot
-from edp.ir.layers import Function
+from edp.ir.base import Indices, Layer, Number, Slot
+from edp.ir.layers import Function, depth_of
 
 Bytes = NDArray[np.int8]
 Halves = NDArray[np.int16]
@@ -167,6 +167,29 @@ class QGroupedDense(_Weighted):
     @property
     def width(self) -> int:
         return self.bias.size
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class QTreeSums(FixedLayer):
+    """Sums of trees: `feature` and `threshold` ``(output, tree, node)``, `leaf` ``(output, tree, leaf)``.
+
+    Thresholds have the format of the input, rounded down: ``q > threshold`` is what ``q 2^-frac`` says of the real one.
+    The sum of the leaves is shifted right by `right`.
+    """
+
+    feature: Indices
+    threshold: Halves
+    leaf: Halves
+    right: int
+
+    @property
+    def width(self) -> int:
+        return len(self.leaf)
+
+    @property
+    def depth(self) -> int:
+        """Comparisons from the root to a leaf."""
+        return depth_of(self.leaf.shape[2])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -274,6 +274,17 @@ def _grouped(work: _Work, x: layers.GroupedDense, input_fracs: list[int]) -> qua
     return quantised.QGroupedDense(name=x.name, inputs=(), frac=work.frac(x.name), **work.rows(x, input_fracs[0]))
 
 
+def _trees(work: _Work, x: layers.TreeSums, input_fracs: list[int]) -> quantised.FixedLayer:
+    # In double precision: times a power of two, thresholds that are never exceeded leave single precision. Values lie
+    # from -32767 to 32767, so that the ends of 16 bits are exceeded always and never.
+    floor = np.floor(np.ldexp(x.threshold.astype(np.float64), input_fracs[0]))
+    threshold = np.clip(floor, -(2**15), 2**15 - 1).astype(np.int16)
+    leaf, bits = halves(x.leaf)
+    frac = _within(work.frac(x.name), bits)
+    tables: dict[str, Any] = {"feature": x.feature, "threshold": threshold, "leaf": leaf}
+    return quantised.QTreeSums(name=x.name, inputs=(), frac=frac, right=bits - frac, **tables)
+
+
 def _convolution(work: _Work, x: memory.Convolution, input_fracs: list[int]) -> quantised.FixedLayer:
     frac = work.frac(x.name)
     work.slots[x.name, "ring"] = input_fracs[0]
@@ -360,6 +371,7 @@ LOWER: dict[type[Layer], Lower] = {
     layers.Glu: _glu,
     layers.Dense: _dense,
     layers.GroupedDense: _grouped,
+    layers.TreeSums: _trees,
     memory.Convolution: _convolution,
     memory.Lstm: _lstm,
     memory.Gru: _gru,

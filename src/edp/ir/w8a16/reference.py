@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.ir.base import INPUT, Graph, Layer, Number
+from edp.ir.descent import reached_leaves
 from edp.ir.layers import Function
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
@@ -132,6 +133,11 @@ def _grouped(layer: quantised.QGroupedDense, m: Memory, x: Fixed) -> Fixed:
     return np.asarray(flat(saturated(scaled(sums, layer.multiplier, layer.shift))))
 
 
+def _trees(layer: quantised.QTreeSums, m: Memory, x: Fixed) -> Fixed:
+    leaves = reached_leaves(layer.feature, layer.threshold, layer.leaf, x)
+    return saturated(rounded_shift(leaves.sum(axis=-1, dtype=np.int64), layer.right))
+
+
 def _convolution(layer: quantised.QConvolution, m: Memory, x: Fixed) -> Fixed:
     _, taps, into = layer.weight.shape
     history = np.concatenate([m["ring"], x]) if taps > 1 else x
@@ -242,6 +248,7 @@ INTEGER_STEPS: dict[type[Layer], Callable[..., Any]] = {
     quantised.QGlu: _glu,
     quantised.QDense: _dense,
     quantised.QGroupedDense: _grouped,
+    quantised.QTreeSums: _trees,
     quantised.QConvolution: _convolution,
     quantised.QLstm: _lstm,
     quantised.QGru: _gru,

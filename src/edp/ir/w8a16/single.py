@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from edp.ir import layers, memory
 from edp.ir.base import Layer
+from edp.ir.descent import reached_leaves, summed
 from edp.ir.layers import BinaryOperation, Function
 
 Rows = NDArray[np.float32]
@@ -210,6 +211,10 @@ def _glu(layer: layers.Glu, m: Memory, x: Rows) -> Rows:
     return result
 
 
+def _trees(layer: layers.TreeSums, m: Memory, x: Rows) -> Rows:
+    return summed(reached_leaves(layer.feature, layer.threshold, layer.leaf, x))
+
+
 Run = Callable[..., Any]
 OVER_TIME: dict[type[Layer], Run] = {
     layers.Gather: gather,
@@ -219,6 +224,7 @@ OVER_TIME: dict[type[Layer], Run] = {
     layers.Activate: lambda layer, m, x: FUNCTIONS[layer.function](x),
     layers.Glu: _glu,
     layers.Accumulate: _accumulate,
+    layers.TreeSums: _trees,
     layers.LayerNorm: _layer_norm,
     layers.RowAttention: _rows,
     memory.Difference: _difference,

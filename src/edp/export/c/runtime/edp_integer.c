@@ -299,6 +299,24 @@ void edp_q_grouped_dense(const int16_t *x, const edp_q_matrix *w, const int32_t 
     }
 }
 
+void edp_q_trees(const int16_t *x, const uint16_t *feature, const int16_t *threshold, const int16_t *leaf,
+                 uint32_t outputs, uint32_t trees, uint32_t depth, uint32_t right, int16_t *y) {
+    const uint32_t nodes = (1u << depth) - 1u;
+    for (uint32_t o = 0; o < outputs; o++) {
+        int32_t sum = 0;
+        for (uint32_t tree = o * trees; tree < (o + 1u) * trees; tree++) {
+            const uint16_t *column = feature + tree * nodes;
+            const int16_t *split = threshold + tree * nodes;
+            uint32_t at = 0;
+            for (uint32_t level = 0; level < depth; level++) {
+                at = 2u * at + ((x[column[at]] > split[at]) ? 2u : 1u);
+            }
+            sum += leaf[tree * (nodes + 1u) + at - nodes];
+        }
+        y[o] = narrow32(edp_q_rounded(sum, right));
+    }
+}
+
 void edp_q_gates(const int16_t *x, const edp_q_matrix *w, uint32_t out, uint32_t in, int32_t *gates) {
     edp_q_fill32(0, out, gates);
     edp_q_products(x, w->weight, out, in, gates);

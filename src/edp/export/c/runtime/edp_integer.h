@@ -84,6 +84,9 @@ void edp_q_dense(const int16_t *x, const edp_q_matrix *w, const int32_t *bias, u
                  int32_t *sums, int16_t *y);
 void edp_q_grouped_dense(const int16_t *x, const edp_q_matrix *w, const int32_t *bias, uint32_t rows, uint32_t out,
                          uint32_t in, int32_t *sums, int16_t *y);
+/* As edp_trees; thresholds have the format of x, and the sum of the leaves `right` bits more than y. */
+void edp_q_trees(const int16_t *x, const uint16_t *feature, const int16_t *threshold, const int16_t *leaf,
+                 uint32_t outputs, uint32_t trees, uint32_t depth, uint32_t right, int16_t *y);
 /* gates = W x, 16 fractional bits. */
 void edp_q_gates(const int16_t *x, const edp_q_matrix *w, uint32_t out, uint32_t in, int32_t *gates);
 

@@ -398,6 +398,24 @@ void edp_grouped_dense(const float *x, const float *weight, const float *bias, u
     }
 }
 
+void edp_trees(const float *x, const uint16_t *feature, const float *threshold, const float *leaf, uint32_t outputs,
+               uint32_t trees, uint32_t depth, float *y) {
+    const uint32_t nodes = (1u << depth) - 1u;
+    for (uint32_t o = 0; o < outputs; o++) {
+        float sum = 0.0f;
+        for (uint32_t tree = o * trees; tree < (o + 1u) * trees; tree++) {
+            const uint16_t *column = feature + tree * nodes;
+            const float *split = threshold + tree * nodes;
+            uint32_t at = 0;
+            for (uint32_t level = 0; level < depth; level++) {
+                at = 2u * at + ((x[column[at]] > split[at]) ? 2u : 1u);
+            }
+            sum += leaf[tree * (nodes + 1u) + at - nodes];
+        }
+        y[o] = sum;
+    }
+}
+
 void edp_layer_norm(const float *x, const float *gain, const float *shift, float epsilon, uint32_t rows, uint32_t n,
                     float *y) {
     for (uint32_t row = 0; row < rows; row++) {

@@ -125,6 +125,10 @@ void edp_dense(const float *x, const float *weight, const float *bias, uint32_t 
 /* The same, row i with its own W (out, in) and b. */
 void edp_grouped_dense(const float *x, const float *weight, const float *bias, uint32_t rows, uint32_t out, uint32_t in,
                        float *y);
+/* Sums of complete trees: features and thresholds (outputs, trees, 2^depth - 1), leaves (outputs, trees, 2^depth). From
+   node 0 on, node i goes to 2 i + 2 where x[feature] > threshold, else to 2 i + 1. Always as many comparisons. */
+void edp_trees(const float *x, const uint16_t *feature, const float *threshold, const float *leaf, uint32_t outputs,
+               uint32_t trees, uint32_t depth, float *y);
 /* y may be x or shift. */
 void edp_layer_norm(const float *x, const float *gain, const float *shift, float epsilon, uint32_t rows, uint32_t n,
                     float *y);

@@ -1,0 +1,40 @@
+"""What complete regression trees give, for any number of rows at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.ir.base import Indices
+from edp.ir.layers import depth_of
+
+
+def reached_leaves(feature: Indices, threshold: NDArray[Any], leaf: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
+    """The leaf of each tree of `edp.ir.layers.TreeSums` that a row of the input reaches.
+
+    Args:
+        feature: ``(output, tree, node)``.
+        threshold: likewise; compared as they come, so their type and that of `x` must hold the same numbers.
+        leaf: ``(output, tree, leaf)``.
+        x: ``(..., input)``.
+
+    Returns:
+        ``(..., output, tree)``.
+    """
+    outputs, trees, nodes = feature.shape
+    root = nodes * np.arange(outputs * trees).reshape(outputs, trees)
+    at = np.zeros((*x.shape[:-1], outputs, trees), dtype=np.int64)
+    for _ in range(depth_of(nodes + 1)):
+        columns = feature.ravel()[root + at]
+        values = np.take_along_axis(x, columns.reshape(*x.shape[:-1], -1).astype(np.int64), -1).reshape(columns.shape)
+        at = 2 * at + 1 + (values > threshold.ravel()[root + at])
+    first = (nodes + 1) * np.arange(outputs * trees).reshape(outputs, trees)
+    return np.asarray(leaf.ravel()[first + at - nodes])
+
+
+def summed(leaves: NDArray[Any]) -> NDArray[Any]:
+    """Sums over the last axis, one after the other from nought on, as a loop in C does."""
+    # NumPy's own sum adds in pairs, which gives other bits; plus nought makes +0 of a sum of -0.
+    return np.asarray(np.add.accumulate(leaves, axis=-1)[..., -1] + leaves.dtype.type(0))
