@@ -160,6 +160,32 @@ def test_of_equal_models_the_simplest_is_chosen():
     choice = choose({"simple": simple, "clear": clear})
     assert (choice.name, choice.best) == ("clear", "clear")
     assert choice.excess["simple"] > choice.doubt["simple"]
+    assert choice.excess["simple"] == pytest.approx(np.log(simple.error() / clear.error()).mean(), rel=0.05)
+
+
+def test_an_advantage_while_the_machine_idles_decides_nothing():
+    idle, rows = np.full((19, 1), 1e-8), np.full(20, 50.0)
+    simple = Promise(np.vstack([idle, [[1.0]]]), rows)
+    quiet = Promise(np.vstack([0.5 * idle, [[1.01]]]), rows)
+    assert choose({"simple": simple, "quiet": quiet}).best == "simple"
+
+
+def test_a_single_outlier_does_not_decide_against_all_other_blocks():
+    rng = np.random.default_rng(0)
+    plain, rows = rng.uniform(0.9, 1.1, size=(40, 1)), np.full(40, 50.0)
+    outlier = np.eye(40)[:, :1]
+    simple, better = Promise(plain + 60 * outlier, rows), Promise(0.7 * plain + 80 * outlier, rows)
+    assert (better.error() > simple.error()).all()
+    assert choose({"simple": simple, "better": better}).name == "better"
+
+
+def test_candidates_that_left_out_fewer_blocks_are_compared_on_those():
+    rng = np.random.default_rng(0)
+    squared = rng.uniform(0.9, 1.1, size=(30, 1))
+    whole, part = Promise(squared, np.full(30, 10.0)), Promise(0.5 * squared[-10:], np.full(10, 10.0))
+    choice = choose({"whole": whole, "part": part})
+    assert choice.name == "part"
+    assert choice.excess["whole"] == pytest.approx(0.5 * np.log(2))
 
 
 def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():

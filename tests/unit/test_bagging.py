@@ -1,5 +1,7 @@
 """Committees trained on folds: left-out predictions are honest, and the network says what the sum of its parts says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -108,8 +110,23 @@ def test_long_recordings_are_thinned_out_evenly():
     found = fit_bagged(data_of(recording()), MODEL, spec(rows=300, steps=10))
     assert 250 < len(found.table.columns) <= 310
     assert found.table.stride > 1
-    truth = [np.zeros((part.samples - 4, 2)) for part in data_of(recording()).validation]
-    assert [len(one) for one in found.of_validation(truth)] == [len(one) for one in truth]
+    data = data_of(recording())
+    truth = [np.zeros((part.samples - 4, 2)) for part in (*data.train, *data.validation)]
+    assert [len(one) for one in found.at_every_tick(truth)] == [len(one) for one in truth]
+
+
+def test_a_channel_that_never_moved_moves_no_prediction_later():
+    column = Recording(
+        name="still",
+        channels=(*recording().channels, Channel("idle", Kind.GENERIC)),
+        rate_hz=RATE,
+        values=np.column_stack([recording().values, np.full(recording().samples, 3.7)]).astype(np.float32),
+    )
+    task = Task(FeatureSet("three", ("u", "y", "idle")), ("y",), (1, 4), TargetMode.DELTA, RATE)
+    data = prepare([column], task, ByTime(), 10)
+    net = fit_bagged(data, MODEL, spec(steps=60)).fitted.predictor
+    other = replace(data.test[0], inputs=data.test[0].inputs + np.float32([0, 0, 1]))
+    assert np.abs(stream_predictions(net, [other])[0] - stream_predictions(net, data.test)[0]).max() < 1e-6
 
 
 @pytest.mark.parametrize(

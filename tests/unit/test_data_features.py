@@ -142,6 +142,15 @@ def test_a_channel_that_does_not_move_scales_by_its_nominal_size():
     assert scaler.feature_scale[2] == KINDS[Kind.PRESSURE].nominal
 
 
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e9])
+def test_a_channel_of_no_kind_moves_by_its_own_size(size):
+    task = Task(FeatureSet("plain", ("a", "b")), ("a",), (1,), TargetMode.DELTA, 100.0)
+    values = np.column_stack([np.sin(np.arange(200) / 9), np.full(200, 3.7)]).astype(np.float32) * np.float32(size)
+    scaler = fit_scaler(task, [Series("log", values, values[:, :1])], (Kind.GENERIC, Kind.GENERIC))
+    assert scaler.constant == ("b",)
+    assert scaler.feature_scale[0] == pytest.approx(values[:, 0].std(), rel=1e-5)
+
+
 @pytest.mark.parametrize("mode", list(TargetMode))
 def test_target_scales_are_those_of_the_encoded_targets(mode):
     task = Task(MIXED.features, MIXED.targets, MIXED.horizons, mode, 100.0)

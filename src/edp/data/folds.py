@@ -50,8 +50,8 @@ def blocked_folds(lengths: Sequence[int], folds: int, gap: int) -> Folds:
     total = int(sum(lengths))
     if total < folds * FEWEST_ROWS:
         raise DataError(
-            f"cross-validation: {total} rows for {folds} folds; each fold needs {FEWEST_ROWS}: record longer, or take "
-            "fewer folds"
+            f"cross-validation: {total} rows for {folds} folds; each fold needs {FEWEST_ROWS}: record longer, or, "
+            "where training.bagging.folds is among your settings, take fewer folds"
         )
     # Contiguous: rows drawn one by one would share history and future with those that are left out.
     owner = np.arange(total) * folds // total

@@ -13,7 +13,7 @@ from edp.data.series import Series
 from edp.data.task import TargetMode, Task
 from edp.signals import KINDS, Kind
 
-# A standard deviation below this share of the kind's nominal size is a constant channel, not a signal.
+# A standard deviation below this share of the kind's size is a constant channel, not a signal.
 CONSTANT = 1e-6
 
 
@@ -35,6 +35,16 @@ class Scaler:
     target_offset: NDArray[np.float64]
     target_scale: NDArray[np.float64]
     constant: tuple[str, ...] = ()
+
+
+def least_spread(kind: Kind, largest: float) -> float:
+    """Standard deviation, in SI units, at or below which a channel counts as constant.
+
+    Args:
+        kind: its nominal size is the measure: the noise of a frozen sensor is not motion.
+        largest: magnitude of the channel in the recordings, which is the measure where the kind says nothing of size.
+    """
+    return CONSTANT * (largest if kind is Kind.GENERIC else KINDS[kind].nominal)
 
 
 def feature_matrix(task: Task, series: Series) -> NDArray[np.float32]:
@@ -62,7 +72,7 @@ def fit_scaler(task: Task, train: Sequence[Series], kinds: Sequence[Kind]) -> Sc
     constant = []
     for i, kind in enumerate(kinds):
         facts = KINDS[kind]
-        if std[i] <= CONSTANT * facts.nominal:
+        if std[i] <= least_spread(kind, max(abs(low[i]), abs(high[i]))):
             scale[i] = facts.nominal
             # It is constant by construction while channels of the start are read, and no fault of the data.
             if task.features.features[i] != STARTING:

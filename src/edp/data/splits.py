@@ -107,7 +107,7 @@ class ByRecording:
         }
         if not parts["validation"]:
             parts = _hold_tail(parts, self.tail_share, gap)
-        return _checked(parts, recordings)
+        return _checked(parts, recordings, gap)
 
 
 @SPLITS.register("time")
@@ -142,7 +142,7 @@ class ByTime:
             parts["train"].append(Stretch(i, 0, validation - gap))
             parts["validation"].append(Stretch(i, validation, test - gap))
             parts["test"].append(Stretch(i, test, n))
-        return _checked(parts, recordings)
+        return _checked(parts, recordings, gap)
 
 
 @SPLITS.register("blocks")
@@ -194,7 +194,7 @@ class ByBlocks:
                 if after and part != "test" and part != after[0]:
                     stop -= gap
                 parts[part].append(Stretch(i, start, stop))
-        return _checked(parts, recordings)
+        return _checked(parts, recordings, gap)
 
     def _owner(self, number: int, turn: Iterator[int]) -> str:
         """Part of block `number`; `turn` counts the blocks that do not test, over all recordings."""
@@ -274,7 +274,7 @@ class ByMachine:
         machines_by_part = {"train": set(drawn), "validation": set(validation), "test": set(test)}
         whole = [Stretch(i, 0, recording.samples) for i, recording in enumerate(recordings)]
         parts = {part: [s for s in whole if owners[s.recording] in names] for part, names in machines_by_part.items()}
-        return _checked(parts, recordings)
+        return _checked(parts, recordings, gap)
 
     def _heavy(self, recordings: Sequence[Recording], owners: Sequence[str]) -> list[str]:
         """Machines whose mass lies in the range that tests."""
@@ -339,7 +339,7 @@ def _hold_tail(parts: dict[str, list[Stretch]], share: float, gap: int) -> dict[
     return {"train": train, "validation": validation, "test": parts["test"]}
 
 
-def _checked(parts: dict[str, list[Stretch]], recordings: Sequence[Recording]) -> Split:
+def _checked(parts: dict[str, list[Stretch]], recordings: Sequence[Recording], gap: int) -> Split:
     for part in PARTS:
         if not parts[part]:
             raise DataError(
@@ -350,7 +350,8 @@ def _checked(parts: dict[str, list[Stretch]], recordings: Sequence[Recording]) -
             if stretch.stop <= stretch.start:
                 raise DataError(
                     f"split: recording '{recordings[stretch.recording].name}' is too short "
-                    f"({recordings[stretch.recording].samples} samples) to leave a stretch for {part}; "
-                    "give a longer recording or another split"
+                    f"({recordings[stretch.recording].samples} samples) to leave a stretch for {part} beside a gap of "
+                    f"{gap} samples (window plus largest horizon); give a longer recording, a shorter horizon or "
+                    "another split"
                 )
     return Split(tuple(parts["train"]), tuple(parts["validation"]), tuple(parts["test"]))

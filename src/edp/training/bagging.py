@@ -55,14 +55,14 @@ class Table:
         targets: standardised, ``(row, output)``; outputs are horizons times targets.
         folds: who is left out when.
         stride: ticks from row to row.
-        validation: first row of each validation stretch.
+        starts: first row of each stretch, those of the training part first.
     """
 
     columns: NDArray[np.float32]
     targets: DoubleArray
     folds: Folds
     stride: int
-    validation: tuple[int, ...]
+    starts: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +81,18 @@ class Bagged:
     linear: DoubleArray
     table: Table
 
-    def of_validation(self, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
-        """Left-out predictions of each validation stretch at every tick, standardised ``(tick, output)``.
+    def at_every_tick(self, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
+        """Left-out predictions of each stretch at every tick, standardised ``(tick, output)``.
 
         Where rows were thinned out, the error of the row before a tick stands for that of the tick.
 
         Args:
-            truth: what was to be predicted, of each stretch, likewise.
+            truth: what was to be predicted, of each stretch of the training part, then of the validation part.
         """
         error = self.left_out - self.table.targets
         rows = [
             first + np.arange(len(one)) // self.table.stride
-            for first, one in zip(self.table.validation, truth, strict=True)
+            for first, one in zip(self.table.starts, truth, strict=True)
         ]
         return [one + error[chosen] for one, chosen in zip(truth, rows, strict=True)]
 
@@ -172,7 +172,6 @@ def _groups(net: Predictor) -> list[Members]:
 def _table(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     """Rows of both parts as the network sees them, and the gains that give each change unit spread."""
     stretches = [part for part in (*data.train, *data.validation) if part.samples > data.task.max_horizon]
-    validated = sum(part.samples > data.task.max_horizon for part in data.validation)
     if not stretches:
         raise DataError(
             f"no stretch of the training and validation parts is longer than the largest horizon of "
@@ -193,13 +192,17 @@ def _table(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     spread = columns[:, bank.width :].std(axis=0, dtype=np.float64)
     gain = np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0), 1.0).astype(np.float32)
     columns[:, bank.width :] *= gain
+    still = torch.from_numpy(np.ptp(columns, axis=0) == 0)
     with torch.no_grad():
         bank.gain.copy_(torch.from_numpy(gain).view_as(bank.gain))
+        for group in _groups(net):
+            # No gradient reaches these weights: random ones would answer a channel that moves later for the first time.
+            group.weights[0][:, still] = 0.0
     # Rows within the longest lag and the largest horizon of a fold share samples with it.
     gap = math.ceil((bank.lags[-1] + data.task.max_horizon) / stride)
     lengths = [len(range(0, count, stride)) for count in ticks]
     gap = min(gap, max(1, sum(lengths) // (4 * spec.folds)))
-    starts = np.cumsum([0, *lengths])[len(stretches) - validated : -1]
+    starts = np.cumsum([0, *lengths])[:-1]
     return Table(columns, targets, blocked_folds(lengths, spec.folds, gap), stride, tuple(map(int, starts)))
 
 

@@ -1,6 +1,10 @@
 """``edp train`` without a preset, and the guard of ``edp evaluate``."""
 
 import json
+import tomllib
+
+import numpy as np
+import pytest
 
 SETTINGS = ("--set", "task.targets=['CylVels_1']", "--set", "task.horizons=[5]", "--minutes", "0.01")
 
@@ -54,3 +58,50 @@ def test_a_network_that_loses_says_so_first_and_by_its_exit_code(edp, trained):
     won = edp(*few)
     assert won.code == 0
     assert "less error than the network" not in won.out
+
+
+def log(folder, ticks, u=None, y=None):
+    """A CSV with a lever and what follows it, and its map; the options that name both."""
+    steps = np.repeat(np.random.default_rng(0).uniform(-1, 1, ticks // 10 + 1), 10)[:ticks]
+    u = steps if u is None else np.full(ticks, u)
+    y = np.convolve(steps, 0.9 ** np.arange(40))[:ticks] if y is None else np.full(ticks, y)
+    rows = "".join(f"{tick / 50:.3f},{a:.6f},{b:.6f}\n" for tick, (a, b) in enumerate(zip(u, y, strict=True)))
+    (folder / "log.csv").write_text("time,u,y\n" + rows)
+    (folder / "map.toml").write_text('time = "time"\n[channels.u]\ncolumn = "u"\n[channels.y]\ncolumn = "y"\n')
+    return folder / "log.csv", "--map", folder / "map.toml", "--minutes", "0.001", "--set", "task.targets=['y']"
+
+
+BLIND = ("task.features={name='lever', channels=['u']}", "task.mode='absolute'")
+
+
+@pytest.mark.parametrize(
+    ("ticks", "values", "settings", "words"),
+    [
+        (900, {"y": 2.0}, (), ("target y never moves", "take it out of task.targets")),
+        (900, {"y": 0.0}, (), ("target y never moves", "record it while the machine works")),
+        (900, {"u": 3e7}, BLIND, ("no input moves", "check the signal map")),
+        (900, {}, ("task.horizons=[190]",), ("too short", "shorter horizon")),
+        (900, {}, ("task.horizons=[90]",), ("longer than the largest horizon of 90 ticks", "shorter horizon")),
+        (9, {}, (), ("log", "too short (9 samples)", "give a longer recording")),
+        (40, {}, ("task.horizons=[1]",), ("1 independent block(s)", "two must hold", "longer or more recordings")),
+        (80, {}, ("task.horizons=[1]",), ("56 rows for 5 folds", "record longer")),
+        (900, {}, ("split={kind='recordings', test=['log']}",), ("no recording is left for train", "split by time")),
+    ],
+)
+def test_data_that_hold_nothing_to_learn_are_one_error(edp, tmp_path, ticks, values, settings, words):
+    options = [word for setting in settings for word in ("--set", setting)]
+    ended = edp("train", *log(tmp_path, ticks, **values), "--out", tmp_path / "run", *options)
+    text = " ".join(ended.err.split())
+    assert ended.code == 1, text
+    assert "Traceback" not in text
+    assert text.count("error:") == 1
+    for word in words:
+        assert word in text
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_one_recording_is_divided_by_time(edp, tmp_path):
+    ended = edp("train", *log(tmp_path, 900), "--out", tmp_path / "run", "--set", "task.horizons=[2]")
+    assert ended.code == 0, ended.err
+    split = tomllib.loads((tmp_path / "run" / "config.toml").read_text())["split"]
+    assert split == {"kind": "time", "validation_share": 0.15, "test_share": 0.2}

@@ -18,9 +18,12 @@ from edp.signals import KINDS
 from edp.training.validation import standard_targets
 
 BLOCKS = 10
-"""Pieces of the judged rows at least, whose errors tell how sure a difference is."""
+"""Pieces of the validation part, whose errors tell how sure a difference is; the training part has more of them."""
 FEWEST_BLOCKS = 2
 TINY = 1e-12
+"""Error in standard deviations below which a prediction is exact; a logarithm needs some number."""
+Block = tuple[int, int, int]
+"""Number of a stretch, its first row and the row after its last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +43,9 @@ class Promise:
         share = self.rows / self.rows.sum()
         return np.asarray(np.sqrt((self.squared * share[:, None]).sum(axis=0)))
 
-    def logarithms(self, scale: DoubleArray) -> DoubleArray:
-        """Mean over outputs of the logarithm of each block's error relative to `scale` ``(output,)``; ``(block,)``."""
-        relative = np.sqrt(self.squared) / np.maximum(scale, TINY)
-        return np.asarray(np.log(np.maximum(relative, TINY)).mean(axis=1))
+    def last(self, count: int) -> Promise:
+        """That of the last `count` blocks alone."""
+        return Promise(self.squared[-count:], self.rows[-count:])
 
 
 @dataclass(frozen=True)
@@ -63,75 +65,85 @@ class PortfolioChoice:
     doubt: Mapping[str, float]
 
 
-def blocks_of(data: Prepared, skip: int) -> list[tuple[int, int, int]]:
-    """Stretch, first and last row of each block of the validation part.
+def blocks_of(data: Prepared, skip: int) -> tuple[list[Block], int]:
+    """Blocks of nearly equal size of the training stretches, then of the validation stretches; how many the latter are.
 
     Raises:
-        DataError: fewer than two blocks longer than the largest horizon.
+        DataError: fewer than two blocks of the validation part are longer than the largest horizon.
     """
     reach = data.task.max_horizon
-    usable = [max(0, part.samples - reach - min(skip, part.samples // 4)) for part in data.validation]
+    usable = [max(0, part.samples - reach - min(skip, part.samples // 4)) for part in (*data.train, *data.validation)]
+    validated = usable[len(data.train) :]
     least = max(reach + 1, 2)
-    size = max(least, sum(usable) // BLOCKS)
+    size = max(least, sum(validated) // BLOCKS)
     blocks = []
-    for number, (part, count) in enumerate(zip(data.validation, usable, strict=True)):
+    for number, (part, count) in enumerate(zip((*data.train, *data.validation), usable, strict=True)):
         first = part.samples - reach - count
         pieces = max(1, count // size)
         if count >= least:
             edges = first + np.linspace(0, count, pieces + 1).round().astype(int)
             blocks += [(number, int(a), int(b)) for a, b in itertools.pairwise(edges)]
-    if len(blocks) < FEWEST_BLOCKS:
+    judged = sum(number >= len(data.train) for number, _, _ in blocks)
+    if judged < FEWEST_BLOCKS:
         raise DataError(
-            f"automatic choice: the validation part has {sum(usable)} usable ticks, {len(blocks)} independent block(s) "
+            f"automatic choice: the validation part has {sum(validated)} usable ticks, {judged} independent block(s) "
             f"longer than the largest horizon of {reach} ticks; two must hold: give longer or more recordings, a "
             "larger validation share (split.validation_share), or a shorter horizon"
         )
-    return blocks
+    return blocks, judged
 
 
-def promise_of(
-    predicted: Sequence[DoubleArray], truth: Sequence[DoubleArray], blocks: Sequence[tuple[int, int, int]]
-) -> Promise:
-    """Errors of predictions of the validation stretches, both standardised ``(tick, output)`` and of equal length."""
+def promise_of(predicted: Sequence[DoubleArray], truth: Sequence[DoubleArray], blocks: Sequence[Block]) -> Promise:
+    """Errors of predictions of stretches, both standardised ``(tick, output)`` and of equal length."""
     squared = [np.square(predicted[n][a:b] - truth[n][a:b]).mean(axis=0) for n, a, b in blocks]
     return Promise(np.stack(squared), np.array([b - a for _, a, b in blocks], dtype=np.float64))
 
 
 def standard_truth(predictor: Predictor, data: Prepared) -> list[DoubleArray]:
-    """Change or value to be predicted at each tick of the validation stretches, standardised ``(tick, output)``."""
-    return [standard_targets(predictor, part)[0].flatten(1).numpy() for part in data.validation]
+    """Change or value to be predicted at each tick of the training stretches, then of the validation stretches.
+
+    Standardised, ``(tick, output)`` each.
+    """
+    return [standard_targets(predictor, part)[0].flatten(1).numpy() for part in (*data.train, *data.validation)]
 
 
-def streamed(predictor: Predictor, data: Prepared) -> list[DoubleArray]:
-    """What a network predicts of the validation stretches, standardised as `standard_truth`."""
+def promise_of_validation(predictor: Predictor, data: Prepared, blocks: Sequence[Block], judged: int) -> Promise:
+    """Errors of a network that trained on the training part alone: on the last `judged` of the blocks."""
     scale = predictor.code.width.double().numpy()
-    truth = standard_truth(predictor, data)
-    standard = []
-    predictions = stream_predictions(predictor, data.validation)
-    for values, part, target in zip(predictions, data.validation, truth, strict=True):
-        ticks = len(target)
+    squared = [np.zeros((0, scale.size))] * len(data.train)
+    for values, part in zip(stream_predictions(predictor, data.validation), data.validation, strict=True):
+        ticks = part.samples - data.task.max_horizon
         future = np.stack([part.targets[k : k + ticks] for k in data.task.horizons], axis=1)
-        # The error in SI units, standardised, on top of the truth: the same for values and for changes.
-        standard.append(target + ((values[:ticks] - future) / scale).reshape(ticks, -1))
-    return standard
+        # In SI units, standardised: the same for values and for changes.
+        squared.append(((values[:ticks] - future) / scale).reshape(ticks, -1))
+    return promise_of(squared, [np.zeros_like(one) for one in squared], blocks[-judged:])
 
 
 def choose(promises: Mapping[str, Promise]) -> PortfolioChoice:
     """The simplest candidate whose error is within one standard error of the least (Breiman et al., 1984).
 
+    Compared is the logarithm of the root-mean-square error of each block that every candidate left out, as the mean
+    over outputs and over blocks, these weighted by their error: blocks in which the machine rests hardly count, and one
+    with an outlier does not decide alone, as it would in the error over all blocks.
+
     Args:
-        promises: by name, the simplest first; all of the same blocks.
+        promises: by name, the simplest first; blocks of the shorter ones are the last of the longer ones.
     """
-    scale = np.min([promise.error() for promise in promises.values()], axis=0)
-    values = {name: promise.logarithms(scale) for name, promise in promises.items()}
-    # Blocks of equal rows but for rounding: their plain mean.
-    best = min(values, key=lambda name: float(values[name].mean()))
+    count = min(len(promise.rows) for promise in promises.values())
+    errors = {name: np.sqrt(promise.squared[-count:]) for name, promise in promises.items()}
+    level = np.mean(list(errors.values()), axis=0)
+    # An output that every candidate predicts exactly has no error to weigh by.
+    weights = (level + TINY) / (level + TINY).sum(axis=0)
+    logarithms = {name: np.log(np.maximum(error, TINY)) for name, error in errors.items()}
+    means = {name: (weights * value).sum(axis=0) for name, value in logarithms.items()}
+    best = min(means, key=lambda name: float(means[name].mean()))
     excess, doubt = {}, {}
-    for name, value in values.items():
-        difference = value - values[best]
-        excess[name] = float(difference.mean())
-        doubt[name] = float(difference.std(ddof=1) / np.sqrt(len(difference))) if name != best else 0.0
-    name = next(name for name in values if excess[name] <= doubt[name])
+    for name, value in logarithms.items():
+        mean = means[name] - means[best]
+        excess[name] = float(mean.mean())
+        apart = (weights * (value - logarithms[best] - mean)).mean(axis=1)
+        doubt[name] = float(np.sqrt(np.square(apart).sum() * count / (count - 1)))
+    name = next(name for name in means if excess[name] <= doubt[name])
     return PortfolioChoice(name, best, excess, doubt)
 
 

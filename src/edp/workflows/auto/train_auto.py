@@ -11,13 +11,15 @@ import numpy as np
 
 from edp.config.experiment import Experiment, experiment_toml, plain_tree
 from edp.data.features import FEATURE_SETS
-from edp.data.lags import DoubleArray
 from edp.data.prepared import Prepared
+from edp.data.scaling import least_spread
+from edp.data.splits import ByRecording, ByTime
 from edp.errors import ConfigError, DataError, StorageError
 from edp.logs.source import DataSource
 from edp.networks.predictor import Predictor
-from edp.recording import Recording
+from edp.recording import FloatArray, Recording
 from edp.report.run.choice import FILE, read_choice
+from edp.signals import Kind
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.runs import KeyedRun, RunFolder, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
@@ -25,14 +27,15 @@ from edp.training.bagging import fit_bagged
 from edp.training.fit import fit
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
 from edp.workflows.auto.promise import (
+    Block,
     PortfolioChoice,
     Promise,
     blocks_of,
     choose,
     in_report_units,
     promise_of,
+    promise_of_validation,
     standard_truth,
-    streamed,
     to_json,
 )
 from edp.workflows.auto.settings import AutoSettings
@@ -42,8 +45,6 @@ USUAL = "FG2"
 """The feature set that is taken without a word where the recordings have its channels."""
 MOST_LISTED = 20
 """Channels that a message lists."""
-STILL = 1e-9
-"""Share of a channel's size below which it does not move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,7 @@ def train_auto(
         EdpError: the data, settings or folder cannot be used; what was on disk stays.
     """
     once = _ReadOnce(source)
-    settings = _of_these_channels(once, settings)
+    settings = _of_one_recording(once, _of_these_channels(once, settings))
     data, amount = _prepare(once, settings)
     key = run_key({"auto": plain_tree(settings)}, data.digest)
     folder = make_folder(out)
@@ -100,14 +101,14 @@ def train_auto(
         return finished
     _check_moving(data)
     experiments = _experiments(settings, amount)
-    blocks = blocks_of(data, amount.window)
+    blocks, judged = blocks_of(data, amount.window)
     trained: dict[str, _Trained] = {}
     failed: dict[str, str] = {}
     for number, (name, experiment) in enumerate(experiments.items()):
         if on_candidate is not None:
             on_candidate(CANDIDATES[name].label, number, len(experiments))
         try:
-            trained[name] = _train(name, experiment, data, folder, on_event, blocks)
+            trained[name] = _train(name, experiment, data, folder, on_event, (blocks, judged))
         except Diverged as end:
             failed[name] = str(end)
     if not trained:
@@ -179,6 +180,14 @@ def _of_these_channels(source: _ReadOnce, settings: AutoSettings) -> AutoSetting
     return replace(settings, task=task)
 
 
+def _of_one_recording(source: _ReadOnce, settings: AutoSettings) -> AutoSettings:
+    """Settings that divide a single recording by time: it cannot train, validate and test as a whole."""
+    split = settings.split
+    if len(source.read()) != 1 or not isinstance(split, ByRecording) or split.validation or split.test:
+        return settings
+    return replace(settings, split=ByTime(validation_share=split.validation_share, test_share=split.test_share))
+
+
 def _prepare(source: _ReadOnce, settings: AutoSettings) -> tuple[Prepared, Amount]:
     """The data cut for the candidates' common window, and what there is of it."""
 
@@ -225,23 +234,30 @@ def _check_moving(data: Prepared) -> None:
     Raises:
         DataError: a target or all inputs never move in the training part.
     """
-    targets = np.concatenate([part.targets for part in data.train])
-    inputs = np.concatenate([part.inputs for part in data.train])
     still = [
         name
-        for name, column in zip(data.task.targets, targets.T, strict=True)
-        if np.ptp(column) <= STILL * max(1.0, float(np.abs(column).max()))
+        for name, moves in zip(
+            data.task.targets, _moving([part.targets for part in data.train], data.target_kinds), strict=True
+        )
+        if not moves
     ]
     if still:
         raise DataError(
             f"the target {', '.join(still)} never moves in the training part; there is nothing to learn of it: take it "
             "out of task.targets, or record it while the machine works"
         )
-    if np.ptp(inputs, axis=0).max() <= STILL * max(1.0, float(np.abs(inputs).max())):
+    if not any(_moving([part.inputs for part in data.train], [channel.kind for channel in data.inputs])):
         raise DataError(
             "no input moves in the training part; a model of these recordings could only repeat a constant: record "
             "while the machine works, or check the signal map"
         )
+
+
+def _moving(parts: Sequence[FloatArray], kinds: Sequence[Kind]) -> list[bool]:
+    """Whether each channel moves in stretches ``(time, channel)``, by its own size: units differ by factors of 1e12."""
+    values = np.concatenate(parts).astype(np.float64)
+    spreads, sizes = values.std(axis=0), np.abs(values).max(axis=0)
+    return [spread > least_spread(kind, size) for spread, size, kind in zip(spreads, sizes, kinds, strict=True)]
 
 
 def _experiments(settings: AutoSettings, amount: Amount) -> dict[str, Experiment]:
@@ -265,20 +281,20 @@ def _train(
     data: Prepared,
     folder: Path,
     on_event: Callable[[TrainingProgress], None] | None,
-    blocks: Sequence[tuple[int, int, int]],
+    pieces: tuple[Sequence[Block], int],
 ) -> _Trained:
+    blocks, judged = pieces
     if experiment.training.bagging is not None:
         bagged = fit_bagged(data, experiment.model, experiment.training, on_event)
         net = bagged.fitted.predictor
         truth = standard_truth(net, data)
-        return _Trained(experiment, bagged.fitted, promise_of(bagged.of_validation(truth), truth, blocks))
+        return _Trained(experiment, bagged.fitted, promise_of(bagged.at_every_tick(truth), truth, blocks))
     with RunFolder(folder / "candidates" / name) as run:  # a stop is gone on from
         settings = {part: values for part, values in plain_tree(experiment).items() if part != "judge"}
         key = run_key(settings, data.digest)
         run.claim(key, experiment_toml(experiment))
         fitted = fit(data, experiment.model, experiment.training, KeyedRun(run, key), on_event)
-    net = fitted.predictor
-    return _Trained(experiment, fitted, promise_of(streamed(net, data), standard_truth(net, data), blocks))
+    return _Trained(experiment, fitted, promise_of_validation(fitted.predictor, data, blocks, judged))
 
 
 def _facts(
@@ -300,8 +316,8 @@ def _facts(
         }
         for name, one in trained.items()
     }
-    net = trained[choice.name].fitted.predictor
-    unchanged = in_report_units(_persistence(net, data, amount), net, data)
+    net, promise = trained[choice.name].fitted.predictor, trained[choice.name].promise
+    unchanged = in_report_units(_persistence(net, data, amount).last(len(promise.rows)).error(), net, data)
     return {
         "schema": 1,
         "key": key,
@@ -315,11 +331,11 @@ def _facts(
     }
 
 
-def _persistence(net: Predictor, data: Prepared, amount: Amount) -> DoubleArray:
-    """Error of the present value, or of the mean in absolute mode, on the judged rows, standardised ``(output,)``."""
+def _persistence(net: Predictor, data: Prepared, amount: Amount) -> Promise:
+    """Errors of the present value, or of the mean in absolute mode."""
     truth = standard_truth(net, data)  # zero is no change, or in absolute mode the mean
-    blocks = blocks_of(data, amount.window)
-    return promise_of([np.zeros_like(one) for one in truth], truth, blocks).error()
+    blocks, _ = blocks_of(data, amount.window)
+    return promise_of([np.zeros_like(one) for one in truth], truth, blocks)
 
 
 def sentence(choice: PortfolioChoice, trained: dict[str, _Trained], amount: Amount, data: Prepared) -> str:

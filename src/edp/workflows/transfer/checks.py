@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edp.data.chunks import ChunkSpec
 from edp.data.prepared import Prepared
-from edp.data.scaling import CONSTANT
+from edp.data.scaling import least_spread
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.errors import DataError, closest
@@ -105,11 +105,15 @@ def check_moving(data: Prepared) -> None:
         values = np.concatenate([series.targets for series in getattr(data, part)]).astype(np.float64)
         still = [
             f"{name} is {mean:.4g} throughout"
-            for name, kind, mean, std in zip(
-                data.task.targets, data.target_kinds, values.mean(axis=0), values.std(axis=0), strict=True
+            for name, kind, mean, std, largest in zip(
+                data.task.targets,
+                data.target_kinds,
+                values.mean(axis=0),
+                values.std(axis=0),
+                np.abs(values).max(axis=0),
+                strict=True,
             )
-            # A share of the kind's nominal size: noise of a frozen sensor is not motion.
-            if std <= CONSTANT * KINDS[kind].nominal
+            if std <= least_spread(kind, largest)
         ]
         if still:
             raise DataError(
