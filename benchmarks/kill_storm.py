@@ -1,6 +1,6 @@
 """Does a search lose or repeat trainings when its workers and its coordinator are killed, and does it end the same?
 
-A study of many tiny trainings runs once in peace. Then it runs again while workers, and at the end of each round the
+A study of many tiny trainings runs once undisturbed. Then it runs again while workers, and at the end of each round the
 coordinator, are killed with signal 9 at drawn moments; it is started anew each time until it ends. Each training notes
 its starts, and whether its record was there already. Last, the finished study is started once more.
 """

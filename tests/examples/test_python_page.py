@@ -22,7 +22,9 @@ def members_of(part: object) -> set[str]:
     """Public methods, properties and attributes of a class or module."""
     if inspect.ismodule(part):
         return set(part.__all__)
-    names = {name for name in vars(part) if not name.startswith("_")}
+    # Those of a base class of the front door are members, too.
+    bases = [base for base in part.__mro__ if base is part or base.__module__.startswith("edp.workflows.api.")]
+    names = {name for base in bases for name in vars(base) if not name.startswith("_")}
     return names | ({field.name for field in dataclasses.fields(part)} if dataclasses.is_dataclass(part) else set())
 
 

@@ -188,8 +188,8 @@ def test_the_s_function_watches_time_and_blocks_are_their_own(blocks, bundle_of)
     found, *_, error = run(other, twice)
     assert "algebraic loop" in error
     assert len(found) == 22
-    assert "not a whole number of ticks" in run(rows, np.arange(40) * period * 1.5)[3]
-    assert "not a whole number of ticks" in run(rows, np.arange(40)[::-1] * period)[3]
+    assert "not an integer number of ticks" in run(rows, np.arange(40) * period * 1.5)[3]
+    assert "not an integer number of ticks" in run(rows, np.arange(40)[::-1] * period)[3]
     # Minor steps of a continuous solver between ticks are no ticks.
     minor = np.tile([0, 1], 40)
     shifted = twice + minor * period / 2

@@ -30,7 +30,7 @@ BAD = [
     ("bore", '["wide", 0.135, 0.120]', None, ["cylinders.bore[boom] = 'wide'", "no number"]),
     ("bore", "[0.125, 0.135]", None, ["bore", "boom, arm, bucket"]),
     ("rod", "[0.085, 0.135, 0.080]", None, ["rod[arm] = 0.135", "below bore[arm] = 0.135"]),
-    ("count", "[2, 0, 1]", None, ["count[arm] = 0", "whole number from 1"]),
+    ("count", "[2, 0, 1]", None, ["count[arm] = 0", "integer from 1"]),
     ("mass", "[0.0, 950.0, 880.0]", None, ["[bodies]", "mass[boom] = 0.0", "above 0"]),
     ("gravity", "nan", None, ["gravity = nan"]),
     ("gravity", "[9.81, 9.81]", None, ["gravity = [9.81, 9.81]", "a number"]),

@@ -1,4 +1,4 @@
-"""Whether a simple rival does better than the network after all, by the scores of held-out recordings."""
+"""Whether a simple baseline does better than the network after all, by the scores of held-out recordings."""
 
 from __future__ import annotations
 

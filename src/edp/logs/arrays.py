@@ -42,7 +42,7 @@ def recording_of_columns(
         rate_hz: samples per second; without it a column of time stamps tells the rate.
         signal_map: which columns become which channels; without it every column of numbers is taken under its own
             name, and its kind is that of the vocabulary or of its unit.
-        repair: what may be mended; by default nothing is.
+        repair: what may be repaired; by default nothing is.
 
     Raises:
         DataError: no column, a rate that is not positive, no time stamps where they are needed, text for numbers, or

@@ -175,7 +175,7 @@ def check_batch(predictor: Predictor) -> None:
 
 
 def check_gradients(predictor: Predictor) -> None:
-    """The error reaches every parameter that learns; only an untrained by-pass may have others.
+    """The error reaches every parameter that learns; only an untrained skip connection may have others.
 
     Args:
         predictor: in double precision.

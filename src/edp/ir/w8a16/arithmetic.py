@@ -80,7 +80,7 @@ def factor(real: Any) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
         raise ExportError(
             f"a factor of {values.max():.3g} between two formats is beyond 2^30: their ranges differ too much"
         )
-    small = shift > 62  # A factor this small is no more than nought after rounding.
+    small = shift > 62  # A factor this small is no more than zero after rounding.
     return np.where(small, 0, multiplier).astype(np.int32), np.where(small, 62, shift).astype(np.uint8)
 
 

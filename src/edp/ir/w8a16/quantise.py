@@ -142,7 +142,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
 
 
 def outline(graph: Graph) -> Graph:
-    """The network in W8A16 with nothing in it: every constant has its shape and kind, but noughts for numbers.
+    """The network in W8A16 with nothing in it: every constant has its shape and kind, but zeros for numbers.
 
     What a network takes of a controller depends on no number, so neither training nor recordings are needed.
 

@@ -36,7 +36,7 @@ _FACTS_BYTES = 1 << 24
 _PIECE_BYTES = 1 << 25
 """Of records read at a time, so that wide groups take larger steps than `PIECE_ROWS`."""
 _NUMBERS = range(6)
-"""Data types of whole numbers and floats; above are texts, bytes, dates and pictures."""
+"""Data types of integers and floats; above are texts, bytes, dates and pictures."""
 _PLAIN_TYPES = (0, 2, 3, 6)
 """Channel types: fixed length, master, virtual master, virtual."""
 _TIME = 1

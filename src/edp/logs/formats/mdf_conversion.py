@@ -133,7 +133,7 @@ def _in_ranges(
 ) -> NDArray[np.intp]:
     """Which range each value lies in, -1 for none.
 
-    ASAM: the upper end belongs to a range (`closed`) of whole numbers, not to one of floats.
+    ASAM: the upper end belongs to a range (`closed`) of integers, not to one of floats.
     """
     if not len(lower):
         return np.full(len(raw), -1, dtype=np.intp)
@@ -147,7 +147,7 @@ def _in_ranges(
 
 
 def _linear(block: Any, raw: NDArray[Any]) -> NDArray[Any]:
-    # Nothing to convert: whole numbers keep their type.
+    # Nothing to convert: integers keep their type.
     if (block.a, block.b) == (1, 0):
         return raw
     values = raw * block.a

@@ -48,7 +48,7 @@ def colour(facts: Facts, model: str) -> str:
     """The network is blue and the truth dark grey everywhere; a baseline keeps one muted colour in all figures."""
     if model in (NETWORK, TRUTH):
         return BLUE if model == NETWORK else GREY
-    # Colours repeat when the rivals outnumber them; marks and names still tell them apart.
+    # Colours repeat when the baselines outnumber them; marks and names still tell them apart.
     return MUTED[_place(facts, model) % len(MUTED)]
 
 

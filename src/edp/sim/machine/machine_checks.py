@@ -40,7 +40,7 @@ class ParameterBound:
         return fits and (not self.whole or value == int(value))
 
     def __str__(self) -> str:
-        text = "a whole number " if self.whole else ""
+        text = "an integer " if self.whole else ""
         if math.isinf(self.high):
             return f"{text}{'above' if self.above else 'at least'} {self.low:g}"
         return f"{text}{f'above {self.low:g} and at most' if self.above else f'from {self.low:g} to'} {self.high:g}"

@@ -27,7 +27,7 @@ from edp.workflows.api.recordings import MemorySource, Recordings, as_recordings
 from edp.workflows.api.scores import JudgedScores
 
 BASELINES = ("persistence", "ridge_arx")
-"""Rivals that take seconds; the others, `trees` and `mlp` among them, are asked for by name."""
+"""Baselines that take seconds; the others, `trees` and `mlp` among them, are asked for by name."""
 PROVENANCE = "provenance.json"
 """What a run folder has and a bundle alone has not: which data it was trained on."""
 

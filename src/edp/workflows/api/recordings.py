@@ -67,7 +67,7 @@ class Recordings(Sequence[Recording]):
             units: of the channels, in their order or by name; values are converted to SI. Without one a value is
                 taken as it is.
             recording_names: of the recordings; ``recording_0``, ... by default.
-            repair: what may be mended: ``{"nan": "hold"}`` holds the last good value, ``{"nan": "keep"}`` keeps NaN.
+            repair: what may be repaired: ``{"nan": "hold"}`` holds the last good value, ``{"nan": "keep"}`` keeps NaN.
 
         Raises:
             DataError: shapes, names or units that do not fit, a rate that is not positive, or missing values.
@@ -101,7 +101,7 @@ class Recordings(Sequence[Recording]):
                 ``time``, ``timestamp`` or the like; numbers or dates) tells the rate, under the time rule of logs.
             units: by column; values are converted to SI. Without one a value is taken as it is.
             recording_names: of the recordings; ``recording_0``, ... by default.
-            repair: what may be mended, as in `read`.
+            repair: what may be repaired, as in `read`.
 
         Raises:
             DataError: no frame, no time stamps and no rate, text for numbers, or missing values.
@@ -124,10 +124,10 @@ class Recordings(Sequence[Recording]):
         names = names_of(
             recording_names, [f"recording_{i}" for i in range(len(tables))], "recording_names", "recordings"
         )
-        mend = repair_of(repair)
+        allowed = repair_of(repair)
         return cls(
             [
-                recording_of_columns(name, columns, units, rate_hz, repair=mend)
+                recording_of_columns(name, columns, units, rate_hz, repair=allowed)
                 for name, columns in zip(names, tables, strict=True)
             ]
         )
@@ -271,7 +271,7 @@ def read(
         path: what to read (docs/recordings.md).
         map: which columns become which channels: a map file, or its content as a mapping. Without one every column of
             numbers is taken under its own name; the vocabulary or else the file's unit tells its kind.
-        repair: what may be mended, by default nothing: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``,
+        repair: what may be repaired, by default nothing: ``nan`` (``hold``, ``keep``), ``gaps`` (``hold``, ``cut``,
             ``keep``), ``duplicates`` (``last``), ``falling`` (``sort``).
 
     Raises:
@@ -319,7 +319,7 @@ class MemorySource(DataSource):
 
 
 def repair_of(table: Mapping[str, str] | None) -> Repair | None:
-    """What may be mended, from a mapping.
+    """What may be repaired, from a mapping.
 
     Raises:
         ConfigError: an unknown repair or choice.

@@ -172,7 +172,7 @@ def try_feature_sets(
             tell(None)
             run = folder / f"{_slug(name)}_seed{seed}"
             bundle = train(source, settings, run, tell)
-            # Persistence alone: the sets are compared with each other, other rivals cost minutes each.
+            # Persistence alone: the sets are compared with each other, other baselines cost minutes each.
             evaluate(run, baselines=["persistence"])
             finished.setdefault(name, []).append(_Finished.of(bundle, run))
             done += 1

@@ -132,7 +132,7 @@ def finetune(
         try:
             results[name] = METHODS[name]().make(case)
         except Diverged as end:
-            # The asked method must succeed; rivals may fail with a note.
+            # The asked method must succeed; baselines may fail with a note.
             if name == order.method:
                 raise
             notes.append(f"{METHODS[name].label} is left out: {end}")

@@ -1,4 +1,4 @@
-/* Whole numbers: scalars, element by element, rows. */
+/* Integer arithmetic: scalars, element by element, rows. */
 #include "edp_integer.h"
 #include "edp_tables.h"
 

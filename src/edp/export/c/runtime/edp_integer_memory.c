@@ -1,4 +1,4 @@
-/* Whole numbers: layers that carry numbers from tick to tick. */
+/* Integer arithmetic: layers that carry numbers from tick to tick. */
 #include "edp_integer.h"
 
 #include <stddef.h>

@@ -75,8 +75,8 @@ static float small_expm1(float r) {
     return r + r * r * (0.5f + r * tail);
 }
 
-/* 2^n e^r with n a whole number; relative error about 2e-7. Beyond the range of float32 the nearest end of it. NaN stays
- * NaN here and in what follows, and never becomes a whole number: so it reaches the output, where it is seen. */
+/* 2^n e^r with n an integer; relative error about 2e-7. Beyond the range of float32 the nearest end of it. NaN stays
+ * NaN here and in what follows, and never becomes an integer: so it reaches the output, where it is seen. */
 float edp_exp(float x) {
     const float limited = (x > 88.0f) ? 88.0f : ((x < -87.0f) ? -87.0f : x);
     const float turns = limited * 1.44269504f;

@@ -75,7 +75,7 @@ edp_fmu_status edp_fmu_end(edp_fmu *f) {
 
 /* ---- a step ------------------------------------------------------------------------------------------------------ */
 
-/* Whole ticks left out before `at`, or -1: then it is told why there is no step. */
+/* Whole ticks left out before `at`, or -1 after a message why there is no step. */
 static int32_t left_out(const edp_fmu *f, double at, double size) {
     char text[TEXT];
     const double gap = (at - f->now.next) / FMU_STEP_S;
@@ -213,7 +213,7 @@ edp_fmu_status edp_fmu_get_whole(const edp_fmu *f, uint32_t ref, int32_t *value)
         count = f->now.state.restarts;
         break;
     default:
-        return unknown(f, ref, "a whole number");
+        return unknown(f, ref, "an integer");
     }
     *value = (count < (uint32_t)INT32_MAX) ? (int32_t)count : INT32_MAX;
     return EDP_FMU_OK;

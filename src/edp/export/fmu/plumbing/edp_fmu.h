@@ -51,7 +51,7 @@ typedef struct {
 
 typedef struct edp_fmu edp_fmu;
 
-/* Hands a message to the importer. */
+/* Passes a message to the importer. */
 typedef void edp_fmu_tell(const edp_fmu *f, edp_fmu_status status, const char *category, const char *message);
 
 struct edp_fmu {
@@ -68,7 +68,7 @@ struct edp_fmu {
 const char *edp_fmu_refused(const char *name, const char *token);
 /* As after instantiation. */
 void edp_fmu_clear(edp_fmu *f);
-/* Tells and returns EDP_FMU_ERROR. */
+/* Logs a message and returns EDP_FMU_ERROR. */
 edp_fmu_status edp_fmu_wrong(const edp_fmu *f, const char *message);
 
 edp_fmu_status edp_fmu_begin(edp_fmu *f, double start);
