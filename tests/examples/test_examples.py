@@ -15,20 +15,25 @@ from edp.cli import app
 from edp.cli.console import run_app
 from edp.config.experiment import SETTINGS as TREE
 from edp.config.experiment import FeatureSettings, TaskSettings, load_experiment
+from edp.config.twin import TWIN_SETTINGS
 from edp.data.chunks import ChunkSpec
 from edp.data.features import Derived
 from edp.data.screening import ForestSpec, ScreeningSpec
+from edp.data.twin_channels import TwinChannelSettings
 from edp.evaluation.controller import Budget
+from edp.evaluation.free_run import FreeRunJudgeSpec
 from edp.evaluation.judge import JudgeSpec
 from edp.ir.rls import AdaptationSpec
 from edp.logs import write_recording
 from edp.logs.source import RecordingEntry, load_data_set, load_signal_map
 from edp.networks.losses import AdaptiveWeights
 from edp.networks.predictor import ModelSpec
+from edp.networks.twin import TWINS
 from edp.recording import Recording
 from edp.signals import TABLE_A1
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.training import TrainingSpec
+from edp.training.free_run import FreeRunSpec
 from edp.workflows.compression import CompressionSearchSpec, DistillationSpec, DistilSpec
 from edp.workflows.feature_selection.trials import TrialSpec
 from edp.workflows.pretraining import PRETRAININGS, MetaSpec
@@ -147,6 +152,26 @@ def test_settings_page_names_every_key_of_a_command_and_its_default(table):
         if isinstance(entry.default, int | float):
             value = tomllib.loads(f"value = {text.strip('`')}")["value"]
             assert value == pytest.approx(entry.default, rel=2e-3), name
+
+
+TWIN_TABLES = {
+    "`[channels]`": TwinChannelSettings,
+    **{f'`[twin]`, `kind = "{name}"`': TWINS[name] for name in TWINS},
+    "`[training]`": FreeRunSpec,
+    "`[judge]`": FreeRunJudgeSpec,
+}
+
+
+@pytest.mark.parametrize("title", list(TWIN_TABLES))
+def test_page_of_twins_names_every_key_and_its_default(title):
+    page = (ROOT / "docs" / "twin.md").read_text(encoding="utf-8")
+    section = page.split(f"### {title}\n")[1].split("\n#")[0]
+    rows = re.findall(r"^\| `(\w+)` \| `(.+?)` \|", section, re.MULTILINE)
+    spec = TWIN_TABLES[title]()
+    assert [name for name, _ in rows] == [entry.name for entry in dataclasses.fields(spec)]
+    for name, text in rows:
+        plain = TWIN_SETTINGS.plain(getattr(spec, name), name)
+        assert tomllib.loads(f"value = {text}")["value"] == plain, name
 
 
 def test_compression_page_names_every_option_and_shows_the_budget_of_the_examples():

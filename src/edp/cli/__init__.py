@@ -28,6 +28,7 @@ from edp.cli import (
     search,
     simulate,
     train,
+    twin,
 )
 from edp.cli.console import run_app
 from edp.cli.ending import stop_on_request
@@ -49,6 +50,8 @@ app.command("screen")(screen.screen)
 app.command("animate")(animate.animate)
 app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
+app.command("twin")(twin.twin)
+app.command("rollout")(twin.rollout)
 app.add_typer(search.app, name="search")
 app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)

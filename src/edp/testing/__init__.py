@@ -10,6 +10,7 @@ from edp.testing.losses import check_loss
 from edp.testing.networks import check_block, check_spec
 from edp.testing.streaming import check_network
 from edp.testing.targets import check_export_target
+from edp.testing.twins import check_twin
 
 __all__ = [
     "ContractError",
@@ -19,4 +20,5 @@ __all__ = [
     "check_loss",
     "check_network",
     "check_spec",
+    "check_twin",
 ]

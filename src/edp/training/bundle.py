@@ -140,11 +140,11 @@ def save_bundle(bundle: Bundle, folder: str | Path) -> Path:
     }
     referenced = {weights}
     if isinstance(predictor, IntegerPredictor):
-        entry = _write_arrays(path, "integers", _integers_bytes(predictor))
+        entry = write_arrays(path, "integers", _integers_bytes(predictor))
         referenced.add(entry["file"])
         header |= {"number_format": form, "formats": dict(predictor.formats.fracs), "integers": entry}
     if bundle.adaptation is not None:
-        entry = _write_arrays(path, "adaptation", save_arrays(bundle.adaptation.arrays()))
+        entry = write_arrays(path, "adaptation", save_arrays(bundle.adaptation.arrays()))
         referenced.add(entry["file"])
         header |= {"schema": ADAPTED_SCHEMA, "adaptation": bundle.adaptation.to_plain() | {"arrays": entry}}
     # The header comes last: it is what makes the new files count.
@@ -161,7 +161,7 @@ def _integers_bytes(predictor: IntegerPredictor) -> bytes:
     return save(tensors)
 
 
-def _write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
+def write_arrays(path: Path, what: str, data: bytes) -> dict[str, str]:
     """Write arrays beside the weights; returns file and digest."""
     digest = hashlib.blake2b(data, digest_size=16).hexdigest()
     file = f"{what}-{digest[:12]}.safetensors"
@@ -185,19 +185,18 @@ def load_bundle(folder: str | Path) -> Bundle:
             version does not know.
     """
     path = _bundle_folder(folder)
-    with _as_damage(path):
+    with as_damage(path):
         header = _read_header(path)
         _check_schema(header, path)
-        _check_hash(header, path)
+        check_hash(header, path / HEADER)
         return _assembled(header, path)
 
 
-def _check_hash(header: Mapping[str, Any], path: Path) -> None:
+def check_hash(header: Mapping[str, Any], file: Path) -> None:
+    """Refuse a header that its hash does not fit."""
     # The hash protects against damage and stray edits, not against an attacker: it has no key.
     if header.get(HASH) != header_digest(header):
-        raise BundleError(
-            f"'{path / HEADER}' does not match its hash: it was cut off or changed by hand; restore the bundle"
-        )
+        raise BundleError(f"'{file}' does not match its hash: it was cut off or changed by hand; restore the bundle")
 
 
 def upgrade_bundle(folder: str | Path) -> Path:
@@ -209,13 +208,13 @@ def upgrade_bundle(folder: str | Path) -> Path:
         BundleError: not a bundle of an earlier version, or a damaged one; it is left as it is.
     """
     path = _bundle_folder(folder)
-    with _as_damage(path):
+    with as_damage(path):
         header = _read_header(path)
         schema = header["schema"]
         if schema not in UNHASHED | REWORDED:
             raise BundleError(f"bundle '{path}' has schema {schema}; there is nothing to upgrade")
         if schema in REWORDED:
-            _check_hash(header, path)
+            check_hash(header, path / HEADER)
         upgraded = _reworded(header) | {"schema": (UNHASHED | REWORDED)[schema]}
         # The content is assembled once, so that damage is not sealed under a new hash.
         _assembled(upgraded, path)
@@ -240,13 +239,15 @@ def _bundle_folder(folder: str | Path) -> Path:
     path = Path(folder)
     # Both the run folder and the bundle in it are accepted.
     path = path / "bundle" if os.path.lexists(path / "bundle" / HEADER) else path
+    if os.path.lexists(path / "twin" / "twin.json"):
+        raise BundleError(f"'{path}' holds a twin, not a network that predicts; edp rollout runs it")
     if not os.path.lexists(path / HEADER):
         raise BundleError(f"'{path}' is not a bundle: it has no {HEADER}; give the folder that edp train wrote")
     return path
 
 
 @contextlib.contextmanager
-def _as_damage(path: Path) -> Iterator[None]:
+def as_damage(path: Path) -> Iterator[None]:
     """What goes wrong in a file of a bundle, as one message that names the bundle."""
     # A damaged file can raise any of these deep in a parser; a bug elsewhere keeps its own type.
     kinds = (EdpError, LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError)
@@ -277,9 +278,9 @@ def _assembled(header: dict[str, Any], path: Path) -> Bundle:
     _check_channels(header, task, inputs)
     predictor = Predictor(task, spec, blank_scaler(task))
     # Weights are loaded on top of placeholders: nothing in the file decides the structure.
-    _fill(predictor, load(_weights(path, header["weights"])))
+    _fill(predictor, load(read_arrays(path, header["weights"])))
     if header["schema"] == INTEGER_SCHEMA or "number_format" in header:
-        integers = {name: x.numpy() for name, x in load(_weights(path, header["integers"])).items()}
+        integers = {name: x.numpy() for name, x in load(read_arrays(path, header["integers"])).items()}
         predictor = IntegerPredictor(predictor, Formats(_formats(header["formats"]), integers))
     adaptation = _adaptation(header["adaptation"], task, path) if header["schema"] == ADAPTED_SCHEMA else None
     provenance = object_with(header["provenance"], (), "its provenance")
@@ -338,7 +339,7 @@ def _fill(predictor: Predictor, tensors: Mapping[str, torch.Tensor]) -> None:
 
 
 def _adaptation(entry: Mapping[str, Any], task: Task, path: Path) -> Adaptation:
-    adaptation = Adaptation.from_plain(entry, load_arrays(_weights(path, entry["arrays"])))
+    adaptation = Adaptation.from_plain(entry, load_arrays(read_arrays(path, entry["arrays"])))
     if (len(adaptation.offset), len(adaptation.columns), adaptation.horizons) != (
         len(task.inputs),
         len(task.targets),
@@ -373,7 +374,8 @@ def _check_schema(header: Mapping[str, Any], path: Path) -> None:
     )
 
 
-def _weights(path: Path, entry: Mapping[str, str]) -> bytes:
+def read_arrays(path: Path, entry: Mapping[str, str]) -> bytes:
+    """A file of arrays that a header names, checked against its digest."""
     file = path / Path(_text(entry["file"])).name  # never a path out of the bundle
     if not os.path.lexists(file):
         raise BundleError(f"bundle '{path}' lacks its weights '{file.name}'; restore the bundle")

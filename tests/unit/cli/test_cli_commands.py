@@ -17,7 +17,7 @@ LIMIT = [w for s in ("moments=4", "branches=4", "horizons=[1,10]") for w in ("--
 COMMANDS = [command.name for command in app.registered_commands]
 EXPECTED = [
     *("demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "distil", "compress", "footprint"),
-    *("quantise", "export", "parity", "pretrain", "finetune", "adapt", "replay", "report"),
+    *("quantise", "export", "parity", "pretrain", "finetune", "adapt", "replay", "report", "twin", "rollout"),
 ]
 
 

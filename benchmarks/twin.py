@@ -1,0 +1,121 @@
+"""How far off is a twin that runs free for a minute, beside the static valve map and ARX in the same run?
+
+Machine M22 in free air, recordings that no training saw: a short measured prefix, then 60 s on commands alone. The full
+form also asks whether one set of weights for all modes is as good as a specialist that was only ever run free.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import finish, parser, table, verdict
+from edp.config.twin import TwinExperiment, load_twin_experiment
+from edp.data.series import Series
+from edp.evaluation.free_run import free_run_scores, free_runs
+from edp.logs.source import DataSource
+from edp.networks.twin import TWINS, Twin, fit_scales
+from edp.networks.twin.recurrent import RecurrentTwin
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.training.free_run import FreeRunSpec, fit_free_runs
+from edp.workflows.twin.train_twin import prepare_twin
+
+AHEAD = 10
+"""Ticks that a measured twin looks ahead, told the commands in between."""
+
+
+def main() -> None:
+    arguments = parser(__doc__ or "").parse_args()
+    quick = arguments.quick
+    minutes, recordings, starts = (24.0, 8, 4) if quick else (180.0, 60, 16)
+    with tempfile.TemporaryDirectory() as temporary:
+        source = arguments.data or Path(temporary) / "data"
+        simulate_data_set(source, SimulationOrder(minutes=minutes, recordings=recordings, seed=arguments.seed + 1))
+        experiment = load_twin_experiment()
+        channels, data = prepare_twin(DataSource.of(source), experiment)
+    scales = fit_scales(channels, data.train)
+    training = replace(experiment.training, seed=arguments.seed)
+    if quick:
+        training = replace(training, lengths_s=(0.1, 0.5, 2.0), updates=(200, 200, 60), validate_every=100)
+    models: dict[str, tuple[Twin, float]] = {}
+    for name in experiment.judge.floors:
+        models[name] = (TWINS[name]().start(channels, scales, data.train, arguments.seed), 0.0)
+    models["recurrent"] = trained(experiment, training, (channels, scales, data))
+    if not quick:
+        free_only = replace(training, measured_share=0.0, mixed_share=0.0)
+        models["recurrent, free lanes only"] = trained(experiment, free_only, (channels, scales, data))
+    scores = {}
+    for name, (twin, _) in models.items():
+        scores[name] = free_run_scores(free_runs(twin, data.test, 60.0, starts), experiment.judge.at_s)
+        scores[name] |= {"ahead_mm_s": ahead_error(twin, data.test), "training_s": models[name][1]}
+    show(scores)
+    ours, rival = scores["recurrent"], scores["static"]
+    last, floor = (row["stroke_error"][-1]["mean"] for row in (ours, rival))
+    verdicts = [
+        verdict("stroke error at 60 s against the static map", last, floor, "<= 0.04", "mm", quick),
+        verdict("stroke error at 60 s", last, 3.0, "<= 1", "mm", quick),
+        verdict("velocity MAE over 60 s", ours["velocity_mae"]["mean"], 1.5, "<= 1", "mm/s", quick),
+        verdict("pressure NRMSE over 60 s", ours["pressure_nrmse"]["mean"], 0.15, "<= 1", "1", quick),
+        verdict("diverged runs", ours["diverged"], 1e-3, "<= 1", "share", quick),
+        verdict("processor time of the training", ours["training_s"], 1200.0, "<= 1", "s", quick),
+    ]
+    if not quick:
+        special = scores["recurrent, free lanes only"]["velocity_mae"]["mean"]
+        free = ours["velocity_mae"]["mean"]
+        verdicts.append(
+            verdict(
+                "one set of weights in free mode against the free specialist", free, special, "<= 1.05", "mm/s", quick
+            )
+        )
+    finish("twin", verdicts, arguments.seed, scores)
+
+
+def trained(experiment: TwinExperiment, training: FreeRunSpec, parts: Any) -> tuple[RecurrentTwin, float]:
+    """A recurrent twin and the processor seconds of its training."""
+    channels, scales, data = parts
+    twin = experiment.twin.start(channels, scales, data.train, training.seed)
+    fitted = fit_free_runs(
+        twin,
+        data.train,
+        data.validation,
+        training,
+        lambda e: print(f"update {e.update}/{e.updates}, {e.length_s:g} s, validation {e.validation:.4f}", flush=True),
+    )
+    return twin, fitted.seconds
+
+
+def ahead_error(twin: Twin, series: list[Series]) -> float:
+    """MAE of the velocities `AHEAD` ticks ahead in mm/s, measured up to the tick and told the commands in between."""
+    errors, prefix, count = [], twin.prefix_ticks, len(twin.channels.velocities)
+    for part in series:
+        at = np.linspace(prefix, part.samples - AHEAD - 1, 200).astype(int)
+        before = np.stack([np.arange(t - prefix, t) for t in at])
+        after = np.stack([np.arange(t, t + AHEAD) for t in at])
+        state = twin.reset(part.inputs[before], part.targets[before])
+        ports = np.full((len(at), AHEAD, part.targets.shape[1]), np.nan, np.float32)
+        ports[:, 0] = part.targets[at]
+        answers, _ = twin.rollout(part.inputs[after], state, ports)
+        errors.append(1e3 * np.abs(answers[:, -1, :count] - part.targets[at + AHEAD, :count]).mean())
+    return float(np.mean(errors))
+
+
+def show(scores: dict[str, dict[str, Any]]) -> None:
+    """Print a row a model."""
+    first = next(iter(scores.values()))
+    heads = ["model", "velocity MAE, mm/s", *(f"stroke at {row['at_s']:g} s, mm" for row in first["stroke_error"])]
+    heads += ["median at the end", "pressure NRMSE", "diverged", f"k = {AHEAD}, mm/s", "training, s"]
+    rows = []
+    for name, row in scores.items():
+        strokes = [entry["mean"] for entry in row["stroke_error"]]
+        tail = [row["stroke_error"][-1]["median"], row["pressure_nrmse"]["mean"], row["diverged"]]
+        rows.append([name, row["velocity_mae"]["mean"], *strokes, *tail, row["ahead_mm_s"], row["training_s"]])
+    print(f"\n{first['runs']} runs of {first['seconds']:g} s")
+    table(heads, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""``edp twin`` and ``edp rollout``: a plant model that runs free, and a free run along a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from edp.cli.console import JsonFlag, Steps, duration, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from edp.training.free_run import FreeRunProgress
+
+
+def twin(
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; a finished run is read.")],
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
+    changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.units=64.")] = [],  # noqa: B006
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Train a plant model that runs on commands alone: velocities, strokes and pressures over a minute.
+
+    Judged on held-out recordings beside a static valve map and ARX. Ends with exit code 4 where the training diverged.
+
+    Example: `edp twin data/m22 --out runs/twin`
+    """
+    from edp.config.twin import load_twin_experiment
+    from edp.workflows.twin import train_twin
+
+    experiment = load_twin_experiment(config, changes)
+    with progress(as_json) as shown:
+        display = _Display(shown, Steps(as_json))
+        trained = train_twin(source_of(data, signal_map, repair), experiment, folder, display.on_event, display.on_step)
+    seconds = trained.bundle.provenance["seconds"]
+    facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
+
+    def show() -> None:
+        score_table(trained.scores)
+        out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
+        out.print(f"next: edp rollout {folder} LOG --seconds 60")
+
+    emit(as_json, facts, show)
+
+
+def rollout(
+    run: Annotated[Path, typer.Argument(help="Run folder of edp twin.")],
+    log: Annotated[Path, typer.Argument(help="One log.")],
+    seconds: Annotated[float, typer.Option(help="Length of the free run.")] = 60.0,
+    start_s: Annotated[
+        float | None, typer.Option("--from", help="Start in the log, in seconds; default: as early as possible.")
+    ] = None,
+    measured: Annotated[list[str], typer.Option(help="A channel that stays measured; give it again for more.")] = [],  # noqa: B006
+    file: Annotated[
+        Path | None, typer.Option("--out", help="File for measured and free-run values (.parquet, .csv, ...).")
+    ] = None,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Run a twin along a log: measured up to a moment, on the commands alone from there on.
+
+    Prints the error by the time since then. Channels of the written file that end in _twin are the twin's.
+
+    Example: `edp rollout runs/twin logs/monday.parquet --seconds 60 --from 12.5 --out monday_free.parquet`
+    """
+    from edp.workflows.twin import rollout_log
+
+    result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file)
+    facts = {"start_s": result.start_s, "file": None if file is None else str(file), **result.scores}
+
+    def show() -> None:
+        error_table(result.scores)
+        if file is not None:
+            out.print(f"{result.recording.samples:,} ticks in {file}")
+
+    emit(as_json, facts, show)
+
+
+def score_table(models: dict[str, Any]) -> None:
+    """Print a row a model: errors of velocities, strokes by time, pressures, and the share of diverged runs."""
+    first = next(iter(models.values()))
+    velocity, strokes = first["velocity_mae"], first["stroke_error"]
+    heads = [_with_unit("velocity", velocity), *(_with_unit(f"{row['at_s']:g} s", row) for row in strokes)]
+    rows = []
+    for name, scores in models.items():
+        cells = [_number(scores["velocity_mae"]["mean"]), *(_number(row["mean"]) for row in scores["stroke_error"])]
+        rows.append([name, *cells, _number(scores["pressure_nrmse"]["mean"]), f"{scores['diverged']:.1%}"])
+    out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over actuators and runs:")
+    table("MAE of velocities, stroke error by time, NRMSE of pressures", ["", *heads, "pressure", "diverged"], rows)
+
+
+def error_table(scores: dict[str, Any]) -> None:
+    """Print the errors of one run: a row a time with the error of each stroke, then velocities and pressures."""
+    strokes = scores["stroke_error"]
+    rows = [[f"{row['at_s']:g} s", *map(_number, row["by_channel"].values())] for row in strokes]
+    unit = "" if strokes[0]["unit"] is None else f", {strokes[0]['unit']}"
+    table(f"error after{unit}", ["", *strokes[0]["by_channel"]], rows)
+    velocity, pressures = scores["velocity_mae"], scores["pressure_nrmse"]
+    unit = "" if velocity["unit"] is None else f", {velocity['unit']}"
+    out.print(f"MAE{unit}: " + ", ".join(f"{name} {_number(value)}" for name, value in velocity["by_channel"].items()))
+    if pressures["by_channel"]:
+        out.print("NRMSE: " + ", ".join(f"{name} {_number(value)}" for name, value in pressures["by_channel"].items()))
+
+
+def _with_unit(text: str, row: dict[str, Any]) -> str:
+    return text if row["unit"] is None else f"{text}, {row['unit']}"
+
+
+def _number(value: float | None) -> str:
+    # Mixed units have no mean; the JSON has each channel.
+    return "-" if value is None else f"{value:.3g}"
+
+
+class _Display:
+    """Shows what is at work, and how far the training is."""
+
+    def __init__(self, shown: Progress, steps: Steps) -> None:
+        self.shown, self.steps = shown, steps
+        self.bar = shown.add_task("twin", total=1.0, note="")
+
+    def on_step(self, text: str) -> None:
+        self.shown.update(self.bar, note=text)
+        self.steps.say(f"twin: {text}", force=True)
+
+    def on_event(self, event: FreeRunProgress) -> None:
+        error = "" if event.validation is None else f", free-run error {event.validation:.3g} deviations"
+        note = f"update {event.update}/{event.updates}, runs of {event.length_s:g} s{error}"
+        self.shown.update(self.bar, completed=event.update / event.updates, note=note)
+        self.steps.say(f"twin: {note}, {duration(event.seconds_left)} left")

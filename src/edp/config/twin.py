@@ -1,0 +1,69 @@
+"""The settings of a twin: TOML in, validated specs out, as those of an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tomli_w
+
+from edp.data.frozen import SPLITS
+from edp.data.splits import ByRecording, SplitSpec
+from edp.data.twin_channels import TwinChannelSettings
+from edp.errors import ConfigError
+from edp.evaluation.free_run import FreeRunJudgeSpec
+from edp.networks.twin import TWINS, TwinSpec
+from edp.networks.twin.recurrent import Recurrent
+from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+from edp.training.free_run import FreeRunSpec
+from edp.training.optimizers import OPTIMIZERS
+
+TWIN_SETTINGS = SettingsTree(
+    {"twin": TWINS, "split": SPLITS, "optimizer": OPTIMIZERS},
+    {"twin": "recurrent", "split": "recordings", "optimizer": "soap"},
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinExperiment:
+    """Everything that settles a twin and its judgement.
+
+    Attributes:
+        channels: which channels command, and which it answers.
+        split: how recordings are divided.
+        twin: the formulation.
+        training: how it is trained, where it is trained on free runs.
+        judge: how it is judged.
+    """
+
+    channels: TwinChannelSettings = field(default_factory=TwinChannelSettings)
+    split: SplitSpec = field(default_factory=ByRecording)
+    twin: TwinSpec = field(default_factory=Recurrent)
+    training: FreeRunSpec = field(default_factory=FreeRunSpec)
+    judge: FreeRunJudgeSpec = field(default_factory=FreeRunJudgeSpec)
+
+    def __post_init__(self) -> None:
+        for name in self.judge.floors:
+            try:
+                _ = TWINS[name]
+            except ConfigError as error:
+                raise ConfigError(f"judge.floors: {error}") from None
+
+
+def load_twin_experiment(path: str | Path | None = None, overrides: Sequence[str] = ()) -> TwinExperiment:
+    """Settings from a TOML file, changed by ``key.path=value`` overrides, over the defaults of the specs.
+
+    Raises:
+        ConfigError: names every unknown key, wrong type and impossible value at once.
+    """
+    table: Table = {} if path is None else read_toml(path)
+    for text in overrides:
+        table = merged(table, override(text))
+    where = "of a twin" if path is None else f"'{path}'"
+    return TWIN_SETTINGS.build(TwinExperiment, table, where + (" with --set" if overrides else ""))
+
+
+def twin_toml(experiment: TwinExperiment) -> str:
+    """The whole settings as TOML, defaults included: what a run folder keeps."""
+    return tomli_w.dumps(TWIN_SETTINGS.plain(experiment))

@@ -1,0 +1,248 @@
+"""Twins: plant models that answer commands with the state of the machine, measured or fed back, for as long as told."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError, DataError
+from edp.networks.twin.scales import Array, TwinScales
+from edp.registry import Registry
+from edp.settings.bounds import MOST_TICKS, whole
+
+TwinState = dict[str, Array]
+"""All that a twin remembers, by name; the first dimension is the batch. ``answer`` is what its free ports read next."""
+PREFIX = whole(1, MOST_TICKS)
+BEYOND = 0.05
+"""Share of a stroke by which a measured start may lie beyond an end stop: noise and play, not another machine."""
+
+
+class Twin(ABC):
+    """A causal map from commands and feedback to the state of the machine one tick later.
+
+    Every answer is a *feedback port*: at each tick it reads what was measured, or where nothing was measured (NaN)
+    its own last answer. Measured mode (a filter), free mode (a plant model) and any mixture are the same numbers::
+
+        state = twin.reset(commands[:, :50], measured[:, :50])
+        answers, state = twin.rollout(commands[:, 50:], state)  # answers[:, t] is the machine after commands[:, 50 + t]
+
+    State is explicit: ticks, chunks and one call over everything give the same numbers, and so does a run that goes on
+    from a kept state. Arrays are float32 in SI units; nothing here needs torch.
+
+    Attributes:
+        channels: what commands it and what it answers.
+        scales: of its numbers, and the bounds of its answers.
+        prefix_ticks: least number of measured ticks before a free run.
+    """
+
+    def __init__(self, channels: TwinChannels, scales: TwinScales, prefix_ticks: int) -> None:
+        self.channels, self.scales, self.prefix_ticks = channels, scales, prefix_ticks
+
+    @abstractmethod
+    def initial_state(self, command: Array, measured: Array) -> TwinState:
+        """State of machines that have rested with this command ``(batch, command)`` and state ``(batch, answer)``."""
+
+    @abstractmethod
+    def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
+        """`rollout` of checked arrays, `measured` with NaN at free ports."""
+
+    @abstractmethod
+    def arrays(self) -> dict[str, Array]:
+        """All of its numbers by name, scales included, for its file."""
+
+    def reset(self, commands: Array, measured: Array) -> TwinState:
+        """State after a measured stretch.
+
+        Args:
+            commands: ``(batch, tick, command)``, at least `prefix_ticks` of them.
+            measured: ``(batch, tick, answer)``; NaN where a sensor is missing, but not at the first tick.
+
+        Raises:
+            DataError: too few ticks, a port about which nothing is known, or a start beyond an end stop.
+        """
+        commands, measured = np.asarray(commands, np.float32), np.asarray(measured, np.float32)
+        ticks = commands.shape[1] if commands.ndim == 3 else 0
+        if ticks < self.prefix_ticks:
+            raise DataError(
+                f"a prefix of {ticks} ticks came; the twin needs {self.prefix_ticks} measured ticks "
+                f"({self.prefix_ticks / self.channels.rate_hz:g} s) before it runs free: give a longer one"
+            )
+        self._check("measured", measured, (*commands.shape[:2], len(self.channels.answers)))
+        self._check_start(measured[:, 0])
+        return self.rollout(commands, self.initial_state(commands[:, 0], measured[:, 0]), measured)[1]
+
+    def step(self, command: Array, state: TwinState, measured: Array | None = None) -> tuple[Array, TwinState]:
+        """One tick: the machine after `command`.
+
+        Args:
+            command: ``(batch, command)``.
+            state: before it.
+            measured: ``(batch, answer)``, NaN where a port is free; None frees all.
+
+        Returns:
+            Answers ``(batch, answer)``, and the state after them.
+        """
+        row = None if measured is None else np.asarray(measured)[:, None]
+        answers, state = self.rollout(np.asarray(command)[:, None], state, row)
+        return answers[:, 0], state
+
+    def rollout(self, commands: Array, state: TwinState, measured: Array | None = None) -> tuple[Array, TwinState]:
+        """Many ticks: row t of the answers is the machine one tick after row t of the commands.
+
+        Args:
+            commands: ``(batch, tick, command)``.
+            state: before the first tick.
+            measured: ``(batch, tick, answer)``, NaN where a port is free; None frees all.
+
+        Returns:
+            Answers ``(batch, tick, answer)`` within the bounds of the twin, and the state after them.
+
+        Raises:
+            DataError: other shapes, or a command that is missing.
+        """
+        commands = np.ascontiguousarray(commands, dtype=np.float32)
+        batch = len(state["answer"])
+        ticks = commands.shape[1] if commands.ndim == 3 else 0
+        self._check("commands", commands, (batch, ticks, len(self.channels.commands)))
+        gaps = np.argwhere(~np.isfinite(commands))
+        if len(gaps):
+            lane, tick, which = (int(i) for i in gaps[0])
+            raise DataError(
+                f"command '{self.channels.commands[which].name}' is missing at tick {tick} of lane {lane}; a twin has "
+                "no other source for it: repair the log, or end the run before the gap"
+            )
+        shape = (batch, ticks, len(self.channels.answers))
+        measured = np.full(shape, np.nan, np.float32) if measured is None else np.asarray(measured, np.float32)
+        self._check("measured", measured, shape)
+        return self._run(commands, np.where(np.isfinite(measured), measured, np.float32(np.nan)), state)
+
+    def bounded(self, feedback: Array, velocity: Array, pressure: Array) -> Array:
+        """Answers ``(batch, answer)`` within the bounds, SI units.
+
+        A stroke is the integral of its velocity by the trapezoidal rule; at an end stop it stays, and the velocity
+        into the stop is zero.
+
+        Args:
+            feedback: what the ports read ``(batch, answer)``.
+            velocity: proposed velocities ``(batch, velocity)``; `pressure` likewise.
+            pressure: proposed pressures.
+        """
+        count, strokes = len(self.channels.velocities), len(self.channels.strokes)
+        low, high = self.scales.low, self.scales.high
+        velocity = np.clip(velocity, low[:count], high[:count])
+        pressure = np.clip(pressure, low[count + strokes :], high[count + strokes :])
+        if not strokes:
+            return np.concatenate([velocity, pressure], axis=1, dtype=np.float32)
+        ends = slice(count, 2 * count)
+        stroke = feedback[:, ends] + (feedback[:, :count] + velocity) * np.float32(0.5 / self.channels.rate_hz)
+        velocity = np.where(stroke > high[ends], np.minimum(velocity, 0.0), velocity)
+        velocity = np.where(stroke < low[ends], np.maximum(velocity, 0.0), velocity)
+        stroke = np.clip(stroke, low[ends], high[ends])
+        return np.concatenate([velocity, stroke, pressure], axis=1, dtype=np.float32)
+
+    def _check(self, what: str, values: Array, expected: tuple[int, ...]) -> None:
+        if values.shape != expected:
+            raise DataError(f"{what} of shape {values.shape} came; {expected} (batch, tick, channel) must hold")
+
+    def _check_start(self, start: Array) -> None:
+        """Refuse a start of which nothing is known, or where the machine cannot be."""
+        for which, channel in enumerate(self.channels.answers):
+            values = start[:, which]
+            if not np.isfinite(values).all():
+                raise DataError(
+                    f"'{channel.name}' is not measured at the first tick of the prefix; a free port starts from a "
+                    "measured value: begin where all channels are measured"
+                )
+        for lane in np.flatnonzero(~self.within_stops(start)):
+            beyond = self._beyond(start[lane : lane + 1])[0]
+            which = int(np.argmax(beyond))
+            stroke = self.channels.strokes[which]
+            low, high = (ends[len(self.channels.velocities) + which] for ends in (self.scales.low, self.scales.high))
+            raise DataError(
+                f"'{stroke.name}' starts {beyond[which] * (high - low):.4g} {stroke.unit} beyond an end stop of the "
+                f"twin ({low:.4g} to {high:.4g} {stroke.unit}); check its unit and zero, or train on recordings that "
+                "go there"
+            )
+
+    def within_stops(self, start: Array) -> NDArray[np.bool_]:
+        """Whether a twin can start there ``(batch,)``: no stroke of ``(batch, answer)`` far beyond an end stop."""
+        return np.asarray((self._beyond(start) <= BEYOND).all(axis=1))
+
+    def _beyond(self, start: Array) -> Array:
+        """How far strokes lie beyond the end stops, as a share of the range ``(batch, stroke)``."""
+        count, strokes = len(self.channels.velocities), len(self.channels.strokes)
+        ends = slice(count, count + strokes)
+        low, high = self.scales.low[ends], self.scales.high[ends]
+        return np.asarray(np.maximum(low - start[:, ends], start[:, ends] - high) / (high - low), dtype=np.float32)
+
+
+class TwinSpec(Protocol):
+    """Options of a formulation."""
+
+    @property
+    def prefix_ticks(self) -> int:
+        """Least number of measured ticks before a free run."""
+        ...
+
+    def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
+        """A twin of these training stretches: fitted, or ready to be trained on free runs."""
+        ...
+
+    def shapes(self, channels: TwinChannels) -> Mapping[str, tuple[int, ...]]:
+        """Shape of each of its arrays beside the scales."""
+        ...
+
+    def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> Twin:
+        """The twin that has these arrays."""
+        ...
+
+
+TWINS: Registry[type] = Registry("twin")
+
+
+def solved_columns(channels: TwinChannels) -> list[int]:
+    """Answers that a regression solves for: all but the strokes, which are integrals."""
+    velocities, strokes = len(channels.velocities), len(channels.strokes)
+    return [i for i in range(len(channels.answers)) if not velocities <= i < velocities + strokes]
+
+
+def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) -> list[tuple[Series, int]]:
+    """Evenly spread starts of runs of `length` ticks, at most `each` in a stretch; none beyond an end stop.
+
+    Raises:
+        DataError: all of them lie beyond.
+    """
+    # Starts within one stretch that would be the same tick are one run.
+    runs = [
+        (part, int(at))
+        for part in series
+        if part.samples >= length
+        for at in np.unique(np.linspace(0, part.samples - length, each).astype(np.int64))
+    ]
+    usable = [(part, at) for part, at in runs if twin.within_stops(part.targets[at : at + 1])[0]]
+    if not usable:
+        raise DataError(
+            f"all {len(runs)} starts lie beyond an end stop of the twin, and its end stops are the ends of the strokes "
+            "in the training part; divide the recordings otherwise, or check the zeros of the strokes"
+        )
+    return usable
+
+
+def check_length(channels: TwinChannels, spec: TwinSpec, train: Sequence[Series]) -> None:
+    """Refuse recordings in which no prefix and free run have room.
+
+    Raises:
+        ConfigError: says how long the longest one is.
+    """
+    longest = max((series.samples for series in train), default=0)
+    if longest < spec.prefix_ticks + 2:
+        raise ConfigError(
+            f"twin: the longest training recording has {longest} ticks; more than prefix_ticks = {spec.prefix_ticks} "
+            "must hold: give longer recordings, or set a shorter prefix"
+        )

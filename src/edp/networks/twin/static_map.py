@@ -1,0 +1,122 @@
+"""The static valve map: velocities and pressures as a piecewise linear function of the commands a little earlier."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edp.data.lags import LagTask
+from edp.data.ridge import RidgeSolution, ridge_solution
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
+from edp.networks.twin.scales import Array, TwinScales
+from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, whole
+
+PENALTY = 1e-6
+"""Of the regression, per row on standardised features: knots that no command passed stay flat."""
+
+
+@TWINS.register("static")
+@dataclass(frozen=True, kw_only=True)
+class StaticMap:
+    """A floor for every twin: what the commands alone say, without any memory but a delay.
+
+    Each command enters by a polygon with `knots` corners over its range, so dead bands and saturation are followed; the
+    polygons of all commands add up. The delay with the smallest error on the training data is kept.
+
+    Attributes:
+        knots: corners of each command's polygon.
+        delays: delays to choose from, in ticks.
+        prefix_ticks: measured ticks before a free run.
+
+    Raises:
+        ConfigError: a value out of range, or no delay.
+    """
+
+    knots: int = 12
+    delays: tuple[int, ...] = (0, 2, 5, 10, 15, 20, 30)
+    prefix_ticks: int = 30
+
+    def __post_init__(self) -> None:
+        check_bounds("static map", self, knots=whole(2, 1000), delays=whole(0, MOST_TICKS), prefix_ticks=PREFIX)
+        check_count("static map", "delays", self.delays, 100, least=1)
+
+    def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
+        """Fitted by least squares; there is nothing to draw."""
+        low = np.min([series.inputs.min(axis=0) for series in train], axis=0)
+        high = np.max([series.inputs.max(axis=0) for series in train], axis=0)
+        # A command that never moved has no range; its polygon is flat.
+        corners = np.linspace(low, np.where(high > low, high, low + 1), self.knots + 1, dtype=np.float32)[:-1]
+        solved = solved_columns(channels)
+        rows = [Series(s.name, polygon(s.inputs, corners), s.targets[:, solved]) for s in train]
+        delays = tuple(sorted(set(self.delays)))
+        task = LagTask(tuple(delay + 1 for delay in delays), (None,) * len(solved), 1)
+        solution = ridge_solution(rows, task, penalties=(PENALTY,))
+        best = int(np.argmin([_error(solution, rows, i, delay) for i, delay in enumerate(delays)]))
+        arrays = {
+            "corners": corners,
+            "weight": np.ascontiguousarray(solution.weights[0, :, best], dtype=np.float32),
+            "intercept": solution.intercept[best].astype(np.float32),
+            "delay": np.array([delays[best]], dtype=np.float32),
+        }
+        return self.build(channels, scales, arrays)
+
+    def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
+        """Corners, weights by corner and answer, intercepts, and the delay."""
+        commands, solved = len(channels.commands), len(solved_columns(channels))
+        corners = (self.knots, commands)
+        return {"corners": corners, "weight": (self.knots * commands, solved), "intercept": (solved,), "delay": (1,)}
+
+    def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> Twin:
+        """The map with these numbers."""
+        return StaticTwin(channels, scales, self.prefix_ticks, {name: arrays[name] for name in self.shapes(channels)})
+
+
+class StaticTwin(Twin):
+    """State: ``answer`` in SI units, and the commands of the delay ``(batch, delay, command)``."""
+
+    def __init__(
+        self, channels: TwinChannels, scales: TwinScales, prefix_ticks: int, numbers: Mapping[str, Array]
+    ) -> None:
+        super().__init__(channels, scales, prefix_ticks)
+        self.numbers, self.delay = dict(numbers), int(numbers["delay"][0])
+        if not 0 <= self.delay <= MOST_TICKS:
+            raise ValueError(f"its delay is {self.delay} ticks; 0 to {MOST_TICKS:,} must hold")
+
+    def initial_state(self, command: Array, measured: Array) -> TwinState:
+        return {"answer": measured, "commands": np.repeat(command[:, None], self.delay, axis=1)}
+
+    def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
+        ticks, velocities = commands.shape[1], len(self.channels.velocities)
+        earlier = np.concatenate([state["commands"], commands], axis=1)
+        answers, answer = np.empty_like(measured), state["answer"]
+        for t in range(ticks):
+            # A product a tick, so that a chunk and its single ticks round alike.
+            solved = (
+                polygon(earlier[:, t], self.numbers["corners"]) @ self.numbers["weight"] + self.numbers["intercept"]
+            )
+            fed = np.where(np.isnan(measured[:, t]), answer, measured[:, t])
+            answers[:, t] = answer = self.bounded(fed, solved[:, :velocities], solved[:, velocities:])
+        return answers, {"answer": answer, "commands": earlier[:, ticks:]}
+
+    def arrays(self) -> dict[str, Array]:
+        return self.scales.arrays() | self.numbers
+
+
+def polygon(commands: Array, corners: Array) -> Array:
+    """How far each command ``(row, command)`` is past each of its corners ``(knot, command)``, as ``(row, all)``."""
+    past = np.maximum(commands[:, None] - corners, 0.0)
+    return np.asarray(past.reshape(len(commands), -1), dtype=np.float32)
+
+
+def _error(solution: RidgeSolution, rows: Sequence[Series], which: int, delay: int) -> float:
+    """Sum of squares of one delay, each target in its own deviation."""
+    total = 0.0
+    for series in rows:
+        truth = series.targets[delay + 1 :]
+        error = solution.predict(series.inputs)[: len(truth), which] - truth
+        total += float(np.square(error).mean(axis=0) @ (1.0 / np.maximum(series.targets.var(axis=0), 1e-12)))
+    return total

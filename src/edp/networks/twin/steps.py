@@ -1,0 +1,213 @@
+"""A recurrent twin over time, forward and backward by hand, compiled: feedback makes every tick wait for the last one.
+
+One loop over the ticks, without Python and without a graph. What does not wait is left to the caller: the commands'
+part of the gates before it, the gradients of the weights after it. Everything is in scaled numbers, float32.
+
+The cell is PyTorch's GRU with feedback ports: at each tick it reads f, measured values or the last answers, and answers
+with f plus its change::
+
+    r, k = sigmoid(a + W f + U h),  n = tanh(a + W f + r (U h + b)),  h' = n + k (h - n)
+    velocity = clip(f + c o),  pressure = clip(f + c o),  o = V h' + d
+    stroke = clip(f + trapezoid (velocity before + velocity)), and no velocity into an end stop
+
+All compiled code of a twin is in this file, whose content is the fingerprint of the code that is kept on disk.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.storage.machine_code import Compiler
+
+Array = NDArray[np.float32]
+
+# No "nnan" and "ninf": gradients that are not finite must stay visible.
+_FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+compiler = Compiler("twin", lambda: (Path(__file__),), {"nogil": True, "error_model": "numpy", "fastmath": _FASTMATH})
+
+
+@compiler.compiled
+def _tanh(x: np.float32) -> np.float32:
+    """The rational function of Eigen and XLA, within 3e-7: loops over it become vector instructions, unlike libm's."""
+    bounded = min(max(x, np.float32(-7.90531110763549805)), np.float32(7.90531110763549805))
+    square = bounded * bounded
+    top = square * np.float32(-2.76076847742355e-16) + np.float32(2.00018790482477e-13)
+    top = square * top + np.float32(-8.60467152213735e-11)
+    top = square * top + np.float32(5.12229709037114e-08)
+    top = square * top + np.float32(1.48572235717979e-05)
+    top = square * top + np.float32(6.37261928875436e-04)
+    top = square * top + np.float32(4.89352455891786e-03)
+    under = square * np.float32(1.19825839466702e-06) + np.float32(1.18534705686654e-04)
+    under = square * under + np.float32(2.26843463243900e-03)
+    under = square * under + np.float32(4.89352518554385e-03)
+    return np.float32(bounded * top / under)
+
+
+@compiler.compiled
+def _gates(into: Array, up: Array, bias: Array, h: Array, gates: Array, inner: Array, new_h: Array) -> None:
+    """Gates r, k, n ``(batch, 3 units)``, ``inner = U h + b`` of n, and the next h."""
+    batch, units = h.shape
+    half = np.float32(0.5)
+    for row in range(batch):
+        for i in range(2 * units):
+            gates[row, i] = half * _tanh(half * (into[row, i] + up[row, i])) + half
+        for i in range(units):
+            inner[row, i] = up[row, 2 * units + i] + bias[i]
+        for i in range(units):
+            gates[row, 2 * units + i] = _tanh(into[row, 2 * units + i] + gates[row, i] * inner[row, i])
+        for i in range(units):
+            new = gates[row, 2 * units + i]
+            new_h[row, i] = new + gates[row, units + i] * (h[row, i] - new)
+
+
+@compiler.compiled
+def _answer(
+    fed: Array, change: Array, low: Array, high: Array, trapezoid: Array, velocities: int, answer: Array, free: Array
+) -> None:
+    """Answers within the bounds, and 1 where none acts ``(batch, answer)``."""
+    batch, answers = fed.shape
+    strokes = len(trapezoid)
+    for row in range(batch):
+        for j in range(answers):
+            if velocities <= j < velocities + strokes:
+                continue
+            value = fed[row, j] + change[row, j]
+            bounded = min(max(value, low[j]), high[j])
+            answer[row, j] = bounded
+            free[row, j] = 1.0 if bounded == value else 0.0
+        for j in range(strokes):
+            s = velocities + j
+            value = fed[row, s] + trapezoid[j] * (fed[row, j] + answer[row, j])
+            bounded = min(max(value, low[s]), high[s])
+            answer[row, s] = bounded
+            free[row, s] = 1.0 if bounded == value else 0.0
+            into_stop = (value > high[s] and answer[row, j] > 0) or (value < low[s] and answer[row, j] < 0)
+            if into_stop:
+                answer[row, j] = 0.0
+                free[row, j] = 0.0
+
+
+@compiler.compiled
+def run_forward(
+    projected: Array,
+    measured: Array,
+    port: Array,
+    weights: tuple[Array, ...],
+    bounds: tuple[Array, ...],
+    velocities: int,
+    start: tuple[Array, Array],
+    saved: tuple[Array, ...],
+) -> None:
+    """Run all ticks.
+
+    Args:
+        projected: the commands' part of the gates ``(time, batch, 3 units)``, biases included.
+        measured: ``(time, batch, answer)``, any finite number where `port` is 0.
+        port: 1 where a port reads `measured`, 0 where it reads the last answer; the shape of `measured`.
+        weights: of feedback ``(answer, 3 units)``, of h ``(units, 3 units)``, bias of n's inner sum ``(units,)``, of
+            the answers ``(units, answer)`` and their bias ``(answer,)``.
+        bounds: scale of changes, low, high ``(answer,)``, and the trapezoid ``(stroke,)``.
+        velocities: number of velocities, the first answers.
+        start: last answer ``(batch, answer)`` and h ``(batch, units)``.
+        saved: written: answers, fed values, and where no bound acts, each ``(time, batch, answer)``; gates ``(time,
+            batch, 3 units)``; inner ``(time, batch, units)``; h ``(time + 1, batch, units)``.
+    """
+    feedback_weight, h_weight, inner_bias, out_weight, out_bias = weights
+    scale, low, high, trapezoid = bounds
+    answers, fed, free, gates, inner, hs = saved
+    ticks, batch, width = measured.shape
+    into, up = np.empty_like(gates[0]), np.empty_like(gates[0])
+    change = np.empty_like(start[0])
+    hs[0] = start[1]
+    for t in range(ticks):
+        for row in range(batch):
+            for j in range(width):
+                last = answers[t - 1, row, j] if t > 0 else start[0][row, j]
+                fed[t, row, j] = measured[t, row, j] if port[t, row, j] > 0 else last
+        np.dot(fed[t], feedback_weight, into)
+        np.dot(hs[t], h_weight, up)
+        for row in range(batch):
+            for i in range(into.shape[1]):
+                into[row, i] += projected[t, row, i]
+        _gates(into, up, inner_bias, hs[t], gates[t], inner[t], hs[t + 1])
+        np.dot(hs[t + 1], out_weight, change)
+        for row in range(batch):
+            for j in range(width):
+                change[row, j] = scale[j] * (change[row, j] + out_bias[j])
+        _answer(fed[t], change, low, high, trapezoid, velocities, answers[t], free[t])
+
+
+@compiler.compiled
+def run_backward(
+    grad_answers: Array,
+    port: Array,
+    weights: tuple[Array, ...],
+    bounds: tuple[Array, ...],
+    velocities: int,
+    saved: tuple[Array, ...],
+    grads: tuple[Array, ...],
+) -> None:
+    """The adjoint of `run_forward`, from the last tick to the first.
+
+    Args:
+        grad_answers: gradient by the answers ``(time, batch, answer)``.
+        port: as in the forward run; `weights`, `bounds`, `velocities` and `saved` likewise.
+        weights: of the cell.
+        bounds: of the answers.
+        velocities: number of them.
+        saved: what the forward run wrote.
+        grads: written: by the gates' pre-activations ``(time, batch, 3 units)``, by n's inner sum ``(time, batch,
+            units)``, by o ``(time, batch, answer)``; and by the start: last answer and h. The last one comes in as the
+            gradient by the final h, the one before it as that by the final answer.
+    """
+    feedback_weight, h_weight, _, out_weight, _ = weights
+    scale, _, _, trapezoid = bounds
+    _, _, free, gates, inner, hs = saved
+    by_gates, by_inner, by_out, by_answer, by_h = grads
+    ticks, batch, width = grad_answers.shape
+    units, strokes = by_h.shape[1], len(trapezoid)
+    # Contiguous transposes: the products of each tick read them row by row.
+    feedback_up = np.ascontiguousarray(feedback_weight.T)
+    h_up, out_up = np.ascontiguousarray(h_weight.T), np.ascontiguousarray(out_weight.T)
+    by_fed, through = np.empty_like(by_answer), np.empty_like(by_answer)
+    by_up, from_out, from_h = np.empty_like(gates[0]), np.empty_like(by_h), np.empty_like(by_h)
+    for t in range(ticks - 1, -1, -1):
+        for row in range(batch):
+            for j in range(width):
+                by_answer[row, j] += grad_answers[t, row, j]
+            for j in range(width):
+                by_fed[row, j] = by_answer[row, j] * free[t, row, j]
+            for j in range(strokes):
+                # A stroke that moves depends on the velocities of both ends of the tick.
+                along = by_fed[row, velocities + j] * trapezoid[j]
+                by_fed[row, j] = (by_answer[row, j] + along) * free[t, row, j]
+            for j in range(width):
+                by_out[t, row, j] = by_fed[row, j] * scale[j]
+            for j in range(strokes):
+                by_out[t, row, velocities + j] = 0.0
+                by_fed[row, j] += by_fed[row, velocities + j] * trapezoid[j]
+        np.dot(by_out[t], out_up, from_out)
+        for row in range(batch):
+            for i in range(units):
+                total = by_h[row, i] + from_out[row, i]
+                reset, keep, new = gates[t, row, i], gates[t, row, units + i], gates[t, row, 2 * units + i]
+                by_new = total * (1 - keep) * (1 - new * new)
+                by_gates[t, row, i] = by_new * inner[t, row, i] * reset * (1 - reset)
+                by_gates[t, row, units + i] = total * (hs[t, row, i] - new) * keep * (1 - keep)
+                by_gates[t, row, 2 * units + i] = by_new
+                by_inner[t, row, i] = by_new * reset
+                by_h[row, i] = total * keep
+            for i in range(2 * units):
+                by_up[row, i] = by_gates[t, row, i]
+            for i in range(units):
+                by_up[row, 2 * units + i] = by_inner[t, row, i]
+        np.dot(by_up, h_up, from_h)
+        np.dot(by_gates[t], feedback_up, through)
+        for row in range(batch):
+            for i in range(units):
+                by_h[row, i] += from_h[row, i]
+            for j in range(width):
+                by_answer[row, j] = (by_fed[row, j] + through[row, j]) * (1 - port[t, row, j])

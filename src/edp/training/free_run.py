@@ -1,0 +1,343 @@
+"""Training a twin on what it is for: free runs, from measured starts everywhere in the recordings.
+
+One-step networks drift when they are fed back. Here the loss is taken on the run itself, first short and then longer,
+through the compiled loop and its adjoint; ports stay measured by chance, so that one set of weights serves all modes.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edp.data.series import Series
+from edp.errors import ConfigError, DataError, NotFiniteError
+from edp.networks.losses.huber import huber
+from edp.networks.twin import Twin, even_starts
+from edp.networks.twin.recurrent import RecurrentTwin
+from edp.settings.bounds import (
+    MOST_BATCH,
+    MOST_NAMES,
+    MOST_TICKS,
+    MOST_UPDATES,
+    SEED,
+    SHARE,
+    WEIGHT,
+    above,
+    check_bounds,
+    check_count,
+    whole,
+)
+from edp.training.optimizers import OptimizerSpec, Soap
+
+Array = NDArray[np.float32]
+MOST_LENGTH_S = 600.0
+"""Of a free run that is trained on; gradients over longer ones say nothing more."""
+
+
+class FreeRunDiverged(NotFiniteError):
+    """Loss or gradients of a free run are not finite any more."""
+
+    exit_code = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeRunSpec:
+    """How a twin is trained.
+
+    Attributes:
+        seed: of the weights, the starts and the measured ports.
+        lanes: free runs side by side in an update.
+        lengths_s: lengths of the free runs, stage after stage.
+        updates: updates of each stage.
+        measured_share: share of the lanes that are measured throughout, as a filter is.
+        mixed_share: share of the lanes in which each port is measured or free by chance, as with missing sensors.
+        stroke_weight: of an error of a stroke in its deviations, beside that of a velocity; small errors add up.
+        pressure_weight: of an error of a pressure in its deviations.
+        delta: where the Huber loss turns from a square to a line, in weighted deviations.
+        clip: bound on the norm of a gradient.
+        optimizer: with the learning rate that rises over `warmup` and falls to zero by a cosine.
+        warmup: share of all updates.
+        validate_every: updates from one validation to the next.
+        validation_s: length of a free run of the validation.
+        patience: validations without an improvement after which the last stage ends; 0 never ends early.
+
+    Raises:
+        ConfigError: a value out of range, or stages that do not fit one another.
+    """
+
+    seed: int = 0
+    lanes: int = 64
+    lengths_s: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
+    updates: tuple[int, ...] = (800, 800, 1000, 700)
+    measured_share: float = 0.15
+    mixed_share: float = 0.2
+    stroke_weight: float = 10.0
+    pressure_weight: float = 0.3
+    delta: float = 0.1
+    clip: float = 1.0
+    # On M22 its free runs were off by 5.95 mm/s after 160 processor s, those of AdamW (4e-3) by 6.44 after 202.
+    optimizer: OptimizerSpec = field(default_factory=lambda: Soap(learning_rate=3e-3))
+    warmup: float = 0.02
+    validate_every: int = 250
+    validation_s: float = 10.0
+    patience: int = 8
+
+    def __post_init__(self) -> None:
+        bounds = {"seed": SEED, "lanes": whole(1, MOST_BATCH), "updates": whole(1, MOST_UPDATES)}
+        bounds |= {"lengths_s": above(0.0, MOST_LENGTH_S), "validation_s": above(0.0, MOST_LENGTH_S)}
+        bounds |= {"measured_share": SHARE, "mixed_share": SHARE, "warmup": SHARE, "clip": WEIGHT, "delta": WEIGHT}
+        bounds |= {"stroke_weight": WEIGHT, "pressure_weight": WEIGHT}
+        bounds |= {"validate_every": whole(1, MOST_UPDATES), "patience": whole(0, MOST_UPDATES)}
+        check_bounds("free runs", self, **bounds)
+        check_count("free runs", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
+        if len(self.lengths_s) != len(self.updates):
+            raise ConfigError(
+                f"free runs: {len(self.lengths_s)} lengths_s and {len(self.updates)} updates; one number of updates "
+                "for each length must hold"
+            )
+        if self.measured_share + self.mixed_share >= 1.0:
+            raise ConfigError(
+                f"free runs: measured_share = {self.measured_share:g} and mixed_share = {self.mixed_share:g} leave no "
+                "lane that runs free; a sum below 1 must hold"
+            )
+
+
+@dataclass(frozen=True)
+class FreeRunProgress:
+    """Progress of a training on free runs.
+
+    Attributes:
+        update: updates done, of `updates`.
+        updates: of all stages.
+        length_s: of the free runs now.
+        seconds_left: estimated.
+        validation: error of the last validation, in deviations of the velocities; None before the first.
+        best: whether that is the least one so far.
+    """
+
+    update: int
+    updates: int
+    length_s: float
+    seconds_left: float
+    validation: float | None
+    best: bool
+
+
+@dataclass(frozen=True, eq=False)
+class FittedTwin:
+    """A trained twin with its history.
+
+    Attributes:
+        twin: with the weights of the best validation.
+        history: a row per validation; none of a twin that is fitted in closed form.
+        seconds: processor time.
+    """
+
+    twin: Twin
+    history: list[dict[str, Any]]
+    seconds: float
+
+
+class FreeRunSampler:
+    """Stretches of prefix and free run with starts everywhere, scaled; a pure function of seed and update.
+
+    Args:
+        twin: whose numbers they are in.
+        series: training stretches.
+
+    Raises:
+        DataError: no stretch is long enough.
+    """
+
+    def __init__(self, twin: RecurrentTwin, series: Sequence[Series], longest: int) -> None:
+        usable = [part for part in series if part.samples > twin.prefix_ticks + longest]
+        if not usable:
+            rate = twin.channels.rate_hz
+            raise DataError(
+                f"no stretch is longer than prefix and free run, {(twin.prefix_ticks + longest) / rate:g} s; give "
+                "longer recordings, or shorter free runs (training.lengths_s)"
+            )
+        self.commands = twin.scaled_commands(np.concatenate([part.inputs for part in usable]))
+        self.answers = twin.scaled(np.concatenate([part.targets for part in usable]))
+        self.samples = np.array([part.samples for part in usable])
+        self.first = np.cumsum(self.samples) - self.samples
+
+    def rows(self, ticks: int, lanes: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Rows ``(tick + 1, lane)`` of stretches drawn at random; the last row is the truth of the last answer."""
+        # Each start is equally likely, so long recordings count by their length.
+        starts = self.samples - ticks
+        ends = np.cumsum(starts)
+        drawn = rng.integers(0, ends[-1], lanes)
+        part = np.searchsorted(ends, drawn, side="right")
+        first = self.first[part] + drawn - (ends[part] - starts[part])
+        return np.asarray(first + np.arange(ticks + 1)[:, None], dtype=np.int64)
+
+
+def measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, rng: np.random.Generator) -> Array:
+    """Which ports are measured ``(tick, lane, answer)``: 1 in the prefix, later by the shares of the settings."""
+    _, lanes, answers = shape
+    kind = rng.random(lanes)
+    ports = np.zeros(shape, np.float32)
+    ports[:prefix] = 1.0
+    ports[:, kind < spec.measured_share] = 1.0
+    mixed = (kind >= spec.measured_share) & (kind < spec.measured_share + spec.mixed_share)
+    # A sensor that is missing is missing in the prefix, too, but for the tick that a run starts from.
+    ports[1:, mixed] = (rng.random((lanes, answers)) < 0.5)[mixed]
+    return ports
+
+
+def fit_free_runs(
+    twin: RecurrentTwin,
+    train: Sequence[Series],
+    validation: Sequence[Series],
+    spec: FreeRunSpec,
+    on_event: Callable[[FreeRunProgress], None] | None = None,
+) -> FittedTwin:
+    """Train on free runs, choose by free runs of the validation part.
+
+    Args:
+        twin: untrained, or trained before; it is changed.
+        train: training stretches.
+        validation: stretches that choose among the weights on the way.
+        spec: how to train.
+        on_event: called with progress.
+
+    Raises:
+        DataError: stretches that are too short.
+        FreeRunDiverged: a gradient is not finite any more.
+    """
+    torch.set_num_threads(1)  # the products of a tick are too small to share
+    rate, network = twin.channels.rate_hz, twin.network
+    lengths = [max(1, round(length * rate)) for length in spec.lengths_s]
+    if max(lengths) + twin.prefix_ticks > MOST_TICKS:
+        raise ConfigError(f"free runs: {max(spec.lengths_s):g} s at {rate:g} Hz are more than {MOST_TICKS:,} ticks")
+    sampler = FreeRunSampler(twin, train, max(lengths))
+    judge = FreeRunValidation(twin, validation, round(spec.validation_s * rate), spec.lanes)
+    optimizer = spec.optimizer.build(network.named_parameters())
+    rates = [group["lr"] for group in optimizer.param_groups]
+    weight = torch.from_numpy(answer_weights(twin, spec))
+    began, total = time.process_time(), sum(spec.updates)
+    history: list[dict[str, Any]] = []
+    best, waited, done = math.inf, 0, 0
+    chosen = copy.deepcopy(network.state_dict())
+    for stage, (ticks, updates) in enumerate(zip(lengths, spec.updates, strict=True)):
+        for _ in range(updates):
+            share = _rate(done / total, spec.warmup)
+            for group, base in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = base * share
+            loss = _update(twin, sampler, spec, (ticks, done), weight, optimizer)
+            done += 1
+            if done % spec.validate_every and done != total:
+                continue
+            error = judge.error()
+            if error < best:
+                best, waited, chosen = error, 0, copy.deepcopy(network.state_dict())
+            else:
+                waited += 1
+            seconds = time.process_time() - began
+            row = {"update": done, "length_s": spec.lengths_s[stage], "loss": loss, "validation": error}
+            history.append(row | {"best": waited == 0, "seconds": round(seconds, 2)})
+            if on_event is not None:
+                left = _work_left(lengths, spec.updates, done, twin.prefix_ticks)
+                on_event(FreeRunProgress(done, total, spec.lengths_s[stage], seconds * left, error, waited == 0))
+            if spec.patience and waited >= spec.patience and stage == len(lengths) - 1:
+                break
+    network.load_state_dict(chosen)
+    return FittedTwin(twin, history, time.process_time() - began)
+
+
+def answer_weights(twin: RecurrentTwin, spec: FreeRunSpec) -> Array:
+    """Weight of each answer's error in deviations ``(answer,)``."""
+    channels = twin.channels
+    counts = (len(channels.velocities), len(channels.strokes), len(channels.pressures))
+    return np.repeat(np.array([1.0, spec.stroke_weight, spec.pressure_weight], np.float32), counts)
+
+
+def _update(
+    twin: RecurrentTwin,
+    sampler: FreeRunSampler,
+    spec: FreeRunSpec,
+    now: tuple[int, int],
+    weight: Tensor,
+    optimizer: torch.optim.Optimizer,
+) -> float:
+    """One update; `now` is the length of the free run in ticks, and how many updates were done. Returns the loss."""
+    ticks, done = now
+    rng = np.random.default_rng([spec.seed, done])
+    rows = sampler.rows(twin.prefix_ticks + ticks, spec.lanes, rng)
+    truth = sampler.answers[rows]
+    ports = measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
+    commands, measured, port = (torch.from_numpy(a) for a in (sampler.commands[rows[:-1]], truth[:-1], ports))
+    start = (measured[0], torch.zeros(spec.lanes, twin.network.units))
+    answers, _ = twin.network(commands, measured, port, start, twin.bounds)
+    loss = huber((answers - torch.from_numpy(truth[1:])) * weight, spec.delta).mean()
+    optimizer.zero_grad()
+    loss.backward()
+    norm = torch.nn.utils.clip_grad_norm_(twin.network.parameters(), spec.clip)
+    if not torch.isfinite(norm):
+        raise FreeRunDiverged(
+            f"the gradient of update {done + 1} is not finite; lower optimizer.learning_rate or the lengths of the runs"
+        )
+    optimizer.step()
+    return float(loss.detach())
+
+
+def _rate(progress: float, warmup: float) -> float:
+    """Share of the learning rate: a ramp, then half a cosine down to zero."""
+    if progress < warmup:
+        return (progress + 1e-3) / warmup
+    return 0.5 * (1.0 + math.cos(math.pi * (progress - warmup) / max(1e-9, 1.0 - warmup)))
+
+
+def _work_left(lengths: Sequence[int], updates: Sequence[int], done: int, prefix: int) -> float:
+    """Ticks still to be run, as a multiple of those that were."""
+    ticks = np.repeat([length + prefix for length in lengths], updates)
+    return float(ticks[done:].sum() / ticks[:done].sum())
+
+
+class FreeRunValidation:
+    """Free runs from even starts in the validation stretches.
+
+    Args:
+        twin: whose answers are judged.
+        series: validation stretches.
+        ticks: of a free run; cut to the longest stretch.
+        lanes: number of runs at most.
+
+    Raises:
+        DataError: no stretch is longer than the prefix.
+    """
+
+    def __init__(self, twin: RecurrentTwin, series: Sequence[Series], ticks: int, lanes: int) -> None:
+        self.twin, prefix = twin, twin.prefix_ticks
+        longest = max((part.samples for part in series), default=0)
+        ticks = min(ticks, longest - prefix - 1)
+        if ticks < 1:
+            raise DataError(
+                f"the longest validation stretch has {longest} ticks; more than prefix_ticks = {prefix} must hold: "
+                "give longer recordings, or set a shorter prefix"
+            )
+        whole_run = prefix + ticks + 1
+        usable = [part for part in series if part.samples >= whole_run]
+        each = max(1, lanes // len(usable))
+        starts = even_starts(twin, usable, whole_run, each)
+        self.commands = np.stack([part.inputs[at : at + whole_run - 1] for part, at in starts])
+        self.truth = np.stack([part.targets[at : at + whole_run] for part, at in starts])
+
+    def error(self) -> float:
+        """Mean absolute error of the velocities over the free runs, in deviations of each."""
+        twin, prefix = self.twin, self.twin.prefix_ticks
+        state = twin.reset(self.commands[:, :prefix], self.truth[:, :prefix])
+        answers, _ = twin.rollout(self.commands[:, prefix:], state)
+        count = len(twin.channels.velocities)
+        error = np.abs(answers - self.truth[:, prefix + 1 :])[..., :count] / twin.scales.answer_width[:count]
+        return float(error.mean(dtype=np.float64))

@@ -1,0 +1,141 @@
+"""Twins on disk: JSON and safetensors, as bundles of predictors are; loading one executes nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from edp import __version__
+from edp.data.twin_channels import TwinChannels
+from edp.errors import BundleError
+from edp.networks.twin import TWINS, Twin, TwinScales, TwinSpec
+from edp.settings.bounds import above
+from edp.settings.tree import SettingsTree
+from edp.signals import Channel, Kind
+from edp.storage import make_folder, object_with, read_json, write_json
+from edp.storage.memory import check_setting
+from edp.training.bundle import HASH, as_damage, check_hash, header_digest, read_arrays, write_arrays
+
+SCHEMA = 1
+HEADER = "twin.json"
+PARTS = ("commands", "velocities", "strokes", "pressures")
+RATE = above(0.0, 1e6)
+_TREE = SettingsTree({"twin": TWINS}, what="twin")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Form:
+    twin: TwinSpec
+
+
+@dataclass(frozen=True, eq=False)
+class TwinBundle:
+    """A twin with what a user of it must know.
+
+    Attributes:
+        spec: the formulation and its options.
+        twin: ready to run.
+        provenance: data digest, environment, settings, training time.
+        scores: held-out scores; empty before they are known.
+    """
+
+    spec: TwinSpec
+    twin: Twin
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    scores: Mapping[str, Any] = field(default_factory=dict)
+
+
+def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
+    """Write a twin; the header is renamed into place last, so a reader sees the old twin or the new one.
+
+    Raises:
+        StorageError: the folder cannot be written.
+    """
+    path, channels = make_folder(folder), bundle.twin.channels
+    arrays = {name: np.ascontiguousarray(values) for name, values in bundle.twin.arrays().items()}
+    entry = write_arrays(path, "weights", save_arrays(arrays))
+    header = {
+        "schema": SCHEMA,
+        "edp": __version__,
+        "twin": _TREE.plain(bundle.spec, "twin"),
+        "rate_hz": channels.rate_hz,
+        "channels": {part: [_plain(channel) for channel in getattr(channels, part)] for part in PARTS},
+        "weights": entry,
+        "provenance": dict(bundle.provenance),
+        "scores": dict(bundle.scores),
+    }
+    write_json(path / HEADER, header | {HASH: header_digest(header)})
+    # Old files go only after the rename; a kill in between leaves spare files, not a broken twin.
+    for old in path.glob("weights-*.safetensors"):
+        if old.name != entry["file"]:
+            old.unlink(missing_ok=True)
+    return path
+
+
+def load_twin(folder: str | Path) -> TwinBundle:
+    """Read a twin; schema, hashes, shapes and ranges are checked before it is built.
+
+    Args:
+        folder: the twin's own, or the run folder around it.
+
+    Raises:
+        BundleError: not a twin, another schema, damaged numbers, or a formulation that this version does not know.
+    """
+    path = Path(folder)
+    path = path / "twin" if os.path.lexists(path / "twin" / HEADER) else path
+    if not os.path.lexists(path / HEADER):
+        raise BundleError(f"'{path}' is not a twin: it has no {HEADER}; give the run folder that edp twin wrote")
+    with as_damage(path):
+        header = object_with(read_json(path / HEADER), ("schema",), f"'{path / HEADER}'")
+        schema = header["schema"]
+        if isinstance(schema, bool) or schema != SCHEMA:
+            raise BundleError(
+                f"twin '{path}' has schema {str(schema)[:40]}, this version of EDP ({__version__}) reads {SCHEMA}; "
+                "install a newer EDP, or train again"
+            )
+        check_hash(header, path / HEADER)
+        return _assembled(header, path)
+
+
+def _assembled(header: Mapping[str, Any], path: Path) -> TwinBundle:
+    parts = {part: tuple(_channel(entry) for entry in header["channels"][part]) for part in PARTS}
+    if not RATE.holds(header["rate_hz"]):
+        raise ValueError(f"its rate_hz is {str(header['rate_hz'])[:40]}; {RATE.rule('rate_hz')} must hold")
+    channels = TwinChannels(**parts, rate_hz=float(header["rate_hz"]))
+    spec = _TREE.build(_Form, {"twin": header["twin"]}, f"'{path / HEADER}'").twin
+    expected = {**TwinScales.shapes(channels), **spec.shapes(channels)}
+    numbers = sum(int(np.prod(shape)) for shape in expected.values())
+    check_setting(8 * numbers, f"a twin of {numbers:,} numbers", "the header may be damaged")
+    arrays = load_arrays(read_arrays(path, header["weights"]))
+    other = sorted({*expected} ^ {*arrays})
+    if other:
+        raise ValueError(f"its weights are not those of its header: '{other[0][:80]}' is in one of them only")
+    for name, values in sorted(arrays.items()):
+        if values.shape != expected[name] or values.dtype != np.float32:
+            raise ValueError(f"'{name[:80]}' is {values.shape} {values.dtype}, not {expected[name]} float32")
+        if not np.isfinite(values).all():
+            raise ValueError(f"'{name[:80]}' holds a number that is not finite")
+    provenance = object_with(header["provenance"], (), "its provenance")
+    scores = object_with(header["scores"], (), "its scores")
+    return TwinBundle(spec, spec.build(channels, TwinScales.of(arrays), arrays), provenance, scores)
+
+
+def _plain(channel: Channel) -> dict[str, str]:
+    return {"name": channel.name, "kind": str(channel.kind), "unit": channel.unit, "description": channel.description}
+
+
+def _channel(entry: Mapping[str, Any]) -> Channel:
+    texts = [entry["name"], entry["description"]]
+    if not all(isinstance(text, str) for text in texts):
+        raise TypeError("the name or description of a channel is no text")
+    channel = Channel(entry["name"], Kind(entry["kind"]), entry["description"])
+    if entry["unit"] != channel.unit:
+        raise ValueError(f"channel '{channel.name[:80]}' is in {str(entry['unit'])[:20]}, {channel.unit} must hold")
+    return channel

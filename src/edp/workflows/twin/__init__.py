@@ -1,0 +1,6 @@
+"""Plant models that run free: trained on a data set, judged beside floors, and run along a log."""
+
+from edp.workflows.twin.rollout import Rollout, rollout_log
+from edp.workflows.twin.train_twin import TrainedTwin, train_twin
+
+__all__ = ["Rollout", "TrainedTwin", "rollout_log", "train_twin"]

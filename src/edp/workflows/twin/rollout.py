@@ -1,0 +1,144 @@
+"""A twin along a log: measured up to a moment, on the commands alone from there on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edp.data.twin_channels import same_channels
+from edp.errors import ConfigError, DataError, closest
+from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
+from edp.logs import write_recording
+from edp.logs.source import DataSource
+from edp.networks.twin import Twin
+from edp.recording import Recording
+from edp.settings.bounds import above, span
+from edp.training.twin_bundle import load_twin
+
+FREE = "_twin"
+"""Behind the name of a channel, for what the twin answered in its place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A free run beside what was measured.
+
+    Attributes:
+        recording: commands, measured channels, and the twin's answers under names that end in `FREE`; row by row at
+            the same time.
+        scores: see `edp.evaluation.free_run.free_run_scores`.
+        start_s: of the free run in the log.
+    """
+
+    recording: Recording
+    scores: dict[str, Any]
+    start_s: float
+
+
+def rollout_log(
+    run: str | Path,
+    source: DataSource,
+    seconds: float = 60.0,
+    start_s: float | None = None,
+    measured: Sequence[str] = (),
+    out: str | Path | None = None,
+) -> Rollout:
+    """Let the twin of a run answer the commands of a log.
+
+    Args:
+        run: run folder of a twin.
+        source: one log.
+        seconds: length of the free run.
+        start_s: its start in the log; None: as early as the prefix allows.
+        measured: channels that stay measured throughout (mixed mode).
+        out: file for `Rollout.recording`; its ending chooses the format.
+
+    Raises:
+        EdpError: several logs, another rate or kind, times outside the log, or a channel that the twin does not answer.
+    """
+    twin = load_twin(run).twin
+    recording = _only(source.read())
+    same_channels(twin.channels, recording)
+    measured_columns = _columns(twin, measured)
+    series = twin.channels.task().series(recording)
+    start, ticks = _span(twin, recording, seconds, start_s)
+    first = start - twin.prefix_ticks
+    commands, truth = series.inputs[None, first : start + ticks], series.targets[None, first : start + ticks + 1]
+    prefix = twin.prefix_ticks
+    ports = np.full_like(truth[:, prefix:-1], np.nan)
+    for column in measured_columns:
+        ports[..., column] = truth[:, prefix:-1, column]
+    state = twin.reset(commands[:, :prefix], truth[:, :prefix])
+    answers, _ = twin.rollout(commands[:, prefix:], state, ports)
+    runs = runs_of(twin, (recording.name,), answers, truth[:, prefix:])
+    seconds_seen = FreeRunJudgeSpec().at_s
+    at_s = sorted({*(at for at in seconds_seen if at < seconds), ticks / twin.channels.rate_hz})
+    result = Rollout(
+        _recorded(twin, recording, answers[0], start), free_run_scores(runs, at_s), start / recording.rate_hz
+    )
+    if out is not None:
+        write_recording(result.recording, out)
+    return result
+
+
+def _only(recordings: Sequence[Recording]) -> Recording:
+    if len(recordings) != 1:
+        names = ", ".join(recording.name for recording in recordings[:5])
+        raise DataError(f"{len(recordings)} recordings came ({names}); a twin runs along one: give one log")
+    return recordings[0]
+
+
+def _span(twin: Twin, recording: Recording, seconds: float, start_s: float | None) -> tuple[int, int]:
+    """First tick of a free run and its length, which both lie in the log."""
+    rate, prefix = recording.rate_hz, twin.prefix_ticks
+    if not above(0.0, MOST_SECONDS).holds(seconds):
+        raise ConfigError(f"--seconds {seconds:g}: {above(0.0, MOST_SECONDS).rule('seconds')} must hold")
+    if start_s is not None and not span(0.0, MOST_SECONDS).holds(start_s):
+        raise ConfigError(f"--from {start_s:g}: {span(0.0, MOST_SECONDS).rule('from')} must hold")
+    start = prefix if start_s is None else round(start_s * rate)
+    ticks = max(1, round(seconds * rate))
+    if start < prefix:
+        raise DataError(
+            f"a free run from {start / rate:g} s has {start} measured ticks before it; the twin needs a prefix of "
+            f"{prefix} ({prefix / rate:g} s): begin at --from {prefix / rate:g} or later"
+        )
+    # One more row than answers: the last answer is compared with the tick after the last command.
+    if start + ticks + 1 > recording.samples:
+        longest = (recording.samples - 1 - start) / rate
+        room = f"at most --seconds {longest:g} from there" if longest > 0 else "begin earlier"
+        raise DataError(
+            f"a free run of {seconds:g} s from {start / rate:g} s goes beyond the end of '{recording.name}' at "
+            f"{recording.duration_s:g} s; {room}"
+        )
+    return start, ticks
+
+
+def _columns(twin: Twin, measured: Sequence[str]) -> list[int]:
+    names = [channel.name for channel in twin.channels.answers]
+    for name in measured:
+        if name not in names:
+            raise ConfigError(f"--measured {name}: the twin does not answer this channel{closest(name, names)}")
+    return [names.index(name) for name in measured]
+
+
+def _recorded(twin: Twin, recording: Recording, answers: np.ndarray, start: int) -> Recording:
+    """Row t holds the commands and measured values of tick start + 1 + t, and the answers for it."""
+    channels = twin.channels.commands + twin.channels.answers
+    rows = slice(start + 1, start + 1 + len(answers))
+    measured_values = recording.select([channel.name for channel in channels])[rows]
+    own = tuple(
+        replace(channel, name=f"{channel.name}{FREE}", description=f"{channel.description} (free run)".strip())
+        for channel in twin.channels.answers
+    )
+    return Recording(
+        f"{recording.name}_rollout",
+        channels + own,
+        np.ascontiguousarray(np.concatenate([measured_values, answers], axis=1)),
+        recording.rate_hz,
+        recording.source,
+        {"start_s": (start + 1) / recording.rate_hz},
+    )

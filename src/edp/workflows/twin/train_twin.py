@@ -1,0 +1,129 @@
+"""From recordings to a twin in a run folder, with its scores on free runs beside those of the floors."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from edp import __version__
+from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
+from edp.data.prepared import Prepared, prepare
+from edp.data.twin_channels import TwinChannels, same_channels, twin_channels
+from edp.evaluation.free_run import FreeRunJudgeSpec, free_run_scores, free_runs
+from edp.logs.source import DataSource
+from edp.networks.twin import TWINS, Twin, TwinSpec, fit_scales
+from edp.networks.twin.base import check_length
+from edp.networks.twin.recurrent import RecurrentTwin
+from edp.storage import write_json
+from edp.storage.runs import RunFolder, command_line, environment, run_key
+from edp.training.free_run import FittedTwin, FreeRunProgress, fit_free_runs
+from edp.training.twin_bundle import HEADER, TwinBundle, load_twin, save_twin
+
+SCORES = "free_run.json"
+FOLDER = "twin"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedTwin:
+    """What `train_twin` leaves.
+
+    Attributes:
+        bundle: the twin on disk.
+        scores: of the twin and of every floor, by label: see `edp.evaluation.free_run.free_run_scores`.
+        resumed: whether it was finished before, and only read.
+    """
+
+    bundle: TwinBundle
+    scores: dict[str, Any]
+    resumed: bool
+
+
+def train_twin(
+    source: DataSource,
+    experiment: TwinExperiment,
+    out: str | Path,
+    on_event: Callable[[FreeRunProgress], None] | None = None,
+    on_step: Callable[[str], None] | None = None,
+) -> TrainedTwin:
+    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``. A finished one is read.
+
+    Args:
+        source: where the recordings are.
+        experiment: the settings.
+        out: run folder.
+        on_event: called with progress of the training.
+        on_step: called with what begins.
+
+    Raises:
+        EdpError: the recordings, settings or folder cannot be used; what was on disk stays.
+    """
+    tell = on_step or (lambda text: None)
+    tell("reading recordings")
+    channels, data = prepare_twin(source, experiment)
+    key = run_key({"twin": TWIN_SETTINGS.plain(experiment)}, data.digest)
+    with RunFolder(out) as run:
+        if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
+            bundle = load_twin(run.path)
+            return TrainedTwin(bundle, dict(bundle.scores), True)
+        run.write_status("running")
+        scales = fit_scales(channels, data.train)
+        started = time.process_time()
+        twin = experiment.twin.start(channels, scales, data.train, experiment.training.seed)
+        if isinstance(twin, RecurrentTwin):
+            tell("training on free runs")
+            fitted = fit_free_runs(twin, data.train, data.validation, experiment.training, on_event)
+            run.write_history(fitted.history)
+        else:
+            fitted = FittedTwin(twin, [], time.process_time() - started)
+        scores = {"twin": _judged(fitted.twin, data, experiment.judge, tell, "the twin")}
+        for name in experiment.judge.floors:
+            # The floors are those of the same recordings and the same prefix.
+            spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
+            floor = spec.start(channels, scales, data.train, experiment.training.seed)
+            scores[name] = _judged(floor, data, experiment.judge, tell, name)
+        write_json(run.file(SCORES), {"schema": 1, "models": scores})
+        bundle = TwinBundle(experiment.twin, fitted.twin, _provenance(source, experiment, data, fitted), scores)
+        save_twin(bundle, run.file(FOLDER))
+        run.write_status("finished")
+    return TrainedTwin(bundle, scores, False)
+
+
+def prepare_twin(source: DataSource, experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
+    """Read and cut a data set: commands as inputs, what the twin answers as targets.
+
+    Raises:
+        EdpError: recordings or settings that cannot be used.
+    """
+    recordings = source.read()
+    channels = twin_channels(recordings[0], experiment.channels)
+    for recording in recordings[1:]:
+        same_channels(channels, recording)
+    data = prepare(recordings, channels.task(), experiment.split, experiment.twin.prefix_ticks)
+    check_length(channels, experiment.twin, data.train)
+    return channels, data
+
+
+def _judged(
+    twin: Twin, data: Prepared, spec: FreeRunJudgeSpec, tell: Callable[[str], None], label: str
+) -> dict[str, Any]:
+    tell(f"free runs of {label}")
+    return free_run_scores(free_runs(twin, data.test, spec.seconds, spec.starts), spec.at_s)
+
+
+def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, fitted: FittedTwin) -> dict[str, Any]:
+    parts = {part: [series.name for series in getattr(data, part)] for part in ("train", "validation", "test")}
+    return {
+        "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": command_line(),
+        "edp_version": __version__,
+        "environment": environment(1),
+        "seed": experiment.training.seed,
+        "seconds": round(fitted.seconds, 2),
+        "data": {"source": str(source.path), "reader": source.to_plain(), "digest": data.digest, "names": parts},
+    }
+
+
+__all__ = ["FOLDER", "HEADER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]

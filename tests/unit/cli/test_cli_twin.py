@@ -1,0 +1,133 @@
+"""``edp twin`` and ``edp rollout``, from logs of two actuators to a free run beside what was measured."""
+
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.logs import write_recording
+from edp.logs.source import DataSource
+from edp.testing.twins import sample_actuators
+from edp.training.twin_bundle import load_twin
+
+SMALL = (
+    *("twin.units=6", "twin.prefix_ticks=20", "training.lanes=4", "training.lengths_s=[0.2]", "training.updates=[6]"),
+    *("training.validate_every=3", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]"),
+)
+WORDS = [word for change in SMALL for word in ("--set", change)]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("actuators")
+    for seed in range(6):
+        write_recording(sample_actuators(seed=seed), folder / f"log_{seed}.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, logs):
+    from edp.config.twin import load_twin_experiment
+    from edp.workflows.twin import train_twin
+
+    run = tmp_path_factory.mktemp("twins") / "run"
+    train_twin(DataSource.of(logs), load_twin_experiment(None, SMALL), run)
+    return run
+
+
+def test_a_run_holds_a_twin_its_settings_and_scores_beside_the_floors(edp, logs, trained, tmp_path):
+    run = shutil.copytree(trained, tmp_path / "run")
+    before = (run / "twin" / "twin.json").read_bytes()
+    ended = edp("twin", logs, "--out", run, *WORDS, "--json")
+    assert ended.code == 0
+    assert set(ended.json["models"]) == {"twin", "static", "arx"}
+    assert [row["at_s"] for row in ended.json["models"]["twin"]["stroke_error"]] == [1.0, 4.0]
+    assert (run / "twin" / "twin.json").read_bytes() == before
+    shown = edp("twin", logs, "--out", run, *WORDS).out
+    assert "velocity, mm/s" in shown
+    assert f"next: edp rollout {run}" in shown.replace("\n", " ")
+    history = (run / "history.jsonl").read_text().splitlines()
+    assert len(history) == 2
+    assert "units = 6" in (run / "config.toml").read_text()
+    other = edp("twin", logs, "--out", run, *WORDS, "--set", "twin.units=7")
+    assert other.code == 1
+    assert "holds another run" in other.err
+
+
+def test_floors_are_formulations_of_their_own(edp, logs, tmp_path):
+    ended = edp("twin", logs, "--out", tmp_path / "run", "--set", "twin.kind=arx", *WORDS[4:], "--json")
+    models = ended.json["models"]
+    assert models["twin"]["stroke_error"] == models["arx"]["stroke_error"]
+    assert load_twin(tmp_path / "run").spec.lags == 25
+
+
+def test_a_rollout_writes_measured_and_free_values_row_by_row(edp, logs, trained, tmp_path):
+    log, file = logs / "log_1.parquet", tmp_path / "free.parquet"
+    ended = edp("rollout", trained, log, "--seconds", 3, "--from", 2, "--out", file, "--json")
+    assert ended.code == 0
+    assert ended.json["start_s"] == 2.0
+    assert [row["at_s"] for row in ended.json["stroke_error"]] == [1.0, 3.0]
+    (written,), (recording,) = DataSource.of(file).read(), DataSource.of(log).read()
+    twin = load_twin(trained).twin
+    series = twin.channels.task().series(recording)
+    state = twin.reset(series.inputs[None, 80:100], series.targets[None, 80:100])
+    answers, _ = twin.rollout(series.inputs[None, 100:250], state)
+    names = [channel.name for channel in twin.channels.answers]
+    assert written.samples == 150
+    np.testing.assert_allclose(written.select([f"{name}_twin" for name in names]), answers[0], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(written.select(names), series.targets[101:251], rtol=1e-5, atol=1e-6)
+    error = 1e3 * np.abs(answers[0] - series.targets[101:251])[:, :2].mean()
+    assert ended.json["velocity_mae"]["mean"] == pytest.approx(error, rel=1e-4)
+
+
+def test_a_rollout_prints_the_error_of_each_channel_by_time(edp, logs, trained):
+    shown = edp("rollout", trained, logs / "log_1.parquet", "--seconds", 3).out
+    lines = shown.splitlines()
+    assert "error after, mm" in lines[0]
+    assert lines[1].split() == ["stroke_1", "stroke_2"]
+    assert [line.split()[:2] for line in lines[2:4]] == [["1", "s"], ["3", "s"]]
+    assert re.search(r"MAE, mm/s: speed_1 [\d.]+, speed_2 [\d.]+", shown)
+    assert re.search(r"NRMSE: pressure_1 [\d.]+, pressure_2 [\d.]+", shown)
+
+
+def test_channels_that_stay_measured(edp, logs, trained, tmp_path):
+    log = logs / "log_1.parquet"
+    free, mixed = (
+        edp("rollout", trained, log, "--seconds", 3, *words, "--json").json["velocity_mae"]["mean"]
+        for words in ([], ["--measured", "speed_1", "--measured", "speed_2"])
+    )
+    assert mixed < 0.5 * free
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["--from", 0.1],
+            r"has 5 measured ticks before it; the twin needs a prefix of 20 \(0\.4 s\): begin at --from",
+        ),
+        (
+            ["--from", 11, "--seconds", 5],
+            "goes beyond the end of 'actuators_1' at 12 s; at most --seconds 0.98 from there",
+        ),
+        (["--from", 50], "goes beyond the end.*begin earlier"),
+        (["--seconds", -1], "--seconds -1: .* must hold"),
+        (["--measured", "speed_3"], "the twin does not answer this channel; did you mean 'speed_2'"),
+    ],
+)
+def test_a_rollout_that_cannot_be_is_refused(edp, logs, trained, words, message):
+    ended = edp("rollout", trained, logs / "log_1.parquet", *words)
+    assert ended.code == 1
+    assert re.search(message, " ".join(ended.err.split()))
+
+
+def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, tmp_path):
+    assert "6 recordings came" in edp("rollout", trained, logs).err
+    slow = write_recording(sample_actuators(), tmp_path / "slow.parquet")
+    (recording,) = DataSource.of(slow).read()
+    write_recording(replace(recording, rate_hz=25.0), slow)
+    assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
+    assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())
+    assert "holds a twin" in " ".join(edp("evaluate", trained).err.split())

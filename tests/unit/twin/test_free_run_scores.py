@@ -1,0 +1,100 @@
+"""Scores of free runs, by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.data.twin_channels import TwinChannels
+from edp.errors import DataError
+from edp.evaluation.free_run import FreeRuns, free_run_scores, free_runs
+from edp.networks.twin.static_map import StaticMap
+from edp.signals import Channel, Kind
+from edp.testing.twins import sample_actuators, sample_twin
+
+VELOCITIES = (Channel("v1", Kind.VELOCITY), Channel("v2", Kind.VELOCITY))
+STROKES = (Channel("x1", Kind.POSITION), Channel("x2", Kind.POSITION))
+PRESSURES = (Channel("p", Kind.PRESSURE), Channel("still", Kind.PRESSURE))
+COMMAND = (Channel("u", Kind.RATIO),)
+
+
+def runs(velocities=VELOCITIES, strokes=STROKES, pressures=PRESSURES):
+    """Two runs of four ticks at 2 Hz: velocity 1 is off by 3 mm/s, stroke 2 by 1, 2, 3, 4 mm, pressure by 1 Pa."""
+    channels = TwinChannels(COMMAND, velocities, strokes, pressures, 2.0)
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(2, 4, len(channels.answers))).astype(np.float32)
+    truth[..., -1] = 5.0
+    answers = truth.copy()
+    answers[..., 0] += np.array([3e-3, 3e-3, -3e-3, 3e-3])
+    answers[..., 3] += 1e-3 * np.arange(1, 5)
+    answers[..., 4] += 1.0
+    return FreeRuns(channels, ("a", "b"), answers, truth, truth[:, 0], np.float32([10, 10]))
+
+
+def test_errors_by_kind_and_time():
+    scores = free_run_scores(runs(), (0.5, 2.0, 60.0))
+    assert scores["velocity_mae"]["unit"] == "mm/s"
+    assert scores["velocity_mae"]["by_channel"] == pytest.approx({"v1": 3.0, "v2": 0.0}, abs=1e-3)
+    assert scores["velocity_mae"]["mean"] == pytest.approx(1.5, abs=1e-3)
+    rows = {row["at_s"]: row for row in scores["stroke_error"]}
+    assert set(rows) == {0.5, 2.0}
+    assert rows[0.5]["by_channel"] == pytest.approx({"x1": 0.0, "x2": 1.0}, abs=1e-3)
+    assert rows[2.0]["mean"] == pytest.approx(2.0, abs=1e-3)
+    assert scores["pressure_nrmse"]["by_channel"]["p"] == pytest.approx(1 / runs().truth[..., 4].std(), rel=1e-4)
+    assert scores["pressure_nrmse"]["by_channel"]["still"] is None
+    assert scores["diverged"] == 0.0
+    assert (scores["runs"], scores["recordings"], scores["seconds"]) == (2, 2, 2.0)
+
+
+def test_without_strokes_velocities_are_integrated():
+    channels = TwinChannels(COMMAND, VELOCITIES[:1], (), (), 2.0)
+    truth = np.zeros((1, 4, 1), np.float32)
+    answers = truth + np.float32(0.01)
+    scores = free_run_scores(FreeRuns(channels, ("a",), answers, truth, truth[:, 0], truth[0, 0, :0]), (2.0,))
+    # Trapezoid of 0, 10, 10, 10, 10 mm/s over steps of 0.5 s.
+    assert scores["stroke_error"][0]["mean"] == pytest.approx(17.5, rel=1e-5)
+    assert scores["stroke_error"][0]["unit"] == "mm"
+
+
+def test_a_run_astray_counts_as_diverged_and_so_does_one_without_a_number():
+    astray, nothing = runs(), runs()
+    astray.answers[1, 2, 2] += 100.0
+    nothing.answers[0, 0, 4] = np.nan
+    assert astray.diverged().tolist() == [False, True]
+    assert nothing.diverged().tolist() == [True, False]
+
+
+def test_units_are_never_mixed():
+    mixed = (Channel("v1", Kind.VELOCITY), Channel("w", Kind.ANGULAR_VELOCITY))
+    ends = (Channel("x1", Kind.POSITION), Channel("q", Kind.ANGLE))
+    scores = free_run_scores(runs(mixed, ends), (1.0,))
+    assert scores["velocity_mae"]["mean"] is None
+    assert scores["velocity_mae"]["by_channel"]["v1"] == pytest.approx(3.0, abs=1e-3)
+    assert scores["stroke_error"][0]["median"] is None
+
+
+def test_runs_are_what_the_twin_answers_from_even_starts():
+    twin, _, _ = sample_twin(StaticMap(prefix_ticks=40), sample_actuators(ticks=1200))
+    recording, task = sample_actuators(ticks=1200), twin.channels.task()
+    series = [task.series(recording, at, at + 600, f"part_{at}") for at in (0, 600)]
+    result = free_runs(twin, series, 2.0, 3)
+    assert result.names == ("part_0",) * 3 + ("part_600",) * 3
+    assert result.answers.shape == (6, 100, 6)
+    at = (600 - 141) // 2 + 40
+    state = twin.reset(series[1].inputs[None, at - 40 : at], series[1].targets[None, at - 40 : at])
+    expected, _ = twin.rollout(series[1].inputs[None, at : at + 100], state)
+    np.testing.assert_allclose(result.answers[4], expected[0], rtol=1e-4, atol=1e-6)
+    assert np.array_equal(result.truth[4], series[1].targets[at + 1 : at + 101])
+    with pytest.raises(DataError, match="the longest recording has 30 ticks"):
+        free_runs(twin, [task.series(sample_actuators(ticks=30))], 2.0, 3)
+
+
+def test_starts_beyond_an_end_stop_are_left_out():
+    twin, _, _ = sample_twin(StaticMap(prefix_ticks=10))
+    low, high = twin.scales.low[2], twin.scales.high[2]
+    within = twin.channels.task().series(sample_actuators())
+    beyond = replace(within, name="beyond", targets=within.targets + np.float32([0, 0, high - low, 0, 0, 0]))
+    assert set(free_runs(twin, [within, beyond], 1.0, 5).names) == {"actuators_0"}
+    high_starts = replace(within, targets=within.targets + np.float32([0, 0, 3 * (high - low), 0, 0, 0]))
+    with pytest.raises(DataError, match="all 5 starts lie beyond an end stop"):
+        free_runs(twin, [high_starts], 1.0, 5)

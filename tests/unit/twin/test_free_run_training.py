@@ -1,0 +1,122 @@
+"""Training on free runs: what is drawn, what is learned, and that a seed settles it."""
+
+import numpy as np
+import pytest
+
+from edp.errors import ConfigError, DataError
+from edp.evaluation.free_run import free_run_scores, free_runs
+from edp.networks.twin import TWINS, fit_scales
+from edp.networks.twin.recurrent import Recurrent
+from edp.testing.twins import sample_series
+from edp.training.free_run import FreeRunDiverged, FreeRunSampler, FreeRunSpec, fit_free_runs, measured_ports
+from edp.training.optimizers import AdamW
+
+SMALL = {"lanes": 16, "lengths_s": (0.2, 1.0), "updates": (150, 100), "validate_every": 50, "validation_s": 5.0}
+SMALL |= {"optimizer": AdamW(learning_rate=2e-2)}
+
+
+@pytest.fixture(scope="module")
+def data():
+    channels, series = sample_series(6)
+    return channels, fit_scales(channels, series[:4]), series[:4], series[4:5], series[5:]
+
+
+def fitted(data, **changes):
+    channels, scales, train, validation, _ = data
+    twin = Recurrent(units=12, prefix_ticks=10).start(channels, scales, train, seed=0)
+    return fit_free_runs(twin, train, validation, FreeRunSpec(**{**SMALL, **changes}))
+
+
+@pytest.mark.training
+def test_free_runs_are_learned_far_better_than_the_static_map(data):
+    channels, scales, train, _, test = data
+    result = fitted(data)
+    floor = TWINS["static"]().start(channels, scales, train, 0)
+    errors = [
+        free_run_scores(free_runs(twin, test, 8.0, 4), (8.0,))["velocity_mae"]["mean"] for twin in (result.twin, floor)
+    ]
+    assert errors[0] < 0.6 * errors[1]
+    assert [row["update"] for row in result.history] == [50, 100, 150, 200, 250]
+    assert result.history[-1]["validation"] < 0.7 * result.history[0]["validation"]
+
+
+@pytest.mark.training
+def test_a_seed_settles_every_bit_and_another_one_changes_them(data):
+    short = {"lengths_s": (0.2,), "updates": (20,), "validate_every": 10}
+    first, again, other = (fitted(data, seed=seed, **short).twin.arrays() for seed in (0, 0, 1))
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    assert not np.array_equal(first["h_weight"], other["h_weight"])
+
+
+def test_the_best_validation_is_kept(data, monkeypatch):
+    errors = iter([3.0, 1.0, 2.0, 4.0])
+    monkeypatch.setattr("edp.training.free_run.FreeRunValidation.error", lambda self: next(errors))
+    seen = []
+    channels, scales, train, validation, _ = data
+    twin = Recurrent(units=4, prefix_ticks=5).start(channels, scales, train, seed=0)
+    spec = FreeRunSpec(**{**SMALL, "lengths_s": (0.1,), "updates": (40,), "validate_every": 10})
+    result = fit_free_runs(twin, train, validation, spec, lambda e: seen.append((e.best, twin.arrays()["h_weight"])))
+    assert [best for best, _ in seen] == [True, True, False, False]
+    assert np.array_equal(result.twin.arrays()["h_weight"], seen[1][1])
+    assert not np.array_equal(result.twin.arrays()["h_weight"], seen[3][1])
+
+
+def test_the_last_stage_ends_early_and_no_other_one(data, monkeypatch):
+    errors = iter([1.0] + [2.0] * 50)
+    monkeypatch.setattr("edp.training.free_run.FreeRunValidation.error", lambda self: next(errors))
+    history = fitted(data, lengths_s=(0.1, 0.1), updates=(30, 100), validate_every=5, patience=3).history
+    assert [row["update"] for row in history] == [5, 10, 15, 20, 25, 30, 35]
+
+
+def test_stretches_lie_within_recordings_and_begin_everywhere(data):
+    channels, scales, train, _, _ = data
+    twin = Recurrent(units=4, prefix_ticks=5).start(channels, scales, train, seed=0)
+    sampler = FreeRunSampler(twin, train, 20)
+    rows = sampler.rows(25, 20_000, np.random.default_rng(0))
+    assert rows.shape == (26, 20_000)
+    owners = np.searchsorted(np.cumsum([s.samples for s in train]), rows, side="right")
+    assert (owners == owners[0]).all()
+    assert set(rows[0]) == {s * 600 + t for s in range(4) for t in range(600 - 25)}
+    expected = twin.scaled_commands(train[2].inputs)
+    assert np.array_equal(sampler.commands[1200:1800], expected)
+
+
+def test_ports_are_measured_by_their_shares():
+    spec = FreeRunSpec(measured_share=0.25, mixed_share=0.25)
+    ports = measured_ports(spec, (30, 4000, 6), 10, np.random.default_rng(0))
+    assert (ports[0] == 1).all()
+    later = ports[10:]
+    assert (later == later[:1]).all()
+    measured, free = (later[0] == 1).all(axis=1).mean(), (later[0] == 0).all(axis=1).mean()
+    assert measured == pytest.approx(0.25, abs=0.03)
+    assert free == pytest.approx(0.5, abs=0.03)
+    mixed = ~((later[0] == 1).all(axis=1) | (later[0] == 0).all(axis=1))
+    assert later[0][mixed].mean() == pytest.approx(0.5, abs=0.03)
+    assert np.array_equal(ports[1][mixed], later[0][mixed])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lengths_s": (1.0,)}, r"1 lengths_s and 4 updates; one number"),
+        ({"measured_share": 0.7, "mixed_share": 0.3}, "leave no lane that runs free"),
+        ({"lanes": 0}, "lanes = 0"),
+        ({"lengths_s": (0.1, 1.0, 2.0, 1e9)}, "lengths_s"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        FreeRunSpec(**changes)
+
+
+def test_recordings_that_are_too_short_are_refused(data):
+    channels, scales, train, _, _ = data
+    twin = Recurrent(units=4, prefix_ticks=5).start(channels, scales, train, seed=0)
+    with pytest.raises(DataError, match=r"no stretch is longer than prefix and free run, 20\.1 s"):
+        FreeRunSampler(twin, train, 1000)
+
+
+@pytest.mark.training
+def test_a_gradient_that_is_not_finite_ends_the_training(data):
+    with pytest.raises(FreeRunDiverged, match=r"the gradient of update \d+ is not finite; lower"):
+        fitted(data, optimizer=AdamW(learning_rate=1e38), clip=1e6)
