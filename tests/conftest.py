@@ -250,7 +250,7 @@ def rows_of() -> Callable[..., np.ndarray]:
 
 @pytest.fixture(scope="session")
 def integers_of(predictor_of) -> Callable[[str], IntegerPredictor]:
-    """Predictors in whole numbers by structure, calibrated on smooth random inputs.
+    """Predictors in integers by structure, calibrated on smooth random inputs.
 
     Skips, with the reason that was given, where a network has no such form.
     """

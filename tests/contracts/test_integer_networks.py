@@ -1,4 +1,4 @@
-"""Every network that the registries allow, in whole numbers."""
+"""Every network that the registries allow, in integers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def series_of(rows, predictor):
 
 @pytest.fixture
 def network(structure, predictor_of, integers_of):
-    """A float network and its whole-number form."""
+    """A float network and its integer form."""
     return predictor_of(structure, dtype=torch.float32), integers_of(structure)
 
 
@@ -40,7 +40,7 @@ def test_networks_without_a_form_are_refused_by_name(structure, predictor_of, ro
 
 
 @pytest.mark.covering
-def test_whole_numbers_predict_nearly_the_same(network, rows_of):
+def test_integers_predict_nearly_the_same(network, rows_of):
     predictor, integers = network
     rows = [series_of(rows_of(predictor, seed=seed), predictor) for seed in (1, 2)]
     wanted, found = (np.stack(stream_predictions(each, rows)) for each in (predictor, integers))
@@ -68,7 +68,7 @@ def on_grid(graph):
 
 @pytest.mark.covering
 def test_sixteen_bit_values_lose_next_to_nothing(network, rows_of):
-    """Against double precision with weights that are whole numbers already: what is left is formats and tables."""
+    """Against double precision with weights that are integers already: what is left is formats and tables."""
     predictor, _ = network
     if predictor.physics is not None:
         pytest.skip("the equations stay in single precision, which poses of random inputs strain")

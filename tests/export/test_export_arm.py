@@ -14,7 +14,7 @@ CORES = {
     "m7": ("cortex-m7", "fpv5-sp-d16", "mps2-an500", 25_000_000),
     "m33": ("cortex-m33", "fpv5-sp-d16", "mps2-an505", 20_000_000),
 }
-# Instructions of a step on the M4 with GCC 12, -O2, in single precision and in whole numbers.
+# Instructions of a step on the M4 with GCC 12, -O2, in single precision and in integers.
 STORED = {
     ("hybrid", False): 8_315,
     ("tcn", False): 5_133,

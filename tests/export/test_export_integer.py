@@ -1,4 +1,4 @@
-"""C code in whole numbers against the integer reference, bit for bit."""
+"""C code in integers against the integer reference, bit for bit."""
 
 from __future__ import annotations
 

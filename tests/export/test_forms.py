@@ -12,7 +12,7 @@ from edp.workflows.parity import FORMS, Broken, Missing, Ran, compare, golden_ca
 from edp.workflows.parity.base import compared
 
 WHOLE = {"c", "torch_ticks"}
-"""Forms that whole numbers have at least."""
+"""Forms that integer networks have at least."""
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ def hot(bundle):
 
 
 def test_numbers_that_overflow_inside_end_in_a_restart(bundle_of, fuzzing, tmp_path):
-    """The fuzzer found NaN made a whole number in the exponential of such a network, which C leaves undefined."""
+    """The fuzzer found NaN converted to an integer in the exponential of such a network, which C leaves undefined."""
     bundle = hot(bundle_of("gru"))
     CTarget().write(bundle, "predictor", tmp_path)
     fuzzing.build(tmp_path)

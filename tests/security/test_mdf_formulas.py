@@ -221,7 +221,7 @@ def test_other_conversions_give_the_librarys_numbers(tmp_path):
         read = read_recording(tmp_path / f"{kind} {dtype}.mf4", BM_UP).column("BmUp")
         expected = np.load(tmp_path / f"{kind} {dtype}.npy")
         if kind == "ranges":
-            # The library leaves out whole numbers within a range; ASAM has both ends belong to it.
+            # The library leaves out integers within a range; ASAM has both ends belong to it.
             x = np.arange(100)
             last = dtype != "float64"
             first = (x >= 5) & (x < 9 + last)

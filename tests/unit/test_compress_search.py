@@ -60,7 +60,7 @@ def run(lever_sessions, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tight(run):
-    """Half of what the teacher takes in whole numbers."""
+    """Half of what the teacher takes in integers."""
     need = resource_usage(load_bundle(run).predictor, "w8a16", Budget())
     return Budget(name="tight", cycles=need.cycles[2] // 2, parameter_bytes=need.parameter_bytes // 2)
 

@@ -1,4 +1,4 @@
-"""The format of a network's inputs in whole numbers: what clips rare values may cost less than what is coarse."""
+"""The format of a network's inputs in integers: what clips rare values may cost less than what is coarse."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""``edp quantise``: a run in whole numbers is judged and exported as such."""
+"""``edp quantise``: a run in integers is judged and exported as such."""
 
 from __future__ import annotations
 
