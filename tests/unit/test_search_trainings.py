@@ -108,7 +108,7 @@ def test_a_process_of_a_pool_does_an_order_to_the_same_bits(order, record, tmp_p
         len({job.key, job_of(order, "other").key, *(job_of(other, "digest of the data").key for other in others)}) == 5
     )
     with LocalPool(1) as pool, Ledger(tmp_path) as ledger:
-        do = Dispatcher(ledger, pool, "digest of the data", on_record=lambda _, trained: told.append(trained))
+        do = Dispatcher(ledger, pool, "digest of the data", on_record=lambda *row: told.append(row[-1]))
         bad = dataclasses.replace(order, train=("s0", "s9"))
         outcomes = do([order, bad, order])
         assert [outcome.order for outcome in outcomes] == [order, bad, order]

@@ -13,7 +13,7 @@ from edp.storage.ledger import Ledger, read_records
 STUDY = """
 import sys
 from edp.storage.ledger import Ledger, TrainingIdentity
-from edp.workflows.search.batch import complete
+from edp.workflows.search.dispatch import complete
 from edp.workflows.search.executor import Job
 from edp.workflows.search.local import LocalPool
 

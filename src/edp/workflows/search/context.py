@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from edp.config.experiment import Table
 from edp.errors import ConfigError, DataError, closest
 from edp.stats.folds import repeated_folds, repeated_splits
+from edp.storage.ledger import Record
 from edp.workflows.search.modules import with_modules
 from edp.workflows.search.settings import SearchSpec
 from edp.workflows.search.space import WIDTHS, Candidate
@@ -37,6 +38,11 @@ class Outcome:
     status: str
     result: Mapping[str, Any] | None = None
     message: str = ""
+
+    @staticmethod
+    def of(order: TrainingRequest, record: Record) -> Outcome:
+        """The outcome of an order, from the ledger's record of it."""
+        return Outcome(order, str(record.status), record.result, record.message)
 
     def score(self, session: str, horizon: int, name: str = "composite") -> float:
         """A score on one session; NaN where the training did not end well, which counts as the worst."""

@@ -1,12 +1,16 @@
-"""What the phases of a search call to have their orders done."""
+"""The way of a training: a phase asks for it, a process does it, the ledger keeps it, the phase hears of it.
+
+`TrainingRequest` is what a phase asks for; `edp.workflows.search.jobs.job_of` makes a `Job` of it, whose key covers all
+that decides the result; whoever does the job answers with a `Record`, which the ledger keeps under that key; an
+`Outcome` is the record beside its request.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from edp.storage.ledger import FINAL, Ledger, Record
-from edp.workflows.search.batch import complete
 from edp.workflows.search.context import Outcome
 from edp.workflows.search.executor import START, Executor, Job
 from edp.workflows.search.jobs import job_of
@@ -16,7 +20,7 @@ from edp.workflows.search.trainings import TrainingRequest
 
 @dataclass(frozen=True)
 class Dispatcher:
-    """Has the orders of a phase done: what `edp.workflows.search.run_phases` calls.
+    """Has the trainings done that a phase asks for: what `edp.workflows.search.run_phases` calls.
 
     Attributes:
         ledger: of the study.
@@ -25,8 +29,8 @@ class Dispatcher:
         threads: of each training; the pool pins as many.
         seconds: cap on the time of a training.
         memory_mb: cap on its memory.
-        on_record: called with each record, and whether it was trained now.
-        on_orders: called with each batch before it is done: keys and orders.
+        on_batch: called with the requests of a batch by key before any of them is done.
+        on_record: called with each record, its request, and whether it was trained now.
         teacher_keys: keys of the networks of phase 6, whose states later ones are made of.
     """
 
@@ -36,42 +40,90 @@ class Dispatcher:
     threads: int = 1
     seconds: float | None = None
     memory_mb: float | None = None
-    on_record: Callable[[Record, bool], None] | None = None
-    on_orders: Callable[[list[str], list[TrainingRequest]], None] | None = None
+    on_batch: Callable[[Mapping[str, TrainingRequest]], None] = lambda batch: None
+    on_record: Callable[[Record, TrainingRequest, bool], None] = lambda record, request, trained: None
     teacher_keys: set[str] = field(default_factory=set)
 
-    def __call__(self, orders: list[TrainingRequest]) -> list[Outcome]:
-        """Outcomes in the order of the orders; equal orders are done once.
+    def __call__(self, requests: list[TrainingRequest]) -> list[Outcome]:
+        """Outcomes in the order of the requests; equal ones are done once.
 
         Parts of trainings go on from the latest part before them whose state is still there. Once a batch is trained,
         states of other batches are not needed any more and removed.
         """
-        jobs = [self._job(order) for order in orders]
-        if self.on_orders is not None:
-            self.on_orders([job.key for job in jobs], orders)
+        keys = [self._job(request).key for request in requests]
+        batch = dict(zip(keys, requests, strict=True))
+        self.on_batch(batch)
         # Asked before the trainings: afterwards every record is there.
-        new = any(self.ledger.finished(job.key) is None for job in jobs)
-        records_by_key = complete(
-            self.ledger, self.executor, [self._begun(*pair) for pair in zip(jobs, orders)], self.on_record
+        new = any(self.ledger.finished(key) is None for key in batch)
+        records = complete(
+            self.ledger,
+            self.executor,
+            [self._begun(request) for request in batch.values()],
+            lambda record, trained: self.on_record(record, batch[record.key], trained),
         )
-        self.teacher_keys.update(job.key for job, order in zip(jobs, orders) if order.recipe is not None)
+        self.teacher_keys.update(key for key, request in batch.items() if request.recipe is not None)
         # A search that goes on comes by earlier batches first, and one that stops here needs what it had.
-        if new and all(record.status in FINAL for record in records_by_key.values()):
-            self.ledger.keep_states({*self.teacher_keys, *(job.key for job in jobs)})
-        records = [records_by_key[job.key] for job in jobs]
-        return [Outcome(o, str(r.status), r.result, r.message) for o, r in zip(orders, records)]
+        if new and all(record.status in FINAL for record in records.values()):
+            self.ledger.keep_states({*self.teacher_keys, *batch})
+        return [Outcome.of(request, records[key]) for request, key in zip(requests, keys, strict=True)]
 
-    def _job(self, order: TrainingRequest) -> Job:
-        return job_of(order, self.data, self.threads, self.seconds, self.memory_mb)
+    def _job(self, request: TrainingRequest) -> Job:
+        return job_of(request, self.data, self.threads, self.seconds, self.memory_mb)
 
-    def _begun(self, job: Job, order: TrainingRequest) -> Job:
-        """The job with the state from which it goes on, where there is one."""
+    def _begun(self, request: TrainingRequest) -> Job:
+        """The job of a request, with the state from which it goes on, where there is one."""
+        job = self._job(request)
         if self.ledger.finished(job.key):
             return job
         # The latest rung saves most of the training.
-        earlier = [replace(order, until=stop, stops=()) for stop in reversed(order.stops)]
-        for one in [*earlier, *before(order)]:
-            file = self.ledger.state(self._job(one).key)
+        rungs = [replace(request, until=stop, stops=()) for stop in reversed(request.stops)]
+        for earlier in [*rungs, *before(request)]:
+            file = self.ledger.state(self._job(earlier).key)
             if file is not None:
                 return replace(job, where={**job.where, START: str(file)})
         return job
+
+
+def complete(
+    ledger: Ledger, executor: Executor, jobs: Iterable[Job], on_record: Callable[[Record, bool], None] | None = None
+) -> dict[str, Record]:
+    """The records of all jobs by key, in the order of the jobs: what the ledger holds is not done again.
+
+    Args:
+        ledger: of the study; each training is on disk before `on_record` hears of it.
+        executor: does what the ledger does not hold; jobs of others that it runs must not come back meanwhile.
+        jobs: equal ones are done once.
+        on_record: called with each record and whether it was trained now.
+
+    Raises:
+        StorageError: a record could not be written; what ran is stopped, and what was entered stays.
+    """
+    tell = on_record or (lambda record, trained: None)
+    # Equal jobs share a key and are trained once.
+    jobs_by_key = {job.key: job for job in jobs}
+    records: dict[str, Record] = {}
+    waiting: set[str] = set()
+    try:
+        for key, job in jobs_by_key.items():
+            finished_record = ledger.finished(key)
+            if finished_record is not None:
+                records[key] = finished_record
+                tell(finished_record, False)
+            else:
+                executor.submit(replace(job, folder=str(ledger.path)))
+                waiting.add(key)
+        while waiting:
+            # Everything is submitted before the first wait, so that no worker is idle while others train.
+            record = executor.wait_any()
+            if record is None:
+                raise RuntimeError(f"the executor gave up {len(waiting)} trainings without a word")
+            waiting.discard(record.key)
+            # Into the ledger before anybody hears of it: what was told must survive a kill.
+            ledger.put(record)
+            records[record.key] = record
+            tell(record, True)
+    finally:
+        # An exception or an interrupt must not leave trainings running that nobody waits for.
+        for key in waiting:
+            executor.cancel(key)
+    return {key: records[key] for key in jobs_by_key}

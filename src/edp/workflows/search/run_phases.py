@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from edp.errors import ConfigError
+from edp.errors import ConfigError, DataError, LostError
+from edp.storage.ledger import TrainingStatus
 from edp.workflows.search.context import Decision, Outcome, SearchContext
 from edp.workflows.search.phases import PHASES
 from edp.workflows.search.trainings import TrainingRequest
 
 Do = Callable[[list[TrainingRequest]], list[Outcome]]
-"""Has orders done side by side; outcomes in their order. Orders that were done before need not be done again."""
+"""Has orders done side by side; outcomes in their order. Orders that were done before need not be done again. That of
+a study is an `edp.workflows.search.dispatch.Dispatcher`."""
 
 
 def run_phases(
@@ -37,6 +39,8 @@ def run_phases(
 
     Raises:
         ConfigError: an unknown phase.
+        LostError: a training was lost.
+        DataError: every one of several trainings of a batch ended in an error.
     """
     names = list(PHASES if phases is None else phases)
     if until is not None:
@@ -61,7 +65,27 @@ def _run(name: str, context: SearchContext, do: Do) -> Decision:
         # A phase is a coroutine: it keeps its place between batches and holds no other state.
         orders = next(course)
         while True:
-            orders = course.send(do(orders))
+            orders = course.send(_sound(do(orders)))
     except StopIteration as end:
         decision: Decision = end.value
         return decision
+
+
+def _sound(outcomes: list[Outcome]) -> list[Outcome]:
+    """The outcomes of a batch, unless they tell of a fault that a decision must not rest on.
+
+    Raises:
+        LostError: a training was lost.
+        DataError: every one of several trainings ended in an error.
+    """
+    lost = [outcome for outcome in outcomes if outcome.status == TrainingStatus.LOST]
+    if lost:
+        raise LostError(
+            f"{len(lost)} trainings were lost: {lost[0].message}. What is done is kept; free memory or take fewer "
+            "workers, and give the same command again"
+        )
+    # One failure is a result; a whole batch of them is a fault that a decision must not rest on.
+    failed = [outcome for outcome in outcomes if outcome.status == TrainingStatus.FAILED]
+    if len(outcomes) > 1 and len(failed) == len(outcomes):
+        raise DataError(f"all {len(outcomes)} trainings of a batch failed; the first says: {failed[0].message}")
+    return outcomes

@@ -16,14 +16,14 @@ import tomli_w
 
 from edp.config.experiment import Experiment, Table, build, plain_tree
 from edp.data.frozen import SECOND_TEST_SET, ByFrozen
-from edp.errors import ConfigError, DataError, LostError
+from edp.errors import ConfigError, DataError
 from edp.logs.source import DataSource
 from edp.recording import Recording
 from edp.settings.bounds import MOST_THREADS, above, check_bounds, whole
 from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
-from edp.storage.ledger import Ledger, Record, TrainingStatus
-from edp.workflows.search.context import Decision, Outcome, SearchContext, set_apart
+from edp.storage.ledger import Ledger, Record
+from edp.workflows.search.context import Decision, SearchContext, set_apart
 from edp.workflows.search.dispatch import Dispatcher
 from edp.workflows.search.executor import Executor
 from edp.workflows.search.local import LocalPool
@@ -172,22 +172,20 @@ def run_search(
         study_log = StudyLog(target, _facts(plan, data, source, context), context)
         executor = open_things.enter_context(resources.gather())
         study_log.workers = executor.workers
-        work = _Work(ledger, study_log, context, callbacks)
-        doing = Dispatcher(
+        observer = _Observer(ledger, study_log, context, callbacks)
+        dispatcher = Dispatcher(
             ledger,
             executor,
             data.digest,
             resources.threads,
             resources.seconds,
             resources.memory_mb,
-            work.on_record,
-            work.on_orders,
+            observer.on_batch,
+            observer.on_record,
         )
         state = "stopped"
         try:
-            context = run_phases(
-                context, lambda orders: _whole(doing(orders)), until, work.on_decision, on_phase=work.on_phase
-            )
+            context = run_phases(context, dispatcher, until, observer.on_decision, on_phase=observer.on_phase)
             # States were for going on; at the end nothing reads them.
             ledger.keep_states(())
             state = "finished" if len(context.decided) == len(PHASES) else "stopped"
@@ -196,7 +194,7 @@ def run_search(
             study_log.openings = ledger.openings()
             study_log.end(state)
         split = frozen_split(target, context, data.digests)
-        networks = write_networks(target, source, context, split, work.judged_networks)
+        networks = write_networks(target, source, context, split, observer.judged_networks)
         teacher = _write_teacher(target, context, split)
         return SearchResult(target, context, state, ledger.digest(), study_log.trained, teacher, networks)
 
@@ -232,38 +230,35 @@ class _Data:
         return _Data(names, families, recordings[0].channel_names, state.hexdigest(), hours, unit, digests)
 
 
-class _Work:
+class _Observer:
     """Passes on what happens, and opens a sealed test set when a batch is to be judged on its sessions.
 
     Attributes:
-        orders: of the batch under way, by key.
-        judged: networks that were judged on the second test set, by name: order and result.
+        judged_networks: networks that were judged on the second test set, by name: order and result.
     """
 
     def __init__(self, ledger: Ledger, study_log: StudyLog, context: SearchContext, callbacks: SearchCallbacks) -> None:
         self.ledger, self.study_log, self.context, self.callbacks = ledger, study_log, context, callbacks
-        self.orders: dict[str, TrainingRequest] = {}
         self.judged_networks: dict[str, JudgedNetwork] = {}
 
     def on_phase(self, name: str, context: SearchContext) -> None:
         self.study_log.on_phase(name, context)
         self.callbacks.on_phase(name, self.study_log)
 
-    def on_orders(self, keys: Sequence[str], orders: Sequence[TrainingRequest]) -> None:
-        self.orders = dict(zip(keys, orders, strict=True))
+    def on_batch(self, batch: Mapping[str, TrainingRequest]) -> None:
         for test_set, sessions, why in (
             (TEST_SET, self.context.test, "phase 4: its winner and the baseline, trained at length"),
             (SECOND_TEST_SET, self.context.second, "phase 6: the chosen network and its teacher"),
         ):
-            sealed = sorted({key for key, order in self.orders.items() if set(order.judged) & set(sessions)})
+            sealed = sorted({key for key, order in batch.items() if set(order.judged) & set(sessions)})
             if sealed:
                 self._open(test_set, sealed, why)
-        self.study_log.on_orders(keys, orders)
+        self.study_log.on_batch(batch)
         self.callbacks.on_progress(self.study_log)
 
     def _open(self, test_set: str, keys: Sequence[str], why: str) -> None:
-        # Recorded before it is made: a kill in between must not leave an opening without a trace.
         """Record an opening before it is made. ``edp compress`` may have opened the second test set before phase 6."""
+        # Recorded before it is made: a kill in between must not leave an opening without a trace.
         earlier = [one for one in self.ledger.openings(test_set) if one.judged != tuple(keys)]
         self.ledger.open_test_set(test_set, keys, why, again=test_set == SECOND_TEST_SET)
         if earlier:
@@ -273,8 +268,7 @@ class _Work:
             )
         self.study_log.openings = self.ledger.openings()
 
-    def on_record(self, record: Record, trained: bool) -> None:
-        order = self.orders[record.key]
+    def on_record(self, record: Record, order: TrainingRequest, trained: bool) -> None:
         if record.result is not None and set(order.judged) & set(self.context.second):
             self.judged_networks[network_name(order)] = JudgedNetwork(order, record.result)
         self.study_log.on_record(record, order, trained)
@@ -283,26 +277,6 @@ class _Work:
     def on_decision(self, decision: Decision) -> None:
         self.study_log.on_decision(decision)
         self.callbacks.on_decision(decision)
-
-
-def _whole(outcomes: list[Outcome]) -> list[Outcome]:
-    """The outcomes of a batch, unless they tell of a fault that a decision must not rest on.
-
-    Raises:
-        LostError: a training was lost.
-        DataError: every one of several trainings ended in an error.
-    """
-    lost = [outcome for outcome in outcomes if outcome.status == TrainingStatus.LOST]
-    if lost:
-        raise LostError(
-            f"{len(lost)} trainings were lost: {lost[0].message}. What is done is kept; free memory or take fewer "
-            "workers, and give the same command again"
-        )
-    # One failure is a result; a whole batch of them is a fault that a decision must not rest on.
-    failed = [outcome for outcome in outcomes if outcome.status == TrainingStatus.FAILED]
-    if len(outcomes) > 1 and len(failed) == len(outcomes):
-        raise DataError(f"all {len(outcomes)} trainings of a batch failed; the first says: {failed[0].message}")
-    return outcomes
 
 
 def _refuse_twice(recordings: Sequence[Recording]) -> None:

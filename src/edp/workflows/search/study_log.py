@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -85,12 +85,12 @@ class StudyLog:
             self._expected[later] = PHASES[later].trainings(context)
         self.write(force=True)
 
-    def on_orders(self, keys: Sequence[str], orders: Sequence[TrainingRequest]) -> None:
-        """A batch of trainings is asked for; those that were asked for before are no new ones."""
+    def on_batch(self, batch: Mapping[str, TrainingRequest]) -> None:
+        """A batch of trainings is asked for, by key; those that were asked for before are no new ones."""
         phase = self._phase
-        self._row_of = {key: digest_of(order.whole.to_json()) for key, order in zip(keys, orders, strict=True)}
+        self._row_of = {key: digest_of(order.whole.to_json()) for key, order in batch.items()}
         self._end_paused(self._row_of.values())
-        for key, order in zip(keys, orders, strict=True):
+        for key, order in batch.items():
             if self._row_of[key] not in self.rows:
                 # A training in parts is one row, so its key is that of the whole.
                 phase["trainings"] += 1
@@ -105,7 +105,7 @@ class StudyLog:
         self._heard.add(record.key)
         which = self._row_of[record.key]
         row = self.rows[which]
-        outcome = Outcome(order, str(record.status), record.result, record.message)
+        outcome = Outcome.of(order, record)
         score, result = outcome.mean(self.horizon), record.result or {}
         seconds = float(record.measured.get("seconds", 0.0))
         row |= {

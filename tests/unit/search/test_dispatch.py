@@ -43,7 +43,7 @@ def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(conte
             do = Dispatcher(ledger, pool, "data", on_record=on_record)
             return run_phases(context, do, until="isolation").decided["isolation"]
 
-    def stop_after_three(record, now):
+    def stop_after_three(record, order, now):
         trained.append(record.key)
         assert now
         if len(trained) == 3:
@@ -52,12 +52,12 @@ def test_a_search_that_was_stopped_does_nothing_twice_and_decides_the_same(conte
     with pytest.raises(Stop):
         search(stop_after_three)
     seen = []
-    decision = search(lambda record, now: seen.append((record.key, now, record.status)))
+    decision = search(lambda record, order, now: seen.append((record.key, now, record.status)))
     assert sum(not now for _, now, _ in seen) >= 3
     assert len({key for key, _, _ in seen}) == len(seen) == 8
     assert {status for *_, status in seen} == {TrainingStatus.DONE}
     seen.clear()
-    again = search(lambda record, now: seen.append(now))
+    again = search(lambda record, order, now: seen.append(now))
     assert not any(seen)
     assert again == decision
     assert decision.facts["arms"]["lstm all"]["seed"] > 0
