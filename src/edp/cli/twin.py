@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def twin(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
-    folder: Annotated[Path, typer.Option("--out", help="Run folder; a finished run is read.")],
+    folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.units=64.")] = [],  # noqa: B006
     signal_map: MapOption = None,

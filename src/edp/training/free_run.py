@@ -22,7 +22,7 @@ from edp.data.series import Series
 from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.networks.losses.huber import huber
 from edp.networks.twin import Twin, even_starts
-from edp.networks.twin.recurrent import RecurrentTwin
+from edp.networks.twin.recurrent import RecurrentTwin, TwinNetwork
 from edp.settings.bounds import (
     MOST_BATCH,
     MOST_NAMES,
@@ -36,6 +36,8 @@ from edp.settings.bounds import (
     check_count,
     whole,
 )
+from edp.storage.runs import KeyedRun
+from edp.training.checkpoint import FILE, Progress, Weights, damaged, load_checkpoint, save_checkpoint
 from edp.training.optimizers import OptimizerSpec, Soap
 
 Array = NDArray[np.float32]
@@ -201,6 +203,7 @@ def fit_free_runs(
     validation: Sequence[Series],
     spec: FreeRunSpec,
     on_event: Callable[[FreeRunProgress], None] | None = None,
+    run: KeyedRun | None = None,
 ) -> FittedTwin:
     """Train on free runs, choose by free runs of the validation part.
 
@@ -209,50 +212,76 @@ def fit_free_runs(
         train: training stretches.
         validation: stretches that choose among the weights on the way.
         spec: how to train.
-        on_event: called with progress.
+        on_event: called with progress, after each validation.
+        run: folder and key of the run; where given, a checkpoint after each validation makes it resumable.
 
     Raises:
         DataError: stretches that are too short.
         FreeRunDiverged: a gradient is not finite any more.
+        StorageError: a checkpoint is damaged, or of another run.
     """
     torch.set_num_threads(1)  # the products of a tick are too small to share
     rate, network = twin.channels.rate_hz, twin.network
     lengths = [max(1, round(length * rate)) for length in spec.lengths_s]
     if max(lengths) + twin.prefix_ticks > MOST_TICKS:
         raise ConfigError(f"free runs: {max(spec.lengths_s):g} s at {rate:g} Hz are more than {MOST_TICKS:,} ticks")
+    ticks = np.repeat(lengths, spec.updates)
     sampler = FreeRunSampler(twin, train, max(lengths))
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * rate), spec.lanes)
     optimizer = spec.optimizer.build(network.named_parameters())
     rates = [group["lr"] for group in optimizer.param_groups]
     weight = torch.from_numpy(answer_weights(twin, spec))
-    began, total = time.process_time(), sum(spec.updates)
-    history: list[dict[str, Any]] = []
-    best, waited, done = math.inf, 0, 0
-    chosen = copy.deepcopy(network.state_dict())
-    for stage, (ticks, updates) in enumerate(zip(lengths, spec.updates, strict=True)):
-        for _ in range(updates):
-            share = _rate(done / total, spec.warmup)
-            for group, base in zip(optimizer.param_groups, rates, strict=True):
-                group["lr"] = base * share
-            loss = _update(twin, sampler, spec, (ticks, done), weight, optimizer)
-            done += 1
-            if done % spec.validate_every and done != total:
-                continue
-            error = judge.error()
-            if error < best:
-                best, waited, chosen = error, 0, copy.deepcopy(network.state_dict())
-            else:
-                waited += 1
-            seconds = time.process_time() - began
-            row = {"update": done, "length_s": spec.lengths_s[stage], "loss": loss, "validation": error}
-            history.append(row | {"best": waited == 0, "seconds": round(seconds, 2)})
-            if on_event is not None:
-                left = _work_left(lengths, spec.updates, done, twin.prefix_ticks)
-                on_event(FreeRunProgress(done, total, spec.lengths_s[stage], seconds * left, error, waited == 0))
-            if spec.patience and waited >= spec.patience and stage == len(lengths) - 1:
-                break
+    progress, chosen = _resumed(run, network, optimizer)
+    before, began = progress.seconds, time.process_time()
+    while progress.updates < len(ticks) and not _waited_out(progress, spec, len(ticks)):
+        share = _rate(progress.updates / len(ticks), spec.warmup)
+        for group, base in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = base * share
+        loss = _update(twin, sampler, spec, (int(ticks[progress.updates]), progress.updates), weight, optimizer)
+        progress.updates += 1
+        if progress.updates % spec.validate_every and progress.updates != len(ticks):
+            continue
+        error = judge.error()
+        if error < progress.best_score:
+            progress.best_score, progress.best_epoch = error, progress.updates
+            chosen = copy.deepcopy(network.state_dict())
+        progress.seconds = before + time.process_time() - began
+        length_s = float(ticks[progress.updates - 1]) / rate
+        row = {"update": progress.updates, "length_s": length_s, "loss": loss, "validation": error}
+        best = progress.best_epoch == progress.updates
+        progress.history.append(row | {"best": best, "seconds": round(progress.seconds, 2)})
+        if run is not None:
+            weights = Weights(network.state_dict(), {}, chosen, torch.zeros(0))
+            save_checkpoint(run.folder.file(FILE), run.key, progress, weights, optimizer)
+        if on_event is not None:
+            worked = ticks + twin.prefix_ticks
+            left = worked[progress.updates :].sum() / worked[: progress.updates].sum()
+            on_event(FreeRunProgress(progress.updates, len(ticks), length_s, progress.seconds * left, error, best))
     network.load_state_dict(chosen)
-    return FittedTwin(twin, history, time.process_time() - began)
+    return FittedTwin(twin, progress.history, progress.seconds)
+
+
+def _resumed(
+    run: KeyedRun | None, network: TwinNetwork, optimizer: torch.optim.Optimizer
+) -> tuple[Progress, dict[str, Tensor]]:
+    """Where the run stands and its best weights; network and optimiser are set to where it stopped."""
+    checkpoint = None if run is None else load_checkpoint(run.folder.file(FILE), run.key)
+    if run is None or checkpoint is None:
+        return Progress(), copy.deepcopy(network.state_dict())
+    progress, weights, state = checkpoint
+    try:
+        network.load_state_dict(weights.current)
+        optimizer.load_state_dict(state)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise damaged(run.folder.file(FILE), error) from error
+    return progress, weights.best
+
+
+def _waited_out(progress: Progress, spec: FreeRunSpec, total: int) -> bool:
+    """Whether the last stage has gone on for too long without an improvement."""
+    since = sum(row["update"] > progress.best_epoch for row in progress.history)
+    judged = progress.history[-1]["update"] if progress.history else 0
+    return bool(spec.patience) and since >= spec.patience and judged > total - spec.updates[-1]
 
 
 def answer_weights(twin: RecurrentTwin, spec: FreeRunSpec) -> Array:
@@ -296,12 +325,6 @@ def _rate(progress: float, warmup: float) -> float:
     if progress < warmup:
         return (progress + 1e-3) / warmup
     return 0.5 * (1.0 + math.cos(math.pi * (progress - warmup) / max(1e-9, 1.0 - warmup)))
-
-
-def _work_left(lengths: Sequence[int], updates: Sequence[int], done: int, prefix: int) -> float:
-    """Ticks still to be run, as a multiple of those that were."""
-    ticks = np.repeat([length + prefix for length in lengths], updates)
-    return float(ticks[done:].sum() / ticks[:done].sum())
 
 
 class FreeRunValidation:

@@ -56,6 +56,23 @@ def test_a_run_holds_a_twin_its_settings_and_scores_beside_the_floors(edp, logs,
     assert "holds another run" in other.err
 
 
+def test_a_stopped_training_goes_on(edp, logs, trained, tmp_path, monkeypatch):
+    from edp.cli.twin import _Display
+
+    def stop(self, event):
+        if event.update == 3:
+            raise KeyboardInterrupt
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(_Display, "on_event", stop)
+        assert edp("twin", logs, "--out", run, *WORDS).code == 130
+    assert not (run / "twin").exists()
+    assert edp("twin", logs, "--out", run, *WORDS).code == 0
+    resumed, whole = (load_twin(folder).twin.arrays() for folder in (run, trained))
+    assert all(np.array_equal(resumed[name], whole[name]) for name in whole)
+
+
 def test_floors_are_formulations_of_their_own(edp, logs, tmp_path):
     ended = edp("twin", logs, "--out", tmp_path / "run", "--set", "twin.kind=arx", *WORDS[4:], "--json")
     models = ended.json["models"]
@@ -130,4 +147,5 @@ def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, t
     write_recording(replace(recording, rate_hz=25.0), slow)
     assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
     assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())
-    assert "holds a twin" in " ".join(edp("evaluate", trained).err.split())
+    for command in ("evaluate", "report", "parity"):
+        assert "holds a twin" in " ".join(edp(command, trained).err.split())

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from edp.errors import ConfigError, DataError
+from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.free_run import free_run_scores, free_runs
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.recurrent import Recurrent
+from edp.storage.runs import KeyedRun, RunFolder
 from edp.testing.twins import sample_series
 from edp.training.free_run import FreeRunDiverged, FreeRunSampler, FreeRunSpec, fit_free_runs, measured_ports
-from edp.training.optimizers import AdamW
+from edp.training.optimizers import AdamW, Soap
 
 SMALL = {"lanes": 16, "lengths_s": (0.2, 1.0), "updates": (150, 100), "validate_every": 50, "validation_s": 5.0}
 SMALL |= {"optimizer": AdamW(learning_rate=2e-2)}
@@ -46,6 +47,38 @@ def test_a_seed_settles_every_bit_and_another_one_changes_them(data):
     first, again, other = (fitted(data, seed=seed, **short).twin.arrays() for seed in (0, 0, 1))
     assert all(np.array_equal(first[name], again[name]) for name in first)
     assert not np.array_equal(first["h_weight"], other["h_weight"])
+
+
+class Stop(Exception):
+    """Raised in place of Ctrl-C."""
+
+
+@pytest.mark.training
+@pytest.mark.parametrize("optimizer", [AdamW(learning_rate=1e-2), Soap()], ids=["adamw", "soap"])
+def test_a_stopped_training_goes_on_to_the_same_bits(data, tmp_path, optimizer):
+    channels, scales, train, validation, _ = data
+    stages = {"lengths_s": (0.1, 0.2), "updates": (20, 20), "validate_every": 10, "optimizer": optimizer}
+    spec = FreeRunSpec(**{**SMALL, **stages})
+
+    def new():
+        return Recurrent(units=6, prefix_ticks=10).start(channels, scales, train, seed=0)
+
+    def stop(event):
+        if event.update in (10, 30):
+            raise Stop
+
+    whole = fit_free_runs(new(), train, validation, spec)
+    for _ in range(2):
+        with RunFolder(tmp_path) as folder, pytest.raises(Stop):
+            fit_free_runs(new(), train, validation, spec, stop, KeyedRun(folder, "k" * 32))
+    with RunFolder(tmp_path) as folder:
+        resumed = fit_free_runs(new(), train, validation, spec, run=KeyedRun(folder, "k" * 32))
+    first, second = whole.twin.arrays(), resumed.twin.arrays()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    facts = [[{k: v for k, v in row.items() if k != "seconds"} for row in fit.history] for fit in (whole, resumed)]
+    assert facts[0] == facts[1]
+    with RunFolder(tmp_path) as folder, pytest.raises(StorageError, match="belongs to another run"):
+        fit_free_runs(new(), train, validation, spec, run=KeyedRun(folder, "x" * 32))
 
 
 def test_the_best_validation_is_kept(data, monkeypatch):

@@ -112,6 +112,11 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
     folder = Path(run_folder)
     if not folder.is_dir():
         raise StorageError(f"no run folder at '{folder}'; give the folder that `edp train` wrote")
+    if (folder / "twin" / "twin.json").is_file():
+        raise StorageError(
+            f"'{folder}' holds a twin, which has no report page yet; its scores are in free_run.json, and edp rollout "
+            "runs it along a log"
+        )
     absent = tuple(name for name in MAKERS if not (folder / name).is_file())
     if len(absent) == len(MAKERS):
         raise StorageError(f"'{folder}' is not a run folder: it holds none of {listed(MAKERS)}")

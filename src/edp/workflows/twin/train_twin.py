@@ -18,7 +18,7 @@ from edp.networks.twin import TWINS, Twin, TwinSpec, fit_scales
 from edp.networks.twin.base import check_length
 from edp.networks.twin.recurrent import RecurrentTwin
 from edp.storage import write_json
-from edp.storage.runs import RunFolder, command_line, environment, run_key
+from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.free_run import FittedTwin, FreeRunProgress, fit_free_runs
 from edp.training.twin_bundle import HEADER, TwinBundle, load_twin, save_twin
 
@@ -48,7 +48,8 @@ def train_twin(
     on_event: Callable[[FreeRunProgress], None] | None = None,
     on_step: Callable[[str], None] | None = None,
 ) -> TrainedTwin:
-    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``. A finished one is read.
+    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``. A finished one is read,
+    a stopped one goes on.
 
     Args:
         source: where the recordings are.
@@ -74,7 +75,8 @@ def train_twin(
         twin = experiment.twin.start(channels, scales, data.train, experiment.training.seed)
         if isinstance(twin, RecurrentTwin):
             tell("training on free runs")
-            fitted = fit_free_runs(twin, data.train, data.validation, experiment.training, on_event)
+            keyed = KeyedRun(run, key)
+            fitted = fit_free_runs(twin, data.train, data.validation, experiment.training, on_event, keyed)
             run.write_history(fitted.history)
         else:
             fitted = FittedTwin(twin, [], time.process_time() - started)
