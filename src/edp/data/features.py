@@ -5,48 +5,110 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from edp.errors import ConfigError, DataError
 from edp.recording import FloatArray, Recording
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, MOST_TICKS, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, whole
 from edp.signals import TABLE_A1, VOCABULARY, Kind
 
 STARTING = "starting"
 """The feature that tells a network whether channels of the start are read at this tick."""
 
-Derivation = Callable[[Any, Any, float], Any]
-"""(value now, value one tick before, rate in Hz) to the derived value; the same code serves arrays and tensors."""
+MOST_SECONDS = 31_557_600.0  # a year; how many ticks a span may have is checked where the rate is known
+ROUNDING = 1e-6
+"""Ticks by which a span may miss a whole number of them."""
+MOST_LAG = 4096
+"""Longest span in ticks that a layer before a network looks back; a longer memory is the work of a recurrent layer."""
+Gain = Callable[[int, float], float]
+"""(ticks of the span, rate in Hz) to a factor."""
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """``gain mean(s[t], ..., s[t - n + 1])``, where s is the source or its change from tick to tick.
+
+    The first tick after a reset is its own predecessor, so its change is 0; before n ticks have passed, the mean is
+    that of those seen. All derivations are causal, and made of layers that every export has.
+
+    Attributes:
+        of_changes: whether s is the change ``x[t] - x[t - 1]``, and not x itself.
+        gain: see `Gain`.
+        least_ticks: of a span that is given in seconds; 0 where the derivation takes none, and n is 1.
+    """
+
+    of_changes: bool
+    gain: Gain
+    least_ticks: int = 0
+
 
 DERIVATIONS: Registry[Derivation] = Registry("derivation")
-
-
-@DERIVATIONS.register("difference")
-def difference(now: Any, before: Any, rate_hz: float) -> Any:
-    """``x[t] - x[t-1]`` (eq. 3.1), in the unit of the source."""
-    return now - before
-
-
-@DERIVATIONS.register("derivative")
-def derivative(now: Any, before: Any, rate_hz: float) -> Any:
-    """Backward difference quotient ``(x[t] - x[t-1]) rate``, in unit per second; never a central one."""
-    return (now - before) * rate_hz
+DERIVATIONS.register("difference")(Derivation(of_changes=True, gain=lambda ticks, rate_hz: 1.0))
+"""``x[t] - x[t - 1]`` (eq. 3.1), in the unit of the source."""
+DERIVATIONS.register("derivative")(Derivation(of_changes=True, gain=lambda ticks, rate_hz: rate_hz))
+"""Backward difference quotient ``(x[t] - x[t - 1]) rate``, in unit per second; never a central one."""
+DERIVATIONS.register("change")(Derivation(of_changes=True, gain=lambda ticks, rate_hz: float(ticks), least_ticks=1))
+"""``x[t] - x[t - n]``; in the first n ticks what it would be if the stream had gone on like this before."""
+DERIVATIONS.register("trailing_mean")(Derivation(of_changes=False, gain=lambda ticks, rate_hz: 1.0, least_ticks=2))
+"""Mean of the last n values, in the unit of the source."""
 
 
 @dataclass(frozen=True)
 class Derived:
-    """A channel computed from one source channel, now and one tick before; its value at the first tick is 0."""
+    """A channel computed tick by tick from one source channel.
+
+    Attributes:
+        name: its own.
+        source: the logged channel that it comes from.
+        how: a registered derivation.
+        kind: what it measures.
+        seconds: span that it looks back, for derivations that take one; rounded to ticks of the task's rate.
+    """
 
     name: str
     source: str
     how: str = "difference"
     kind: Kind = Kind.GENERIC
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
-        _ = DERIVATIONS[self.how]  # an unknown name fails here, with the closest one
+        least = DERIVATIONS[self.how].least_ticks  # an unknown name fails here, with the closest one
+        if least and self.seconds is None:
+            raise ConfigError(
+                f"derived '{self.name}': how = '{self.how}' looks back over a span; give it, for example seconds = 0.1"
+            )
+        if not least and self.seconds is not None:
+            timed = [f"'{name}'" for name in DERIVATIONS if DERIVATIONS[name].least_ticks]
+            raise ConfigError(
+                f"derived '{self.name}': seconds = {self.seconds:g} came with how = '{self.how}', which has no span; "
+                f"leave it out, or take {' or '.join(timed)}"
+            )
+        if self.seconds is not None:
+            check_bounds(f"derived '{self.name}'", self, seconds=above(0.0, MOST_SECONDS))
+
+    def ticks(self, rate_hz: float) -> int:
+        """How many ticks it looks back at a rate, n of its derivation; 1 where it takes no span.
+
+        Raises:
+            ConfigError: a span shorter than the derivation allows, or longer than `MOST_LAG`.
+        """
+        if self.seconds is None:
+            return 1
+        exact, least = self.seconds * rate_hz, DERIVATIONS[self.how].least_ticks
+        # A hair below, so that 0.03 s at 100 Hz, which floats make 2.9999 ticks, are 3.
+        if exact < least - ROUNDING or round(exact) > MOST_LAG:
+            raise ConfigError(
+                f"derived '{self.name}': seconds = {self.seconds:g} are {exact:.4g} ticks at {rate_hz:g} Hz; from "
+                f"{least} to {MOST_LAG} ticks must hold for how = '{self.how}': choose from {least / rate_hz:.4g} to "
+                f"{MOST_LAG / rate_hz:.4g} s"
+            )
+        return round(exact)
+
+    def gain(self, rate_hz: float) -> float:
+        """What the mean is multiplied by at a rate."""
+        return DERIVATIONS[self.how].gain(self.ticks(rate_hz), rate_hz)
 
 
 @dataclass(frozen=True)
@@ -114,10 +176,28 @@ FEATURE_SETS: Mapping[str, FeatureSet] = {"FG1": FG1, "FG2": FG2}
 
 
 def derive(entry: Derived, source: FloatArray, rate_hz: float) -> FloatArray:
-    """A derived channel over a whole stretch, shape ``(time,)``; the first tick is 0."""
-    # The first tick is its own predecessor, as in a stream from reset.
-    before = np.concatenate([source[:1], source[:-1]])
-    return np.asarray(DERIVATIONS[entry.how](source, before, rate_hz), dtype=np.float32)
+    """A derived channel over a whole stretch, shape ``(time,)``, as a stream gives it from reset.
+
+    Raises:
+        ConfigError: a span that does not go with the rate.
+    """
+    ticks, gain = entry.ticks(rate_hz), entry.gain(rate_hz)
+    if DERIVATIONS[entry.how].of_changes:
+        # The first tick is its own predecessor, as in a stream from reset.
+        before = np.concatenate([source[:1], source[:-1]])
+        values = (source - before) * np.float32(gain)
+        return np.asarray(values if ticks == 1 else _trailing_mean(source - before, ticks) * gain, dtype=np.float32)
+    return np.asarray(_trailing_mean(source, ticks) * gain, dtype=np.float32)
+
+
+def _trailing_mean(values: FloatArray, ticks: int) -> np.ndarray:
+    """Mean of the last `ticks` values, before that of those seen, ``(time,)`` in double precision."""
+    # About the first value: sums of 30 MPa over hours would lose the digits in which the signal lies.
+    first = float(values[0]) if len(values) else 0.0
+    sums = np.concatenate([np.zeros(1), np.cumsum(values.astype(np.float64) - first)])
+    count = np.arange(1, len(values) + 1)
+    begin = np.maximum(count - ticks, 0)
+    return np.asarray(first + (sums[count] - sums[begin]) / (count - begin))
 
 
 def column(recording: Recording, name: str, derived: Sequence[Derived]) -> FloatArray:

@@ -96,6 +96,8 @@ class Task:
             raise ConfigError(
                 f"task: horizons = {list(self.horizons)}; samples >= 0, increasing, each once, at least one"
             )
+        for entry in self.derived:
+            entry.ticks(self.rate_hz)  # a span that the rate does not allow fails here
         blind = [name for name in self.targets if name not in self.features.lasting]
         if self.mode is TargetMode.DELTA and blind:
             raise ConfigError(

@@ -2,26 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
-from edp.data.features import DERIVATIONS, derivative, difference
+from edp.data.features import DERIVATIONS, Derived
 from edp.data.scaling import Scaler
 from edp.data.task import Task
-from edp.errors import ExportError
 from edp.ir import Builder
 from edp.ir.layers import BinaryOperation, ScaleShift, Standardise
-from edp.ir.memory import Difference, Starting
+from edp.ir.memory import Difference, Starting, TrailingMean
 from edp.networks.streaming import Cost, State, Streaming
+from edp.networks.trailing import StreamingTrailingMean
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Derived channels that are means over one span of sources, or of their changes.
+
+    Attributes:
+        of_changes: see `Derivation`.
+        ticks: of the span; 1 needs no mean.
+        entries: their numbers among the derived channels.
+    """
+
+    of_changes: bool
+    ticks: int
+    entries: tuple[int, ...]
+
+
+def _spans(derived: Sequence[Derived], rate_hz: float) -> tuple[_Span, ...]:
+    """Derived channels by what they are means of, those without a span first."""
+    kinds = [(DERIVATIONS[entry.how].of_changes, entry.ticks(rate_hz)) for entry in derived]
+    return tuple(
+        _Span(*kind, tuple(number for number, other in enumerate(kinds) if other == kind))
+        for kind in sorted(set(kinds), key=lambda kind: (kind[1], kind[0]))
+    )
 
 
 class FrontEnd(Streaming):
     """Derived channels and scaling (eq. 3.1, 3.4, 3.5), with its numbers kept as buffers.
 
     Maps inputs ``(batch, time, input)`` in SI units to physical features ``(batch, time, feature)``; `scale` gives
-    the standardised ones. State: the previous tick's inputs and whether there was one; at the first tick after a
-    reset every derived value is 0. Inputs of the physics base follow those of the features and are passed over.
-    Channels of the start have their mean from `starting_ticks` on, whatever is fed; the state then counts the ticks.
+    the standardised ones. State: the previous tick's inputs, whether there was one, and what the derived channels'
+    means need; at the first tick after a reset every change is 0. Inputs of the physics base follow those of the
+    features and are passed over. Channels of the start have their mean from `starting_ticks` on, whatever is fed; the
+    state then counts the ticks.
     """
 
     offset: Tensor
@@ -37,27 +65,49 @@ class FrontEnd(Streaming):
         self.starting = [inputs.index(name) for name in task.features.starting]
         self.starting_ticks = task.features.starting_ticks if self.starting else 1
         self.lasting = len(task.features.lasting)
-        self.derived = [(DERIVATIONS[entry.how], inputs.index(entry.source)) for entry in task.features.derived]
+        derived = task.features.derived
+        self.derived = [inputs.index(entry.source) for entry in derived]
+        self.spans = _spans(derived, task.rate_hz)
+        self.means = nn.ModuleList(StreamingTrailingMean(len(s.entries), s.ticks) for s in self.spans if s.ticks > 1)
+        self.gains = [entry.gain(task.rate_hz) for entry in derived]
         self.register_buffer("offset", torch.tensor(scaler.feature_offset, dtype=torch.get_default_dtype()))
         self.register_buffer("width", torch.tensor(scaler.feature_scale, dtype=torch.get_default_dtype()))
 
     def initial_state(self, batch: int, like: Tensor) -> State:
-        return like.new_zeros(batch, 1, self.sources), like.new_zeros(batch, 1, 1)
+        rings = tuple(mean.initial_state(batch, like) for mean in self._means())
+        return like.new_zeros(batch, 1, self.sources), like.new_zeros(batch, 1, 1), rings
+
+    def _means(self) -> list[StreamingTrailingMean]:
+        return [mean for mean in self.means if isinstance(mean, StreamingTrailingMean)]
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        previous, age = state
+        previous, age, rings = state
         x = x[..., : self.sources]
         # At the first tick after a reset the previous sample is the tick itself: derivatives start at zero, not with
         # a jump.
         first = torch.where(age > 0.5, previous, x[:, :1])
         before = torch.cat([first, x[:, :-1]], dim=1)
-        columns = [x[..., : self.logged]]
-        for how, source in self.derived:
-            columns.append(how(x[..., source], before[..., source], self.rate_hz).unsqueeze(-1))
+        derived, rings = self._derive(x, x - before, rings)
+        columns = [x[..., : self.logged], *derived]
         if self.starting:
             columns += self._start(x[..., self.starting], age)
         # Age is counted no further than needed, so that it stays exact in float32 over hours.
-        return torch.cat(columns, dim=-1), (x[:, -1:], (age + x.shape[1]).clamp(max=self.starting_ticks))
+        age = (age + x.shape[1]).clamp(max=self.starting_ticks)
+        return torch.cat(columns, dim=-1), (x[:, -1:], age, rings)
+
+    def _derive(self, x: Tensor, change: Tensor, rings: tuple[State, ...]) -> tuple[list[Tensor], tuple[State, ...]]:
+        """Derived channels ``(batch, time, 1)`` each, in order, and what their means need next."""
+        columns: dict[int, Tensor] = {}
+        means, states, after = iter(self._means()), iter(rings), []
+        for span in self.spans:
+            source = change if span.of_changes else x
+            values = source[..., [self.derived[entry] for entry in span.entries]]
+            if span.ticks > 1:
+                values, ring = next(means)(values, next(states))
+                after.append(ring)
+            for column, entry in enumerate(span.entries):
+                columns[entry] = values[..., column : column + 1] * self.gains[entry]
+        return [columns[entry] for entry in range(len(self.derived))], tuple(after)
 
     def _start(self, x: Tensor, age: Tensor) -> list[Tensor]:
         """Channels of the start ``(batch, time, channel)``, and whether they are read at a tick."""
@@ -74,14 +124,31 @@ class FrontEnd(Streaming):
         """Physical features."""
         parts = [build.pick("logged", x, range(self.logged))]
         if self.derived:
-            factors = [_factor(how, self.rate_hz) for how, _ in self.derived]
-            sources = build.pick("sources", x, [source for _, source in self.derived])
-            parts.append(build.add(Difference, "derived", sources, factor=torch.tensor(factors), from_zero=False))
+            parts.append(self._lower_derived(build, x))
         if self.starting:
             mean = self.offset[self.lasting : self.lasting + len(self.starting)]
             read = build.pick("start", x, self.starting)
             parts.append(build.add(Starting, "starting", read, mean=mean, ticks=self.starting_ticks))
         return build.join("features", *parts)
+
+    def _lower_derived(self, build: Builder, x: str) -> str:
+        """Derived channels, in order: differences, the means of these and of values, then gains."""
+        results: list[str] = []
+        order: list[int] = []
+        for number, span in enumerate(self.spans):
+            sources = build.pick(f"sources{number or ''}", x, [self.derived[entry] for entry in span.entries])
+            gain = torch.tensor([self.gains[entry] for entry in span.entries])
+            name = f"derived{number or ''}"
+            if span.of_changes:
+                # A mean is linear: gains before it save a layer.
+                sources = build.add(Difference, name, sources, factor=gain, from_zero=False)
+            if span.ticks > 1:
+                size = len(span.entries)
+                sources = build.add(TrailingMean, f"{name}.mean", sources, size=size, window=span.ticks)
+            results.append(sources)
+            order += span.entries
+        together = build.join("derived_by_span", *results)
+        return build.pick("derived_in_order", together, [order.index(entry) for entry in range(len(order))])
 
     def lower_scale(self, build: Builder, features: str) -> str:
         """Standardised features."""
@@ -89,18 +156,6 @@ class FrontEnd(Streaming):
 
     def costs(self) -> list[Cost]:
         return [Cost("features and scaling", 0, width_in=self.inputs, width_out=int(self.offset.numel()))]
-
-
-def _factor(how: object, rate_hz: float) -> float:
-    """What a derivation multiplies a difference with."""
-    if how is difference:
-        return 1.0
-    if how is derivative:
-        return rate_hz
-    name = DERIVATIONS.name_of(how)
-    raise ExportError(
-        f"derivation '{name}' has no form as a layer; 'difference' and 'derivative' have: use one of them"
-    )
 
 
 class TargetTransform(nn.Module):

@@ -30,8 +30,8 @@ def usual_range(predictor: Predictor) -> tuple[Array, Array]:
     centre[:logged], spread[:logged] = offset[:logged], width[:logged]
     for number, entry in enumerate(features.derived):
         source = features.inputs.index(entry.source)
-        # A scaler knows the derivative's width; over one tick it bounds the change of the hidden source.
-        change = width[logged + number] / (predictor.task.rate_hz if entry.how == "derivative" else 1.0)
+        # A scaler knows the derived width; over one tick it bounds the change of the hidden source.
+        change = width[logged + number] / entry.gain(predictor.task.rate_hz)
         if source >= logged:
             spread[source] = min(spread[source], change)
     first, count = logged + hidden, len(features.starting)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from edp.data.features import MOST_LAG
 from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.ir.layers import ScaleShift
@@ -14,9 +15,6 @@ from edp.ir.memory import Difference
 from edp.networks.streaming import Cost, State, Streaming
 from edp.networks.trailing import StreamingTrailingMean
 from edp.settings.bounds import shown
-
-MOST_LAG = 4096
-"""Longest span in ticks; a longer memory is the work of a recurrent layer."""
 
 
 def check_lags(lags: Sequence[int]) -> None:

@@ -57,7 +57,8 @@ def size_at_most(spec: Any, task: Task) -> tuple[int, int]:
     )
     # A tree has two numbers a node and one a leaf.
     tables = targets * len(task.horizons) * max(0, most("trees")) * 3 * 2 ** most("tree_depth") if spans else 0
-    return squares * width**2 + ends + small + tables, 4 * reach * stacks * (levels + layers + 2) * width
+    spans_state = sum(2 * entry.ticks(task.rate_hz) for entry in task.features.derived)
+    return squares * width**2 + ends + small + tables, spans_state + 4 * reach * stacks * (levels + layers + 2) * width
 
 
 def _integers(parts: tuple[Any, ...] | list[Any], name: str = "") -> Iterator[tuple[str, int]]:

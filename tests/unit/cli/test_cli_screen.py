@@ -87,6 +87,14 @@ def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
     kept = load_experiment(tmp_path / "run" / "config.toml", preset=None).task
     assert (kept.features.name, set(kept.features.channels), kept.horizons) == ("proposed", {"lever", "speed"}, (5,))
 
+    lead = -min(curve["best"] for curve in found["lags"] if curve["channel"] == "lever")
+    settings = ["--map", out / "map.toml", "--config", out / "settings_with_changes.toml", "--out", tmp_path / "second"]
+    trained = edp("train", logs, *settings, *small)
+    assert trained.code == 0, trained.err
+    derived = load_experiment(tmp_path / "second" / "config.toml", preset=None).task.features.derived
+    spans = {entry.source: round(entry.seconds * found["rate_hz"]) for entry in derived if entry.how == "change"}
+    assert spans == {"lever": lead, "speed": 5}
+
 
 def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     drawn = []
@@ -115,14 +123,14 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     first = edp("screen", logs, "--out", out, "--exclude", "oracle,dead", *QUICK, *trials)
     assert first.code == 0, first.err
     lines = [line for line in first.err.splitlines() if line.startswith("trials: ")]
-    assert lines[0] == "trials: proposed, training 1 of 4, 0 %"
-    assert any(line.startswith("trials: random 1, training 4 of 4, epoch 1/1, 100 %, 0 s left") for line in lines)
+    assert lines[0] == "trials: proposed, training 1 of 5, 0 %"
+    assert any(line.startswith("trials: random 1, training 5 of 5, epoch 1/1, 100 %, 0 s left") for line in lines)
     assert not [line for line in lines if line.endswith(" 0 %, 0 s left")]
     assert "MAE 10 ahead, mm/s" in first.out
     table = [
         line.split()[0] for line in first.out.splitlines() if line.startswith(("proposed ", "mine ", "persistence "))
     ]
-    assert table == ["proposed", "mine", "persistence"]
+    assert table == ["proposed", "proposed", "mine", "persistence"]
 
     # What is trained already is not trained again.
     kept = (out / "trials" / "trials.json").read_bytes()
@@ -132,7 +140,7 @@ def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     facts = ended.json
     assert "oracle" not in facts["kept"] + facts["dropped"]
     names = [trial["name"] for trial in facts["trials"]["trials"]]
-    assert names == ["proposed", "all candidates", "mine", "random 1"]
+    assert names == ["proposed", "proposed + changes", "all candidates", "mine", "random 1"]
     assert drawn == [out / "pictures"] * 2
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "Held-out errors of the sets" in page

@@ -201,6 +201,21 @@ def _window(layer: memory.WindowAttention, m: Memory, q: Rows, k: Rows, v: Rows)
     return out
 
 
+def _trailing_mean(layer: memory.TrailingMean, m: Memory, x: Rows) -> Rows:
+    """The ring is read as it lies in memory, as in `_window`; rows not yet seen are zero."""
+    shape = (layer.window - 1, *x.shape[1:])
+    ring = np.array(np.broadcast_to(m["ring"].reshape(len(m["ring"]), -1, layer.size), shape))
+    at, seen, out = m.get("at", 0), int(m["age"][0]), np.empty_like(x)
+    for tick in range(len(x)):
+        seen = min(seen + 1, layer.window)
+        out[tick] = _sum(np.concatenate([x[tick][None], ring]), axis=0) / np.float32(seen)
+        if layer.window > 1:
+            ring[at] = x[tick]
+            at = (at + 1) % (layer.window - 1)
+    m["ring"], m["at"], m["age"] = ring, at, np.full_like(m["age"], seen)
+    return out
+
+
 def _accumulate(layer: layers.Accumulate, m: Memory, x: Rows) -> Rows:
     return np.add.accumulate(split(x, layer.rows), axis=2).reshape(x.shape)
 
@@ -229,6 +244,7 @@ OVER_TIME: dict[type[Layer], Run] = {
     layers.RowAttention: _rows,
     memory.Difference: _difference,
     memory.Starting: _starting,
+    memory.TrailingMean: _trailing_mean,
     memory.WindowAttention: _window,
 }
 """Many ticks of a kind of layer: (layer, memory, inputs ...) to its value; the memory is brought on."""

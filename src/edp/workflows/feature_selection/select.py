@@ -23,9 +23,10 @@ from edp.report import build_screening_page, write_pictures
 from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import command_line
+from edp.workflows.feature_selection.changes import with_changes
 from edp.workflows.feature_selection.trials import OnTrial, Trials, TrialSpec, try_feature_sets, with_differences
 
-PROPOSED, DIFFERENCES, ALL = "proposed", "proposed + differences", "all candidates"
+PROPOSED, DIFFERENCES, CHANGES, ALL = "proposed", "proposed + differences", "proposed + changes", "all candidates"
 # The file stays readable; the whole list is in `screening.json`.
 _MOST_DROPPED = 200
 
@@ -78,7 +79,7 @@ class Selection:
         notes: what a reader must know of how the data were read.
         sets: the feature sets by name, the proposed one first.
         files: by what they are: ``page``, ``screening``, ``quality``, ``settings``, ``sets``, and where there are such,
-            ``map``, ``pictures``, ``trials``.
+            ``settings_with_changes``, ``map``, ``pictures``, ``trials``.
         trials: errors of the sets, where they were tried.
     """
 
@@ -194,6 +195,9 @@ def _sets(screening: ScreeningResult, first: Recording) -> dict[str, FeatureSett
     differences = with_differences(proposed, first, DIFFERENCES)
     if differences.derived:
         sets[DIFFERENCES] = differences
+    changes = with_changes(proposed, screening, first, CHANGES)
+    if changes.derived:
+        sets[CHANGES] = changes
     sets[ALL] = FeatureSettings(name=ALL, channels=screening.channels)
     for name, usual in FEATURE_SETS.items():
         if all(channel in first.channel_names for channel in usual.inputs):
@@ -213,7 +217,10 @@ def _write(
         text = _proposal_text(screening, features) if name == PROPOSED else set_text(_plain(features))
         write_bytes(files["sets"] / f"{_file_name(name)}.toml", text.encode())
     files["settings"] = folder / "settings.toml"
-    write_bytes(files["settings"], _settings_text(screening).encode())
+    write_bytes(files["settings"], _settings_text(screening, PROPOSED).encode())
+    if CHANGES in sets:
+        files["settings_with_changes"] = folder / "settings_with_changes.toml"
+        write_bytes(files["settings_with_changes"], _settings_text(screening, CHANGES).encode())
     return files
 
 
@@ -238,10 +245,14 @@ def _proposal_text(screening: ScreeningResult, features: FeatureSettings) -> str
     return set_text(_plain(features), head, reasons, tail)
 
 
-def _settings_text(screening: ScreeningResult) -> str:
-    """Settings of a training on the proposed set, to lay over a preset."""
+def _settings_text(screening: ScreeningResult, name: str) -> str:
+    """Settings of a training on a set, to lay over a preset."""
     table = {
-        "task": {"features": "sets/proposed.toml", "targets": list(screening.targets), "horizons": [screening.horizon]},
+        "task": {
+            "features": f"sets/{_file_name(name)}.toml",
+            "targets": list(screening.targets),
+            "horizons": [screening.horizon],
+        },
         "model": {"window": screening.proposal.window},
     }
     why = " ".join(screening.proposal.window_reason.split())
