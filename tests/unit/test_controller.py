@@ -12,18 +12,21 @@ from edp.data.task import TargetMode, Task
 from edp.errors import ConfigError
 from edp.evaluation.controller import CORES, FORMATS, Budget, load_budget
 from edp.evaluation.footprint import check_possible, footprint
-from edp.networks.backbones import HybridSpec
-from edp.networks.heads import MlpHead
+from edp.networks.backbones import CommitteeSpec, HybridSpec
+from edp.networks.heads import LinearHead, MlpHead
 from edp.networks.predictor import ModelSpec, build_model
 
 BUDGETS = sorted((Path(__file__).parents[2] / "examples" / "budgets").glob("*.toml"))
 
 
 def network(channels, units, hidden=32):
+    return network_of(HybridSpec(channels=(channels,) * 4, kernel=3, units=units), MlpHead(hidden=hidden))
+
+
+def network_of(backbone, head):
     task = Task(FG2, ("CylVels_1", "CylVels_2", "CylVels_3"), (10,), TargetMode.DELTA, 100.0)
     scaler = Scaler(np.zeros(30), np.ones(30), np.zeros((1, 3)), np.ones((1, 3)))
-    backbone = HybridSpec(channels=(channels,) * 4, kernel=3, units=units)
-    return build_model(task, ModelSpec(backbone=backbone, head=MlpHead(hidden=hidden), window=50), scaler, seed=0)
+    return build_model(task, ModelSpec(backbone=backbone, head=head, window=50), scaler, seed=0)
 
 
 # Cycles of a step of the exported code (w8a16, float32), counted by benchmarks/controller_cycles.py.
@@ -50,6 +53,23 @@ def test_estimates_of_cycles_are_those_of_the_exported_code(channels, units):
         low, typical, high = by_format[name].cycles["cortex_m4f"]
         assert low == pytest.approx(counted, rel=0.07)
         assert (typical, high) == (pytest.approx(1.26 * low, abs=2), pytest.approx(1.43 * low, abs=2))
+
+
+# Likewise, of committees of two groups of 4 perceptrons of 32 units, by trees and their depth.
+WITH_TREES = {(60, 4): (213_683, 328_125), (200, 6): (263_603, 389_563)}
+
+
+@pytest.mark.parametrize(("trees", "depth"), WITH_TREES)
+def test_steps_of_trees_take_the_cycles_that_were_counted(trees, depth):
+    by_format = {}
+    for backbone in (CommitteeSpec(members=4, units=32, trees=n, tree_depth=depth) for n in (0, trees)):
+        counts = footprint(network_of(backbone, LinearHead()))
+        by_format[backbone.trees] = {entry.number_format: entry.cycles["cortex_m4f"][0] for entry in counts.estimates}
+    for name, counted in zip(("w8a16", "float32"), WITH_TREES[trees, depth], strict=True):
+        assert by_format[trees][name] == pytest.approx(counted, rel=0.12)
+        # Per output a comparison a level and a leaf; the three sums are features that are written.
+        each = (by_format[trees][name] - by_format[0][name] - 3 * FORMATS[name].per_output) / (3 * trees * (depth + 1))
+        assert each == pytest.approx(FORMATS[name].per_tree_step, rel=0.05)
 
 
 @pytest.mark.parametrize(("channels", "units"), LINKED)

@@ -14,7 +14,7 @@ from edp.data.chunks import ChunkSampler, ChunkSpec
 from edp.data.series import Series
 from edp.data.unlabelled import unlabelled
 from edp.errors import ConfigError, DataError
-from edp.networks.backbones import HybridSpec, LstmSpec, TcnSpec
+from edp.networks.backbones import CommitteeSpec, HybridSpec, LstmSpec, TcnSpec
 from edp.networks.heads import MlpHead
 from edp.networks.losses import MeanSquared, Prediction
 from edp.networks.narrow import student, width_of
@@ -250,6 +250,8 @@ def test_students_of_other_backbones():
     assert tcn.backbone.channels == (8, 8, 4, 4)
     model = ModelSpec(backbone=HybridSpec(channels=(64, 32), units=64))
     assert student(model, 32, levels=2).backbone.channels == (32, 16)
+    committee = student(ModelSpec(backbone=CommitteeSpec(units=64, trees=20)), units=16)
+    assert (committee.backbone.units, committee.backbone.trees) == (16, 0)
 
 
 @pytest.mark.parametrize(

@@ -35,16 +35,18 @@ class NumberFormat:
         state_bytes: of a number that is carried from tick to tick, working memory included; the most that was seen.
         per_mac: cycles of a multiply-accumulate.
         per_output: cycles of a feature that a part writes.
+        per_tree_step: cycles of a comparison of a regression tree, or of taking its leaf.
     """
 
     state_bytes: float
     per_mac: float
     per_output: float
+    per_tree_step: float
 
 
 FORMATS = {
-    "float32": NumberFormat(4.6, 4.05, 40.0),
-    "w8a16": NumberFormat(3.1, 2.14, 98.0),
+    "float32": NumberFormat(4.6, 4.05, 40.0, 19.0),
+    "w8a16": NumberFormat(3.1, 2.14, 98.0, 16.0),
 }
 
 
@@ -160,6 +162,7 @@ def estimate(costs: Sequence[Cost], state_numbers: int, number_format: str, size
     outputs = sum(cost.width_out for cost in costs)
     # Products and element-wise outputs are counted apart: in W8A16 an output weighs as much as 46 products.
     step = macs * form.per_mac + outputs * form.per_output
+    step += sum(cost.tree_steps for cost in costs) * form.per_tree_step
     cycles = {
         # Only the high estimate decides: a tick that sometimes misses its deadline misses it.
         name: (round(step * core.low), round(step * core.typical * BOARD_TYPICAL), round(step * BOARD_SLOW))

@@ -19,7 +19,7 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
     """A network of the same parts, all widths scaled from those of `model` to `units`, with fewer convolution levels.
 
     The thesis's students (Table 4.9): half or a quarter of the teacher's units, channels and head width, and of three
-    convolution levels the first two.
+    convolution levels the first two. Trees of a committee are left out.
 
     Args:
         model: the teacher's specs.
@@ -41,6 +41,9 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
     names: set[str] = {entry.name for entry in fields(model.backbone)} if is_dataclass(model.backbone) else set()
     if "units" in names:
         changed["units"] = units
+    if "trees" in names:
+        # A student learns by gradients, which no tree does: its trees would give zero for good.
+        changed["trees"] = 0
     if "channels" in names:
         channels = model.backbone.channels  # type: ignore[attr-defined]
         if levels is None:

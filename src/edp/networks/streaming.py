@@ -33,6 +33,7 @@ class Cost:
         width_in: features read per time step.
         width_out: features written per time step.
         per_time_step: False where the part runs on the last time step only (heads).
+        tree_steps: comparisons of regression trees of a prediction, and one step for the leaf of each tree.
     """
 
     part: str
@@ -44,6 +45,7 @@ class Cost:
     width_in: int = 0
     width_out: int = 0
     per_time_step: bool = True
+    tree_steps: int = 0
 
 
 class Operation(StrEnum):

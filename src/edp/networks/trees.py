@@ -109,6 +109,7 @@ class Trees(Streaming):
                 width_in=self.width,
                 width_out=self.outputs,
                 per_time_step=False,
+                tree_steps=self.outputs * self.trees * (self.depth + 1),
             )
         ]
 
