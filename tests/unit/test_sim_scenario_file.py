@@ -9,7 +9,9 @@ import edp.sim.data_set
 from edp.errors import ConfigError, StorageError
 from edp.sim import DEFAULT_MIX, DataSetSpec, Scenario, plan_data_set, read_scenario_file, simulate_many
 from edp.sim.data_set import SimulationOrder, bytes_needed, simulate_data_set
+from edp.sim.predictability import LimitSpec
 from edp.sim.scenario import plain
+from edp.sim.scenario_file import limit_settings
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "scenarios").glob("*.toml"))
 
@@ -210,3 +212,17 @@ def test_closed_loops_give_the_same_bits_for_any_number_of_workers(material):
     assert [r.digest for r in alone] == [r.digest for r in together]
     assert len({r.digest for r in alone}) == 3
     assert [r.meta["material"] for r in together] == [material] * 3
+
+
+def test_the_limit_and_single_keys_can_be_changed(tmp_path):
+    path = written(tmp_path, 'machine = "C14"\nrecordings = 8\n[limit]\nmoments = 60\nhorizons = [1, 10]\n')
+    assert limit_settings(path, ["limit.branches=8"]) == LimitSpec(horizons=(1, 10), moments=60, branches=8)
+    assert limit_settings(None, ()) == LimitSpec()
+    order = SimulationOrder.of(path, None, ["family=3", "masses=[12,20]", "files.layout=speedgoat", "files.format=mat"])
+    assert (order.family, order.masses, order.layout, order.suffix) == (3, (12.0, 20.0), "speedgoat", ".mat")
+    # What the command line asks for by an option goes before single keys.
+    assert SimulationOrder.of(path, None, ["minutes=7", "recordings=2"], minutes=5.0).minutes == 5.0
+    with pytest.raises(ConfigError, match="unknown key 'recording'; did you mean 'recordings'"):
+        SimulationOrder.of(path, None, ["recording=3"])
+    with pytest.raises(ConfigError, match="branches = 5 must be even"):
+        limit_settings(path, ["limit.branches=5"])

@@ -167,7 +167,7 @@ def test_a_bundle_of_a_newer_schema(edp, trained):
     header = trained / "bundle" / "bundle.json"
     held = json.loads(header.read_text())
     header.write_text(json.dumps(held | {"schema": held["schema"] + 3}))
-    refused(edp("footprint", trained), f"schema {held['schema'] + 3}", "reads 5 to 7", "newer EDP")
+    refused(edp("footprint", trained), f"schema {held['schema'] + 3}", "reads 8 to 10", "newer EDP")
 
 
 def test_damaged_weights(edp, trained):
