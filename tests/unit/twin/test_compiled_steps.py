@@ -6,36 +6,9 @@ import torch
 
 from edp.networks.twin.recurrent import Bounds, TwinNetwork
 from edp.networks.twin.steps import _tanh
+from edp.testing.twin_cell import plain_steps
 
 TICKS, BATCH, COMMANDS, VELOCITIES, PRESSURES, UNITS = 40, 5, 3, 2, 3, 8
-
-
-def plain_steps(network, commands, measured, port, start, bounds, strokes):
-    """The equations of `edp.networks.twin.steps`, tick by tick, for autograd."""
-    change, low, high, trapezoid = (torch.from_numpy(values) for values in bounds.arrays)
-    n, units = bounds.velocities, network.units
-    answer, h = start
-    answers = []
-    for t in range(len(commands)):
-        fed = torch.where(port[t] > 0, measured[t], answer)
-        into = commands[t] @ network.command_weight.T + network.bias + fed @ network.feedback_weight
-        up = h @ network.h_weight
-        soft = torch.sigmoid(into[:, : 2 * units] + up[:, : 2 * units])
-        reset, keep = soft.chunk(2, dim=1)
-        new = torch.tanh(into[:, 2 * units :] + reset * (up[:, 2 * units :] + network.inner_bias))
-        h = new + keep * (h - new)
-        value = fed + change * (h @ network.out_weight + network.out_bias)
-        velocity = value[:, :n].clamp(low[:n], high[:n])
-        rest = value[:, n + strokes :].clamp(low[n + strokes :], high[n + strokes :])
-        parts = [velocity, rest]
-        if strokes:
-            s = slice(n, 2 * n)
-            stroke = fed[:, s] + trapezoid * (fed[:, :n] + velocity)
-            into_stop = ((stroke > high[s]) & (velocity > 0)) | ((stroke < low[s]) & (velocity < 0))
-            parts = [velocity.masked_fill(into_stop, 0.0), stroke.clamp(low[s], high[s]), rest]
-        answer = torch.cat(parts, dim=1)
-        answers.append(answer)
-    return torch.stack(answers), h
 
 
 def case(strokes, tight):
@@ -65,7 +38,7 @@ def case(strokes, tight):
 def test_values_and_gradients_are_those_of_autograd(strokes, tight):
     network, (commands, measured, port), start, bounds, target = case(strokes, tight)
     results = []
-    for run in (network, lambda *a: plain_steps(network, *a, strokes)):
+    for run in (network, lambda *a: plain_steps(network, *a)):
         leaves = [commands.clone().requires_grad_(), *(values.clone().requires_grad_() for values in start)]
         answers, h = run(leaves[0], measured, port, (leaves[1], leaves[2]), bounds)
         loss = (answers - target).square().sum() + 3 * answers[-1].sum() + h.square().sum()
