@@ -90,6 +90,8 @@ def check_twin(name: str) -> None:
 def _chunks(twin: Twin, commands: Array, measured: Array, state: TwinState, where: str) -> None:
     """Ticks, chunks and a run that goes on from a copied state are the whole run, to the bit, in every mode."""
     mixed = np.where(np.random.default_rng(2).random(measured.shape) < 0.5, measured, np.nan).astype(np.float32)
+    none, same = twin.rollout(commands[:, :0], state)
+    expect(none.shape[1] == 0 and same is state, f"{where}: a run of no ticks changes the state")
     for mode, ports in (("free", None), ("measured", measured), ("mixed", mixed)):
         whole, _ = twin.rollout(commands, state, ports)
         first, later = twin.rollout(commands[:, :7], state, None if ports is None else ports[:, :7])

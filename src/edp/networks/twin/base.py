@@ -120,6 +120,8 @@ class Twin(ABC):
         shape = (batch, ticks, len(self.channels.answers))
         measured = np.full(shape, np.nan, np.float32) if measured is None else np.asarray(measured, np.float32)
         self._check("measured", measured, shape)
+        if not ticks:
+            return np.empty(shape, np.float32), state
         return self._run(commands, np.where(np.isfinite(measured), measured, np.float32(np.nan)), state)
 
     def bounded(self, feedback: Array, velocity: Array, pressure: Array) -> Array:
