@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from edp.errors import ExportError
-from edp.ir import Builder
+from edp.ir import Builder, Graph
 from edp.ir.base import INPUT
 from edp.ir.layers import BinaryOperation, Dense, Standardise
-from edp.ir.w8a16 import calibrate
+from edp.ir.w8a16 import Formats, Integers, calibrate, quantise
 from edp.ir.w8a16.calibration import finer
 from edp.ir.w8a16.quantise import outline
 from edp.networks.integer import integer_predictor, spread
@@ -81,3 +81,33 @@ def test_an_operation_without_an_integer_form_is_refused_by_its_word():
     result = build.add(Dense, "result", quotient, weight=ones[None], bias=ones[:1])
     with pytest.raises(ExportError, match="layer 'quotient' is a Divide, which has no form in integer arithmetic"):
         outline(build.graph({"prediction": result}, 1))
+
+
+def wide_layer(count, seed=0):
+    """A dense layer of one row of `count` large weights, one of small ones that fit, and a graph around it."""
+    draw = np.random.default_rng(seed)
+    weight = np.stack([draw.choice([-1.0, 1.0], count), np.where(np.arange(count) < 4, 1.0, 1e-3)]).astype(np.float32)
+    ones, none = np.ones(count, np.float32), np.zeros(count, np.float32)
+    scaled = Standardise(name="scaled", inputs=("input",), offset=none, scale=ones)
+    dense = Dense(name="dense", inputs=("scaled",), weight=weight, bias=np.float32([0.5, 0.5]))
+    return Graph(count, (scaled, dense), {"prediction": "dense"})
+
+
+def test_rows_that_could_leave_32_bits_take_coarser_weights_and_others_keep_theirs():
+    graph = wide_layer(1500)
+    integers = quantise(graph, Formats({"scaled": 10, "dense": 5}))
+    layer = integers.layer("dense")
+    sums = np.abs(layer.weight.astype(np.int64)).sum(axis=1) * 32767 + np.abs(layer.bias)
+    assert 0.9 * 2**31 < sums[0] < 2**31
+    assert np.abs(layer.weight[0]).max() < 127
+    assert np.abs(layer.weight[1]).max() == 127
+    rows = np.random.default_rng(1).normal(size=(50, 1500)).astype(np.float32)
+    found = Integers(integers).run(rows[:, None])["prediction"][:, 0]
+    wanted = rows @ graph.layer("dense").weight.T + 0.5
+    # Equal weights are whole multiples of any scale: what is left is the format of the result, and of the inputs.
+    np.testing.assert_allclose(found[:, 0], wanted[:, 0], rtol=0.015, atol=2 * 2.0**-5)
+
+
+def test_rows_that_two_bits_do_not_save_are_refused():
+    with pytest.raises(ExportError, match=r"a sum of 6000 products may reach .*; \d+ inputs of this size would fit"):
+        quantise(wide_layer(6000), Formats({"scaled": 10, "dense": 5}))

@@ -9,9 +9,13 @@ from numpy.typing import NDArray
 
 from edp.errors import ExportError
 from edp.ir.w8a16 import arithmetic as fixed
-from edp.ir.w8a16.rounding import WeightRounding
+from edp.ir.w8a16.rounding import WeightRounding, nearest
 
 Array = NDArray[np.floating]
+COARSER = 1.02
+"""More than a sum needs to fit: weights of least error are a little larger in sum than the nearest ones."""
+MOST_COARSE = 4.0
+"""Times its own scale that a row may take, two bits of its weights; beyond, the network is refused."""
 
 
 def rows(matrix: str, weight: Array, bias: Array, formats: tuple[int, int], rounding: WeightRounding) -> dict[str, Any]:
@@ -28,16 +32,30 @@ def rows(matrix: str, weight: Array, bias: Array, formats: tuple[int, int], roun
         ExportError: a sum that might not fit in 32 bits.
     """
     input_frac, frac = formats
-    terms = tuple(range(bias.ndim, weight.ndim))
-    # A bias far larger than its weights takes part in the choice of the scale, else it would not fit.
-    scale = np.maximum(np.abs(weight).max(axis=terms) / fixed.WEIGHT, np.abs(bias) * 2.0 ** (input_frac - 30))
-    # A row of zeros has no scale; any positive one gives zeros again.
-    scale = np.maximum(scale.astype(np.float64), 1e-30)
+    scale = _scale(weight, bias, input_frac)
     rounded = rounding.of(matrix, weight, scale)
     offset = np.floor(bias / scale * 2.0**input_frac + 0.5)
     _check(matrix, rounded, offset)
     multiplier, shift = fixed.factor(scale * 2.0 ** (frac - input_frac))
     return {"weight": rounded, "bias": offset.astype(np.int32), "multiplier": multiplier, "shift": shift}
+
+
+def _scale(weight: Array, bias: Array, input_frac: int) -> Array:
+    """What one step of an integer weight is worth, for each output."""
+    terms = tuple(range(bias.ndim, weight.ndim))
+    # A bias far larger than its weights takes part in the choice of the scale, else it would not fit.
+    scale = np.maximum(np.abs(weight).max(axis=terms) / fixed.WEIGHT, np.abs(bias) * 2.0 ** (input_frac - 30))
+    # A row of zeros has no scale; any positive one gives zeros again.
+    scale = np.maximum(scale.astype(np.float64), 1e-30)
+    offset = np.abs(bias) * 2.0**input_frac
+    worst = np.abs(nearest(weight, scale).astype(np.int64)).sum(axis=terms) * fixed.LARGEST + offset / scale
+    # Where a row of very many weights could leave 32 bits, coarser weights keep it within; half a step of each is
+    # what rounding may add. All other rows keep their scale, and so what was quantised before keeps its numbers.
+    count = float(np.prod([weight.shape[axis] for axis in terms]))
+    room = max(1.0, fixed.ACCUMULATOR - fixed.LARGEST * (0.5 * count + 1.0))
+    coarser = COARSER * (np.abs(weight).sum(axis=terms, dtype=np.float64) * fixed.LARGEST + offset) / room
+    saved = (worst > fixed.ACCUMULATOR) & (coarser <= MOST_COARSE * scale)
+    return np.asarray(np.where(saved, np.maximum(scale, coarser), scale))
 
 
 def to_gates(matrix: str, weight: Array, input_frac: int, rounding: WeightRounding) -> dict[str, Any]:
