@@ -56,7 +56,13 @@ TRAINING = frozenset(
         ),
         *("report/study/test_study_page", "screening/test_screening_figures", "stats/test_null_calibration"),
         *("screening/test_screening_verdicts", "report/study/test_study_in_notebook", "report/test_report_page"),
-        *("report/test_screening_page", "report/test_transfer_page", "test_compress_search", "test_downsizing"),
+        *(
+            "report/test_screening_page",
+            "report/test_transfer_page",
+            "report/test_scores_file",
+            "test_compress_search",
+            "test_downsizing",
+        ),
     )
 )
 """Of ``tests/unit``: whose tests train networks or draw pages for seconds each."""

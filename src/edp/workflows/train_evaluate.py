@@ -30,12 +30,13 @@ from edp.evaluation.conditional import collinear
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import footprint
 from edp.evaluation.judge import Evaluation, JudgeSpec, judge
+from edp.evaluation.scores_file import read_scores
 from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
 from edp.recording import Recording
 from edp.report import build_report
 from edp.sim.data_set import SimulationOrder, simulate_data_set
-from edp.storage import check_writable, make_folder, read_object, write_bytes, write_json
+from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import weights_digest
@@ -346,7 +347,7 @@ def _kept(folder: Path, key: str) -> dict[str, Any] | None:
     """Scores of an earlier judgement of the same things."""
     if not (folder / "scores.json").is_file() or not (folder / "predictions.safetensors").is_file():
         return None
-    scores = read_object(folder / "scores.json")
+    scores = read_scores(folder / "scores.json")
     return scores if scores.get("key") == key else None
 
 

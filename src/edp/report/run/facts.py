@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edp.errors import DataError, StorageError
 from edp.evaluation.guard import beaten_by
+from edp.evaluation.scores_file import read_scores
 from edp.report.common.wording import decimals_for, listed, number, percent
 from edp.report.run.predictability import limit_line, read_limit
 from edp.storage import JSON_BYTES, SETTINGS_BYTES, parse_json, read_object, read_text
@@ -130,7 +131,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         config=None if "config.toml" in absent else read_text(folder / "config.toml", SETTINGS_BYTES),
         provenance=provenance,
         history=() if "history.jsonl" in absent else read_history(folder / "history.jsonl"),
-        scores=json_part("scores.json"),
+        scores=None if "scores.json" in absent else read_scores(folder / "scores.json"),
         footprint=json_part("footprint.json"),
         predictions={} if "predictions.safetensors" in absent else _read_predictions(folder),
         absent=absent,
