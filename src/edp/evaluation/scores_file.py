@@ -121,12 +121,12 @@ def _check(value: Any, shape: Shape, where: str, file: str) -> None:
     else:
         if not isinstance(value, dict):
             _refuse(value, "an object", where, file)
-        known = dict.fromkeys(value, shape.value) if isinstance(shape, NamedValues) else shape.keys
+        shapes = dict.fromkeys(value, shape.value) if isinstance(shape, NamedValues) else shape.keys
         for key in shape.needed:
             if key not in value:
                 _refuse(value, f"an object with the key '{key}'", where, file)
-        for key in value.keys() & known.keys():
-            _check(value[key], known[key], f"{where}.{key}".lstrip("."), file)
+        for key in value.keys() & shapes.keys():
+            _check(value[key], shapes[key], f"{where}.{key}".lstrip("."), file)
 
 
 def _refuse(value: Any, words: str, where: str, file: str) -> None:
