@@ -67,7 +67,7 @@ PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
         *("budget", "config", "data", "features", "further", "limit", "map", "out", "page", "scenario", "start"),
-        *("study", "teacher"),
+        *("plots", "study", "teacher"),
     )
 )
 """Options of all commands that name a file or folder."""

@@ -60,6 +60,7 @@ def rollout(
     file: Annotated[
         Path | None, typer.Option("--out", help="File for measured and free-run values (.parquet, .csv, ...).")
     ] = None,
+    plots: Annotated[Path | None, typer.Option(help="Folder for plots of the run (SVG and PNG).")] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
@@ -72,13 +73,16 @@ def rollout(
     """
     from edp.workflows.twin import rollout_log
 
-    result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file)
-    facts = {"start_s": result.start_s, "file": None if file is None else str(file), **result.scores}
+    result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file, plots)
+    written = {"file": file and str(file), "plots": plots and str(plots)}
+    facts = {"start_s": result.start_s, **written, **result.scores}
 
     def show() -> None:
         error_table(result.scores)
         if file is not None:
             out.print(f"{result.recording.samples:,} ticks in {file}")
+        if plots is not None:
+            out.print(f"plots in {plots}")
 
     emit(as_json, facts, show)
 

@@ -10,6 +10,7 @@ from edp.report.screening.pictures import write_pictures
 from edp.report.search.page import StudyReport, write_study_page
 from edp.report.transfer.facts import Transfer, read_transfer
 from edp.report.transfer.page import write_transfer_page
+from edp.report.twin.plots import write_rollout_plots
 
 __all__ = [
     "CompressionFacts",
@@ -26,6 +27,7 @@ __all__ = [
     "read_transfer",
     "write_compression_page",
     "write_pictures",
+    "write_rollout_plots",
     "write_study_page",
     "write_transfer_page",
 ]

@@ -109,6 +109,18 @@ def test_a_rollout_prints_the_error_of_each_channel_by_time(edp, logs, trained):
     assert re.search(r"NRMSE: pressure_1 [\d.]+, pressure_2 [\d.]+", shown)
 
 
+def test_plots_of_a_rollout(edp, logs, trained, tmp_path):
+    folder = tmp_path / "plots"
+    words = ["rollout", trained, logs / "log_1.parquet", "--seconds", 3, "--from", 2, "--plots", folder]
+    assert f"plots in {folder}" in edp(*words).out.replace("\n", "")
+    stems = ("velocities", "strokes", "pressures")
+    assert sorted(path.name for path in folder.iterdir()) == sorted(f"{s}.{e}" for s in stems for e in ("svg", "png"))
+    drawing = (folder / "velocities.svg").read_text()
+    for text in ("speed_1", "speed_2", "[mm/s]", "answered by the twin", "Time in the log [s]"):
+        assert text in drawing
+    assert "pressure_1" not in drawing
+
+
 def test_channels_that_stay_measured(edp, logs, trained, tmp_path):
     log = logs / "log_1.parquet"
     free, mixed = (

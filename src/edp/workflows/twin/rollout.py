@@ -16,6 +16,7 @@ from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
 from edp.recording import Recording
+from edp.report import write_rollout_plots
 from edp.settings.bounds import above, span
 from edp.training.twin_bundle import load_twin
 
@@ -46,6 +47,7 @@ def rollout_log(
     start_s: float | None = None,
     measured: Sequence[str] = (),
     out: str | Path | None = None,
+    plots: str | Path | None = None,
 ) -> Rollout:
     """Let the twin of a run answer the commands of a log.
 
@@ -56,6 +58,7 @@ def rollout_log(
         start_s: its start in the log; None: as early as the prefix allows.
         measured: channels that stay measured throughout (mixed mode).
         out: file for `Rollout.recording`; its ending chooses the format.
+        plots: folder for plots of it.
 
     Raises:
         EdpError: several logs, another rate or kind, times outside the log, or a channel that the twin does not answer.
@@ -82,6 +85,8 @@ def rollout_log(
     )
     if out is not None:
         write_recording(result.recording, out)
+    if plots is not None:
+        write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, plots)
     return result
 
 

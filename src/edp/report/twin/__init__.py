@@ -1,0 +1,1 @@
+"""Plots of the free runs of a twin."""
