@@ -9,6 +9,7 @@ import numpy as np
 from edp.networks import Stream
 from edp.networks.integer import IntegerPredictor
 from edp.training import load_bundle
+from edp.training.bundle import INTEGER_SCHEMA
 
 
 def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, tmp_path):
@@ -26,7 +27,7 @@ def test_a_quantised_run_is_judged_and_exported_in_whole_numbers(edp, trained, t
     assert mae[0] != mae[1]
     np.testing.assert_allclose(mae[0], mae[1], rtol=0.2)
     header = json.loads((whole / "bundle" / "bundle.json").read_text())
-    assert (header["schema"], header["number_format"]) == (6, "w8a16")
+    assert (header["schema"], header["number_format"]) == (INTEGER_SCHEMA, "w8a16")
     assert load_bundle(whole).scores
     counts = [edp("footprint", run, "--json").json for run in (whole, trained)]
     assert counts[0] == counts[1]
