@@ -11,8 +11,10 @@ from sklearn.ensemble import HistGradientBoostingRegressor
 
 from edp.ir import Graph
 from edp.ir.descent import reached_leaves, summed
-from edp.ir.layers import NEVER, Dense, Standardise, TreeSums
+from edp.ir.layers import NEVER, BinaryOperation, Dense, Elementwise, Gather, Standardise, TreeSums
+from edp.ir.reference import Reference
 from edp.ir.w8a16 import Formats, quantise
+from edp.ir.w8a16.balance import balanced
 from edp.ir.w8a16.quantise import halves
 from edp.networks import trees as trees_file
 from edp.networks.trees import Trees
@@ -196,3 +198,52 @@ def integer_layer(layer, frac, own):
     dense = Dense(name="dense", inputs=("sums",), weight=ones[None], bias=0 * ones)
     graph = Graph(1, (scaled, layer, dense), {"prediction": "dense"})
     return quantise(graph, Formats({"scaled": frac, "sums": own, "dense": 8})).layer("sums")
+
+
+def joined(weight, *more):
+    """Trees of two outputs beside what they read, before a dense layer; further layers behind it."""
+    feature, threshold, leaf, _ = drawn((3, 2, 4, 2), 5)
+    ones = np.ones(3, np.float32)
+    scaled = Standardise(name="scaled", inputs=("input",), offset=0 * ones, scale=ones)
+    tables = {"feature": feature.astype(np.uint16), "threshold": threshold, "leaf": leaf}
+    trees = TreeSums(name="sums", inputs=("scaled",), **tables)
+    join = Gather(name="join", inputs=("scaled", "sums"), columns=(0, 3, 1, 2, 4))
+    dense = Dense(name="dense", inputs=("join",), weight=np.float32(weight), bias=np.float32([1, 2]))
+    return Graph(3, (scaled, trees, join, dense, *more), {"prediction": "dense"})
+
+
+def twice(value, size):
+    return Elementwise(name="twice", inputs=(value, value), operation=BinaryOperation.ADD, size=size)
+
+
+HEAVY = [[0.02, 1.0, -0.03, 0.1, 0.0], [0.01, 0.0, 0.05, -0.03, 0.9]]
+
+
+def test_heavy_trees_are_balanced_without_a_change_of_any_bit():
+    graph = joined(HEAVY)
+    light = balanced(graph)
+    weight = light.layer("dense").weight
+    np.testing.assert_array_equal(weight[:, [0, 2, 3]], np.float32(HEAVY)[:, [0, 2, 3]])
+    assert 1.0 <= np.abs(weight[:, [1, 4]]).max() / 0.1 < 2.0
+    np.testing.assert_array_equal(light.layer("sums").leaf, 8 * graph.layer("sums").leaf)
+    for row in drawn((3, 2, 4, 2), 6)[3]:
+        first, second = (Reference(each, np.float32).results(row)["prediction"] for each in (graph, light))
+        np.testing.assert_array_equal(first, second)
+    again = balanced(light)
+    np.testing.assert_array_equal(again.layer("dense").weight, weight)
+
+
+@pytest.mark.parametrize(
+    "graph",
+    [
+        joined(np.float32(HEAVY) * [1, 0.05, 1, 1, 0.05]),
+        joined(np.float32(HEAVY) * [0, 1, 0, 0, 1]),
+        joined(HEAVY, twice("sums", 2)),
+        joined(HEAVY, twice("join", 5)),
+    ],
+    ids=["light", "alone", "trees are read elsewhere", "the join is read elsewhere"],
+)
+def test_other_trees_stay_as_they_are(graph):
+    for layer, same in zip(graph.layers, balanced(graph).layers, strict=True):
+        for name, values in layer.tensors().items():
+            np.testing.assert_array_equal(same.tensors()[name], values)

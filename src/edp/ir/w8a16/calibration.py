@@ -13,6 +13,7 @@ from edp.ir.base import INPUT, Graph
 from edp.ir.layers import Standardise
 from edp.ir.memory import Rotation
 from edp.ir.reference import Reference
+from edp.ir.w8a16.balance import balanced
 from edp.ir.w8a16.moments import InputMoments
 from edp.ir.w8a16.quantise import Formats, formats, integer_part, quantise, weights_of
 from edp.ir.w8a16.single import OVER_TIME
@@ -46,6 +47,7 @@ def calibrate(
     Raises:
         ExportError: a part of the network has no integer form.
     """
+    graph = balanced(graph)
     ranges: dict[str, float] = {}
     moments = InputMoments(graph)
     for rows in recordings:

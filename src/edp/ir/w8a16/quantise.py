@@ -19,6 +19,7 @@ from edp.ir.base import INPUT, Graph, Layer, Number
 from edp.ir.layers import BinaryOperation, Function
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
+from edp.ir.w8a16.balance import balanced
 from edp.ir.w8a16.rounding import WeightRounding
 from edp.ir.w8a16.rows import halves, rows, to_gates
 
@@ -120,6 +121,7 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
         ExportError: a kind of layer that has no integer form, sums that would not fit in 32 bits, or formats of
             another graph.
     """
+    graph = balanced(graph)
     inside = integer_part(graph)
     work = _Work(graph, chosen.fracs, WeightRounding(chosen.weights, moments or {}), {}, [], {})
     for layer in graph.layers:
