@@ -10,6 +10,9 @@ import pytest
 from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.guard import beaten_by
 from edp.report import build_report
+from edp.report.common.wording import MISSING
+from edp.report.run.choice import model_tables, read_choice
+from edp.report.run.facts import read_facts
 from edp.training import load_bundle
 from edp.workflows.auto import load_auto, train_auto
 from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half, spans_by_two
@@ -135,6 +138,37 @@ def test_the_report_says_why(result):
     assert "Why this model" in page
     assert "What left-out data promised" in page
     assert found.sentence[:40].replace(" ", "") in "".join(page.split())
+
+
+def test_page_and_file_show_every_model_on_left_out_data_and_on_the_test_part(result, tmp_path):
+    source, folder, found = result
+    copied = shutil.copytree(folder, tmp_path / "run")
+    evaluate(copied, baselines=("persistence", "ridge_arx"))
+    results = json.loads((copied / "auto.json").read_text())["results"]
+    assert set(results) == {"network", "persistence", "ridge_arx"}
+    assert "validation" not in results["network"]  # it trained on that part; its promise is from rows left out
+    facts = read_facts(copied)
+    models = facts.scores["models"]
+    for name in ("persistence", "ridge_arx"):
+        assert results[name]["test"]["4"]["y"] == models[name]["overall"]["4"]["y"]["rmse"]
+        assert results[name]["validation"]["4"]["y"] == models[name]["validation"]["4"]["y"]["rmse"]
+        assert results[name]["validation"] != results[name]["test"]
+    (table,) = model_tables(facts, read_choice(copied))
+    rows = {cells[0]: cells[1:] for cells in table.rows}
+    assert list(rows)[-2:] == ["Persistence", "Ridge ARX"]
+    assert len(rows) == len(found.facts["candidates"]) + 2
+    kept = found.facts["candidates"][found.facts["chosen"]]
+    (marked,) = table.marked
+    assert table.rows[marked][0] == kept["label"]
+    promise, test = (float(cell) for cell in rows[kept["label"]][-2:])
+    assert promise == pytest.approx(kept["promise"]["4"]["y"], rel=0.01)
+    assert test == pytest.approx(models["network"]["overall"]["4"]["y"]["rmse"], rel=0.01)
+    others = [
+        cells for label, cells in rows.items() if label in {"the linear model", "the committee"} - {kept["label"]}
+    ]
+    assert all(cells[1] == cells[3] == MISSING for cells in others)  # the test part was opened for one model alone
+    assert "Every model, output by output" in build_report(copied).read_text()
+    assert train_auto(source, load_auto(None, SET), copied).facts["results"] == results
 
 
 def test_a_target_that_never_moves_is_refused(tmp_path):

@@ -93,11 +93,13 @@ def judge(
     say("network")
     predictions = {"network": stream_predictions(predictor, data.test)}
     names, times = {"network": label}, {"network": seconds}
+    on_validation: dict[str, Predictions] = {}
     for name in spec.baselines:
         say(name)
         began = time.perf_counter()
         predict, baseline = baseline_predictions(BASELINES[name], data, spec)
         predictions[name] = predict(data)
+        on_validation[name] = predict(replace(data, test=data.validation))
         names[name], times[name] = baseline.label, time.perf_counter() - began
     # A whole window from reset: before that the network's memory is not filled, and baselines lack history.
     skip = predictor.spec.window if spec.skip is None else spec.skip
@@ -108,11 +110,21 @@ def judge(
         name: {"label": names[name], "seconds": times[name], **ruler.measure(predicted)}
         for name, predicted in predictions.items()
     }
+    for name, scores in _on_validation(on_validation, data, max(skip, spec.history)).items():
+        models[name]["validation"] = scores
     coverages = predictor.spec.output.coverages
     if coverages:
         say("intervals")
         models["network"]["intervals"] = ruler.intervals(stream_intervals(predictor, data.test), coverages)
     return Evaluation(ruler.header() | {"models": models}, predictions, data.test)
+
+
+def _on_validation(predictions: dict[str, Predictions], data: Prepared, skip: int) -> dict[str, Any]:
+    """Overall scores of baselines on the validation part, which also chose their sizes; none where it is too short."""
+    if max((part.samples for part in data.validation), default=0) - data.task.max_horizon <= skip:
+        return {}
+    ruler = _Ruler(replace(data, test=data.validation), skip)
+    return {name: ruler.measure(predicted)["overall"] for name, predicted in predictions.items()}
 
 
 def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None:

@@ -76,6 +76,7 @@ MODEL = KeyedObject(
         "label": NAME,
         "seconds": NUMBER,
         "overall": NamedValues(NamedValues(METRICS)),
+        "validation": NamedValues(NamedValues(METRICS)),
         "recordings": NamedValues(NamedValues(NamedValues(METRICS))),
         "spread": NamedValues(METRICS),
         "by_speed": NamedValues(

@@ -35,6 +35,7 @@ from edp.logs.source import DataSource
 from edp.networks.predictor import check_combination, describe
 from edp.recording import Recording
 from edp.report import build_report
+from edp.report.run.choice import note_test_result
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
@@ -282,6 +283,7 @@ def evaluate(
         write_bytes(target / "predictions.safetensors", save(_shown(evaluation)))
         write_json(target / "scores.json", scores)
     if source is None:
+        note_test_result(folder, scores)
         save_bundle(replace(bundle, scores=scores["models"]["network"]["overall"]), folder / "bundle")
     return target
 

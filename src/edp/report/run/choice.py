@@ -10,8 +10,9 @@ from typing import Any
 from edp.errors import StorageError
 from edp.report.common.tables import TextTable
 from edp.report.common.wording import MISSING, decimals_for, number, percent
-from edp.report.run.facts import NETWORK, Facts, horizon_text, score
-from edp.storage import read_object
+from edp.report.run.facts import NETWORK, Facts, Target, horizon_text, label_of, score
+from edp.report.run.figures import horizons_shown
+from edp.storage import read_object, write_json
 
 FILE = "auto.json"
 
@@ -45,6 +46,35 @@ def read_choice(folder: Path) -> Mapping[str, Any] | None:
     return content
 
 
+def note_test_result(folder: Path, scores: Mapping[str, Any]) -> None:
+    """Write what every model reached into ``auto.json``, where a run has one.
+
+    Args:
+        folder: the run folder.
+        scores: the content of its ``scores.json``: of the kept model and of each baseline.
+
+    Raises:
+        StorageError: the file does not hold what the preset auto writes, or cannot be written.
+    """
+    content = read_choice(folder)
+    if content is None:
+        return
+    results = {
+        name: {"label": model["label"], "test": _errors(model["overall"])}
+        | ({"validation": _errors(model["validation"])} if "validation" in model else {})
+        for name, model in scores["models"].items()
+    }
+    write_json(folder / FILE, {**content, "results": results})
+
+
+def _errors(overall: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Root-mean-square errors by horizon and target."""
+    return {
+        k: {name: metrics["rmse"] for name, metrics in targets.items() if name != "mean"}
+        for k, targets in overall.items()
+    }
+
+
 def _is_candidate(value: Any) -> bool:
     """Whether a value is what is known of a candidate."""
     return (
@@ -74,6 +104,50 @@ def candidates_table(content: Mapping[str, Any]) -> TextTable:
     marked = frozenset(row for row, name in enumerate(content["candidates"]) if name == chosen)
     columns = (("Model", ""), ("Parameters", ""), ("Error on left-out data", "against the one kept"))
     return TextTable("The models that were tried", columns, tuple(rows), marked)
+
+
+def model_tables(facts: Facts, content: Mapping[str, Any]) -> list[TextTable]:
+    """Every model that was tried and every baseline, a table an output: left-out data beside the test recordings.
+
+    A candidate's error on left-out data is its cross-validated promise, a baseline's is that on the validation part,
+    which also chose its sizes. Only the model that is kept has met the test recordings.
+    """
+    return [table for table in (_of_output(facts, content, target) for target in facts.targets) if table.rows]
+
+
+def _of_output(facts: Facts, content: Mapping[str, Any], target: Target) -> TextTable:
+    horizons = horizons_shown(facts)
+    chosen = content["chosen"]
+
+    def tested(name: str, k: int) -> float | None:
+        return score(facts.models.get(name, {}), k, "rmse", target.name)
+
+    def validated(name: str, k: int) -> float | None:
+        model = facts.models[name]
+        return score({"overall": model.get("validation", {})}, k, "rmse", target.name)
+
+    def row(label: str, pairs: list[tuple[float | None, float | None]]) -> tuple[str, list[float | None]]:
+        return label, [value for pair in pairs for value in pair]
+
+    rows = []
+    for name, one in content["candidates"].items():
+        promised = [one["promise"].get(str(k), {}).get(target.name) for k in horizons]
+        tests = [tested(NETWORK, k) if name == chosen else None for k in horizons]
+        rows.append(row(one["label"], list(zip(promised, tests, strict=True))))
+    for name in facts.models:
+        if name != NETWORK:
+            rows.append(row(label_of(facts, name), [(validated(name, k), tested(name, k)) for k in horizons]))
+    places = [decimals_for(values[column] for _, values in rows) for column in range(2 * len(horizons))]
+    cells = tuple(
+        (label, *(number(value, decimals) for value, decimals in zip(values, places, strict=True)))
+        for label, values in rows
+    )
+    marked = frozenset(index for index, name in enumerate(content["candidates"]) if name == chosen)
+    columns = [("Model", "")]
+    for k in horizons:
+        columns += [(f"{horizon_text(facts, k)} ahead, {part}", target.unit) for part in ("left-out data", "test")]
+    caption = f"{target.description}: RMSE of every model on left-out data and on the test recordings"
+    return TextTable(caption, tuple(columns), cells, marked)
 
 
 def promise_table(facts: Facts, content: Mapping[str, Any]) -> TextTable | None:

@@ -16,7 +16,7 @@ from edp.report.common.style import Plot
 from edp.report.common.templates import template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
-from edp.report.run.choice import candidates_table, promise_table, read_choice
+from edp.report.run.choice import candidates_table, model_tables, promise_table, read_choice
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
 from edp.report.run.plots import DOTS_AT_MOST, plots_of
 from edp.storage import write_bytes
@@ -95,6 +95,7 @@ def choice_of(facts: run.Facts) -> dict[str, Any]:
     return {
         "sentence": unbroken(content["sentence"]),
         "tables": [entry for entry in (candidates_table(content), promise_table(facts, content)) if entry is not None],
+        "models": model_tables(facts, content),
     }
 
 
