@@ -13,7 +13,7 @@ import scipy.io
 
 from edp import __version__
 from edp.errors import ExportError
-from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
+from edp.export.golden import GOLDEN_TICKS, golden_recording, stream
 from edp.export.hashes import model_hash, scale_hash
 from edp.ir import Graph
 from edp.networks.integer import IntegerPredictor
@@ -103,13 +103,12 @@ def golden(predictor: Predictor, window: int) -> dict[str, Any]:
         the `tolerance` ``(1, number)``.
     """
     # At least a window: the window graph is compared on the last one.
-    inputs = random_inputs(predictor, max(GOLDEN_TICKS, window), seed=0)
-    outputs = stream(predictor, inputs)
+    inputs, outputs, allowed = golden_recording(predictor, max(GOLDEN_TICKS, window))
     return {
         "inputs": inputs,
         "stream": outputs,
         "window": stream(predictor, inputs[-window:])[-1:],
-        "tolerance": tolerance(predictor, inputs, outputs)[None],
+        "tolerance": allowed[None],
     }
 
 

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edp.ir.layers import NEVER
 from edp.networks.input_range import usual_range
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import Predictor
+from edp.networks.trees import Trees
 
 GOLDEN_TICKS = 200
 SHARE = 1e-5
 """How far another form may be from PyTorch, in standard deviations of the target and as a share of the value."""
+NEAR = 1e-5
+"""How near a number may be to the threshold of a tree, in standard deviations and as a share, for a form to differ."""
+MOVES = 12
+"""How often all thresholds are moved, each by a draw of its own: rounding may decide at several nodes at once."""
+TRIES, NEAR_GOLDEN = 20, 1e-6
+"""Recordings that are drawn until none of their numbers is so near to a threshold."""
 Rows = NDArray[np.float32]
 
 
@@ -22,7 +31,8 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     """How far another form may be from `outputs`, PyTorch's in single precision, for each number of a tick.
 
     `SHARE` of a standard deviation and of the largest value; where PyTorch in single precision is farther than that
-    from itself in double precision (a layer norm of a cell near zero), twice that distance. Integers: nothing.
+    from itself in double precision (a layer norm of a cell near zero), twice that distance. Integers: nothing. Ticks
+    `at_thresholds` do not count here.
     """
     if isinstance(predictor, IntegerPredictor):
         return np.zeros(outputs.shape[1], dtype=np.float32)
@@ -30,9 +40,64 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
     widths = np.tile(sigma, outputs.shape[1] // len(sigma))
     # Where PyTorch in single precision is itself far from double precision, no other form can be asked for more.
-    own = np.abs(outputs - exact).max(axis=0)
+    own = np.where(at_thresholds(predictor, inputs) > 0.0, 0.0, np.abs(outputs - exact)).max(axis=0)
     result: Rows = np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
     return result
+
+
+def at_thresholds(predictor: Predictor, inputs: Rows, near: float = NEAR) -> Rows:
+    """How far another form may be beyond `tolerance` where rounding decides on which side of a threshold a tree goes.
+
+    Args:
+        predictor: the network.
+        inputs: ``(tick, input)``, from reset.
+        near: how far a number may be off before it meets a threshold, in standard deviations and as a share.
+
+    Returns:
+        ``(tick, number)``: twice the range of the predictions with all thresholds moved by up to so much; zero where
+        no number is near one, and for networks without trees or in integers.
+    """
+    if isinstance(predictor, IntegerPredictor) or not any(isinstance(part, Trees) for part in predictor.modules()):
+        return np.zeros((len(inputs), 1), dtype=np.float32)
+    draw = torch.Generator().manual_seed(0)
+    predictions = []
+    for number in range(MOVES):
+        moved = copy.deepcopy(predictor)
+        for part in moved.modules():
+            if isinstance(part, Trees):
+                share = torch.rand(part.threshold.shape, generator=draw) * 2.0 - 1.0
+                # All to one side as well: trees share thresholds.
+                share = share if number > 1 else torch.full_like(share, 2.0 * number - 1.0)
+                # What is never exceeded stays so: beyond single precision there is only infinity.
+                step = near * share.to(part.threshold) * part.threshold.abs().clamp(min=1.0)
+                part.threshold.add_(step).clamp_(-NEVER, NEVER)
+        predictions.append(stream(moved, inputs))
+    return np.asarray(2.0 * np.ptp(predictions, axis=0), dtype=np.float32)
+
+
+def golden_recording(predictor: Predictor, ticks: int) -> tuple[Rows, Rows, Rows]:
+    """Random inputs, what PyTorch streams from them, and how far another form may be from it.
+
+    Returns:
+        ``(tick, input)``, ``(tick, number)``, ``(number,)``. No number meets a threshold of a tree where one of
+        `TRIES` draws has that; otherwise what is allowed holds the largest step.
+    """
+    # Fixed seeds: the same network gives the same recording, byte by byte.
+    draws = (random_inputs(predictor, ticks, seed) for seed in range(TRIES))
+    inputs, steps = min(
+        _until_clear((drawn, at_thresholds(predictor, drawn, NEAR_GOLDEN)) for drawn in draws),
+        key=lambda draw: float(draw[1].max()),
+    )
+    outputs = stream(predictor, inputs)
+    return inputs, outputs, tolerance(predictor, inputs, outputs) + steps.max(axis=0)
+
+
+def _until_clear(draws: Iterable[tuple[Rows, Rows]]) -> Iterator[tuple[Rows, Rows]]:
+    """Draws up to the first one without a step."""
+    for inputs, steps in draws:
+        yield inputs, steps
+        if not steps.any():
+            return
 
 
 def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:

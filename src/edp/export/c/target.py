@@ -15,7 +15,7 @@ from edp.export.c.model import Model, make_model
 from edp.export.c.text import filled, number
 from edp.export.escape import C_WORDS, LONGEST_NAME, MATLAB_WORDS, visible
 from edp.export.folder import write_export
-from edp.export.golden import GOLDEN_TICKS, random_inputs, stream, tolerance
+from edp.export.golden import GOLDEN_TICKS, golden_recording
 from edp.training.bundle import Bundle
 
 # A header of these names in the include path would hide the system's.
@@ -95,10 +95,7 @@ def check_name(name: str) -> None:
 def golden(model: Model) -> str:
     """Inputs, and what PyTorch makes of them, as a header for the test on a computer."""
     predictor = model.bundle.predictor
-    # A fixed seed: the same network gives the same file, byte by byte.
-    inputs = random_inputs(predictor, GOLDEN_TICKS, seed=0)
-    outputs = stream(predictor, inputs)
-    allowed = tolerance(predictor, inputs, outputs)
+    inputs, outputs, allowed = golden_recording(predictor, GOLDEN_TICKS)
     text = [f"/* Random inputs of {model.name} and the network's predictions, bounds behind them. */"]
     text.append(f"#define GOLDEN_TICKS {len(inputs)}u")
     for name, rows in (("inputs", inputs), ("outputs", outputs)):

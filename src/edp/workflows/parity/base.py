@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from edp.export.golden import SHARE, Rows, stream
+from edp.export.golden import SHARE, Rows, at_thresholds, stream
 from edp.registry import Registry
 from edp.training.bundle import Bundle
 
@@ -37,7 +37,7 @@ class ParityCase:
         bundle: the trained network.
         inputs: golden recording ``(tick, input)``, SI units.
         expected: what PyTorch streams from it, ``(tick, number)``: predictions, then lower and upper bounds, SI units.
-        allowed: how far a form may be from that, ``(number,)``.
+        allowed: how far a form may be from that, ``(number,)``, or ``(tick, number)`` where trees are at thresholds.
         interpreters: Python programs with another ONNX Runtime.
     """
 
@@ -52,11 +52,19 @@ class ParityCase:
         """Ticks of a window."""
         return int(self.bundle.predictor.spec.window)
 
-    def last_windows(self, count: int) -> tuple[list[Rows], Rows]:
-        """Windows at the end of the recording, and what PyTorch predicts from each alone, ``(window, number)``."""
+    def last_windows(self, count: int) -> tuple[list[Rows], Rows, Rows]:
+        """Windows at the end of the recording, what PyTorch predicts from each alone, and what is allowed.
+
+        Returns:
+            Inputs ``(tick, input)`` of each; ``(window, number)`` twice.
+        """
         ends = range(max(self.window, len(self.inputs) - count + 1), len(self.inputs) + 1)
         windows = [np.ascontiguousarray(self.inputs[end - self.window : end]) for end in ends]
-        return windows, np.concatenate([stream(self.bundle.predictor, window)[-1:] for window in windows])
+        predictor = self.bundle.predictor
+        # The least over the ticks is what is allowed where no tree is at a threshold.
+        least = self.allowed if self.allowed.ndim == 1 else self.allowed.min(axis=0)
+        allowed = [least + at_thresholds(predictor, window)[-1] for window in windows]
+        return windows, np.concatenate([stream(predictor, window)[-1:] for window in windows]), np.stack(allowed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +75,7 @@ class Ran:
         numbers: its numbers ``(row, number)``, SI units.
         seconds: for a tick; for a window where it computes windows.
         expected: what they are compared with, where that is not PyTorch's stream.
-        allowed: how far they may be from it ``(number,)``; the case's where it is None.
+        allowed: how far they may be from it, ``(number,)`` or ``(row, number)``; the case's where it is None.
         note: a remark for the table.
     """
 

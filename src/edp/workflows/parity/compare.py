@@ -11,7 +11,7 @@ import numpy as np
 
 from edp.data.unlabelled import unlabelled
 from edp.errors import DataError, ExportError
-from edp.export.golden import Rows, random_inputs, stream, tolerance
+from edp.export.golden import Rows, at_thresholds, random_inputs, stream, tolerance
 from edp.logs.source import DataSource
 from edp.training.bundle import Bundle
 from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Row, compared
@@ -44,7 +44,9 @@ def _case(bundle: Bundle, inputs: Rows) -> ParityCase:
             "more ticks or a longer recording"
         )
     expected = stream(predictor, inputs)
-    return ParityCase(bundle, inputs, expected, tolerance(predictor, inputs, expected))
+    steps = at_thresholds(predictor, inputs)
+    allowed = tolerance(predictor, inputs, expected)
+    return ParityCase(bundle, inputs, expected, allowed + steps if steps.any() else allowed)
 
 
 def compare(
