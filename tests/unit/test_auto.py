@@ -140,6 +140,18 @@ def test_the_report_says_why(result):
     assert found.sentence[:40].replace(" ", "") in "".join(page.split())
 
 
+def test_a_network_with_a_validation_part_of_its_own_is_compared_on_that_part(tmp_path, monkeypatch):
+    monkeypatch.setattr("edp.workflows.auto.candidates.RECURRENT_ROWS", 1000)
+    source = write(tmp_path / "logs", ticks=1500)
+    settings = load_auto(None, [*SET, "auto.candidates=['linear', 'recurrent']"])
+    facts = train_auto(source, settings, tmp_path / "run").facts
+    assert set(facts["candidates"]) == {"linear", "recurrent"}
+    linear, recurrent = (facts["candidates"][name]["promise"]["4"]["y"] for name in ("linear", "recurrent"))
+    # A network of a few updates hardly beats the mean change; the linear model does.
+    assert facts["chosen"] == "linear"
+    assert linear < recurrent < 3 * facts["persistence"]["4"]["y"]
+
+
 def test_page_and_file_show_every_model_on_left_out_data_and_on_the_test_part(result, tmp_path):
     source, folder, found = result
     copied = shutil.copytree(folder, tmp_path / "run")
