@@ -15,7 +15,7 @@ from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
 from edp.training import load_bundle
 from edp.workflows.auto import load_auto, train_auto
-from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half, spans_by_two
+from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half
 from edp.workflows.auto.promise import Promise, choose
 from edp.workflows.train_evaluate import DataSource, evaluate, trained_run
 
@@ -236,10 +236,9 @@ def test_candidates_that_left_out_fewer_blocks_are_compared_on_those():
 
 def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     amount = Amount(rows=100_000, shortest=100_000, features=5, outputs=2, horizon=10, minutes=5.0)
-    assert spans_by_two(amount) == [1, 2, 4, 8, 16, 32]
     assert spans_by_half(amount) == [1, 2, 3, 4, 6, 8, 12, 16, 24, 32]
-    assert spans_by_two(replace(amount, horizon=100))[-1] == 256
-    assert spans_by_two(replace(amount, shortest=80))[-1] == 8
+    assert spans_by_half(replace(amount, horizon=100))[-1] == 256
+    assert spans_by_half(replace(amount, shortest=80))[-1] == 8
     assert CANDIDATES["recurrent"].tables(replace(amount, rows=5000)) is None
     assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140)) is not None
     assert CANDIDATES["recurrent"].tables(replace(amount, shortest=140, horizon=100)) is None

@@ -21,8 +21,8 @@ from edp.networks.predictor import ModelSpec
 from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.signals import Channel, Kind
-from edp.training.bagging import fit_bagged
-from edp.training.bagging_spec import BaggingSpec
+from edp.training.bagging.fit import fit_bagged
+from edp.training.bagging.spec import BaggingSpec
 from edp.training.fit import fit
 from edp.training.spec import TrainingSpec
 
@@ -80,6 +80,86 @@ def test_the_network_predicts_the_test_part_as_well_as_it_promised(bagged):
         assert np.sqrt(np.square(error).mean()) < 1.3 * promised
 
 
+PARTS = {
+    "perceptrons of two losses": ({"members": 8}, {"robust_width": 0.1}),
+    "radial": ({"activations": (), "centres": 100}, {}),
+    "trees": ({"activations": (), "trees": 60}, {}),
+    "one tree": ({"activations": (), "trees": 1}, {}),
+    "all": ({"members": 8, "centres": 100, "trees": 60}, {"robust_width": 0.1}),
+}
+
+
+def committee(**parts):
+    backbone = CommitteeSpec(**{"lags": (1, 2, 4, 8), "members": 4, "units": 16, **parts})
+    return ModelSpec(backbone=backbone, head=LinearHead(), blocks=(), window=10)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_every_kind_of_learner_lowers_the_error_and_keeps_its_promise(name):
+    parts, settings = PARTS[name]
+    data = data_of(recording())
+    outcome = fit_bagged(data, committee(**parts), spec(steps=300, learning_rate=1e-2, **settings))
+    promise = np.sqrt(np.square(outcome.left_out - outcome.table.targets).mean(axis=0))
+    linear = np.sqrt(np.square(outcome.linear - outcome.table.targets).mean(axis=0))
+    assert (promise <= linear).all()
+    assert promise[0] < (1.0 if name == "one tree" else 0.9) * linear[0]
+    part, net = data.test[0], outcome.fitted.predictor
+    (predicted,) = stream_predictions(net, data.test)
+    for output, k in enumerate(data.task.horizons):
+        error = (predicted[10 : part.samples - k, output] - part.targets[10 + k :]) / net.code.width.numpy()[output]
+        assert np.sqrt(np.square(error).mean()) < 1.3 * promise[output]
+
+
+def test_the_network_computes_the_weighted_sum_of_its_learners():
+    """On rows that all models were fitted to: the linear model, the centres and the trees, put together by hand."""
+    data = data_of(recording(), horizons=(1,), mode=TargetMode.ABSOLUTE)
+    model = committee(activations=(), centres=40, trees=20)
+    outcome = fit_bagged(data, model, spec())
+    net, table = outcome.fitted.predictor, outcome.table
+    backbone, columns = net.backbone, torch.from_numpy(table.columns)
+    weights = net.heads.weights[0].detach().double().numpy()[0, :, 0]
+    situation = columns * backbone.radial.gain
+    near = torch.sigmoid(-(torch.cdist(situation, backbone.radial.weight[:, :-1].detach()) ** 2) / 2).double().numpy()
+    sums = backbone.trees(columns[None], ())[0][0].double().numpy()
+    by_hand = np.concatenate([table.columns, near, sums], axis=1) @ weights + float(net.heads.biases[0][0, 0].detach())
+    part = data.train[0]
+    (predicted,) = stream_predictions(net, [part])
+    count = part.samples - 1 - table.starts[0][1]
+    scaled = (predicted[table.starts[0][1] :][:count, 0, 0] - net.code.offset.numpy()[0, 0]) / net.code.width.numpy()[
+        0, 0
+    ]
+    np.testing.assert_allclose(scaled, by_hand[:count], atol=2e-3)
+
+
+def test_trees_that_predict_the_target_take_their_share_from_the_linear_model():
+    """A step that no line follows: the trees of the target carry the prediction, and it stays within the recordings."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.uniform(-1, 1, 200), 10)
+    y = np.concatenate([[0.0], np.where(u[:-1] > 0, 1.0, -1.0)]) + 0.01 * rng.normal(size=len(u))
+    values = np.stack([u, y], axis=1).astype(np.float32)
+    log = Recording(name="log", rate_hz=RATE, channels=CHANNELS, values=values, source="test")
+    data = data_of(log, horizons=(1,), mode=TargetMode.ABSOLUTE)
+    outcome = fit_bagged(data, committee(activations=(), trees=60), spec())
+    promise = np.sqrt(np.square(outcome.left_out - outcome.table.targets).mean())
+    assert promise < 0.5 * np.sqrt(np.square(outcome.linear - outcome.table.targets).mean())
+
+
+def test_a_learner_of_noise_gets_no_share():
+    rng = np.random.default_rng(1)
+    log = Recording(
+        name="log", rate_hz=RATE, channels=CHANNELS, values=rng.normal(size=(1500, 2)).astype(np.float32), source="test"
+    )
+    outcome = fit_bagged(data_of(log), committee(activations=(), centres=50, trees=20), spec())
+    error = np.sqrt(np.square(outcome.left_out - outcome.table.targets).mean(axis=0))
+    linear = np.sqrt(np.square(outcome.linear - outcome.table.targets).mean(axis=0))
+    np.testing.assert_allclose(error, linear, rtol=0.01)
+
+
+def test_members_of_two_losses_are_a_multiple_of_twice_the_folds():
+    with pytest.raises(ConfigError, match="twice the folds"):
+        fit(data_of(recording(600)), MODEL, spec(robust_width=0.1))
+
+
 def test_the_same_seed_gives_the_same_bits_and_another_one_others():
     data = data_of(recording(600))
     first, again, other = (
@@ -99,7 +179,9 @@ def test_without_members_it_is_the_linear_model_of_the_folds():
     np.testing.assert_allclose(found.left_out, found.linear)
     net, part = found.fitted.predictor, data.train[0]
     (predicted,) = stream_predictions(net, [part])
-    rows = found.table.columns[: part.samples - data.task.max_horizon].astype(np.float64)
+    (_, tick), *_ = found.table.starts
+    rows = found.table.columns[: part.samples - data.task.max_horizon - tick].astype(np.float64)
+    predicted = predicted[tick:]
     weights = net.heads.weights[0].detach().double().numpy()[0]
     wanted = rows @ weights + net.heads.biases[0].detach().double().numpy()[0]
     scaled = (predicted[: len(rows), :, 0] - net.code.offset.numpy()[:, 0]) / net.code.width.numpy()[:, 0]

@@ -44,14 +44,15 @@ def fold_ridge(
 
     Args:
         table: ``(row, column)``, columns of about unit spread.
-        targets: ``(row, output)``.
+        targets: ``(row, output)``, or those of each fold, ``(fold, row, output)``.
         folds: who is left out when.
         column_sets: sets of columns to choose from, the simplest first.
     """
-    outputs, columns = targets.shape[1], table.shape[1]
+    outputs, columns = targets.shape[-1], table.shape[1]
+    of_fold = np.broadcast_to(targets, (folds.count, len(table), outputs))
     rows_of = [folds.left_out(fold) for fold in range(folds.count)]
-    trained = [_moments(table[rows], targets[rows]) for rows in folds.training]
-    judged = [_moments(table[rows], targets[rows]) for rows in rows_of]
+    trained = [_moments(table[rows], own[rows]) for rows, own in zip(folds.training, of_fold, strict=True)]
+    judged = [_moments(table[rows], own[rows]) for rows, own in zip(rows_of, of_fold, strict=True)]
     shares = [len(rows) / len(table) for rows in rows_of]
     best = np.full(outputs, np.inf)
     weights = np.zeros((folds.count, columns, outputs))
@@ -75,7 +76,7 @@ def fold_ridge(
                 weights[:, :, better] = 0.0
                 weights[np.ix_(np.arange(folds.count), chosen, np.flatnonzero(better))] = np.stack(solved)[:, :, better]
                 intercepts[:, better] = np.stack(shifts)[:, better]
-    left_out = np.zeros_like(targets)
+    left_out = np.zeros((len(table), outputs))
     for rows, weight, intercept in zip(rows_of, weights, intercepts, strict=True):
         left_out[rows] = table[rows] @ weight + intercept
     return FoldRidge(weights, intercepts, left_out)

@@ -21,6 +21,7 @@ from edp.networks.convolution import ConvolutionStack, receptive_field
 from edp.networks.initial import InitialSpec, ZeroState
 from edp.networks.lag_bank import LagBank, check_lags
 from edp.networks.pooling import AttentionPooling
+from edp.networks.radial import MOST_CENTRES, RadialFeatures
 from edp.networks.streaming import Chain, Cost, State, Streaming
 from edp.networks.trees import MOST_DEPTH, MOST_TREES, Trees
 from edp.registry import Registry
@@ -250,6 +251,7 @@ class CommitteeSpec:
         layers: hidden layers of a member.
         activations: ``tanh``, ``relu`` or both; each has its own group of members. None leaves the linear model.
         dropout: rate after each hidden layer, in training.
+        centres: radial basis functions; a training on folds places them.
         trees: regression trees for each predicted number; their sums join the representation. A training on folds
             fits them.
         tree_depth: comparisons from the root of a tree to a leaf.
@@ -262,6 +264,7 @@ class CommitteeSpec:
     layers: int = 2
     activations: tuple[str, ...] = ("tanh", "relu")
     dropout: float = 0.0
+    centres: int = 0
     trees: int = 0
     tree_depth: int = 4
 
@@ -271,6 +274,7 @@ class CommitteeSpec:
         check_count("backbone", "activations", self.activations, len(NON_LINEAR))
         check_bounds("backbone", self, members=whole(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
         check_bounds("backbone", self, trees=whole(0, MOST_TREES), tree_depth=whole(1, MOST_DEPTH))
+        check_bounds("backbone", self, centres=whole(0, MOST_CENTRES))
         for name in self.activations:
             if name not in NON_LINEAR or self.activations.count(name) > 1:
                 raise ConfigError(
@@ -293,8 +297,8 @@ class CommitteeSpec:
         return ()
 
     def parts(self) -> tuple[str, ...]:
-        """The members; the changes have no weights."""
-        return ("groups",)
+        """The members and the radial basis functions; changes and trees have no weights that a gradient trains."""
+        return ("groups", "radial") if self.centres else ("groups",)
 
     def build(self, features: int, window: int, blocks: Blocks, outputs: int = 1) -> tuple[Streaming, int]:
         """The bank of changes, and the members and trees on it."""
@@ -304,7 +308,8 @@ class CommitteeSpec:
             for name in self.activations
         ]
         trees = Trees(bank.columns, outputs, self.trees, self.tree_depth) if self.trees else None
-        net = Committee(bank, groups, trees)
+        radial = RadialFeatures(bank.columns, self.centres) if self.centres else None
+        net = Committee(bank, groups, radial, trees)
         return net, net.width
 
 

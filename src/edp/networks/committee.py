@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from edp.ir import Builder
 from edp.ir.layers import Activate, Dense, Function, GroupedDense
 from edp.networks.lag_bank import LagBank
+from edp.networks.radial import RadialFeatures
 from edp.networks.streaming import Cost, Operation, State, Streaming
 from edp.networks.trees import Trees
 
@@ -80,35 +81,43 @@ class Members(Streaming):
 
 
 class Committee(Streaming):
-    """``[bank ; members' hidden units ; trees' sums]``.
+    """``[bank ; members' hidden units ; radial basis functions ; trees' sums]``.
 
-    A linear head on it is a linear model plus a weighted mean of perceptrons plus weighted sums of trees.
+    A linear head on it is a linear model plus a weighted mean of perceptrons, a kernel machine and sums of trees.
 
     Args:
         bank: gives what the others read.
         groups: of perceptrons.
+        radial: nearness to typical rows; None for none.
         trees: for each predicted number, horizons times targets; None for none.
     """
 
-    def __init__(self, bank: LagBank, groups: Sequence[Members], trees: Trees | None = None) -> None:
+    def __init__(
+        self, bank: LagBank, groups: Sequence[Members], radial: RadialFeatures | None = None, trees: Trees | None = None
+    ) -> None:
         super().__init__()
         self.bank = bank
         self.groups = nn.ModuleList(groups)
+        self.radial = radial
         self.trees = trees
 
     @property
     def width(self) -> int:
         """Numbers of the representation."""
-        hidden = sum(group.members * group.units for group in self._members())
-        return self.bank.columns + hidden + (0 if self.trees is None else self.trees.outputs)
+        hidden = sum(group.members * group.units for group in self.members)
+        near = 0 if self.radial is None else self.radial.count
+        return self.bank.columns + hidden + near + (0 if self.trees is None else self.trees.outputs)
 
-    def _members(self) -> list[Members]:
+    @property
+    def members(self) -> list[Members]:
+        """The groups of perceptrons."""
         return [group for group in self.groups if isinstance(group, Members)]
 
-    def _readers(self) -> dict[str, Members | Trees]:
+    def _readers(self) -> dict[str, Streaming]:
         """What reads the bank, in the order of the representation."""
-        readers: dict[str, Members | Trees] = {f"group{at}": group for at, group in enumerate(self._members())}
-        return readers if self.trees is None else readers | {"trees": self.trees}
+        readers: dict[str, Streaming] = {f"group{at}": group for at, group in enumerate(self.members)}
+        further = {"radial": self.radial, "trees": self.trees}
+        return readers | {name: part for name, part in further.items() if part is not None}
 
     def initial_state(self, batch: int, like: Tensor) -> State:
         return self.bank.initial_state(batch, like)

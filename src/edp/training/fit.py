@@ -20,7 +20,7 @@ from edp.errors import ConfigError, DataError
 from edp.networks.predictor import ModelSpec, build_model, trainable
 from edp.networks.streaming import State, detach_state, reset_where
 from edp.storage.runs import KeyedRun
-from edp.training.bagging import fit_in_folds
+from edp.training.bagging.fit import fit_in_folds
 from edp.training.checkpoint import FILE, REFIT, Progress, Weights, Within, damaged, load_checkpoint, save_checkpoint
 from edp.training.memory import check_training_memory
 from edp.training.objective import Objective

@@ -28,7 +28,7 @@ from edp.settings.bounds import (
     whole,
 )
 from edp.training.averages import AverageSpec, Exponential
-from edp.training.bagging_spec import BaggingSpec
+from edp.training.bagging.spec import BaggingSpec
 from edp.training.optimizers import AdamW, OptimizerSpec
 from edp.training.schedules import Cosine, ScheduleSpec
 
@@ -167,9 +167,11 @@ def _against_bagging(model: ModelSpec, spec: TrainingSpec, bagging: BaggingSpec)
         reasons.append(
             "bagging trains model.backbone = 'committee' with model.head = 'linear'; take these, or leave it"
         )
-    elif model.backbone.members % bagging.folds:
+    elif model.backbone.members % (bagging.folds * (2 if bagging.robust_width else 1)):
+        twice = "twice " if bagging.robust_width else ""
         reasons.append(
-            f"bagging.folds = {bagging.folds} with {model.backbone.members} members; a multiple of the folds must hold"
+            f"bagging.folds = {bagging.folds} with {model.backbone.members} members; a multiple of {twice}the folds "
+            f"must hold{' with bagging.robust_width' if twice else ''}"
         )
     parts = [
         name

@@ -84,7 +84,7 @@ BLIND = ("task.features={name='lever', channels=['u']}", "task.mode='absolute'")
         (900, {}, ("task.horizons=[90]",), ("longer than the largest horizon of 90 ticks", "shorter horizon")),
         (9, {}, (), ("log", "too short (9 samples)", "give a longer recording")),
         (40, {}, ("task.horizons=[1]",), ("1 independent block(s)", "two must hold", "longer or more recordings")),
-        (80, {}, ("task.horizons=[1]",), ("56 rows for 5 folds", "record longer")),
+        (80, {}, ("task.horizons=[1]",), ("54 rows for 5 folds", "record longer")),
         (900, {}, ("split={kind='recordings', test=['log']}",), ("no recording is left for train", "split by time")),
     ],
 )

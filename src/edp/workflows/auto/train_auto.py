@@ -23,7 +23,7 @@ from edp.signals import Kind
 from edp.storage import make_folder, read_object, write_json
 from edp.storage.runs import KeyedRun, RunFolder, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
-from edp.training.bagging import fit_bagged
+from edp.training.bagging.fit import fit_bagged
 from edp.training.fit import fit
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
 from edp.workflows.auto.promise import (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from edp.data.folds import Folds
 from edp.data.lags import DoubleArray
 from edp.networks.committee import Members
 from edp.networks.losses.base import Penalty
-from edp.training.bagging_spec import BaggingSpec
+from edp.training.bagging.spec import BaggingSpec
 from edp.training.spec import TrainingSpec
 
 JUDGED_ROWS = 4000
@@ -26,9 +27,19 @@ PIECE = 4096
 class MemberGroup:
     """The members of one activation while they train: weights of all of them side by side."""
 
-    def __init__(self, members: Members, outputs: int, folds: Folds, spec: TrainingSpec, draw: torch.Generator) -> None:
-        self.members, self.draw = members, draw
+    def __init__(
+        self,
+        members: Members,
+        outputs: int,
+        folds: Folds,
+        spec: TrainingSpec,
+        losses: Sequence[Penalty],
+        draw: torch.Generator,
+    ) -> None:
+        self.members, self.losses, self.draw = members, losses, draw
         self.fold = torch.arange(members.members) % folds.count
+        # Dealt out like the folds: every loss has members that leave each fold out.
+        self.kind = torch.arange(members.members) // folds.count % len(losses)
         last = torch.zeros(members.members, members.units, outputs)
         self.parameters = [
             parameter.detach().clone().requires_grad_()
@@ -59,14 +70,22 @@ class MemberGroup:
                 x = x * (torch.rand(x.shape, generator=self.draw) >= rate) / (1 - rate)
         return torch.baddbmm(parameters[-1], x, parameters[-2])
 
-    def update(self, columns: Tensor, residuals: Tensor, loss: Penalty, rate: float) -> float:
+    def _penalty(self, error: Tensor, kind: Tensor) -> Tensor:
+        """Mean penalty of each member by its own loss; error ``(member, row, output)``, kind ``(member,)``."""
+        each = torch.zeros(len(error))
+        for number, loss in enumerate(self.losses):
+            mine = torch.nonzero(kind == number).flatten()
+            each = each.index_put((mine,), loss.penalty(error[mine]).mean(dim=(1, 2)))
+        return each
+
+    def update(self, columns: Tensor, residuals: Tensor, rate: float) -> float:
         """One step of every member on rows of its own; the mean loss."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         rows = torch.stack([self._draw_rows(int(fold)) for fold in self.fold])
         error = self.forward(columns[rows], self.parameters, dropping=True) - residuals[self.fold[:, None], rows]
         # The sum over members: each has its own gradient, as if it were trained alone.
-        each = loss.penalty(error).mean(dim=(1, 2))
+        each = self._penalty(error, self.kind)
         self.optimizer.zero_grad(set_to_none=True)
         each.sum().backward()
         self.optimizer.step()
@@ -78,7 +97,7 @@ class MemberGroup:
         rows = self.training[fold]
         return rows[torch.randint(len(rows), (self.batch,), generator=self.draw)]
 
-    def judge(self, columns: Tensor, residuals: Tensor, loss: Penalty) -> tuple[float, float]:
+    def judge(self, columns: Tensor, residuals: Tensor) -> tuple[float, float]:
         """Keep each member's average where it is the best so far; mean loss and absolute error on left-out rows."""
         losses, absolute = torch.zeros(len(self.fold)), 0.0
         with torch.no_grad():
@@ -88,7 +107,7 @@ class MemberGroup:
                     continue
                 x = columns[rows].expand(len(mine), -1, -1)
                 error = self.forward(x, [value[mine] for value in self.average]) - residuals[fold, rows]
-                losses[mine] = loss.penalty(error).mean(dim=(1, 2))
+                losses[mine] = self._penalty(error, self.kind[mine])
                 absolute += float(error.abs().mean()) * len(mine) / len(self.fold)
             better = losses < self.least
             self.least = torch.where(better, losses, self.least)
@@ -96,12 +115,16 @@ class MemberGroup:
                 best[better] = value[better]
         return float(losses.mean()), absolute
 
-    def left_out(self, columns: Tensor, folds: Folds) -> DoubleArray:
-        """Mean prediction of each row by the members that left it out, ``(row, output)``; zero where none did."""
+    def of_kind(self, kind: int) -> Tensor:
+        """Numbers of the members that were trained with one of the losses."""
+        return torch.nonzero(self.kind == kind).flatten()
+
+    def left_out(self, columns: Tensor, folds: Folds, kind: int) -> DoubleArray:
+        """Mean prediction of each row by members of a loss that left it out, ``(row, output)``; zero where none did."""
         predicted = np.zeros((len(columns), self.best[-1].shape[-1]))
         with torch.no_grad():
             for fold in range(folds.count):
-                mine = torch.nonzero(self.fold == fold).flatten()
+                mine = torch.nonzero((self.fold == fold) & (self.kind == kind)).flatten()
                 rows = folds.left_out(fold)
                 for start in range(0, len(rows) if len(mine) else 0, PIECE):
                     piece = rows[start : start + PIECE]

@@ -1,0 +1,79 @@
+"""Radial basis functions: how near what is seen now comes to typical situations of the training."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from edp.ir import Builder
+from edp.ir.layers import Activate, BinaryOperation, Dense, Function, ScaleShift
+from edp.networks.streaming import Cost, Operation, State, Streaming
+
+MOST_CENTRES = 4096
+
+
+class RadialFeatures(Streaming):
+    """``sigmoid(-|z - c|^2 / 2)`` for each centre c, ``(batch, time, width)`` to ``(batch, time, centres)``; no memory.
+
+    ``z`` is what it reads, times `gain`. The argument is a linear layer on ``[z ; -|z|^2 / 2]`` with the weights
+    ``[c ; 1]`` and the bias ``-|c|^2 / 2``. Away from a centre the sigmoid falls like the Gaussian kernel
+    ``exp(-|z - c|^2 / 2)``, and unlike it every target computes it in integers, too. Far from all centres a linear map
+    of the features is its intercept alone.
+
+    Args:
+        width: columns that it reads.
+        centres: how many.
+
+    Attributes:
+        gain: what each column is multiplied by, one over the product of length and spread, ``(width,)``.
+        weight: ``(centre, width + 1)``; at first all centres are at the origin.
+        bias: ``(centre,)``.
+    """
+
+    gain: Tensor
+    minus_half: Tensor
+    operations = frozenset({Operation.LINEAR, Operation.SIGMOID})
+    matrices = (("weight", (0,)),)
+
+    def __init__(self, width: int, centres: int) -> None:
+        super().__init__()
+        self.width, self.count = width, centres
+        self.register_buffer("gain", torch.ones(width))
+        self.register_buffer("minus_half", torch.full((1, width), -0.5), persistent=False)
+        self.weight = nn.Parameter(torch.zeros(centres, width + 1))
+        self.bias = nn.Parameter(torch.zeros(centres))
+        self.set_centres(torch.zeros(centres, width))
+
+    def set_centres(self, centres: Tensor) -> None:
+        """Put the centres ``(centre, width)``, in units of length and spread, where the basis functions are largest."""
+        with torch.no_grad():
+            self.weight.copy_(torch.cat([centres, torch.ones_like(centres[:, :1])], dim=1))
+            self.bias.copy_(-0.5 * centres.square().sum(dim=1))
+
+    def initial_state(self, batch: int, like: Tensor) -> State:
+        return ()
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        z = x * self.gain
+        norm = nn.functional.linear(z * z, self.minus_half)
+        return torch.sigmoid(nn.functional.linear(torch.cat([z, norm], dim=-1), self.weight, self.bias)), state
+
+    def lower(self, build: Builder, x: str) -> str:
+        z = build.add(ScaleShift, "situation", x, gain=self.gain, shift=torch.zeros_like(self.gain))
+        square = build.combine("square", BinaryOperation.MULTIPLY, z, z)
+        norm = build.add(Dense, "norm", square, weight=self.minus_half, bias=torch.zeros(1))
+        both = build.join("situation_and_norm", z, norm)
+        argument = build.add(Dense, "argument", both, weight=self.weight, bias=self.bias)
+        return build.add(Activate, "nearness", argument, function=Function.SIGMOID, size=self.count)
+
+    def costs(self) -> list[Cost]:
+        return [
+            Cost(
+                f"{self.count} radial basis functions of {self.width} columns",
+                self.weight.numel() + self.bias.numel(),
+                per_prediction=self.width + self.weight.numel(),
+                width_in=self.width,
+                width_out=self.count,
+                per_time_step=False,
+            )
+        ]

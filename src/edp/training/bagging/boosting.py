@@ -1,0 +1,153 @@
+"""Boosted regression trees as learners of a committee: steps and switches that smooth learners round off.
+
+Two models, each with half of the trees: one of what the linear model leaves, and one of the targets themselves, which
+does not run away with the linear model where the machine goes beyond what was recorded. How many trees, left-out rows
+say; the trees of the network are then grown on all rows.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.lags import DoubleArray
+from edp.networks.trees import Trees
+from edp.training.bagging.learner import FoldFit, HeadPart
+from edp.training.outcome import TrainingProgress
+from edp.training.tree_tables import Tables, complete_tables, stacked_tables
+
+
+@dataclass(frozen=True, eq=False)
+class _Boosted:
+    """One model of one output.
+
+    Attributes:
+        count: trees with the least error on left-out rows; 0 where all of them raise it.
+        left_out: predictions of rows by trees that did not see them, ``(row,)``.
+        tables: of the trees that were grown on all rows; None without trees.
+    """
+
+    count: int
+    left_out: DoubleArray
+    tables: Tables | None
+
+
+class TreeLearner:
+    """Fits the trees of a committee, half of them to residuals and half to the targets."""
+
+    def __init__(self, work: FoldFit, trees: Trees) -> None:
+        self.work, self.trees = work, trees
+        self.rounds = max(1, trees.trees // 2)
+        self.models: list[list[_Boosted]] = []
+        rng = np.random.default_rng(work.spec.seed)
+        most, folds = work.bagging.tree_rows, work.table.folds
+        self.training = [_sample(rows, most, rng) for rows in folds.training]
+        self.every = _sample(np.arange(len(work.table.columns)), most, rng)
+
+    def fit(self) -> None:
+        """Every output of both models; progress after each."""
+        began, outputs = time.perf_counter(), self.work.table.targets.shape[1]
+        kinds = 2 if self.trees.trees > 1 else 1
+        for kind in range(kinds):
+            self.models.append([])
+            for output in range(outputs):
+                self.models[-1].append(self._boost(direct=kind == 1, output=output))
+                done, seconds = kind * outputs + output + 1, time.perf_counter() - began
+                rate = done * len(self.every) / max(seconds, 1e-9)
+                left = (kinds * outputs - done) * seconds / done
+                self.work.tell(TrainingProgress(1, 1, done, kinds * outputs, rate, left))
+
+    def _boost(self, direct: bool, output: int) -> _Boosted:
+        table = self.work.table
+        errors, staged = np.zeros(self.rounds), np.zeros((self.rounds, len(table.columns)))
+        truth = np.zeros(len(table.columns))
+        for fold, rows in enumerate(self.training):
+            judged = table.folds.left_out(fold)
+            truth[judged] = self._target(judged, fold, direct)[:, output]
+            stages = self._grown(rows, self._target(rows, fold, direct)[:, output], self.rounds, judged)
+            for number, predicted in enumerate(stages):
+                staged[number, judged] = predicted
+        errors = np.square(staged - truth).mean(axis=1)
+        count = int(errors.argmin()) + 1
+        if errors[count - 1] >= np.square(truth).mean():
+            return _Boosted(0, np.zeros(len(truth)), None)
+        target = self._target(self.every, None, direct)[:, output]
+        model = self._regressor(count).fit(table.columns[self.every], target)
+        return _Boosted(count, staged[count - 1], complete_tables(model, self.trees.depth))
+
+    def _target(self, rows: NDArray[np.int64], fold: int | None, direct: bool) -> DoubleArray:
+        """What the trees of a fold, or those on all rows, are to predict, ``(row, output)``."""
+        targets = self.work.table.targets[rows]
+        if direct:
+            return targets
+        if fold is not None:
+            return self.work.residuals(rows, fold)
+        weight, intercept = self.work.linear.mean()
+        return np.asarray(targets - self.work.table.columns[rows] @ weight - intercept)
+
+    def _grown(
+        self, rows: NDArray[np.int64], target: DoubleArray, rounds: int, judged: NDArray[np.int64]
+    ) -> Iterator[DoubleArray]:
+        """Predictions of the judged rows after each tree."""
+        columns = self.work.table.columns
+        model = self._regressor(rounds).fit(columns[rows], target)
+        return iter(model.staged_predict(columns[judged]))
+
+    def _regressor(self, rounds: int):  # type: ignore[no-untyped-def]  # scikit-learn has no types
+        # Imported here: it takes over a second, and trainings without trees do not need it.
+        from sklearn.ensemble import HistGradientBoostingRegressor
+
+        bagging = self.work.bagging
+        return HistGradientBoostingRegressor(
+            max_iter=rounds,
+            max_depth=self.trees.depth,
+            max_leaf_nodes=None,
+            learning_rate=bagging.tree_rate,
+            min_samples_leaf=bagging.tree_leaf,
+            early_stopping=False,
+            random_state=self.work.spec.seed,
+        )
+
+    def left_out(self) -> Sequence[DoubleArray]:
+        """Both models' predictions, those of the second less the linear model's, in whose stead they come."""
+        residual, *direct = [np.stack([model.left_out for model in models], axis=1) for models in self.models]
+        return [residual, *(predicted - self.work.linear.left_out for predicted in direct)]
+
+    def write(self, shares: DoubleArray) -> HeadPart:
+        """The trees with their shares into the network; the head passes their sums on."""
+        outputs = self.work.table.targets.shape[1]
+        tables = [
+            [_weighted(models[output].tables, share[output]) for models, share in zip(self.models, shares, strict=True)]
+            for output in range(outputs)
+        ]
+        grown = [[one for one in both if one is not None] for both in tables]
+        empty = self._empty()
+        joined = [tuple(np.concatenate(part) for part in zip(*both, strict=True)) if both else empty for both in grown]
+        self.trees.set_tables(*stacked_tables(joined, self.trees.trees))  # type: ignore[arg-type]
+        taken_away = shares[1] if len(shares) > 1 else np.zeros(outputs)
+        return HeadPart(np.eye(outputs), np.zeros(outputs), np.asarray(taken_away))
+
+    def _empty(self) -> Tables:
+        nodes = 2**self.trees.depth - 1
+        return (
+            np.zeros((0, nodes), dtype=np.int64),
+            np.zeros((0, nodes), dtype=np.float32),
+            np.zeros((0, nodes + 1), dtype=np.float32),
+        )
+
+
+def _weighted(tables: Tables | None, share: float) -> Tables | None:
+    """Tables whose leaves are multiplied by a share; None where nothing is left of them."""
+    if tables is None or share <= 0:
+        return None
+    feature, threshold, leaf = tables
+    return feature, threshold, (leaf * share).astype(np.float32)
+
+
+def _sample(rows: NDArray[np.int64], most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """At most so many of the rows, in order."""
+    return rows if len(rows) <= most else np.sort(rng.choice(rows, most, replace=False))

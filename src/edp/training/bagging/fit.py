@@ -1,0 +1,175 @@
+"""Fit a committee: a linear model, and learners of several kinds on what it leaves, each with one fold left out.
+
+The prediction is the mean of the folds' linear models plus a non-negative combination of the learners (bagging:
+Breiman, 1996; stacking: Wolpert, 1992, and Breiman, 1996). Each row of the training and validation parts is left out by
+one fold: what that fold's models say of it is an honest prediction. These left-out predictions choose the linear model,
+stop each learner, weigh the learners and tell the error to expect.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+
+from edp.data.fold_ridge import FoldRidge, fold_ridge
+from edp.data.lags import DoubleArray
+from edp.data.prepared import Prepared
+from edp.errors import ConfigError
+from edp.networks.predictor import ModelSpec, Predictor, build_model
+from edp.storage.runs import RunFolder
+from edp.training.bagging.boosting import TreeLearner
+from edp.training.bagging.learner import FoldFit, HeadPart, Learner
+from edp.training.bagging.perceptrons import PerceptronLearner, losses_of, record
+from edp.training.bagging.radial import RadialLearner
+from edp.training.bagging.spec import BaggingSpec
+from edp.training.bagging.table import Table, committee_of, table_of
+from edp.training.outcome import Fitted, TrainingProgress
+from edp.training.spec import TrainingSpec, check_training
+
+Event = Callable[[TrainingProgress], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Bagged:
+    """A committee fitted by bagging.
+
+    Attributes:
+        fitted: the predictor with its history.
+        left_out: predictions of each row by what did not train on it, standardised, ``(row, output)``.
+        linear: those of the linear model alone.
+        table: the rows.
+    """
+
+    fitted: Fitted
+    left_out: DoubleArray
+    linear: DoubleArray
+    table: Table
+
+    def at_every_tick(self, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
+        """Left-out predictions of each stretch at every tick, standardised ``(tick, output)``.
+
+        Args:
+            truth: what was to be predicted, of each stretch of the training part, then of the validation part.
+        """
+        return self.table.at_every_tick(self.left_out - self.table.targets, truth)
+
+
+def fit_bagged(data: Prepared, model: ModelSpec, spec: TrainingSpec, on_event: Event | None = None) -> Bagged:
+    """Fit a committee on the training and validation parts; ``data.test`` is not touched.
+
+    Args:
+        data: prepared series.
+        model: a network with the backbone ``committee`` and the head ``linear``.
+        spec: how to train; its `bagging` is given.
+        on_event: called with progress.
+
+    Raises:
+        ConfigError: settings that contradict one another or need more memory than there is.
+        DataError: too few rows for the folds.
+        Diverged: the loss is not finite any more.
+    """
+    check_training(data.task, model, spec)
+    began = time.perf_counter()
+    net = build_model(data.task, model, data.scaler(), spec.seed).eval()
+    table = table_of(net, data, spec.bagging or BaggingSpec())
+    work = FoldFit(net, data, spec, table, _fit_linear(net, table), on_event or (lambda event: None))
+    learners = _learners(work)
+    for learner in learners:
+        learner.fit()
+    left_out = _combine(work, learners)
+    if not work.history:
+        _record_linear(work)
+    seconds = time.perf_counter() - began
+    for row in work.history:
+        row["seconds"] = round(seconds * row["updates"] / max(1, work.history[-1]["updates"]), 3)
+    speeds = [learner.rows_per_s for learner in learners if isinstance(learner, PerceptronLearner)]
+    fitted = Fitted(net.eval(), work.history, seconds, sum(speeds), 0)
+    return Bagged(fitted, left_out, work.linear.left_out, table)
+
+
+def fit_in_folds(
+    data: Prepared,
+    model: ModelSpec,
+    spec: TrainingSpec,
+    run: RunFolder | None,
+    on_event: Event,
+    strategy: object,
+) -> Fitted:
+    """As `fit_bagged`, with its history in a run folder; there is no checkpoint: a stopped training begins anew.
+
+    Raises:
+        ConfigError: a strategy came with it.
+    """
+    if strategy is not None:
+        raise ConfigError(
+            "training.bagging trains from the recordings alone; leave it out, or train without a teacher or source"
+        )
+    fitted = fit_bagged(data, model, spec, on_event).fitted
+    if run is not None:
+        run.write_history(fitted.history)
+    return fitted
+
+
+def _fit_linear(net: Predictor, table: Table) -> FoldRidge:
+    """The linear models: present values alone, then with changes over more and more spans."""
+    bank = committee_of(net).bank
+    sets = [np.arange(bank.width * (1 + spans)) for spans in range(len(bank.lags) + 1)]
+    return fold_ridge(table.columns, table.targets, table.folds, sets)
+
+
+def _learners(work: FoldFit) -> list[Learner]:
+    """What the committee has parts for, in the order of its representation."""
+    committee = committee_of(work.net)
+    learners: list[Learner] = []
+    if committee.members:
+        learners.append(PerceptronLearner(work, committee.members))
+    if committee.radial is not None:
+        learners.append(RadialLearner(work, committee.radial))
+    if committee.trees is not None:
+        learners.append(TreeLearner(work, committee.trees))
+    return learners
+
+
+def _combine(work: FoldFit, learners: Sequence[Learner]) -> DoubleArray:
+    """Weigh all models, write everything into the network, and give the predictions of rows that were left out."""
+    models = [list(learner.left_out()) for learner in learners]
+    every = [one for each in models for one in each]
+    residual = work.residual
+    shares = np.zeros((len(every), residual.shape[1]))
+    for output in range(residual.shape[1] if every else 0):
+        # Non-negative: a model that only fits the noise gets nothing, and none is played off against another.
+        shares[:, output], _ = nnls(np.stack([one[:, output] for one in every], axis=1), residual[:, output])
+    parts, first = [], 0
+    for learner, own in zip(learners, models, strict=True):
+        parts.append(learner.write(shares[first : first + len(own)]))
+        first += len(own)
+    _write_head(work, parts)
+    weighted = (one * share for one, share in zip(every, shares, strict=True))
+    return np.asarray(work.linear.left_out + sum(weighted, np.zeros_like(residual)))
+
+
+def _write_head(work: FoldFit, parts: Sequence[HeadPart]) -> None:
+    """The linear model and every learner's part into the head of the network."""
+    weight, intercept = work.linear.mean()
+    remaining = 1.0 - sum((part.linear for part in parts), np.zeros(len(intercept)))
+    full = np.concatenate([weight * remaining, *(part.weight for part in parts)])
+    bias = intercept * remaining + sum((part.bias for part in parts), np.zeros(len(intercept)))
+    # Outputs are horizon by horizon; heads are (target, in, horizon).
+    task, heads = work.data.task, work.net.heads
+    shape = (len(full), len(task.horizons), len(task.targets))
+    with torch.no_grad():
+        heads.weights[0].copy_(torch.from_numpy(full.reshape(shape).transpose(2, 0, 1).copy()))
+        heads.biases[0].copy_(torch.from_numpy(bias.reshape(shape[1:]).T.copy()))
+
+
+def _record_linear(work: FoldFit) -> None:
+    """The one row of the history where nothing is trained step by step."""
+    error = torch.from_numpy(work.linear.left_out - work.table.targets)
+    validation = float(losses_of(work.spec)[0].penalty(error).mean())
+    record(work, 1, 0, math.nan, validation, float(error.abs().mean()), error.abs().mean(dim=0).numpy(), 0.0)

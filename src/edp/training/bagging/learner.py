@@ -1,0 +1,92 @@
+"""What a committee adds to its linear model: learners, each fitted with every fold left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.fold_ridge import FoldRidge
+from edp.data.lags import DoubleArray
+from edp.data.prepared import Prepared
+from edp.networks.predictor import Predictor
+from edp.training.bagging.spec import BaggingSpec
+from edp.training.bagging.table import Table
+from edp.training.outcome import TrainingProgress
+from edp.training.spec import TrainingSpec
+
+
+@dataclass(frozen=True, eq=False)
+class FoldFit:
+    """A training on folds at work: everything that a learner needs.
+
+    Attributes:
+        net: the network; its bank is set, its other parts wait for their numbers.
+        data: prepared series.
+        spec: how to train.
+        table: the rows.
+        linear: the linear models of the folds.
+        tell: called with progress.
+        history: a row for each check of the learners that train step by step.
+    """
+
+    net: Predictor
+    data: Prepared
+    spec: TrainingSpec
+    table: Table
+    linear: FoldRidge
+    tell: Callable[[TrainingProgress], None]
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def bagging(self) -> BaggingSpec:
+        """The settings of bagging."""
+        return self.spec.bagging or BaggingSpec()
+
+    @property
+    def residual(self) -> DoubleArray:
+        """What the linear models leave of rows that they did not see, standardised ``(row, output)``."""
+        return np.asarray(self.table.targets - self.linear.left_out)
+
+    def residuals(self, rows: NDArray[np.int64], fold: int) -> DoubleArray:
+        """What one fold's linear model leaves of some rows, standardised ``(row, output)``."""
+        predicted = self.table.columns[rows] @ self.linear.weights[fold] + self.linear.intercepts[fold]
+        return np.asarray(self.table.targets[rows] - predicted)
+
+
+@dataclass(frozen=True, eq=False)
+class HeadPart:
+    """A learner's part of the linear head.
+
+    Attributes:
+        weight: of its numbers of the representation, ``(number, output)``.
+        bias: ``(output,)``.
+        linear: share of the linear model that it takes away, ``(output,)``: of those that predict without it.
+    """
+
+    weight: DoubleArray
+    bias: DoubleArray
+    linear: DoubleArray
+
+
+class Learner(Protocol):
+    """One kind of learner; its numbers of the representation come in the order of the committee's parts."""
+
+    def fit(self) -> None:
+        """Learn."""
+        ...
+
+    def left_out(self) -> Sequence[DoubleArray]:
+        """What each of its models adds to the linear prediction of rows that it did not see, ``(row, output)`` each."""
+        ...
+
+    def write(self, shares: DoubleArray) -> HeadPart:
+        """Put what was learned into the network.
+
+        Args:
+            shares: non-negative weight of each of its models in the sum, ``(model, output)``.
+        """
+        ...

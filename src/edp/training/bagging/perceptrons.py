@@ -1,0 +1,171 @@
+"""The perceptrons of a committee as learners: trained side by side, each stopped by the fold that it leaves out."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from edp.data.lags import DoubleArray
+from edp.networks.committee import Members
+from edp.networks.losses.base import Penalty
+from edp.networks.losses.huber import Huber
+from edp.signals import KINDS
+from edp.training.bagging.learner import FoldFit, HeadPart
+from edp.training.bagging.members import MemberGroup
+from edp.training.bagging.spec import BaggingSpec
+from edp.training.outcome import Diverged, TrainingProgress
+from edp.training.spec import TrainingSpec
+
+RISE = 0.1
+"""Share of the updates over which the learning rate rises."""
+
+
+def losses_of(spec: TrainingSpec) -> tuple[Penalty, ...]:
+    """The losses that members are trained with; `check_training` refuses any other.
+
+    Raises:
+        TypeError: one reads more than an error.
+    """
+    if not isinstance(spec.loss, Penalty):
+        raise TypeError("bagging trains with a loss that reads an error alone; check_training refuses any other")
+    width = (spec.bagging or BaggingSpec()).robust_width
+    return (spec.loss, Huber(delta=width)) if width else (spec.loss,)
+
+
+class PerceptronLearner:
+    """Trains all groups of members together, on what each fold's linear model leaves, and keeps each at its best."""
+
+    def __init__(self, work: FoldFit, modules: Sequence[Members]) -> None:
+        self.work, self.modules, self.bagging = work, modules, work.bagging
+        table, linear = work.table, work.linear
+        outputs = table.targets.shape[1]
+        self.columns = torch.from_numpy(table.columns)
+        # Members learn the residual in units of its spread; an output that a line predicts exactly leaves nothing.
+        self.spread = np.sqrt(np.square(work.residual).mean(axis=0))
+        self.spread[self.spread <= 1e-9] = 1.0
+        folds = range(table.folds.count)
+        residuals = [table.targets - table.columns @ linear.weights[f] - linear.intercepts[f] for f in folds]
+        self.residuals = torch.from_numpy(np.stack(residuals) / self.spread).float()
+        draw, self.losses = torch.Generator().manual_seed(work.spec.seed), losses_of(work.spec)
+        self.groups = [MemberGroup(group, outputs, table.folds, work.spec, self.losses, draw) for group in modules]
+        self.rate = self.rows_per_s = 0.0
+
+    def fit(self) -> None:
+        """All updates, with checks between; each check keeps the members that are better than before.
+
+        Raises:
+            Diverged: the loss is not finite any more.
+        """
+        steps, checks = self.bagging.steps, min(self.bagging.checks, self.bagging.steps)
+        edges = [round(steps * check / checks) for check in range(checks + 1)]
+        # The linear model alone is a candidate: members count where they lower the error.
+        for group in self.groups:
+            group.judge(self.columns, self.residuals)
+        began = time.perf_counter()
+        for check, (start, stop) in enumerate(itertools.pairwise(edges), start=1):
+            total, shown = 0.0, time.perf_counter()
+            for step in range(start, stop):
+                total += self._step(step)
+                if time.perf_counter() - shown > 0.5:
+                    shown = time.perf_counter()
+                    self._report(check, checks, step + 1 - start, stop - start, began, edges)
+            self._check(check, stop, total / (stop - start))
+            self._report(check, checks, stop - start, stop - start, began, edges, self.work.history[-1])
+        self.rows_per_s = steps * self.bagging.batch / max(time.perf_counter() - began, 1e-9)
+
+    def _step(self, step: int) -> float:
+        share = step / self.bagging.steps
+        rate = self.rate = self.bagging.learning_rate * min(1.0, share / RISE) * 0.5 * (1 + math.cos(math.pi * share))
+        losses = [group.update(self.columns, self.residuals, rate) for group in self.groups]
+        value = float(np.mean(losses))
+        if not math.isfinite(value):
+            facts = {"epoch": len(self.work.history) + 1, "update": step + 1, "kept_epoch": None}
+            raise Diverged(
+                f"the training loss is {value} at update {step + 1}: the training diverged; nothing is kept. Lower "
+                "training.bagging.learning_rate, or look for outliers with edp inspect",
+                None,
+                facts,
+            )
+        return value
+
+    def _check(self, check: int, updates: int, loss: float) -> None:
+        judged = [group.judge(self.columns, self.residuals) for group in self.groups]
+        validation, absolute = (float(np.mean(values)) for values in zip(*judged, strict=True))
+        record(self.work, check, updates, loss, validation, absolute, absolute * self.spread, self.rate)
+
+    def _report(
+        self,
+        check: int,
+        checks: int,
+        update: int,
+        updates: int,
+        began: float,
+        edges: Sequence[int],
+        row: dict[str, Any] | None = None,
+    ) -> None:
+        done, seconds = edges[check - 1] + update, time.perf_counter() - began
+        rate = done * self.bagging.batch / max(seconds, 1e-9)
+        left = (self.bagging.steps - done) * seconds / max(1, done)
+        self.work.tell(TrainingProgress(check, checks, update, updates, rate, left, row))
+
+    def left_out(self) -> Sequence[DoubleArray]:
+        """A model for each group and loss: the mean of its members that did not see a row."""
+        folds = self.work.table.folds
+        kinds = range(len(self.losses))
+        return [group.left_out(self.columns, folds, kind) * self.spread for group in self.groups for kind in kinds]
+
+    def write(self, shares: DoubleArray) -> HeadPart:
+        """The best members' layers into the backbone, the weighted mean of their last layers into the head."""
+        blocks, bias = [], np.zeros(shares.shape[1])
+        of_group = shares.reshape(len(self.groups), len(self.losses), -1)
+        with torch.no_grad():
+            for group, module, share in zip(self.groups, self.modules, of_group, strict=True):
+                layers = len(module.weights)
+                for layer in range(layers):
+                    module.weights[layer].copy_(group.best[2 * layer])
+                    module.biases[layer].copy_(group.best[2 * layer + 1].squeeze(1))
+                # A member's part of the mean of those with its loss, ``(member, 1, output)``.
+                counts = np.array([len(group.of_kind(kind)) for kind in range(len(self.losses))])
+                scale = (share * self.spread / counts[:, None])[group.kind.numpy()][:, None]
+                last = group.best[2 * layers].double().numpy() * scale
+                blocks.append(last.reshape(-1, len(bias)))
+                bias += (group.best[2 * layers + 1].double().numpy() * scale).sum(axis=(0, 1))
+        return HeadPart(np.concatenate(blocks), bias, np.zeros(len(bias)))
+
+
+def record(
+    work: FoldFit,
+    check: int,
+    updates: int,
+    loss: float,
+    validation: float,
+    absolute: float,
+    each: DoubleArray,
+    rate: float,
+) -> None:
+    """Add a row to the history; `each` is the absolute error of each output in standard deviations."""
+    scale = work.net.code.width.flatten().numpy()
+    factors = np.array([KINDS[kind].report_factor for kind in work.data.target_kinds])
+    factors = np.tile(factors, len(work.data.task.horizons))
+    best = all(validation <= row["validation_loss"] for row in work.history)
+    for row in work.history if best else ():
+        row["best"] = False
+    work.history.append(
+        {
+            "epoch": check,
+            "updates": updates,
+            "train_loss": validation if math.isnan(loss) else loss,
+            "validation_loss": validation,
+            "validation_score": absolute,
+            "validation_mae": float(np.mean(each * scale * factors)),
+            "learning_rate": rate,
+            "seconds": 0.0,
+            "best": best,
+        }
+    )

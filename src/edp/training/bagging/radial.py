@@ -1,0 +1,114 @@
+"""Ridge regression on radial basis functions: the quickest learner of curves where rows are few.
+
+Centres are rows drawn at random; the length and the penalty are those with the least error on rows that were left out.
+The penalty is that of kernel ridge regression with the Gaussian kernel on the centres (Nystroem method: Williams and
+Seeger, 2001), which the basis functions resemble.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from edp.data.fold_ridge import FoldRidge, fold_ridge
+from edp.data.lags import DoubleArray
+from edp.networks.radial import RadialFeatures
+from edp.training.bagging.learner import FoldFit, HeadPart
+
+LENGTHS = (4.0, 2.0, 1.0, 0.5)
+"""Of the basis functions, in roots of the number of columns (the distance of rows of unit spread); smoothest first."""
+RANK = 1e-6
+"""Directions of the centres' kernel below this share of the largest one would need weights that cancel one another
+beyond single precision."""
+TINY = 1e-12
+PIECE = 16_384
+"""Rows whose distances are computed together."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Kernel:
+    """A fit with one length.
+
+    Attributes:
+        scale: of each column, length times spread, ``(column,)``.
+        basis: from basis functions to directions of unit norm of the Gaussian kernel, ``(centre, direction)``.
+        ridge: the folds' ridge regressions on the directions.
+    """
+
+    scale: DoubleArray
+    basis: DoubleArray
+    ridge: FoldRidge
+
+
+class RadialLearner:
+    """Fits the radial basis functions of a committee to what its linear model leaves."""
+
+    def __init__(self, work: FoldFit, features: RadialFeatures) -> None:
+        self.work, self.features = work, features
+        table = work.table
+        count = min(features.count, len(table.columns))
+        chosen = np.random.default_rng(work.spec.seed).choice(len(table.columns), count, replace=False)
+        self.centres = table.columns[np.sort(chosen)].astype(np.float64)
+        spread = table.columns.std(axis=0, dtype=np.float64)
+        self.spread = np.where(spread > 0, spread, 1.0)
+        self.best: _Kernel | None = None
+
+    def fit(self) -> None:
+        """Every length, and for each the best penalty."""
+        table = self.work.table
+        every = np.arange(len(table.columns))
+        targets = np.stack([self.work.residuals(every, fold) for fold in range(table.folds.count)])
+        truth, least = self.work.residual, np.inf
+        for length in LENGTHS:
+            kernel = self._kernel(length * np.sqrt(table.columns.shape[1]), targets)
+            error = np.square(kernel.ridge.left_out - truth).mean(axis=0) / np.maximum(
+                np.square(truth).mean(axis=0), TINY
+            )
+            score = float(np.log(np.maximum(error, TINY)).mean())
+            if score < least:
+                least, self.best = score, kernel
+
+    def _kernel(self, length: float, targets: DoubleArray) -> _Kernel:
+        scale, folds = length * self.spread, self.work.table.folds
+        centres = self.centres / scale
+        values, vectors = np.linalg.eigh(np.exp(_arguments(centres, centres)))
+        within_rank = values > RANK * values[-1]
+        basis = vectors[:, within_rank] / np.sqrt(values[within_rank])
+        rows = np.empty((len(self.work.table.columns), basis.shape[1]))
+        for start in range(0, len(rows), PIECE):
+            part = self.work.table.columns[start : start + PIECE] / scale
+            rows[start : start + PIECE] = expit(_arguments(part, centres)) @ basis
+        return _Kernel(scale, basis, fold_ridge(rows, targets, folds, [np.arange(rows.shape[1])]))
+
+    def left_out(self) -> Sequence[DoubleArray]:
+        """The one model's predictions."""
+        return [self._fitted().ridge.left_out]
+
+    def write(self, shares: DoubleArray) -> HeadPart:
+        """Centres and length into the network; the mean of the folds' models into the head."""
+        kernel = self._fitted()
+        weight, intercept = kernel.ridge.mean()
+        full = np.zeros((self.features.count, weight.shape[1]))
+        full[: len(self.centres)] = kernel.basis @ weight * shares[0]
+        centres = torch.zeros(self.features.count, len(kernel.scale))
+        centres[: len(self.centres)] = torch.from_numpy(self.centres / kernel.scale)
+        with torch.no_grad():
+            self.features.gain.copy_(torch.from_numpy(1.0 / kernel.scale))
+        self.features.set_centres(centres)
+        return HeadPart(full, intercept * shares[0], np.zeros(len(intercept)))
+
+    def _fitted(self) -> _Kernel:
+        if self.best is None:
+            raise RuntimeError("the radial learner was asked for its predictions before it was fitted")
+        return self.best
+
+
+def _arguments(rows: NDArray[np.floating], centres: DoubleArray) -> DoubleArray:
+    """``-|row - centre|^2 / 2``, ``(row, centre)``."""
+    distance = np.square(rows).sum(axis=1)[:, None] + np.square(centres).sum(axis=1) - 2.0 * rows @ centres.T
+    return np.asarray(-0.5 * np.maximum(distance, 0.0))

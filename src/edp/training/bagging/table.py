@@ -1,0 +1,138 @@
+"""The rows that a committee is trained on: what its members read, what they predict, and who is left out when."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edp.data.folds import Folds, blocked_folds
+from edp.data.lags import DoubleArray
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.errors import DataError
+from edp.networks.committee import Committee
+from edp.networks.predictor import Predictor
+from edp.storage.memory import check_setting
+from edp.training.bagging.spec import BaggingSpec
+from edp.training.validation import standard_targets
+
+PIECE = 4096
+"""Ticks of a stretch that go through the front end in one call."""
+FLOAT, DOUBLE = 4, 8
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of all stretches, laid end to end.
+
+    Attributes:
+        columns: the committee's changes over several spans, ``(row, column)``, float32.
+        targets: standardised, ``(row, output)``; outputs are horizons times targets.
+        folds: who is left out when.
+        stride: ticks from row to row.
+        starts: first row of each stretch, those of the training part first, and the tick that it stands for.
+    """
+
+    columns: NDArray[np.float32]
+    targets: DoubleArray
+    folds: Folds
+    stride: int
+    starts: tuple[tuple[int, int], ...]
+
+    def at_every_tick(self, error: DoubleArray, truth: Sequence[DoubleArray]) -> list[DoubleArray]:
+        """Predictions at every tick of each stretch, standardised ``(tick, output)``.
+
+        Where rows were thinned out, the error of the row before a tick stands for that of the tick.
+
+        Args:
+            error: of each row, prediction less target, ``(row, output)``.
+            truth: what was to be predicted, of each stretch of the training part, then of the validation part.
+        """
+        rows = [
+            first + np.maximum(0, np.arange(len(part)) - tick) // self.stride
+            for (first, tick), part in zip(self.starts, truth, strict=True)
+        ]
+        return [part + error[chosen] for part, chosen in zip(truth, rows, strict=True)]
+
+
+def committee_of(net: Predictor) -> Committee:
+    """The backbone of a network that is trained on folds.
+
+    Raises:
+        TypeError: it is another one; `check_training` refuses this before.
+    """
+    if not isinstance(net.backbone, Committee):
+        raise TypeError("bagging trains a committee; check_training refuses any other backbone")
+    return net.backbone
+
+
+def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
+    """Rows of the training and validation parts as the network sees them; its bank then gives changes of unit spread.
+
+    Raises:
+        ConfigError: more rows than the memory takes.
+        DataError: no stretch is longer than the largest horizon.
+    """
+    reach = data.task.max_horizon
+    stretches = [part for part in (*data.train, *data.validation) if part.samples > reach]
+    if not stretches:
+        raise DataError(
+            f"no stretch of the training and validation parts is longer than the largest horizon of {reach} ticks; "
+            "give longer recordings"
+        )
+    bank = committee_of(net).bank
+    ticks = [part.samples - reach for part in stretches]
+    # A filter starts from nothing: derivatives and changes of a stretch's first ticks say what no later tick says. No
+    # test looks at them either; of a short stretch most rows are still taken.
+    skips = [min(net.spec.window - 1, count // 4) for count in ticks]
+    stride = max(1, math.ceil((sum(ticks) - sum(skips)) / spec.rows))
+    chosen = [range(skip, count, stride) for skip, count in zip(skips, ticks, strict=True)]
+    outputs = len(data.task.horizons) * len(data.task.targets)
+    rows = sum(map(len, chosen))
+    check_setting(
+        rows * (2 * FLOAT * bank.columns + 6 * DOUBLE * outputs),
+        f"training: {rows:,} rows of {bank.columns:,} columns and {outputs:,} outputs",
+        "make training.bagging.rows smaller, or the backbone's lags fewer",
+    )
+    columns = np.concatenate([_columns(net, part)[list(of)] for part, of in zip(stretches, chosen, strict=True)])
+    targets = np.concatenate(
+        [
+            standard_targets(net, part)[0].flatten(1).numpy()[list(of)]
+            for part, of in zip(stretches, chosen, strict=True)
+        ]
+    )
+    spread = columns[:, bank.width :].std(axis=0, dtype=np.float64)
+    gain = np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0), 1.0).astype(np.float32)
+    columns[:, bank.width :] *= gain
+    still = torch.from_numpy(np.ptp(columns, axis=0) == 0)
+    with torch.no_grad():
+        bank.gain.copy_(torch.from_numpy(gain).view_as(bank.gain))
+        for group in committee_of(net).members:
+            # No gradient reaches these weights: random ones would answer a channel that moves later for the first time.
+            group.weights[0][:, still] = 0.0
+    # Rows within the longest lag and the largest horizon of a fold share samples with it.
+    gap = math.ceil((bank.lags[-1] + reach) / stride)
+    lengths = [len(of) for of in chosen]
+    gap = min(gap, max(1, sum(lengths) // (4 * spec.folds)))
+    starts = zip(np.cumsum([0, *lengths])[:-1].tolist(), skips, strict=True)
+    return Table(columns, targets, blocked_folds(lengths, spec.folds, gap), stride, tuple(starts))
+
+
+def _columns(net: Predictor, part: Series) -> NDArray[np.float32]:
+    """What the bank gives of a whole stretch, ``(time, column)``."""
+    bank = committee_of(net).bank
+    like = next(net.parameters())
+    rows = []
+    with torch.inference_mode():
+        front, state = net.front.initial_state(1, like), bank.initial_state(1, like)
+        for start in range(0, part.samples, PIECE):
+            x = torch.from_numpy(part.inputs[start : start + PIECE]).unsqueeze(0).to(like)
+            features, front = net.front(x, front)
+            values, state = bank(net.front.scale(features), state)
+            rows.append(values[0].float().numpy())
+    return np.concatenate(rows)
