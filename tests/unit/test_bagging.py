@@ -24,7 +24,7 @@ from edp.signals import Channel, Kind
 from edp.training.bagging.fit import fit_bagged
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.fit import fit
-from edp.training.spec import TrainingSpec
+from edp.training.spec import TrainingSpec, check_fitted_parts
 
 RATE = 50.0
 CHANNELS = (Channel("u", Kind.GENERIC), Channel("y", Kind.GENERIC))
@@ -144,6 +144,21 @@ def test_trees_that_predict_the_target_take_their_share_from_the_linear_model():
     assert promise < 0.5 * np.sqrt(np.square(outcome.linear - outcome.table.targets).mean())
 
 
+def test_no_threshold_of_a_tree_lies_between_values_that_differ_by_rounding():
+    """An encoder that stands still most of the time: its changes are zero or some thousandths, but for rounding."""
+    data = data_of(recording())
+    for part in (*data.train, *data.validation):
+        part.inputs[:, 1] = np.round(part.inputs[:, 1], 1)
+    outcome = fit_bagged(data, committee(activations=(), trees=60), spec())
+    trees, columns = outcome.fitted.predictor.backbone.trees, outcome.table.columns
+    thresholds = trees.threshold[trees.threshold < 1e30].numpy()
+    features = trees.feature[trees.threshold < 1e30].numpy()
+    distance = [np.abs(columns[:, column] - value).min() for column, value in zip(features, thresholds, strict=True)]
+    quantised = (features % 2 == 1)[: len(distance)]
+    assert quantised.any()
+    assert np.min(np.array(distance)[quantised]) > 1e-5
+
+
 def test_a_learner_of_noise_gets_no_share():
     rng = np.random.default_rng(1)
     log = Recording(
@@ -158,6 +173,13 @@ def test_a_learner_of_noise_gets_no_share():
 def test_members_of_two_losses_are_a_multiple_of_twice_the_folds():
     with pytest.raises(ConfigError, match="twice the folds"):
         fit(data_of(recording(600)), MODEL, spec(robust_width=0.1))
+
+
+def test_trees_without_folds_are_refused():
+    with pytest.raises(ConfigError, match=r"no gradient reaches trees; train on folds"):
+        check_fitted_parts(committee(trees=10), TrainingSpec())
+    check_fitted_parts(committee(trees=10), spec())
+    check_fitted_parts(committee(), TrainingSpec())
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_one_others():

@@ -160,6 +160,20 @@ def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:
         raise ConfigError("training: " + "; ".join(reasons))
 
 
+def check_fitted_parts(model: ModelSpec, spec: TrainingSpec) -> None:
+    """Refuse parts that only a training on folds fits, where a training from random weights has none.
+
+    Raises:
+        ConfigError: it has trees, which no gradient reaches.
+    """
+    backbone = model.backbone
+    if spec.bagging is None and isinstance(backbone, CommitteeSpec) and backbone.trees:
+        raise ConfigError(
+            f"training: model.backbone.trees = {backbone.trees}, but no gradient reaches trees; train on folds (a "
+            "table training.bagging, as in the preset 'committee'), or set trees = 0"
+        )
+
+
 def _against_bagging(model: ModelSpec, spec: TrainingSpec, bagging: BaggingSpec) -> list[str]:
     """What stands against training on folds."""
     reasons = []

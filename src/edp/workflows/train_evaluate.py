@@ -42,7 +42,7 @@ from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, rea
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import weights_digest
 from edp.training.fit import fit, thread_count
-from edp.training.spec import check_training
+from edp.training.spec import check_fitted_parts, check_training
 from edp.training.strategy import TrainingStrategy
 
 SHOWN_RECORDINGS = 6
@@ -140,6 +140,8 @@ def train(
     if experiment.model.physics is not None:  # an unknown machine is reported before recordings are read
         # The machine's numbers are part of the key: its file may change under the same name.
         settings["machine"] = experiment.model.physics.digest()
+    if strategy_factory is None:  # weights to begin with bring fitted trees along
+        check_fitted_parts(experiment.model, experiment.training)
     taught = {} if strategy_factory is None else {"strategy": dict(strategy_factory.facts)}
     frozen = {} if strategy_factory is None else strategy_factory.frozen
     data = data or prepare_data(source, experiment, frozen)

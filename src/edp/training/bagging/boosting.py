@@ -20,6 +20,10 @@ from edp.training.bagging.learner import FoldFit, HeadPart
 from edp.training.outcome import TrainingProgress
 from edp.training.tree_tables import Tables, complete_tables, stacked_tables
 
+GRID = 2.0**-12
+"""Of the columns that trees are grown on, in spreads. Values that are equal but for rounding fall together, so that no
+threshold comes to lie between them, where single precision on another machine could go to the other side."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Boosted:
@@ -43,6 +47,7 @@ class TreeLearner:
         self.work, self.trees = work, trees
         self.rounds = max(1, trees.trees // 2)
         self.models: list[list[_Boosted]] = []
+        self.columns = np.round(work.table.columns / np.float32(GRID)) * np.float32(GRID)
         rng = np.random.default_rng(work.spec.seed)
         most, folds = work.bagging.tree_rows, work.table.folds
         self.training = [_sample(rows, most, rng) for rows in folds.training]
@@ -76,7 +81,7 @@ class TreeLearner:
         if errors[count - 1] >= np.square(truth).mean():
             return _Boosted(0, np.zeros(len(truth)), None)
         target = self._target(self.every, None, direct)[:, output]
-        model = self._regressor(count).fit(table.columns[self.every], target)
+        model = self._regressor(count).fit(self.columns[self.every], target)
         return _Boosted(count, staged[count - 1], complete_tables(model, self.trees.depth))
 
     def _target(self, rows: NDArray[np.int64], fold: int | None, direct: bool) -> DoubleArray:
@@ -93,9 +98,8 @@ class TreeLearner:
         self, rows: NDArray[np.int64], target: DoubleArray, rounds: int, judged: NDArray[np.int64]
     ) -> Iterator[DoubleArray]:
         """Predictions of the judged rows after each tree."""
-        columns = self.work.table.columns
-        model = self._regressor(rounds).fit(columns[rows], target)
-        return iter(model.staged_predict(columns[judged]))
+        model = self._regressor(rounds).fit(self.columns[rows], target)
+        return iter(model.staged_predict(self.work.table.columns[judged]))
 
     def _regressor(self, rounds: int):  # type: ignore[no-untyped-def]  # scikit-learn has no types
         # Imported here: it takes over a second, and trainings without trees do not need it.
