@@ -14,7 +14,7 @@ from edp.networks.losses import LOSSES, TERMS, AdaptiveWeights, MeanSquared
 from edp.networks.outputs import OUTPUTS
 from edp.networks.predictor import build_model
 from edp.networks.running import stream_predictions
-from edp.storage.runs import RunFolder
+from edp.storage.runs import KeyedRun, RunFolder
 from edp.training.averages import NoAverage, Stochastic
 from edp.training.fit import Diverged, TrainingError, TrainingSpec, fit, thread_count, validation_scores
 from edp.training.objective import Objective
@@ -175,7 +175,7 @@ def test_an_infinite_input_diverges_in_the_epoch_that_meets_it(tmp_path, tiny, t
     monkeypatch.setattr(type(tiny), "scaler", lambda self: clean)
     with RunFolder(tmp_path) as folder:
         with pytest.raises(Diverged, match=r"no epoch was finished before, so nothing is kept") as caught:
-            fit(poisoned(tiny, slice(300, 302)), tiny_model, tiny_training, (folder, "k"))
+            fit(poisoned(tiny, slice(300, 302)), tiny_model, tiny_training, KeyedRun(folder, "k"))
         assert caught.value.fitted is None
         assert caught.value.facts["kept_epoch"] is None
         assert not folder.file("checkpoint.safetensors").exists()
@@ -192,7 +192,7 @@ def test_a_training_that_diverges_later_hands_over_the_best_weights_and_keeps_it
 
     monkeypatch.setattr(Objective, "evaluate", evaluate)
     with RunFolder(tmp_path) as folder, pytest.raises(Diverged) as caught:
-        fit(tiny, tiny_model, tiny_training, (folder, "k"))
+        fit(tiny, tiny_model, tiny_training, KeyedRun(folder, "k"))
     end, history = caught.value, fitted[0].history[:2]
     assert (end.facts["epoch"], end.facts["update"]) == (3, 70)
     best = min(history, key=lambda row: row["validation_score"])
