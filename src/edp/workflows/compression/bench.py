@@ -13,6 +13,7 @@ from edp.networks.predictor import ModelSpec, Predictor
 from edp.training.fit import fit
 from edp.training.spec import TrainingSpec
 from edp.training.strategy import TrainingStrategy
+from edp.workflows.compression.committee import committee_start
 from edp.workflows.compression.distillation import Distillation, DistillationSpec
 from edp.workflows.compression.pruning import prune
 from edp.workflows.compression.qat import QuantisationAware, RoundingSpec
@@ -69,7 +70,8 @@ class CompressionRequest:
         Raises:
             ConfigError: teachers that contradict one another, or a network that cannot be pruned.
         """
-        narrow = prune(teachers[0], self.model(teachers[0].spec), data.train) if self.pruned else None
+        model = self.model(teachers[0].spec)
+        narrow = prune(teachers[0], model, data.train) if self.pruned else committee_start(teachers[0], model, data)
         strategy = Distillation(teachers, self.distillation, further, narrow)
         if self.rounding is None:
             return strategy
