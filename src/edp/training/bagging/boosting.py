@@ -47,7 +47,6 @@ class TreeLearner:
         self.work, self.trees = work, trees
         self.rounds = max(1, trees.trees // 2)
         self.models: list[list[_Boosted]] = []
-        self.columns = np.round(work.table.columns / np.float32(GRID)) * np.float32(GRID)
         rng = np.random.default_rng(work.spec.seed)
         most, folds = work.bagging.tree_rows, work.table.folds
         self.training = [_sample(rows, most, rng) for rows in folds.training]
@@ -68,21 +67,26 @@ class TreeLearner:
 
     def _boost(self, direct: bool, output: int) -> _Boosted:
         table = self.work.table
-        errors, staged = np.zeros(self.rounds), np.zeros((self.rounds, len(table.columns)))
-        truth = np.zeros(len(table.columns))
+        # Single precision: a hundred predictions of every row are the most that this takes.
+        staged = np.zeros((self.rounds, len(table.columns)), dtype=np.float32)
+        squared, truth = np.zeros(self.rounds), np.zeros(len(table.columns))
         for fold, rows in enumerate(self.training):
             judged = table.folds.left_out(fold)
             truth[judged] = self._target(judged, fold, direct)[:, output]
             stages = self._grown(rows, self._target(rows, fold, direct)[:, output], self.rounds, judged)
             for number, predicted in enumerate(stages):
                 staged[number, judged] = predicted
-        errors = np.square(staged - truth).mean(axis=1)
-        count = int(errors.argmin()) + 1
-        if errors[count - 1] >= np.square(truth).mean():
+                squared[number] += np.square(predicted - truth[judged]).sum()
+        count = int(squared.argmin()) + 1
+        if squared[count - 1] >= np.square(truth).sum():
             return _Boosted(0, np.zeros(len(truth)), None)
         target = self._target(self.every, None, direct)[:, output]
-        model = self._regressor(count).fit(self.columns[self.every], target)
-        return _Boosted(count, staged[count - 1], complete_tables(model, self.trees.depth))
+        model = self._regressor(count).fit(self._on_grid(self.every), target)
+        return _Boosted(count, staged[count - 1].astype(np.float64), complete_tables(model, self.trees.depth))
+
+    def _on_grid(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Columns of some rows, rounded to `GRID`."""
+        return np.asarray(np.round(self.work.table.columns[rows] / np.float32(GRID)) * np.float32(GRID))
 
     def _target(self, rows: NDArray[np.int64], fold: int | None, direct: bool) -> DoubleArray:
         """What the trees of a fold, or those on all rows, are to predict, ``(row, output)``."""
@@ -98,7 +102,7 @@ class TreeLearner:
         self, rows: NDArray[np.int64], target: DoubleArray, rounds: int, judged: NDArray[np.int64]
     ) -> Iterator[DoubleArray]:
         """Predictions of the judged rows after each tree."""
-        model = self._regressor(rounds).fit(self.columns[rows], target)
+        model = self._regressor(rounds).fit(self._on_grid(rows), target)
         return iter(model.staged_predict(self.work.table.columns[judged]))
 
     def _regressor(self, rounds: int):  # type: ignore[no-untyped-def]  # scikit-learn has no types

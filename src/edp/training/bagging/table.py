@@ -95,7 +95,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     outputs = len(data.task.horizons) * len(data.task.targets)
     rows = sum(map(len, chosen))
     check_setting(
-        rows * (3 * FLOAT * bank.columns + 6 * DOUBLE * outputs),
+        rows * (2 * FLOAT * bank.columns + 6 * DOUBLE * outputs),
         f"training: {rows:,} rows of {bank.columns:,} columns and {outputs:,} outputs",
         "make training.bagging.rows smaller, or the backbone's lags fewer",
     )
