@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from edp.config.experiment import build
+from edp.data.chunks import ChunkSpec
 from edp.data.features import FeatureSet
 from edp.data.prepared import prepare
 from edp.data.splits import ByTime
 from edp.data.task import TargetMode, Task
+from edp.errors import ConfigError
 from edp.networks.backbones import CommitteeSpec
 from edp.networks.heads import LinearHead
 from edp.networks.predictor import ModelSpec
@@ -20,9 +22,11 @@ from edp.signals import Channel, Kind
 from edp.training.bagging.fit import fit_bagged
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.fit import fit
-from edp.training.spec import TrainingSpec
+from edp.training.spec import TrainingSpec, by_gradient
+from edp.training.warm_start import WarmStart
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.committee import committee_start, student_training
+from edp.workflows.compression.committee import committee_start
+from edp.workflows.compression.pruning import check_pruning
 
 pytestmark = pytest.mark.training
 HORIZON = 2
@@ -79,14 +83,33 @@ def test_the_first_weights_of_a_student_leave_out_what_it_has_to_learn(data):
 def test_a_student_of_a_committee_learns_from_it_by_gradient(data):
     teacher, spec = teacher_of(data, centres=40, trees=20)
     order = CompressionRequest(name="student", units=8)
-    training = replace(student_training(spec), epochs=4, updates=60)
-    assert training.bagging is None
+    training = replace(spec, epochs=4, updates=60)
     strategy = order.strategy([teacher], data, None)
     student = fit(data, order.model(teacher.spec), training, strategy=strategy).predictor
     assert sum(p.numel() for p in student.parameters()) < 0.6 * sum(p.numel() for p in teacher.parameters())
     assert error(student, data) < 1.3 * error(teacher, data)
 
 
-def test_the_training_of_other_networks_stays(data):
-    spec = TrainingSpec(epochs=3)
-    assert student_training(spec) is spec
+def test_a_committee_trains_on_by_gradient_and_keeps_its_trees(data):
+    teacher, spec = teacher_of(data, centres=40, trees=20)
+    adapted = fit(data, teacher.spec, replace(spec, epochs=1, updates=5), strategy=WarmStart(teacher)).predictor
+    assert torch.equal(adapted.backbone.trees.leaf, teacher.backbone.trees.leaf)
+    assert error(adapted, data) < 1.2 * error(teacher, data)
+
+
+def test_training_by_gradient_obeys_all_settings_that_were_given():
+    spec = TrainingSpec(bagging=BaggingSpec(), epochs=3, patience=2)
+    plain = by_gradient(spec)
+    assert plain.bagging is None
+    assert (plain.epochs, plain.patience) == (3, 2)
+    assert plain.updates > 0
+    assert plain.chunks.burn_in == 0
+    own = replace(spec, chunks=ChunkSpec(length=32), updates=7)
+    assert by_gradient(own) == replace(own, bagging=None)
+    assert by_gradient(plain) is plain
+
+
+def test_committees_and_heads_without_hidden_features_are_not_pruned():
+    model = ModelSpec(backbone=CommitteeSpec(members=4), head=LinearHead(), blocks=(), window=10)
+    with pytest.raises(ConfigError, match="no rule for the backbone 'committee'; the head 'linear'; distil"):
+        check_pruning(model, model)

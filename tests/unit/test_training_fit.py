@@ -16,10 +16,11 @@ from edp.networks.predictor import build_model
 from edp.networks.running import stream_predictions
 from edp.storage.runs import KeyedRun, RunFolder
 from edp.training.averages import NoAverage, Stochastic
-from edp.training.fit import Diverged, TrainingError, TrainingSpec, fit, thread_count, validation_scores
+from edp.training.fit import Diverged, TrainingError, TrainingSpec, fit, validation_scores
 from edp.training.objective import Objective
 from edp.training.optimizers import OPTIMIZERS, AdamW
 from edp.training.schedules import SCHEDULES, Constant
+from edp.training.spec import thread_count
 
 
 def weights(fitted):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +25,7 @@ from edp.training.memory import check_training_memory
 from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
 from edp.training.ridge_start import start_bypass
-from edp.training.spec import TrainingSpec, check_training
+from edp.training.spec import TrainingSpec, by_gradient, check_training, thread_count
 from edp.training.strategy import BatchContext, EpisodicStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
 
@@ -47,7 +46,8 @@ def fit(
         spec: how to train.
         run: where the training writes; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
-        strategy: weights to begin with, or a teacher; it is part of what the key of `run` must tell apart.
+        strategy: weights to begin with, or a teacher; it is part of what the key of `run` must tell apart. A strategy
+            knows no folds: with it a committee trains by gradient, too (`by_gradient`).
 
     Raises:
         ConfigError: settings that contradict one another.
@@ -56,8 +56,9 @@ def fit(
     """
     torch.set_num_threads(thread_count(spec))
     tell = on_event or (lambda event: None)
-    if spec.bagging is not None:
-        return fit_in_folds(data, model, spec, run.folder if run else None, tell, strategy)
+    if spec.bagging is not None and strategy is None:
+        return fit_in_folds(data, model, spec, run.folder if run else None, tell)
+    spec = by_gradient(spec)
     fitted = Loop(data, model, spec, run, strategy).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)
     if spec.refit == "none" or not best:
@@ -68,11 +69,6 @@ def fit(
         raise Diverged(str(end), fitted, end.facts) from end
     again.predictor.output.load_state_dict(fitted.predictor.output.state_dict())
     return replace(again, history=fitted.history, seconds=fitted.seconds + again.seconds)
-
-
-def thread_count(spec: TrainingSpec) -> int:
-    """CPU threads that a training uses."""
-    return spec.threads or os.cpu_count() or 1
 
 
 def _rows_of_refit(history: list[dict[str, Any]], best: int, spec: TrainingSpec) -> list[dict[str, Any]]:
@@ -395,6 +391,5 @@ __all__ = [
     "TrainingProgress",
     "TrainingSpec",
     "fit",
-    "thread_count",
     "validation_scores",
 ]

@@ -15,10 +15,10 @@ from edp.data.prepared import Prepared
 from edp.errors import ConfigError
 from edp.networks.predictor import ModelSpec
 from edp.training.checkpoint import Progress, optimizer_state, pack, unpack
-from edp.training.fit import Loop, thread_count
+from edp.training.fit import Loop
 from edp.training.outcome import Fitted
 from edp.training.schedules import ScheduleState
-from edp.training.spec import TrainingSpec
+from edp.training.spec import TrainingSpec, thread_count
 
 
 def fit_part(

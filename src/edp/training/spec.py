@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from dataclasses import dataclass, field, replace
 
 from edp.data.augment import AugmentationSpec
 from edp.data.chunks import ChunkSpec
@@ -36,6 +37,9 @@ REFITS = ("none", "best", "whole")
 MOST_POWER = 4.0
 """Of the weights of outputs: spreads of targets a thousand times apart then give weights 1e12 times apart."""
 MOST_AUGMENTATIONS = 16
+GRADIENT_CHUNK, GRADIENT_LANES, GRADIENT_UPDATES = 64, 16, 200
+"""Ticks and lanes of an update of a committee, and updates an epoch. Nothing recurs in it, so short chunks do, and
+little data have chunks enough."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +64,7 @@ class TrainingSpec:
             were best before, ``whole`` for all of them, to the end of the schedule, ``none`` not at all. The
             calibration of intervals stays that of the first training.
         bagging: train a committee on folds, by rows and not by chunks; of the other settings only `loss`, `seed` and
-            `threads` then count. None trains in chunks.
+            `threads` then count. None trains in chunks, and so does what begins with given weights or a teacher.
         clip_norm: largest global gradient norm.
         seed: root of every random choice.
         threads: CPU threads, 0 for all cores; more than one pays for wide networks on an idle machine only, and
@@ -127,6 +131,27 @@ class TrainingSpec:
                         else f"chunks have {seen} ticks; {term.span} or more must hold"
                     )
                 )
+
+
+def by_gradient(spec: TrainingSpec) -> TrainingSpec:
+    """How a training on folds is done by gradient instead, in chunks: a teacher or a source of weights knows no folds.
+
+    Chunks and updates an epoch are those of a committee where the spec leaves its defaults; all else stays.
+    """
+    if spec.bagging is None:
+        return spec
+    chunks = ChunkSpec(length=GRADIENT_CHUNK, batch=GRADIENT_LANES, burn_in=0)
+    return replace(
+        spec,
+        bagging=None,
+        chunks=chunks if spec.chunks == ChunkSpec() else spec.chunks,
+        updates=spec.updates or GRADIENT_UPDATES,
+    )
+
+
+def thread_count(spec: TrainingSpec) -> int:
+    """CPU threads that a training uses."""
+    return spec.threads or os.cpu_count() or 1
 
 
 def check_training(task: Task, model: ModelSpec, spec: TrainingSpec) -> None:

@@ -41,8 +41,8 @@ from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
 from edp.training.bundle import weights_digest
-from edp.training.fit import fit, thread_count
-from edp.training.spec import check_fitted_parts, check_training
+from edp.training.fit import fit
+from edp.training.spec import check_fitted_parts, check_training, thread_count
 from edp.training.strategy import TrainingStrategy
 
 SHOWN_RECORDINGS = 6

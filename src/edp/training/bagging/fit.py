@@ -20,7 +20,6 @@ from scipy.optimize import nnls
 from edp.data.fold_ridge import FoldRidge, fold_ridge
 from edp.data.lags import DoubleArray
 from edp.data.prepared import Prepared
-from edp.errors import ConfigError
 from edp.networks.predictor import ModelSpec, Predictor, build_model
 from edp.storage.runs import RunFolder
 from edp.training.bagging.boosting import TreeLearner
@@ -30,7 +29,7 @@ from edp.training.bagging.radial import RadialLearner
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.bagging.table import Table, committee_of, table_of
 from edp.training.outcome import Fitted, TrainingProgress
-from edp.training.spec import TrainingSpec, check_training
+from edp.training.spec import TrainingSpec, check_training, thread_count
 
 Event = Callable[[TrainingProgress], None]
 
@@ -74,6 +73,7 @@ def fit_bagged(data: Prepared, model: ModelSpec, spec: TrainingSpec, on_event: E
         DataError: too few rows for the folds.
         Diverged: the loss is not finite any more.
     """
+    torch.set_num_threads(thread_count(spec))  # another number adds in another order: other bits
     check_training(data.task, model, spec)
     began = time.perf_counter()
     net = build_model(data.task, model, data.scaler(), spec.seed).eval()
@@ -99,17 +99,8 @@ def fit_in_folds(
     spec: TrainingSpec,
     run: RunFolder | None,
     on_event: Event,
-    strategy: object,
 ) -> Fitted:
-    """As `fit_bagged`, with its history in a run folder; there is no checkpoint: a stopped training begins anew.
-
-    Raises:
-        ConfigError: a strategy came with it.
-    """
-    if strategy is not None:
-        raise ConfigError(
-            "training.bagging trains from the recordings alone; leave it out, or train without a teacher or source"
-        )
+    """As `fit_bagged`, with its history in a run folder; there is no checkpoint: a stopped training begins anew."""
     fitted = fit_bagged(data, model, spec, on_event).fitted
     if run is not None:
         run.write_history(fitted.history)

@@ -2,28 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 
-from edp.data.chunks import ChunkSpec
 from edp.data.prepared import Prepared
 from edp.networks.committee import Committee
 from edp.networks.predictor import ModelSpec, Predictor, build_model
-from edp.training.spec import TrainingSpec
-
-UPDATES, EPOCHS = 200, 20
-"""Of a student's training, and how often it is judged: what a committee of the same size was trained with."""
-LENGTH, LANES = 64, 16
-"""Ticks and lanes of an update. Nothing recurs, so short chunks do, and little data have chunks enough."""
-
-
-def student_training(spec: TrainingSpec) -> TrainingSpec:
-    """How the student of a committee is trained: by gradient and in chunks, since a teacher knows no folds."""
-    if spec.bagging is None:
-        return spec
-    chunks = ChunkSpec(length=LENGTH, batch=LANES, burn_in=0)
-    return replace(spec, bagging=None, chunks=chunks, epochs=EPOCHS, updates=UPDATES, patience=0)
 
 
 def committee_start(teacher: Predictor, model: ModelSpec, data: Prepared) -> Predictor | None:

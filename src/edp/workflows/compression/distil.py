@@ -23,7 +23,6 @@ from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.strategy import TrainingStrategy
 from edp.workflows.compression.bench import CompressionRequest
-from edp.workflows.compression.committee import student_training
 from edp.workflows.compression.distillation import DistillationSpec
 from edp.workflows.compression.qat import RoundingSpec
 from edp.workflows.train_evaluate import StrategyFactory, train
@@ -111,7 +110,7 @@ def distil(
     def strategy(data: Prepared) -> TrainingStrategy:
         return order.strategy(teachers, data, None, series)
 
-    student_experiment = replace(experiment, model=model, training=student_training(experiment.training))
+    student_experiment = replace(experiment, model=model)
     return train(source or own, student_experiment, out, on_event, StrategyFactory(facts, strategy, frozen))
 
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor, nn
 
 from edp.data.series import Series
 from edp.errors import ConfigError
-from edp.networks.backbones import RecurrentBackbone
+from edp.networks.backbones import CommitteeSpec, RecurrentBackbone
 from edp.networks.blocks import BLOCKS, CylinderGate, MultiScaleTcn, TemporalDifference
 from edp.networks.blocks.base import BlockSlot
 from edp.networks.cells import CELLS
 from edp.networks.convolution import CausalConv, ConvolutionStack, TemporalBlock
-from edp.networks.heads import Heads
+from edp.networks.heads import HEADS, Heads
 from edp.networks.initial import INITIAL_STATES, ZeroState
 from edp.networks.predictor import ModelSpec, Predictor
 from edp.training.bundle import blank_scaler
@@ -180,6 +180,11 @@ def check_pruning(big: ModelSpec, small: ModelSpec) -> None:
         ConfigError: every reason.
     """
     reasons = []
+    if isinstance(big.backbone, CommitteeSpec):
+        reasons.append("the backbone 'committee'")
+    # By its settings: a head without hidden features may still have an attribute of that name.
+    if "hidden" not in {part.name for part in fields(big.head)}:  # type: ignore[arg-type]
+        reasons.append(f"the head '{HEADS.name_of(big.head)}'")
     cell = getattr(big.backbone, "cell", None)
     if cell is not None and CELLS.name_of(cell) not in GATES:
         reasons.append(f"a recurrent layer '{CELLS.name_of(cell)}' (those of {', '.join(GATES)} can be pruned)")
