@@ -10,6 +10,7 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, duration, emit, out, progress, table
 from edp.cli.train import MapOption, RepairOption, source_of
+from edp.errors import ConfigError
 
 if TYPE_CHECKING:
     from edp.evaluation.channel_importance import ChannelImportances
@@ -21,7 +22,7 @@ BEATEN = 6
 
 
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="Run folder of edp train.")],
+    run: Annotated[Path, typer.Argument(help="Run folder of edp train or edp twin.")],
     data: Annotated[Path | None, typer.Option(help="Other recordings to judge on; default: the held-out ones.")] = None,
     baselines: Annotated[
         str | None, typer.Option(help="Comma-separated names, or 'none'; default: those of the settings.")
@@ -31,16 +32,29 @@ def evaluate(
     channel_importance: Annotated[
         bool, typer.Option(help="Also measure channel importance: the growth of the error when a channel is removed.")
     ] = False,
+    predictor: Annotated[
+        Path | None, typer.Option(help="Of a twin: run folder of a look-ahead predictor to compare with.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Score a trained model on held-out recordings beside baselines.
+    """Score a trained model on held-out recordings beside baselines; a twin on free runs.
 
     Ends with exit code 6 where a baseline has less error than the network.
 
     Example: `edp evaluate runs/first` or `edp evaluate runs/first --data logs/monday --map mine.toml`
     """
-    names = None if baselines is None else [n for n in baselines.split(",") if n and n != "none"]
     source = None if data is None else source_of(data, signal_map, repair)
+    if is_twin(run):
+        if baselines is not None or channel_importance:
+            raise ConfigError(
+                f"'{run}' holds a twin, which has neither --baselines nor --channel-importance; leave them out: its "
+                "floors are those of its settings, judge.floors"
+            )
+        evaluate_twin_run(run, source, predictor, as_json)
+        return
+    if predictor is not None:
+        raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
+    names = None if baselines is None else [n for n in baselines.split(",") if n and n != "none"]
     from edp.evaluation.guard import beaten_by
 
     folder, scores = run_evaluation(run, source, names, as_json)
@@ -62,6 +76,39 @@ def evaluate(
     emit(as_json, facts | importance_json, show)
     if beaten is not None:
         raise typer.Exit(BEATEN)
+
+
+def is_twin(run: Path) -> bool:
+    """Whether a folder is that of a twin, or the run folder around it."""
+    return any(path.is_file() for path in (run / "twin" / "twin.json", run / "twin.json"))
+
+
+def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | None, as_json: bool) -> None:
+    """Judge a twin with a progress display, and print its scores."""
+    from edp.cli.twin import ahead_table, coverage_table, score_table, situation_table
+    from edp.storage import read_object
+    from edp.workflows.twin import evaluate_twin
+    from edp.workflows.twin.judge_twin import SCORES
+
+    steps = Steps(as_json, every_s=0.0)
+    with progress(as_json) as shown:
+        bar = shown.add_task("evaluate", total=None, note="")
+
+        def on_step(name: str) -> None:
+            shown.update(bar, note=name)
+            steps.say(f"evaluate: {name}")
+
+        folder = evaluate_twin(run, source, predictor, on_step)
+    scores = read_object(folder / SCORES)
+
+    def show() -> None:
+        score_table(scores["models"])
+        for print_table in (coverage_table, situation_table, ahead_table):
+            print_table(scores["models"]["twin"])
+        out.print(f"scores in {folder / SCORES}")
+        out.print(f"next: edp report {folder}")
+
+    emit(as_json, {"folder": str(folder), **scores}, show)
 
 
 def run_evaluation(

@@ -67,7 +67,8 @@ def rollout(
 ) -> None:
     """Run a twin along a log: measured up to a moment, on the commands alone from there on.
 
-    Prints the error by the time since then. Channels of the written file that end in _twin are the twin's.
+    Prints the error by the time since then. Channels of the written file that end in _twin are the twin's, those
+    that end in _twin_low and _twin_high are its intervals.
 
     Example: `edp rollout runs/twin logs/monday.parquet --seconds 60 --from 12.5 --out monday_free.parquet`
     """
@@ -75,10 +76,13 @@ def rollout(
 
     result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file, plots)
     written = {"file": file and str(file), "plots": plots and str(plots)}
-    facts = {"start_s": result.start_s, **written, **result.scores}
+    facts = {"start_s": result.start_s, "calibrated_s": result.calibrated_s, **written, **result.scores}
 
     def show() -> None:
         error_table(result.scores)
+        if result.coverage is not None and result.calibrated_s is not None:
+            promise = f"{result.coverage:.0%} up to {result.calibrated_s:g} s"
+            out.print(f"intervals in _twin_low and _twin_high are meant to hold {promise}")
         if file is not None:
             out.print(f"{result.recording.samples:,} ticks in {file}")
         if plots is not None:
@@ -111,6 +115,47 @@ def error_table(scores: dict[str, Any]) -> None:
     out.print(f"MAE{unit}: " + ", ".join(f"{name} {_number(value)}" for name, value in velocity["by_channel"].items()))
     if pressures["by_channel"]:
         out.print("NRMSE: " + ", ".join(f"{name} {_number(value)}" for name, value in pressures["by_channel"].items()))
+
+
+def coverage_table(scores: dict[str, Any]) -> None:
+    """Print the share of free runs that the intervals hold, by time and kind of channel."""
+    intervals = scores.get("intervals")
+    if intervals is None or not intervals["at"]:
+        return
+    parts = [part for part in ("velocities", "strokes", "pressures") if part in intervals["at"][0]]
+    rows = [[f"{row['at_s']:g} s", *(f"{row[part]['share']:.1%}" for part in parts)] for row in intervals["at"]]
+    table(f"share of free runs in intervals meant to hold {intervals['coverage']:.0%}", ["", *parts], rows)
+
+
+def situation_table(scores: dict[str, Any]) -> None:
+    """Print the errors at end stops, at rest and in motion."""
+    rows = []
+    for name, row in scores["situations"].items():
+        strokes = row.get("stroke_error", {"mean": None})
+        cells = [f"{row['share']:.1%}", *map(_number, (row["velocity_mae"]["mean"], strokes["mean"]))]
+        rows.append([name.replace("_", " "), *cells, _number(row["pressure_nrmse"]["mean"])])
+    heads = ["", "share of the time", _with_unit("velocity", scores["velocity_mae"]), "stroke", "pressure (NRMSE)"]
+    table("errors by what the actuators did", heads, rows)
+
+
+def ahead_table(scores: dict[str, Any]) -> None:
+    """Print the errors a few ticks ahead of measured ports, beside a look-ahead predictor where one was given."""
+    ahead, beside = scores.get("ahead"), scores.get("beside")
+    if ahead is not None:
+        velocity = ahead["velocity_mae"]
+        unit = "" if velocity["unit"] is None else f" {velocity['unit']}"
+        out.print(
+            f"{ahead['seconds']:g} s ahead, told the commands: MAE of velocities {_number(velocity['mean'])}{unit}"
+        )
+    if beside is not None:
+        rows = [
+            [part, row["predictor"]["unit"] or "", _number(row["twin"]["mean"]), _number(row["predictor"]["mean"])]
+            for part, row in beside["errors"].items()
+        ]
+        title = f"MAE {beside['seconds']:g} s ahead at the same {beside['moments']:,} moments"
+        table(title, ["", "unit", "twin, told the commands", beside["label"]], rows)
+        if beside["trained_on"]:
+            out.print(f"the predictor was trained on {len(beside['trained_on'])} of these recordings: it is flattered")
 
 
 def _with_unit(text: str, row: dict[str, Any]) -> str:

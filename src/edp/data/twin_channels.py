@@ -99,6 +99,12 @@ class TwinChannels:
         """What the twin answers with: velocities, then strokes, then pressures."""
         return self.velocities + self.strokes + self.pressures
 
+    @property
+    def parts(self) -> dict[str, slice]:
+        """Columns of the answers by part: velocities, strokes, pressures; a part may be empty."""
+        first, second = len(self.velocities), len(self.velocities) + len(self.strokes)
+        return {"velocities": slice(0, first), "strokes": slice(first, second), "pressures": slice(second, None)}
+
     def task(self) -> Task:
         """Commands as inputs and answers as targets one tick later, for the parts of EDP that cut recordings."""
         commands = FeatureSet("commands", tuple(channel.name for channel in self.commands))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
-from edp.networks.twin import Twin, even_starts
-from edp.settings.bounds import MOST_BATCH, MOST_NAMES, above, check_bounds, check_count, whole
-from edp.signals import KINDS, Channel
+from edp.evaluation.free_run_parts import by_channel, by_horizon, by_name, nrmse_by_channel, situations
+from edp.networks.twin import FreeRunIntervals, Twin, calibrate, even_starts
+from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, whole
 
 Array = NDArray[np.float32]
 MOST_SECONDS = 86_400.0
@@ -34,6 +34,10 @@ class FreeRunJudgeSpec:
         starts: free runs in each recording, evenly spread.
         at_s: times after the start at which strokes are compared.
         floors: formulations that are fitted to the same recordings and judged beside it.
+        coverage: share of free runs that an interval is meant to hold.
+        covered_at_s: times after the start at which coverage is counted.
+        calibration_starts: free runs in each validation recording that calibrate the intervals.
+        ahead_ticks: how far it looks ahead of measured ports, told the commands in between.
 
     Raises:
         ConfigError: a value out of range.
@@ -43,11 +47,18 @@ class FreeRunJudgeSpec:
     starts: int = 4
     at_s: tuple[float, ...] = (1.0, 5.0, 10.0, 30.0, 60.0)
     floors: tuple[str, ...] = ("static", "arx")
+    coverage: float = 0.9
+    covered_at_s: tuple[float, ...] = (0.1, 1.0, 10.0, 60.0)
+    calibration_starts: int = 16
+    ahead_ticks: int = 10
 
     def __post_init__(self) -> None:
         length = above(0.0, MOST_SECONDS)
-        check_bounds("judge", self, seconds=length, at_s=length, starts=whole(1, MOST_BATCH))
+        count = whole(1, MOST_BATCH)
+        check_bounds("judge", self, seconds=length, at_s=length, starts=count, calibration_starts=count)
+        check_bounds("judge", self, covered_at_s=length, coverage=between(0.0, 1.0), ahead_ticks=whole(1, MOST_TICKS))
         check_count("judge", "at_s", self.at_s, MOST_NAMES, least=1)
+        check_count("judge", "covered_at_s", self.covered_at_s, MOST_NAMES, least=1)
         check_count("judge", "floors", self.floors, MOST_NAMES)
 
 
@@ -61,7 +72,8 @@ class FreeRuns:
         answers: ``(run, tick, answer)``, SI units; row t is tick t + 1 of the free run.
         truth: measured, of the same shape.
         before: measured at the last tick before the first answer ``(run, answer)``.
-        stroke_range: from end stop to end stop ``(stroke,)``, SI units; empty without strokes.
+        low: least value of each answer, of a stroke the closed end stop ``(answer,)``; `high` likewise.
+        high: largest value.
     """
 
     channels: TwinChannels
@@ -69,7 +81,8 @@ class FreeRuns:
     answers: Array
     truth: Array
     before: Array
-    stroke_range: Array
+    low: Array
+    high: Array
 
     @property
     def stroke_errors(self) -> NDArray[np.float64]:
@@ -79,6 +92,11 @@ class FreeRuns:
             return np.abs(self.answers[..., count : 2 * count].astype(np.float64) - self.truth[..., count : 2 * count])
         return np.abs(self._integral(self.answers) - self._integral(self.truth))
 
+    def only(self, of: NDArray[np.int64]) -> FreeRuns:
+        """Some of the runs, by their places."""
+        names = tuple(self.names[i] for i in of)
+        return FreeRuns(self.channels, names, self.answers[of], self.truth[of], self.before[of], self.low, self.high)
+
     def _integral(self, values: Array) -> NDArray[np.float64]:
         rows = np.concatenate([self.before[:, None], values], axis=1)[..., : len(self.channels.velocities)]
         steps = (rows[:, 1:].astype(np.float64) + rows[:, :-1]) / (2.0 * self.channels.rate_hz)
@@ -87,7 +105,8 @@ class FreeRuns:
     def _range(self) -> NDArray[np.float64]:
         """Range of each stroke ``(velocity,)``; without strokes that of the true integrals."""
         if self.channels.strokes:
-            return self.stroke_range.astype(np.float64)
+            ends = slice(len(self.channels.velocities), 2 * len(self.channels.velocities))
+            return (self.high - self.low)[ends].astype(np.float64)
         return np.asarray(np.ptp(self._integral(self.truth), axis=(0, 1)))
 
     def diverged(self) -> NDArray[np.bool_]:
@@ -141,65 +160,92 @@ def runs_of(twin: Twin, names: tuple[str, ...], answers: Array, truth: Array) ->
         answers: ``(run, tick, answer)``.
         truth: measured ``(run, tick + 1, answer)``, from the last tick before the first answer.
     """
-    ends = slice(len(twin.channels.velocities), len(twin.channels.velocities) + len(twin.channels.strokes))
-    stroke_range = (twin.scales.high - twin.scales.low)[ends]
-    return FreeRuns(twin.channels, names, answers, truth[:, 1:], truth[:, 0], stroke_range)
+    return FreeRuns(twin.channels, names, answers, truth[:, 1:], truth[:, 0], twin.scales.low, twin.scales.high)
 
 
-def free_run_scores(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
+def calibrated(twin: Twin, validation: Sequence[Series], spec: FreeRunJudgeSpec) -> FreeRunIntervals:
+    """Intervals of the twin's free runs, from free runs of the validation part.
+
+    Raises:
+        DataError: no validation stretch has a tick behind the prefix.
+    """
+    runs = free_runs(twin, validation, spec.seconds, spec.calibration_starts)
+    return calibrate(runs.answers - runs.truth, spec.coverage)
+
+
+def free_run_scores(
+    runs: FreeRuns,
+    spec: FreeRunJudgeSpec,
+    intervals: FreeRunIntervals | None = None,
+    labels: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
     """Scores as plain values in the units of reports; velocities, strokes and pressures are never averaged together.
 
     Args:
         runs: free runs.
-        at_s: times after the start at which strokes are compared; those beyond the runs are left out.
+        spec: the times after the start at which strokes are compared and coverage is counted; those beyond the runs
+            are left out.
+        intervals: of the twin that answered, where it has some.
+        labels: way of driving by name of recording; none where they do not tell.
     """
+    channels, names = runs.channels, np.array(runs.names)
+    labels = labels or {}
+    # A stretch of a recording is named after it, with the rows behind.
+    driving = np.array([labels.get(name, labels.get(name.partition("[")[0], "")) for name in runs.names])
+    scores = {
+        "runs": len(names),
+        "recordings": len(set(runs.names)),
+        "seconds": runs.truth.shape[1] / channels.rate_hz,
+        **_errors(runs, spec.at_s),
+        "by_horizon": by_horizon(channels, runs.answers - runs.truth, runs.stroke_errors),
+        "by_recording": by_name(runs.names, lambda of: _summary(runs.only(of))),
+        "by_driving": by_name(driving.tolist(), lambda of: _summary(runs.only(of))) if driving.all() else {},
+        "situations": situations(channels, runs.answers, runs.truth, runs.low, runs.high),
+    }
+    return scores if intervals is None else scores | {"intervals": coverage_of(runs, spec, intervals)}
+
+
+def coverage_of(runs: FreeRuns, spec: FreeRunJudgeSpec, intervals: FreeRunIntervals) -> dict[str, Any]:
+    """Share of the free runs whose truth lies in the interval at each horizon, by kind of channel, and half widths."""
+    channels, ticks = runs.channels, _ticks(runs, spec.covered_at_s)
+    rows = []
+    for at, tick in ticks:
+        half = intervals.at(np.array([tick]))[0]
+        inside = np.abs(runs.answers[:, tick - 1] - runs.truth[:, tick - 1]) <= half
+        row: dict[str, Any] = {"at_s": at, "calibrated": tick <= intervals.ticks[-1]}
+        for part, columns in channels.parts.items():
+            chosen = channels.answers[columns]
+            if chosen:
+                shares = {c.name: float(x) for c, x in zip(chosen, inside[:, columns].mean(axis=0), strict=True)}
+                share = {"share": float(inside[:, columns].mean()), "by_channel": shares}
+                row[part] = share | {"half_width": by_channel(chosen, half[columns])}
+        rows.append(row)
+    return {"coverage": intervals.coverage, "calibrated_by": intervals.runs, "at": rows}
+
+
+def _errors(runs: FreeRuns, at_s: Sequence[float]) -> dict[str, Any]:
+    """Velocity MAE, stroke errors by time, pressure NRMSE and the share of diverged runs."""
     channels, count = runs.channels, len(runs.channels.velocities)
-    errors = np.abs(runs.answers - runs.truth)
-    velocity_mae = errors[..., :count].mean(axis=(0, 1), dtype=np.float64)
-    first = count + len(channels.strokes)
-    squares = np.square((runs.answers - runs.truth)[..., first:].astype(np.float64)).mean(axis=(0, 1))
-    spread = runs.truth[..., first:].astype(np.float64).std(axis=(0, 1))
-    # A pressure that does not move has no scale to measure its error by.
-    nrmse = [float(np.sqrt(s) / d) if d > 0 else None for s, d in zip(squares, spread, strict=True)]
-    ticks = [(at, round(at * channels.rate_hz)) for at in at_s if round(at * channels.rate_hz) <= runs.truth.shape[1]]
+    velocity_mae = np.abs(runs.answers - runs.truth)[..., :count].mean(axis=(0, 1), dtype=np.float64)
     ends = channels.strokes or channels.velocities
     stroke_errors = runs.stroke_errors
     return {
-        "runs": len(runs.names),
-        "recordings": len(set(runs.names)),
-        "seconds": runs.truth.shape[1] / channels.rate_hz,
-        "velocity_mae": _by_channel(channels.velocities, velocity_mae),
+        "velocity_mae": by_channel(channels.velocities, velocity_mae),
         "stroke_error": [
-            {"at_s": at, **_by_channel(ends, stroke_errors[:, max(0, tick - 1)], integral=not channels.strokes)}
-            for at, tick in ticks
+            {"at_s": at, **by_channel(ends, stroke_errors[:, tick - 1], integral=not channels.strokes)}
+            for at, tick in _ticks(runs, at_s)
         ],
-        "pressure_nrmse": {
-            "mean": _mean(nrmse),
-            "by_channel": {c.name: value for c, value in zip(channels.pressures, nrmse, strict=True)},
-        },
+        "pressure_nrmse": nrmse_by_channel(channels, runs.answers, runs.truth),
         "diverged": float(runs.diverged().mean()),
     }
 
 
-def _by_channel(channels: Sequence[Channel], values: NDArray[np.float64], integral: bool = False) -> dict[str, Any]:
-    """Mean of each channel in its unit of reports, and over all, with the median over runs, where the unit is one."""
-    facts = [KINDS[channel.kind] for channel in channels]
-    units = {_integrated(fact.report_unit) if integral else fact.report_unit for fact in facts}
-    scaled = values * np.array([fact.report_factor for fact in facts])
-    by_run = np.atleast_2d(scaled)
-    plain: dict[str, Any] = {c.name: float(x) for c, x in zip(channels, by_run.mean(axis=0), strict=True)}
-    row: dict[str, Any] = {"unit": units.pop() if len(units) == 1 else None, "by_channel": plain}
-    row["mean"] = None if row["unit"] is None else float(by_run.mean())
-    if values.ndim == 2:
-        row["median"] = None if row["unit"] is None else float(np.median(by_run))
-    return row
+def _summary(runs: FreeRuns) -> dict[str, Any]:
+    """The errors over whole runs, and those of the strokes at their end."""
+    return {"runs": len(runs.names), **_errors(runs, (runs.truth.shape[1] / runs.channels.rate_hz,))}
 
 
-def _integrated(unit: str) -> str:
-    """Unit of the integral over seconds of what is in `unit`."""
-    return unit.removesuffix("/s")
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    numbers = [value for value in values if value is not None]
-    return float(np.mean(numbers)) if numbers else None
+def _ticks(runs: FreeRuns, at_s: Sequence[float]) -> list[tuple[float, int]]:
+    """Times within the runs, each with its tick."""
+    ticks = [(at, max(1, round(at * runs.channels.rate_hz))) for at in at_s]
+    return [(at, tick) for at, tick in ticks if tick <= runs.truth.shape[1]]

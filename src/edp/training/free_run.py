@@ -79,7 +79,7 @@ class FreeRunSpec:
     seed: int = 0
     lanes: int = 64
     lengths_s: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
-    updates: tuple[int, ...] = (800, 800, 1000, 700)
+    updates: tuple[int, ...] = (1500, 2000, 3000, 500)
     # More of them cost accuracy in free runs, and gave none where ports are measured (docs/findings.md).
     measured_share: float = 0.05
     mixed_share: float = 0.1

@@ -15,7 +15,7 @@ from safetensors.numpy import save as save_arrays
 from edp import __version__
 from edp.data.twin_channels import TwinChannels
 from edp.errors import BundleError
-from edp.networks.twin import TWINS, Twin, TwinScales, TwinSpec
+from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinScales, TwinSpec
 from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel, Kind
@@ -23,7 +23,9 @@ from edp.storage import make_folder, object_with, read_json, write_json
 from edp.storage.memory import check_setting
 from edp.training.bundle import HASH, as_damage, check_hash, header_digest, read_arrays, write_arrays
 
-SCHEMA = 1
+SCHEMA = 2
+READABLE = (1, 2)
+"""Schema 1 had no intervals."""
 HEADER = "twin.json"
 PARTS = ("commands", "velocities", "strokes", "pressures")
 RATE = above(0.0, 1e6)
@@ -44,12 +46,14 @@ class TwinBundle:
         twin: ready to run.
         provenance: data digest, environment, settings, training time.
         scores: held-out scores; empty before they are known.
+        intervals: of free runs, where they were calibrated.
     """
 
     spec: TwinSpec
     twin: Twin
     provenance: Mapping[str, Any] = field(default_factory=dict)
     scores: Mapping[str, Any] = field(default_factory=dict)
+    intervals: FreeRunIntervals | None = None
 
 
 def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
@@ -68,6 +72,7 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
         "rate_hz": channels.rate_hz,
         "channels": {part: [_plain(channel) for channel in getattr(channels, part)] for part in PARTS},
         "weights": entry,
+        "intervals": None if bundle.intervals is None else bundle.intervals.to_plain(),
         "provenance": dict(bundle.provenance),
         "scores": dict(bundle.scores),
     }
@@ -95,10 +100,10 @@ def load_twin(folder: str | Path) -> TwinBundle:
     with as_damage(path):
         header = object_with(read_json(path / HEADER), ("schema",), f"'{path / HEADER}'")
         schema = header["schema"]
-        if isinstance(schema, bool) or schema != SCHEMA:
+        if isinstance(schema, bool) or schema not in READABLE:
             raise BundleError(
-                f"twin '{path}' has schema {str(schema)[:40]}, this version of EDP ({__version__}) reads {SCHEMA}; "
-                "install a newer EDP, or train again"
+                f"twin '{path}' has schema {str(schema)[:40]}, this EDP ({__version__}) reads 1 to {SCHEMA}; "
+                "install a newer one, or train again"
             )
         check_hash(header, path / HEADER)
         return _assembled(header, path)
@@ -124,7 +129,9 @@ def _assembled(header: Mapping[str, Any], path: Path) -> TwinBundle:
             raise ValueError(f"'{name[:80]}' holds a number that is not finite")
     provenance = object_with(header["provenance"], (), "its provenance")
     scores = object_with(header["scores"], (), "its scores")
-    return TwinBundle(spec, spec.build(channels, TwinScales.of(arrays), arrays), provenance, scores)
+    widths = header.get("intervals") if header["schema"] > 1 else None
+    intervals = None if widths is None else FreeRunIntervals.from_plain(widths, channels)
+    return TwinBundle(spec, spec.build(channels, TwinScales.of(arrays), arrays), provenance, scores, intervals)
 
 
 def _plain(channel: Channel) -> dict[str, str]:

@@ -7,9 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edp.data.features import FeatureSet
+from edp.data.prepared import prepare
+from edp.data.splits import ByRecording
+from edp.data.task import TargetMode, Task
 from edp.logs import write_recording
 from edp.logs.source import DataSource
+from edp.networks.backbones import HybridSpec
+from edp.networks.predictor import ModelSpec, build_model
+from edp.storage import read_object
 from edp.testing.twins import sample_actuators
+from edp.training.bundle import make_bundle, save_bundle
 from edp.training.twin_bundle import load_twin
 
 SMALL = (
@@ -96,7 +104,39 @@ def test_a_rollout_writes_measured_and_free_values_row_by_row(edp, logs, trained
     np.testing.assert_allclose(written.select([f"{name}_twin" for name in names]), answers[0], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(written.select(names), series.targets[101:251], rtol=1e-5, atol=1e-6)
     error = 1e3 * np.abs(answers[0] - series.targets[101:251])[:, :2].mean()
+    half = load_twin(trained).intervals.at(np.arange(1, 151))
+    for end, sign in (("low", -1), ("high", 1)):
+        values = written.select([f"{name}_twin_{end}" for name in names])
+        np.testing.assert_allclose((values - answers[0]) / half, sign, rtol=1e-3)
+    assert ended.json["calibrated_s"] == 4.0
     assert ended.json["velocity_mae"]["mean"] == pytest.approx(error, rel=1e-4)
+
+
+def test_a_twin_is_judged_anew_and_on_other_recordings_beside_a_predictor(edp, logs, trained, tmp_path):
+    run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
+    write_recording(sample_actuators(seed=9, ticks=500), other / "later.parquet")
+    (recording,) = DataSource.of(other).read()
+    speeds = ("speed_1", "speed_2")
+    task = Task(FeatureSet("speeds", (*speeds, "lever_1", "lever_2")), speeds, (1, 5), TargetMode.DELTA, 50.0)
+    model = ModelSpec(backbone=HybridSpec(channels=(4,), kernel=3, units=4, dropout=0.0), window=20)
+    data = prepare([recording] * 3, task, ByRecording(), 20)
+    names = {"data": {"train": {"names": [recording.name]}}}
+    save_bundle(make_bundle(build_model(task, model, data.scaler(), 0).eval(), data, names), tmp_path / "predictor")
+    before = read_object(run / "free_run.json")
+    again = edp("evaluate", run, "--json").json
+    assert again["models"] == before["models"]
+    judged = edp("evaluate", run, "--data", other, "--predictor", tmp_path / "predictor", "--json").json
+    assert judged["folder"] == str(run / "on_other")
+    twin = judged["models"]["twin"]
+    assert twin["recordings"] == 1
+    assert [row["at_s"] for row in twin["intervals"]["at"]] == [0.1, 1.0]
+    beside = twin["beside"]
+    assert (beside["ticks"], beside["trained_on"]) == (5, [recording.name])
+    assert beside["errors"]["velocities"]["twin"]["mean"] > 0
+    shown = edp("evaluate", run, "--data", other, "--predictor", tmp_path / "predictor").out
+    for text in ("share of free runs in intervals", "at rest", "in motion", "told the commands", "it is flattered"):
+        assert text.removeprefix("at ").removeprefix("in ") in " ".join(shown.split())
+    assert "neither --baselines" in edp("evaluate", run, "--baselines", "none").err
 
 
 def test_a_rollout_prints_the_error_of_each_channel_by_time(edp, logs, trained):
@@ -159,5 +199,5 @@ def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, t
     write_recording(replace(recording, rate_hz=25.0), slow)
     assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
     assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())
-    for command in ("evaluate", "report", "parity"):
+    for command in ("report", "parity"):
         assert "holds a twin" in " ".join(edp(command, trained).err.split())

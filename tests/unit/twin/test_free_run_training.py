@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError, DataError, StorageError
-from edp.evaluation.free_run import free_run_scores, free_runs
+from edp.evaluation.free_run import FreeRunJudgeSpec, free_run_scores, free_runs
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.recurrent import Recurrent
 from edp.storage.runs import KeyedRun, RunFolder
@@ -34,7 +34,8 @@ def test_free_runs_are_learned_far_better_than_the_static_map(data):
     result = fitted(data)
     floor = TWINS["static"]().start(channels, scales, train, 0)
     errors = [
-        free_run_scores(free_runs(twin, test, 8.0, 4), (8.0,))["velocity_mae"]["mean"] for twin in (result.twin, floor)
+        free_run_scores(free_runs(twin, test, 8.0, 4), FreeRunJudgeSpec(at_s=(8.0,)))["velocity_mae"]["mean"]
+        for twin in (result.twin, floor)
     ]
     assert errors[0] < 0.6 * errors[1]
     assert [row["update"] for row in result.history] == [50, 100, 150, 200, 250]

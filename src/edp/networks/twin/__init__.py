@@ -2,6 +2,17 @@
 
 from edp.networks.twin import arx, recurrent, static_map  # noqa: F401  registers the formulations
 from edp.networks.twin.base import TWINS, Twin, TwinSpec, TwinState, even_starts
+from edp.networks.twin.intervals import FreeRunIntervals, calibrate
 from edp.networks.twin.scales import TwinScales, fit_scales
 
-__all__ = ["TWINS", "Twin", "TwinScales", "TwinSpec", "TwinState", "even_starts", "fit_scales"]
+__all__ = [
+    "TWINS",
+    "FreeRunIntervals",
+    "Twin",
+    "TwinScales",
+    "TwinSpec",
+    "TwinState",
+    "calibrate",
+    "even_starts",
+    "fit_scales",
+]

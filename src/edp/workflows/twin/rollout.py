@@ -18,10 +18,13 @@ from edp.networks.twin import Twin
 from edp.recording import Recording
 from edp.report import write_rollout_plots
 from edp.settings.bounds import above, span
+from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
 
 FREE = "_twin"
 """Behind the name of a channel, for what the twin answered in its place."""
+LOW, HIGH = f"{FREE}_low", f"{FREE}_high"
+"""Behind the name of a channel, for the ends of the interval of that answer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +32,19 @@ class Rollout:
     """A free run beside what was measured.
 
     Attributes:
-        recording: commands, measured channels, and the twin's answers under names that end in `FREE`; row by row at
-            the same time.
+        recording: commands, measured channels, and the twin's answers under names that end in `FREE`, with their
+            intervals under `LOW` and `HIGH`; row by row at the same time.
         scores: see `edp.evaluation.free_run.free_run_scores`.
         start_s: of the free run in the log.
+        coverage: share that the intervals are meant to hold; None without intervals.
+        calibrated_s: length of a free run up to which they are calibrated; beyond it they stay as wide.
     """
 
     recording: Recording
     scores: dict[str, Any]
     start_s: float
+    coverage: float | None
+    calibrated_s: float | None
 
 
 def rollout_log(
@@ -63,7 +70,8 @@ def rollout_log(
     Raises:
         EdpError: several logs, another rate or kind, times outside the log, or a channel that the twin does not answer.
     """
-    twin = load_twin(run).twin
+    bundle = load_twin(run)
+    twin = bundle.twin
     recording = _only(source.read())
     same_channels(twin.channels, recording)
     measured_columns = _columns(twin, measured)
@@ -78,10 +86,17 @@ def rollout_log(
     state = twin.reset(commands[:, :prefix], truth[:, :prefix])
     answers, _ = twin.rollout(commands[:, prefix:], state, ports)
     runs = runs_of(twin, (recording.name,), answers, truth[:, prefix:])
-    seconds_seen = FreeRunJudgeSpec().at_s
-    at_s = sorted({*(at for at in seconds_seen if at < seconds), ticks / twin.channels.rate_hz})
+    spec = FreeRunJudgeSpec()
+    at_s = sorted({*(at for at in spec.at_s if at < seconds), ticks / twin.channels.rate_hz})
+    # Intervals are calibrated on runs in which every port is free; a measured one would make them wrong, not narrow.
+    intervals = None if measured_columns else bundle.intervals
+    half = None if intervals is None else intervals.at(np.arange(1, ticks + 1)).astype(np.float32)
     result = Rollout(
-        _recorded(twin, recording, answers[0], start), free_run_scores(runs, at_s), start / recording.rate_hz
+        _recorded(twin, recording, answers[0], half, start),
+        free_run_scores(runs, replace(spec, at_s=tuple(at_s)), intervals),
+        start / recording.rate_hz,
+        None if intervals is None else intervals.coverage,
+        None if intervals is None else intervals.ticks[-1] / recording.rate_hz,
     )
     if out is not None:
         write_recording(result.recording, out)
@@ -130,20 +145,28 @@ def _columns(twin: Twin, measured: Sequence[str]) -> list[int]:
     return [names.index(name) for name in measured]
 
 
-def _recorded(twin: Twin, recording: Recording, answers: np.ndarray, start: int) -> Recording:
-    """Row t holds the commands and measured values of tick start + 1 + t, and the answers for it."""
+def _recorded(twin: Twin, recording: Recording, answers: np.ndarray, half: np.ndarray | None, start: int) -> Recording:
+    """Row t holds the commands and measured values of tick start + 1 + t, the answers for it, and their intervals."""
     channels = twin.channels.commands + twin.channels.answers
     rows = slice(start + 1, start + 1 + len(answers))
     measured_values = recording.select([channel.name for channel in channels])[rows]
-    own = tuple(
-        replace(channel, name=f"{channel.name}{FREE}", description=f"{channel.description} (free run)".strip())
-        for channel in twin.channels.answers
-    )
+    columns, own = [measured_values, answers], _named(twin, FREE, "free run")
+    if half is not None:
+        own += _named(twin, LOW, "free run, lower end") + _named(twin, HIGH, "free run, upper end")
+        columns += [answers - half, answers + half]
     return Recording(
         f"{recording.name}_rollout",
         channels + own,
-        np.ascontiguousarray(np.concatenate([measured_values, answers], axis=1)),
+        np.ascontiguousarray(np.concatenate(columns, axis=1)),
         recording.rate_hz,
         recording.source,
         {"start_s": (start + 1) / recording.rate_hz},
+    )
+
+
+def _named(twin: Twin, suffix: str, text: str) -> tuple[Channel, ...]:
+    """The channels of the answers under other names."""
+    return tuple(
+        replace(channel, name=f"{channel.name}{suffix}", description=f"{channel.description} ({text})".strip())
+        for channel in twin.channels.answers
     )

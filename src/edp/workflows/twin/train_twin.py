@@ -10,19 +10,17 @@ from typing import Any
 
 from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
-from edp.data.prepared import Prepared, prepare
-from edp.data.twin_channels import TwinChannels, same_channels, twin_channels
-from edp.evaluation.free_run import FreeRunJudgeSpec, free_run_scores, free_runs
+from edp.data.prepared import Prepared
+from edp.evaluation.free_run import calibrated
 from edp.logs.source import DataSource
-from edp.networks.twin import TWINS, Twin, TwinSpec, fit_scales
-from edp.networks.twin.base import check_length
+from edp.networks.twin import fit_scales
 from edp.networks.twin.recurrent import RecurrentTwin
-from edp.storage import write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.free_run import FittedTwin, FreeRunProgress, fit_free_runs
-from edp.training.twin_bundle import HEADER, TwinBundle, load_twin, save_twin
+from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
+from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
+from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
-SCORES = "free_run.json"
 FOLDER = "twin"
 
 
@@ -63,7 +61,9 @@ def train_twin(
     """
     tell = on_step or (lambda text: None)
     tell("reading recordings")
-    channels, data = prepare_twin(source, experiment)
+    recordings = source.read()
+    channels, data = prepared_twin(recordings, experiment)
+    labels = driving_labels(recordings)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment)}, data.digest)
     with RunFolder(out) as run:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
@@ -80,39 +80,16 @@ def train_twin(
             run.write_history(fitted.history)
         else:
             fitted = FittedTwin(twin, [], time.process_time() - started)
-        scores = {"twin": _judged(fitted.twin, data, experiment.judge, tell, "the twin")}
-        for name in experiment.judge.floors:
-            # The floors are those of the same recordings and the same prefix.
-            spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
-            floor = spec.start(channels, scales, data.train, experiment.training.seed)
-            scores[name] = _judged(floor, data, experiment.judge, tell, name)
-        write_json(run.file(SCORES), {"schema": 1, "models": scores})
-        bundle = TwinBundle(experiment.twin, fitted.twin, _provenance(source, experiment, data, fitted), scores)
+        tell("calibrating intervals")
+        intervals = calibrated(fitted.twin, data.validation, experiment.judge)
+        provenance = _provenance(source, experiment, data, fitted)
+        bundle = TwinBundle(experiment.twin, fitted.twin, provenance, {}, intervals)
+        scores, runs = judge_twin(bundle, experiment, data, labels, tell)
+        write_scores(run.path, scores, runs, intervals)
+        bundle = replace(bundle, scores=scores)
         save_twin(bundle, run.file(FOLDER))
         run.write_status("finished")
     return TrainedTwin(bundle, scores, False)
-
-
-def prepare_twin(source: DataSource, experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
-    """Read and cut a data set: commands as inputs, what the twin answers as targets.
-
-    Raises:
-        EdpError: recordings or settings that cannot be used.
-    """
-    recordings = source.read()
-    channels = twin_channels(recordings[0], experiment.channels)
-    for recording in recordings[1:]:
-        same_channels(channels, recording)
-    data = prepare(recordings, channels.task(), experiment.split, experiment.twin.prefix_ticks)
-    check_length(channels, experiment.twin, data.train)
-    return channels, data
-
-
-def _judged(
-    twin: Twin, data: Prepared, spec: FreeRunJudgeSpec, tell: Callable[[str], None], label: str
-) -> dict[str, Any]:
-    tell(f"free runs of {label}")
-    return free_run_scores(free_runs(twin, data.test, spec.seconds, spec.starts), spec.at_s)
 
 
 def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, fitted: FittedTwin) -> dict[str, Any]:
@@ -128,4 +105,4 @@ def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, 
     }
 
 
-__all__ = ["FOLDER", "HEADER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]
+__all__ = ["FOLDER", "SCORES", "TrainedTwin", "prepare_twin", "train_twin"]

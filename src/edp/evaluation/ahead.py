@@ -1,0 +1,108 @@
+"""A few ticks ahead of measured ports, told the commands in between: a twin as predictor, beside other networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+from edp.errors import DataError
+from edp.evaluation.free_run_parts import by_channel, nrmse_by_channel
+from edp.networks.twin import Twin
+
+Array = NDArray[np.float32]
+EACH = 200
+"""Moments in each stretch: a few hundred in each of a dozen recordings settle a mean error to a per cent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ahead:
+    """What a twin answered some ticks ahead, and what was measured then.
+
+    Attributes:
+        channels: of the twin.
+        ticks: how far ahead.
+        moments: of each stretch ``(moment,)``: the last tick that was measured.
+        answers: ``(moment, answer)``, SI units, stretch after stretch.
+        truth: measured, of the same shape.
+    """
+
+    channels: TwinChannels
+    ticks: int
+    moments: tuple[NDArray[np.int64], ...]
+    answers: Array
+    truth: Array
+
+
+def look_ahead(twin: Twin, series: Sequence[Series], ticks: int, first: int = 0) -> Ahead:
+    """Let a twin answer `ticks` ahead of evenly spread moments, measured up to each and told the commands after it.
+
+    Args:
+        twin: any formulation.
+        series: inputs are commands, targets are what it answers.
+        ticks: how far ahead, at least one.
+        first: earliest moment in a stretch; never before the prefix.
+
+    Raises:
+        DataError: no stretch is long enough.
+    """
+    prefix, answers, truths, moments = twin.prefix_ticks, [], [], []
+    for part in series:
+        earliest, latest = max(first, prefix), part.samples - ticks - 1
+        at = np.unique(np.linspace(earliest, latest, EACH).astype(np.int64)) if latest >= earliest else np.zeros(0, int)
+        # A start beyond an end stop is one that the twin refuses.
+        at = at[twin.within_stops(part.targets[at - prefix])]
+        moments.append(at)
+        if not len(at):
+            continue
+        before, after = at[:, None] + np.arange(-prefix, 0), at[:, None] + np.arange(ticks)
+        state = twin.reset(part.inputs[before], part.targets[before])
+        ports = np.full((len(at), ticks, part.targets.shape[1]), np.nan, np.float32)
+        ports[:, 0] = part.targets[at]
+        answers.append(twin.rollout(part.inputs[after], state, ports)[0][:, -1])
+        truths.append(part.targets[at + ticks])
+    if not answers:
+        raise DataError(
+            f"no recording has {max(first, prefix) + ticks + 1} ticks, and a twin that looks {ticks} ticks ahead needs "
+            "as many: give longer recordings"
+        )
+    return Ahead(twin.channels, ticks, tuple(moments), np.concatenate(answers), np.concatenate(truths))
+
+
+def ahead_scores(ahead: Ahead) -> dict[str, Any]:
+    """Velocity MAE, stroke error and pressure NRMSE that far ahead, never averaged together."""
+    channels = ahead.channels
+    errors = np.abs(ahead.answers - ahead.truth).astype(np.float64)
+    rows: dict[str, Any] = {"ticks": ahead.ticks, "seconds": ahead.ticks / channels.rate_hz}
+    rows["moments"] = len(ahead.truth)
+    for part, key in (("velocities", "velocity_mae"), ("strokes", "stroke_error")):
+        columns = channels.parts[part]
+        rows[key] = by_channel(channels.answers[columns], errors[:, columns].mean(axis=0))
+    # The scores of pressures read runs and ticks: here each moment is a run of one tick.
+    rows["pressure_nrmse"] = nrmse_by_channel(channels, ahead.answers[:, None], ahead.truth[:, None])
+    return rows
+
+
+def predictor_scores(ahead: Ahead, predicted: Mapping[str, Array]) -> dict[str, Any]:
+    """Mean absolute errors of a look-ahead predictor at the same moments, by kind of channel.
+
+    Args:
+        ahead: of the twin.
+        predicted: of each channel that both answer, ``(moment,)``, SI units.
+    """
+    rows: dict[str, Any] = {}
+    for part, columns in ahead.channels.parts.items():
+        named = [(i, c) for i, c in enumerate(ahead.channels.answers) if c in ahead.channels.answers[columns]]
+        shared = [(i, c) for i, c in named if c.name in predicted]
+        if shared:
+            truth = ahead.truth[:, [i for i, _ in shared]]
+            chosen = [c for _, c in shared]
+            errors = np.abs(np.stack([predicted[c.name] for c in chosen], axis=1) - truth).astype(np.float64)
+            own = np.abs(ahead.answers[:, [i for i, _ in shared]] - truth).astype(np.float64)
+            rows[part] = {"predictor": by_channel(chosen, errors.mean(axis=0)), "twin": by_channel(chosen, own.mean(0))}
+    return rows

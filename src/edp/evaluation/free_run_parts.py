@@ -1,0 +1,148 @@
+"""Parts of the scores of free runs: by horizon, by recording, at end stops, at rest; each kind of channel apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.twin_channels import TwinChannels
+from edp.signals import KINDS, Channel
+
+Array = NDArray[np.float32]
+AT_STOP = 0.01
+"""Share of a stroke: as near to an end stop as that, an actuator is at it."""
+AT_REST = 0.01
+"""Share of the fastest velocity of a twin: an actuator that is slower, and at no end stop, stands still."""
+HORIZONS_A_DECADE = 6
+"""Points of an error over the horizon: a line on a page with a logarithmic axis needs no more."""
+
+
+def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool = False) -> dict[str, Any]:
+    """Mean of each channel in its unit of reports, and over all, with the median over runs, where the unit is one.
+
+    Args:
+        channels: of the columns.
+        values: SI units, ``(channel,)`` or ``(run, channel)``.
+        integral: whether they are integrals of the channels over seconds.
+    """
+    facts = [KINDS[channel.kind] for channel in channels]
+    units = {_integrated(fact.report_unit) if integral else fact.report_unit for fact in facts}
+    by_run = np.atleast_2d(values * np.array([fact.report_factor for fact in facts]))
+    plain: dict[str, Any] = {c.name: float(x) for c, x in zip(channels, by_run.mean(axis=0), strict=True)}
+    row: dict[str, Any] = {"unit": units.pop() if len(units) == 1 else None, "by_channel": plain}
+    row["mean"] = None if row["unit"] is None or not by_run.size else float(by_run.mean())
+    if values.ndim == 2:
+        row["median"] = None if row["unit"] is None else float(np.median(by_run))
+    return row
+
+
+def nrmse_by_channel(
+    channels: TwinChannels, answers: Array, truth: Array, ticks: NDArray[np.bool_] | None = None
+) -> dict[str, Any]:
+    """Root mean square error of each pressure in its deviations over all runs, and their mean.
+
+    Args:
+        channels: of the twin.
+        answers: ``(run, tick, answer)``, SI units; `truth` likewise.
+        truth: measured.
+        ticks: those that count ``(run, tick)``; all by default.
+    """
+    columns = channels.parts["pressures"]
+    spread = truth[..., columns].astype(np.float64).std(axis=(0, 1))
+    errors = (answers - truth)[..., columns].astype(np.float64)
+    chosen = errors[np.ones(errors.shape[:2], dtype=bool) if ticks is None else ticks]
+    squares = np.square(chosen).mean(axis=0) if len(chosen) else np.full(len(spread), np.nan)
+    # A pressure that does not move has no scale to measure its error by.
+    each = [float(np.sqrt(s) / d) if d > 0 and np.isfinite(s) else None for s, d in zip(squares, spread, strict=True)]
+    numbers = [value for value in each if value is not None]
+    return {
+        "mean": float(np.mean(numbers)) if numbers else None,
+        "by_channel": {c.name: value for c, value in zip(channels.pressures, each, strict=True)},
+    }
+
+
+def by_horizon(channels: TwinChannels, errors: Array, stroke_errors: NDArray[np.float64]) -> dict[str, Any]:
+    """Mean absolute error of each answer at horizons that grow geometrically, in units of reports.
+
+    Args:
+        channels: of the twin.
+        errors: ``(run, tick, answer)``, SI units.
+        stroke_errors: of strokes, or of integrals where none are measured ``(run, tick, velocity)``.
+    """
+    longest = errors.shape[1]
+    count = max(2, round(HORIZONS_A_DECADE * np.log10(longest)) + 1)
+    ticks = np.unique(np.geomspace(1, longest, count).round().astype(np.int64))
+    rows: dict[str, Any] = {"seconds": [float(tick / channels.rate_hz) for tick in ticks]}
+    for part, columns in channels.parts.items():
+        named, integral = channels.answers[columns], False
+        values = np.abs(errors[:, ticks - 1][..., columns]).astype(np.float64)
+        if part == "strokes" and not named:
+            named, integral, values = channels.velocities, True, stroke_errors[:, ticks - 1]
+        means = [by_channel(named, row, integral) for row in values.mean(axis=0)] if named else []
+        rows[part] = {
+            "unit": means[0]["unit"] if means else None,
+            "mean": [row["mean"] for row in means],
+            "by_channel": {c.name: [row["by_channel"][c.name] for row in means] for c in named},
+        }
+    return rows
+
+
+def by_name(names: Sequence[str], summary: Callable[[NDArray[np.int64]], dict[str, Any]]) -> dict[str, Any]:
+    """A summary of the runs of each name, in the order in which the names came."""
+    return {name: summary(np.flatnonzero(np.array(names) == name)) for name in dict.fromkeys(names)}
+
+
+def situations(channels: TwinChannels, answers: Array, truth: Array, low: Array, high: Array) -> dict[str, Any]:
+    """Errors at end stops, at rest and in motion, by what was measured; a situation that never occurs is left out.
+
+    An actuator is at an end stop within `AT_STOP` of its stroke, at rest where it is slower than `AT_REST` of its
+    fastest velocity. The machine is at a stop where an actuator is, and at rest (idling) where all of them are:
+    that is what counts for pressures, whose pumps serve several actuators.
+
+    Args:
+        channels: of the twin.
+        answers: ``(run, tick, answer)``, SI units; `truth` likewise.
+        truth: measured.
+        low: least value of each answer; `high` likewise.
+        high: largest value.
+    """
+    velocities, strokes = channels.parts["velocities"], channels.parts["strokes"]
+    rest = np.abs(truth[..., velocities]) < AT_REST * high[velocities]
+    stop = np.zeros_like(rest)
+    if channels.strokes:
+        near = AT_STOP * (high - low)[strokes]
+        stop = (truth[..., strokes] < low[strokes] + near) | (truth[..., strokes] > high[strokes] - near)
+    rest &= ~stop
+    machine_stop: NDArray[np.bool_] = np.asarray(stop.any(axis=-1))
+    machine_rest: NDArray[np.bool_] = np.asarray(rest.all(axis=-1))
+    machine = {"end_stops": machine_stop, "rest": machine_rest, "motion": ~machine_stop & ~machine_rest}
+    rows = {}
+    for name, axes in {"end_stops": stop, "rest": rest, "motion": ~stop & ~rest}.items():
+        ticks = machine[name]
+        if not axes.any() and not ticks.any():
+            continue
+        row: dict[str, Any] = {"share": float(axes.mean()), "machine_share": float(ticks.mean())}
+        for columns, key in ((velocities, "velocity_mae"), (strokes, "stroke_error")):
+            named = channels.answers[columns]
+            if named:
+                errors = np.abs(answers - truth)[..., columns].astype(np.float64)
+                row[key] = _where(named, errors, axes)
+        rows[name] = row | {"pressure_nrmse": nrmse_by_channel(channels, answers, truth, ticks)}
+    return rows
+
+
+def _where(channels: Sequence[Channel], errors: NDArray[np.float64], axes: NDArray[np.bool_]) -> dict[str, Any]:
+    """Mean of each channel over its own ticks; None where it has none, and no mean over channels then."""
+    counts = axes.sum(axis=(0, 1))
+    sums = np.where(axes, errors, 0.0).sum(axis=(0, 1))
+    seen = [i for i, count in enumerate(counts) if count]
+    row = by_channel([channels[i] for i in seen], sums[seen] / counts[seen])
+    return row | {"by_channel": {channel.name: row["by_channel"].get(channel.name) for channel in channels}}
+
+
+def _integrated(unit: str) -> str:
+    """Unit of the integral over seconds of what is in `unit`."""
+    return unit.removesuffix("/s")

@@ -1,0 +1,225 @@
+"""A twin judged on free runs and a few ticks ahead, beside its floors, on held-out recordings or on other ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from edp.config.twin import TwinExperiment, load_twin_experiment
+from edp.data.prepared import Prepared
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels, same_channels
+from edp.errors import DataError
+from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scores
+from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
+from edp.logs.source import DataSource
+from edp.networks.predictor import Predictor, describe
+from edp.networks.running import stream_predictions
+from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinSpec
+from edp.recording import Recording
+from edp.signals import KINDS, Channel
+from edp.storage import check_writable, make_folder, write_bytes, write_json
+from edp.training import load_bundle
+from edp.training.twin_bundle import TwinBundle, load_twin
+from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
+
+SCORES = "free_run.json"
+SHOWN = "free_runs.safetensors"
+SHOWN_RUNS = 8
+"""Free runs on a page: a reader goes through a few."""
+SHOWN_TICKS = 1500
+"""Points of a line on a page: more than its width resolves."""
+
+
+def judge_twin(
+    bundle: TwinBundle,
+    experiment: TwinExperiment,
+    data: Prepared,
+    labels: Mapping[str, str],
+    tell: Callable[[str], None],
+) -> tuple[dict[str, Any], FreeRuns]:
+    """Scores of a twin and its floors on the test part, by label, and the free runs of the twin.
+
+    Args:
+        bundle: the twin.
+        experiment: its settings; floors are fitted to the training part with the same prefix.
+        data: prepared series.
+        labels: see `driving_labels`.
+        tell: called with what begins.
+    """
+    twin, spec = bundle.twin, experiment.judge
+    tell("free runs of the twin")
+    runs = free_runs(twin, data.test, spec.seconds, spec.starts)
+    scores = {"twin": free_run_scores(runs, spec, bundle.intervals, labels) | _ahead(twin, data, spec)}
+    for name in spec.floors:
+        tell(f"free runs of {name}")
+        floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
+        floor = floor_spec.start(twin.channels, twin.scales, data.train, experiment.training.seed)
+        floor_runs = free_runs(floor, data.test, spec.seconds, spec.starts)
+        scores[name] = free_run_scores(floor_runs, spec, None, labels) | _ahead(floor, data, spec)
+    return scores, runs
+
+
+def write_scores(
+    folder: Path,
+    scores: Mapping[str, Any],
+    runs: FreeRuns,
+    intervals: FreeRunIntervals | None,
+    more: Mapping[str, Any] | None = None,
+) -> None:
+    """Write ``free_run.json`` and the runs that pages draw, ``free_runs.safetensors``.
+
+    Raises:
+        StorageError: a file cannot be written.
+    """
+    write_bytes(folder / SHOWN, save(shown_runs(runs, intervals)))
+    write_json(
+        folder / SCORES, {"schema": 2, "channels": channel_facts(runs.channels), **(more or {}), "models": scores}
+    )
+
+
+def channel_facts(channels: TwinChannels) -> dict[str, list[dict[str, Any]]]:
+    """Name, description, unit of reports and its factor of each answer, by part."""
+
+    def facts(channel: Channel) -> dict[str, Any]:
+        kind = KINDS[channel.kind]
+        return {
+            "name": channel.name,
+            "description": channel.description,
+            "unit": kind.report_unit,
+            "factor": kind.report_factor,
+        }
+
+    return {part: [facts(c) for c in channels.answers[columns]] for part, columns in channels.parts.items()}
+
+
+def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, NDArray[Any]]:
+    """A few of the runs, thinned out for pages: time, answers, truth, and half widths where intervals are known.
+
+    One run of each way of driving would need labels; one of each recording, evenly chosen, needs none.
+    """
+    ticks = runs.truth.shape[1]
+    at = np.unique(np.linspace(0, ticks - 1, SHOWN_TICKS).astype(np.int64))
+    arrays: dict[str, NDArray[Any]] = {"seconds": ((at + 1) / runs.channels.rate_hz).astype(np.float32)}
+    if intervals is not None:
+        arrays["half_width"] = intervals.at(at + 1).astype(np.float32)
+    first = list(dict(zip(reversed(runs.names), reversed(range(len(runs.names))), strict=True)).values())[::-1]
+    for which in np.unique(np.linspace(0, len(first) - 1, SHOWN_RUNS).astype(np.int64)):
+        run = first[which]
+        arrays[f"{runs.names[run]}/answers"] = np.ascontiguousarray(runs.answers[run, at])
+        arrays[f"{runs.names[run]}/truth"] = np.ascontiguousarray(runs.truth[run, at])
+    return arrays
+
+
+def _ahead(twin: Twin, data: Prepared, spec: FreeRunJudgeSpec) -> dict[str, Any]:
+    """Scores a few ticks ahead; none where no recording is long enough."""
+    longest = max(part.samples for part in data.test)
+    if longest < twin.prefix_ticks + spec.ahead_ticks + 1:
+        return {}
+    return {"ahead": ahead_scores(look_ahead(twin, data.test, spec.ahead_ticks))}
+
+
+def evaluate_twin(
+    run: str | Path,
+    source: DataSource | None = None,
+    predictor_run: str | Path | None = None,
+    on_step: Callable[[str], None] | None = None,
+) -> Path:
+    """Judge a twin anew: on its held-out recordings, or on other ones, all of which are judged.
+
+    Args:
+        run: run folder of a twin.
+        source: other recordings.
+        predictor_run: run folder of a look-ahead predictor; its error stands beside the twin's, at the same moments.
+        on_step: called with what begins.
+
+    Returns:
+        The folder with ``free_run.json``: the run folder, or one in it for `source`.
+
+    Raises:
+        EdpError: no twin, recordings that changed since, or a predictor that predicts nothing that the twin answers.
+    """
+    tell = on_step or (lambda text: None)
+    folder = Path(run)
+    bundle = load_twin(folder)
+    check_writable(folder)
+    experiment = load_twin_experiment(folder / "config.toml")
+    tell("reading recordings")
+    recordings = DataSource.from_plain(bundle.provenance["data"]["reader"]).read()
+    channels, data = prepared_twin(recordings, experiment)
+    if data.digest != bundle.provenance["data"]["digest"]:
+        raise DataError(
+            f"the recordings in '{bundle.provenance['data']['source']}' changed since '{folder}' was trained; the "
+            "held-out part would not be the same: train again, or judge other recordings with --data"
+        )
+    target = folder
+    if source is not None:
+        recordings = source.read()
+        for recording in recordings:
+            same_channels(channels, recording)
+        data = replace(data, test=[channels.task().series(recording) for recording in recordings])
+        target = make_folder(folder / f"on_{source.path.stem}")
+    scores, runs = judge_twin(bundle, experiment, data, driving_labels(recordings), tell)
+    if predictor_run is not None:
+        tell("the look-ahead predictor")
+        beside = beside_predictor(bundle.twin, data.test, recordings, Path(predictor_run), experiment.judge)
+        scores["twin"]["beside"] = beside
+    write_scores(target, scores, runs, bundle.intervals)
+    return target
+
+
+def beside_predictor(
+    twin: Twin, test: Sequence[Series], recordings: Sequence[Recording], run: Path, spec: FreeRunJudgeSpec
+) -> dict[str, Any]:
+    """Errors of a look-ahead predictor and of the twin at the same moments, for the channels that both answer.
+
+    The twin is told the commands in between; the predictor is not.
+
+    Raises:
+        EdpError: no bundle, another rate, or no channel in common.
+    """
+    bundle = load_bundle(run)
+    predictor, task = bundle.predictor, bundle.task
+    ticks = spec.ahead_ticks if spec.ahead_ticks in task.horizons else max(task.horizons)
+    names = [name for name in task.targets if name in {channel.name for channel in twin.channels.answers}]
+    if ticks < 1 or not names:
+        raise DataError(
+            f"'{run}' predicts {', '.join(task.targets)} at horizons {', '.join(map(str, task.horizons))}, nothing "
+            "ahead that the twin answers; give a predictor of the twin's velocities, strokes or pressures"
+        )
+    by_recording = {recording.name: recording for recording in recordings}
+    pieces = [task.series(*_rows(part.name, by_recording), part.name) for part in test]
+    ahead = look_ahead(twin, test, ticks, predictor.spec.window)
+    predicted = _at_moments(predictor, pieces, ahead)
+    columns = {name: predicted[:, task.targets.index(name)] for name in names}
+    # A recording that trained the predictor flatters it: a reader must know.
+    trained = set(bundle.provenance.get("data", {}).get("train", {}).get("names", ()))
+    seen = sorted({part.name for part in test if part.name in trained})
+    facts = {"run": str(run), "label": describe(predictor.spec), "ticks": ticks, "trained_on": seen}
+    facts |= {"seconds": ticks / twin.channels.rate_hz, "moments": len(ahead.truth)}
+    return facts | {"errors": predictor_scores(ahead, columns)}
+
+
+def _rows(name: str, recordings: Mapping[str, Recording]) -> tuple[Recording, int, int | None]:
+    """Recording and rows of a stretch by its name, ``recording`` or ``recording[start:stop]``, see `prepare`."""
+    if name in recordings:
+        return recordings[name], 0, None
+    whole, _, rows = name.removesuffix("]").rpartition("[")
+    start, _, stop = rows.partition(":")
+    return recordings[whole], int(start), int(stop)
+
+
+def _at_moments(predictor: Predictor, series: Sequence[Series], ahead: Ahead) -> NDArray[np.float32]:
+    """Predictions that far ahead at the moments ``(moment, target)``, SI units."""
+    which = predictor.task.horizons.index(ahead.ticks)
+    predictions = stream_predictions(predictor, series)
+    return np.concatenate([p[at, which] for p, at in zip(predictions, ahead.moments, strict=True)])
+
+
+__all__ = ["SCORES", "SHOWN", "beside_predictor", "evaluate_twin", "judge_twin", "write_scores"]

@@ -1,0 +1,42 @@
+"""From recordings to the stretches on which a twin is trained and judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from edp.config.twin import TwinExperiment
+from edp.data.prepared import Prepared, prepare
+from edp.data.splits import FAMILY
+from edp.data.twin_channels import TwinChannels, same_channels, twin_channels
+from edp.logs.source import DataSource
+from edp.networks.twin.base import check_length
+from edp.recording import Recording
+
+
+def prepare_twin(source: DataSource, experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
+    """Read and cut a data set: commands as inputs, what the twin answers as targets.
+
+    Raises:
+        EdpError: recordings or settings that cannot be used.
+    """
+    return prepared_twin(source.read(), experiment)
+
+
+def prepared_twin(recordings: Sequence[Recording], experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
+    """Cut recordings as `prepare_twin` does.
+
+    Raises:
+        EdpError: recordings or settings that cannot be used.
+    """
+    channels = twin_channels(recordings[0], experiment.channels)
+    for recording in recordings[1:]:
+        same_channels(channels, recording)
+    data = prepare(recordings, channels.task(), experiment.split, experiment.twin.prefix_ticks)
+    check_length(channels, experiment.twin, data.train)
+    return channels, data
+
+
+def driving_labels(recordings: Sequence[Recording]) -> dict[str, str]:
+    """Way of driving by name of recording; empty where a recording does not tell."""
+    labels = {recording.name: str(recording.meta.get(FAMILY, "")) for recording in recordings}
+    return labels if all(labels.values()) else {}
