@@ -142,8 +142,8 @@ def _check_memory(predictor: Predictor, data: Prepared, spec: JudgeSpec) -> None
 def baseline_predictions(kind: type[B], data: Prepared, spec: JudgeSpec) -> tuple[Callable[[Prepared], Predictions], B]:
     """A baseline fitted on the training part: what it predicts on the test part of this or other data, and itself."""
     baseline = kind(baseline_task(data, spec))
-    baseline.fit(_with_derived_targets(data, data.train), _with_derived_targets(data, data.validation))
-    return lambda other: [baseline.predict(part) for part in _with_derived_targets(other, other.test)], baseline
+    baseline.fit(_as_baselines_read(data, data.train), _as_baselines_read(data, data.validation))
+    return lambda other: [baseline.predict(part) for part in _as_baselines_read(other, other.test)], baseline
 
 
 def score_predictions(predictions: Predictions, data: Prepared, skip: int) -> dict[str, Any]:
@@ -162,7 +162,7 @@ def score_predictions(predictions: Predictions, data: Prepared, skip: int) -> di
 
 def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     """The baselines' task: present values only where an input measures them, or a feature derived from one."""
-    inputs = (*_lasting(data), *_derived_targets(data))
+    inputs = (*data.task.features.channels, *_derived(data))
     present = tuple(inputs.index(target) if target in inputs else None for target in data.task.targets)
     longest = min(series.samples for series in [*data.train, *data.test]) - data.task.max_horizon - 1
     # At most half of the shortest recording, so that every recording still has ticks to score.
@@ -170,21 +170,19 @@ def baseline_task(data: Prepared, spec: JudgeSpec) -> BaselineTask:
     return BaselineTask(horizons=data.task.horizons, present=present, history=history, seed=spec.seed)
 
 
-def _lasting(data: Prepared) -> tuple[str, ...]:
-    """What baselines read: neither channels of the start nor what only a physics base reads; both come last."""
+def _derived(data: Prepared) -> list[str]:
+    """Derived features that baselines read: those which their history of the channels does not hold.
+
+    These are the targets' present values, and what is derived from channels that are hidden from the network: a
+    comparison is fair only where both sides know the same.
+    """
     features = data.task.features
-    return features.inputs[: len(features.inputs) - len(features.starting)]
+    return [one.name for one in features.derived if one.name in data.task.targets or one.source in features.hidden]
 
 
-def _derived_targets(data: Prepared) -> list[str]:
-    features = data.task.features
-    return [entry.name for entry in features.derived if entry.name in data.task.targets]
-
-
-def _with_derived_targets(data: Prepared, parts: Sequence[Series]) -> list[Series]:
-    """Inputs as the baselines read them: where the network knows a target's present value, so must they."""
-    names = _derived_targets(data)
-    own = len(_lasting(data))
+def _as_baselines_read(data: Prepared, parts: Sequence[Series]) -> list[Series]:
+    """Series whose inputs are channels and derived features: none hidden, none of the start or of a physics base."""
+    names, own = _derived(data), len(data.task.features.channels)
     if not names and own == len(data.task.inputs):
         return list(parts)
     columns = [data.task.features.features.index(name) for name in names]
