@@ -166,7 +166,7 @@ def test_values_do_not_lie_over_values_that_are_still_read(structure, whole, bun
 
 
 def test_every_kind_of_layer_has_calls():
-    assert set(CALLS) - set(INTEGER_CALLS) == set(STEPS) | {memory.PrefixCorrection}
+    assert set(CALLS) - set(INTEGER_CALLS) == set(STEPS) | {memory.Feed, memory.PrefixCorrection}
 
 
 def test_what_cannot_be_written_is_refused_by_name(bundle_of, tmp_path):

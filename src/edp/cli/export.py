@@ -22,7 +22,7 @@ def _list_forms(listing_asked: bool) -> None:
 
 
 def export(
-    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train.")],
+    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train or edp twin.")],
     to: Annotated[str, typer.Option(help="Form, such as c (C99 for controllers); --forms lists all.")],
     folder: Annotated[Path, typer.Option("--out", help="Folder for the files; an existing export is replaced.")],
     name: Annotated[str, typer.Option(help="Name of the network in the exported files.")] = "predictor",

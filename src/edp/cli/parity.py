@@ -17,11 +17,16 @@ if TYPE_CHECKING:
 
 
 def parity(
-    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train or edp quantise.")],
+    bundle: Annotated[Path, typer.Argument(help="Bundle, or run folder of edp train, edp quantise or edp twin.")],
     data: Annotated[
         Path | None, typer.Option(help="Log whose first ticks are the reference recording; default: random inputs.")
     ] = None,
-    ticks: Annotated[int, typer.Option(min=1, help="Length of the reference recording, in ticks.")] = 400,
+    ticks: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Length of the reference recording; default 400 ticks, of a twin its prefix and 60 s."
+        ),
+    ] = None,
     forms: Annotated[
         list[str], typer.Option("--form", help="Exported form to run; may be repeated. Default: all.")
     ] = [],  # noqa: B006
@@ -46,12 +51,12 @@ def parity(
 
     Example: `edp parity runs/first`
     """
-    from edp.training import load_bundle
+    from edp.workflows.deployment import load_exported
     from edp.workflows.parity import compare, from_own_run, golden_case, recorded_case
 
     if not (yes or from_own_run(bundle)):
         _ask(bundle)
-    loaded = load_bundle(bundle)
+    loaded = load_exported(bundle)
     source = None if data is None else source_of(data, signal_map, repair)
     case = golden_case(loaded, ticks) if source is None else recorded_case(loaded, source, ticks)
 

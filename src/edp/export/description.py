@@ -18,7 +18,6 @@ from edp.export.hashes import model_hash, scale_hash
 from edp.ir import Graph
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import Predictor
-from edp.networks.predictor import describe as describe_network
 from edp.signals import KINDS
 from edp.training.bundle import Bundle
 
@@ -53,7 +52,7 @@ class Description:
             "schema": SCHEMA,
             "edp": __version__,
             "name": self.name,
-            "network": describe_network(bundle.predictor.spec),
+            "network": bundle.predictor.title,
             "number_format": bundle.predictor.number_format,
             "model_hash": model_hash(self.graph),
             "scale_hash": scale_hash(bundle.predictor),

@@ -9,15 +9,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edp.ir import Graph
 from edp.ir.layers import NEVER
+from edp.ir.memory import Feed
+from edp.ir.reference import Reference
 from edp.networks.input_range import usual_range
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import Predictor
 from edp.networks.trees import Trees
+from edp.networks.twin import TwinPlant
 
 GOLDEN_TICKS = 200
 SHARE = 1e-5
 """How far another form may be from PyTorch, in standard deviations of the target and as a share of the value."""
+DISTURBED, ROUNDED = 3, 2.0**-23
+"""Disturbed runs of a plant, and how far what they feed back is off, in deviations: a last place of float32."""
 NEAR = 1e-5
 """How near a number may be to the threshold of a tree, in standard deviations and as a share, for a form to differ."""
 MOVES = 12
@@ -36,6 +42,9 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     """
     if isinstance(predictor, IntegerPredictor):
         return np.zeros(outputs.shape[1], dtype=np.float32)
+    if isinstance(predictor, TwinPlant):
+        grown: Rows = grown_tolerance(predictor, inputs, outputs).max(axis=0)
+        return grown
     exact = stream(copy.deepcopy(predictor).double(), inputs)
     sigma = predictor.code.width.detach().cpu().double().numpy().ravel()
     widths = np.tile(sigma, outputs.shape[1] // len(sigma))
@@ -43,6 +52,36 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     own = np.where(at_thresholds(predictor, inputs) > 0.0, 0.0, np.abs(outputs - exact)).max(axis=0)
     result: Rows = np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
     return result
+
+
+def grown_tolerance(plant: TwinPlant, inputs: Rows, outputs: Rows) -> Rows:
+    """How far another form of a plant may be from `outputs` at each tick, ``(tick, number)``; it never shrinks.
+
+    What `tolerance` allows without feedback, plus what comes of it when it is fed back: the largest distance up to the
+    tick between the plant in double precision and `DISTURBED` runs of it in which every answer that is fed back is off
+    by a normal draw of `ROUNDED` standard deviations; at least twice the distance of the plant in single precision.
+    """
+    graph, ticks = plant.graph(), len(inputs)
+    exact = _disturbed(graph, inputs, None)
+    draws = [np.random.default_rng(seed) for seed in range(DISTURBED)]
+    apart = np.max([np.abs(_disturbed(graph, inputs, draw) - exact) for draw in draws], axis=0)
+    moved = np.maximum.accumulate(np.maximum(apart, 2.0 * np.abs(outputs - exact)), axis=0)
+    sigma = plant.code.width.detach().cpu().double().numpy().ravel()
+    return np.asarray(SHARE * (sigma + np.abs(outputs).max(axis=0)) + moved[:ticks], dtype=np.float32)
+
+
+def _disturbed(graph: Graph, inputs: Rows, draw: np.random.Generator | None) -> NDArray[np.float64]:
+    """Answers in double precision ``(tick, number)``, with noise on what is fed back."""
+    run = Reference(graph)
+    fed_back = [layer.into for layer in graph.layers if isinstance(layer, Feed)]
+    rows = []
+    for row in inputs:
+        rows.append(run.results(row)["prediction"])
+        if draw is not None:
+            for name in fed_back:
+                last = run.memory[name]["last"]
+                run.memory[name]["last"] = last + ROUNDED * draw.normal(size=last.shape)
+    return np.asarray(rows)
 
 
 def at_thresholds(predictor: Predictor, inputs: Rows, near: float = NEAR) -> Rows:
@@ -100,8 +139,32 @@ def _until_clear(draws: Iterable[tuple[Rows, Rows]]) -> Iterator[tuple[Rows, Row
             return
 
 
-def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:
-    """Smooth random inputs ``(tick, input)`` in the usual range of each channel, SI units."""
+def random_inputs(predictor: Predictor, ticks: int, seed: int, mixed: bool = True) -> Rows:
+    """Smooth random inputs ``(tick, input)`` in the usual range of each channel, SI units.
+
+    A plant is measured for its prefix, then runs free; with `mixed` its ports are measured by chance from the middle
+    of the rest on.
+    """
+    rows = _smooth(predictor, ticks, seed)
+    if isinstance(predictor, TwinPlant):
+        _set_ports(predictor, rows, seed, mixed)
+    return rows
+
+
+def _set_ports(plant: TwinPlant, rows: Rows, seed: int, mixed: bool) -> None:
+    """Flags of a plant, and zeros where nobody reads: as a program feeds it that knows nothing of the sensors."""
+    commands, answers, _ = plant.sizes
+    flags = np.zeros((len(rows), answers), np.float32)
+    flags[: plant.window] = 1.0
+    middle = (plant.window + len(rows)) // 2
+    if mixed and middle < len(rows):
+        draw = np.random.default_rng(seed).random((len(rows) - middle, answers))
+        flags[middle:] = draw < 0.5
+    rows[:, commands : commands + answers] *= flags
+    rows[:, commands + answers :] = flags
+
+
+def _smooth(predictor: Predictor, ticks: int, seed: int) -> Rows:
     centre, spread = usual_range(predictor)
     # A private generator: an export draws nothing from the caller's.
     rng = np.random.default_rng(seed)
@@ -117,7 +180,7 @@ def random_inputs(predictor: Predictor, ticks: int, seed: int) -> Rows:
 
 def stream(predictor: Predictor, inputs: Rows) -> Rows:
     """What PyTorch predicts from reset, ``(tick, number)``: predictions, then lower and upper bounds, SI units."""
-    like = next(predictor.parameters())
+    like = predictor.front.offset
     x = torch.from_numpy(inputs).to(like).unsqueeze(0)
     with torch.inference_mode():
         prediction, _ = predictor.predict(x, predictor.initial_state(1, x))

@@ -153,6 +153,11 @@ class Graph:
         return self.initial.get((layer, slot.name), np.full(slot.shape, slot.fill, dtype=np.float32))
 
     @property
+    def fed_back(self) -> bool:
+        """Whether a tick reads an answer of the tick before, as a plant model does."""
+        return any(layer.kind == "Feed" for layer in self.layers)
+
+    @property
     def parameters(self) -> int:
         """Numbers in all constant arrays."""
         return sum(values.size for _, _, values in self.tensors())

@@ -92,6 +92,18 @@ class ScaleShift(Layer):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Clip(Layer):
+    """Each number, but no less than its own of `low` and no more than its own of `high`, each ``(width,)``."""
+
+    low: Array
+    high: Array
+
+    @property
+    def width(self) -> int:
+        return len(self.low)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Elementwise(Layer):
     """An operation on each pair of numbers of two values of `size` numbers."""
 

@@ -236,6 +236,35 @@ class WindowAttention(Layer):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Feedback(Layer):
+    """What `Feed` kept at the tick before, `size` numbers; the slot `last` holds it."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        return (Slot("last", (self.size,)),)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Feed(Layer):
+    """The feedback edge of a plant model: its input is what the layer `into`, a `Feedback`, gives at the next tick.
+
+    It gives no value and comes after all readers of that layer.
+    """
+
+    into: str
+
+    @property
+    def width(self) -> int:
+        return 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PrefixCorrection(Layer):
     """Adds ``W_2 tanh(W_1 [mean ; x] + b_1) + b_2`` to what other layers remember, once, `ticks` ticks after a reset.
 

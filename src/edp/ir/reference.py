@@ -50,6 +50,9 @@ class Reference:
             if isinstance(layer, memory.PrefixCorrection):
                 self._correct(layer, layer_inputs[0])
                 continue
+            if isinstance(layer, memory.Feed):
+                self.memory[layer.into]["last"] = layer_inputs[0]
+                continue
             run = STEPS[type(layer)]
             values[layer.name] = run(layer, self._constants[layer.name], self.memory[layer.name], *layer_inputs)
         return values
@@ -150,6 +153,11 @@ def _scale_shift(layer: Any, w: Weights, m: Memory, x: Values) -> Values:
     return np.asarray(w["gain"] * x + w["shift"])
 
 
+@_step(plain.Clip)
+def _clip(layer: Any, w: Weights, m: Memory, x: Values) -> Values:
+    return np.asarray(np.maximum(np.minimum(x, w["high"]), w["low"]))
+
+
 @_step(plain.Elementwise)
 def _elementwise(layer: plain.Elementwise, w: Weights, m: Memory, a: Values, b: Values) -> Values:
     return np.asarray(OPERATIONS[layer.operation](a, b))
@@ -219,6 +227,11 @@ def _starting(layer: memory.Starting, w: Weights, m: Memory, x: Values) -> Value
     m["age"] = np.minimum(m["age"] + 1, layer.ticks)
     flag = np.full(1, 1.0 if read else 0.0, dtype=x.dtype)
     return np.concatenate([x if read else w["mean"], flag])
+
+
+@_step(memory.Feedback)
+def _feedback(layer: memory.Feedback, w: Weights, m: Memory) -> Values:
+    return m["last"]
 
 
 @_step(memory.Convolution)

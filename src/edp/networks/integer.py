@@ -42,12 +42,14 @@ class IntegerPredictor(Predictor):
     number_format = "w8a16"
 
     def __init__(self, source: Predictor, chosen: Formats) -> None:
+        # A network that has no integer form is refused before anything is built.
+        integers = quantise(source.graph(), chosen)
         numbers = (source.front.offset, source.front.width, source.code.offset, source.code.width)
         offset, width, zero, unit = (part.detach().cpu().double().numpy() for part in numbers)
         super().__init__(source.task, source.spec, Scaler(offset, width, zero, unit))
         self.load_state_dict(source.state_dict())
         self.formats = chosen
-        self.integers: Graph = quantise(source.graph(), chosen)
+        self.integers: Graph = integers
         self.eval()
 
     def in_float(self) -> Predictor:

@@ -128,6 +128,21 @@ class Predictor(Streaming):
         parts["physics"] = self.physics
         return {name: part for name, part in parts.items() if part is not None}
 
+    @property
+    def title(self) -> str:
+        """A line about the network, for tables and exported files."""
+        return describe(self.spec)
+
+    @property
+    def window(self) -> int:
+        """Ticks after a reset until a prediction rests on all that the network remembers."""
+        return self.spec.window
+
+    @property
+    def required(self) -> int:
+        """How many of the inputs, the first ones, a program must feed; the others may stay at zero."""
+        return len(self.task.inputs)
+
     def initial_state(self, batch: int, like: Tensor) -> State:
         """State at reset for `batch` streams."""
         state = {"front": self.front.initial_state(batch, like)}

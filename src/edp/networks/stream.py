@@ -96,7 +96,7 @@ class Stream:
         if threads < 1:
             raise ConfigError(f"a stream on {threads} threads was asked for; give at least 1")
         self.predictor, self._threads = predictor.eval(), threads  # evaluation: no dropout on a machine
-        self._like = next(predictor.parameters())
+        self._like = predictor.front.offset
         self._dtype = np.float64 if self._like.dtype is torch.float64 else np.float32
         # In single precision, as the exported code compares.
         self._low, self._high = (limit.astype(np.float32) for limit in input_limits(predictor))
@@ -115,7 +115,7 @@ class Stream:
     @property
     def warm(self) -> bool:
         """True once a whole window has been seen since the memory was cleared."""
-        return self._age >= self.predictor.spec.window
+        return self._age >= self.predictor.window
 
     def step(self, inputs: Inputs) -> StreamTick:
         """Feed one tick ``(input,)`` in SI units, in the order of the network's inputs.
@@ -188,7 +188,7 @@ class Stream:
             self._forget()
             return StreamStatus.RESTARTED
         self._numbers = numbers
-        self._age = min(self._age + 1, self.predictor.spec.window)
+        self._age = min(self._age + 1, self.predictor.window)
         if holding:
             return StreamStatus.HELD
         return StreamStatus.OK if self.warm else StreamStatus.WARMING

@@ -15,13 +15,13 @@ from safetensors.numpy import save as save_arrays
 from edp import __version__
 from edp.data.twin_channels import TwinChannels
 from edp.errors import BundleError
-from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinScales, TwinSpec
+from edp.networks.twin import TWINS, FreeRunIntervals, Twin, TwinPlant, TwinScales, TwinSpec
 from edp.settings.bounds import above
 from edp.settings.tree import SettingsTree
 from edp.signals import Channel, Kind
 from edp.storage import make_folder, object_with, read_json, write_json
 from edp.storage.memory import check_setting
-from edp.training.bundle import HASH, as_damage, check_hash, header_digest, read_arrays, write_arrays
+from edp.training.bundle import HASH, Bundle, as_damage, check_hash, header_digest, read_arrays, write_arrays
 
 SCHEMA = 2
 READABLE = (1, 2)
@@ -56,6 +56,13 @@ class TwinBundle:
     intervals: FreeRunIntervals | None = None
 
 
+def plant_bundle(bundle: TwinBundle) -> Bundle:
+    """A twin as exported forms take it: see `TwinPlant`."""
+    plant, answers = TwinPlant(bundle.twin, f"{TWINS.name_of(bundle.spec)} twin"), bundle.twin.channels.answers
+    kinds, texts = tuple(c.kind for c in answers), tuple(c.description for c in answers)
+    return Bundle(plant, plant.inputs, kinds, texts, bundle.provenance, bundle.scores)
+
+
 def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
     """Write a twin; the header is renamed into place last, so a reader sees the old twin or the new one.
 
@@ -82,6 +89,12 @@ def save_twin(bundle: TwinBundle, folder: str | Path) -> Path:
         if old.name != entry["file"]:
             old.unlink(missing_ok=True)
     return path
+
+
+def holds_twin(folder: str | Path) -> bool:
+    """Whether a folder, or the run folder around it, is that of a twin."""
+    path = Path(folder)
+    return os.path.lexists(path / HEADER) or os.path.lexists(path / "twin" / HEADER)
 
 
 def load_twin(folder: str | Path) -> TwinBundle:

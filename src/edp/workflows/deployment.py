@@ -17,7 +17,8 @@ from edp.networks.integer import IntegerPredictor
 from edp.networks.narrow import student
 from edp.networks.predictor import ModelSpec, Predictor, build_model, describe
 from edp.training import load_bundle
-from edp.training.bundle import blank_scaler
+from edp.training.bundle import Bundle, blank_scaler
+from edp.training.twin_bundle import holds_twin, load_twin, plant_bundle
 
 
 def footprint_of(path: str | Path, budget: Budget | None = None) -> tuple[Footprint, str]:
@@ -63,12 +64,21 @@ def export_bundle(
     Raises:
         EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
     """
-    return make_target(to, options).write(load_bundle(path), name, Path(folder))
+    return make_target(to, options).write(load_exported(path), name, Path(folder))
+
+
+def load_exported(path: str | Path) -> Bundle:
+    """The bundle of a predictor, or a twin as a bundle of a plant.
+
+    Raises:
+        BundleError: neither, or damaged.
+    """
+    return plant_bundle(load_twin(path)) if holds_twin(path) else load_bundle(path)
 
 
 def unheld_adaptation(path: str | Path, to: str) -> bool:
     """Whether a bundle has an adaptation that the form `to` leaves out."""
-    return load_bundle(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
+    return load_exported(path).adaptation is not None and not getattr(TARGETS[to], "adapts", False)
 
 
 def _untrained(model: ModelSpec, task: Any) -> Predictor:

@@ -178,10 +178,22 @@ def _mean(calls: Calls, layer: memory.TrailingMean) -> list[str]:
     return calls.simple(layer, "edp_trailing_mean", layer.size, layer.window, slot(layer, "ring"), ring(layer))
 
 
+def _clip(calls: Calls, layer: layers.Clip) -> list[str]:
+    y, low, high = calls.value(layer.name), constant(layer, "low"), constant(layer, "high")
+    upper = call("edp_minimum", calls.value(layer.inputs[0]), high, layer.width, y)
+    return [upper, call("edp_maximum", y, low, layer.width, y)]
+
+
+def _feed(calls: Calls, layer: memory.Feed) -> list[str]:
+    source = layer.inputs[0]
+    return [call("edp_copy", calls.value(source), calls.graph.width_of(source), slot(layer.into, "last"))]
+
+
 CALLS: dict[type[Layer], Write] = {
     layers.Gather: _gather,
     layers.Standardise: lambda c, x: c.simple(x, "edp_standardise", x.width),
     layers.ScaleShift: lambda c, x: c.simple(x, "edp_scale_shift", x.width),
+    layers.Clip: _clip,
     layers.Elementwise: lambda c, x: c.simple(x, f"edp_{x.operation}", x.size),
     layers.Activate: lambda c, x: c.simple(x, f"edp_map_{x.function}", x.size),
     layers.Glu: lambda c, x: c.simple(x, "edp_glu", x.rows, x.size // 2),
@@ -203,6 +215,8 @@ CALLS: dict[type[Layer], Write] = {
     memory.TrailingMean: _mean,
     memory.AttentionPool: _pool,
     memory.WindowAttention: _window,
+    memory.Feedback: lambda c, x: [call("edp_copy", slot(x, "last"), x.size, c.value(x.name))],
+    memory.Feed: _feed,
     memory.PrefixCorrection: _prefix,
 }
 """By kind of layer."""

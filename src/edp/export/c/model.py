@@ -21,7 +21,6 @@ from edp.ir import Graph, Layer, memory
 from edp.ir.base import Number
 from edp.networks.input_range import HOLD_TICKS, LIMIT, input_limits
 from edp.networks.integer import IntegerPredictor
-from edp.networks.predictor import describe as describe_network
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
@@ -37,6 +36,14 @@ COUNTED = (
     *integer_calls.COUNTED,
 )
 """Layers with a ring or a counter."""
+PLANT = (
+    " *",
+    " * PLANT MODEL. Inputs are the commands, a measured value for each answer, and a flag for each (..._MEASURED): 1",
+    " * reads the measured value, 0 the model's own last answer. With all flags at 0 it runs free on the commands;",
+    " * a value that nobody reads must be finite, such as 0. Start with {ticks} measured ticks, which form its memory;",
+    " * without any it rests at the means of its training data. The state has no pointers: its copy is a saved state.",
+)
+"""Lines of the header of a plant model."""
 STATES = {Number.FLOAT: "float", Number.INT16: "int16_t", Number.INT32: "int32_t"}
 FILLS = {Number.FLOAT: "edp_fill(0.0f, ", Number.INT16: "edp_q_zero16(", Number.INT32: "edp_q_fill32(0, "}
 COPIES = {Number.FLOAT: "edp_copy", Number.INT16: "edp_q_copy16", Number.INT32: "edp_q_copy32"}
@@ -99,7 +106,7 @@ class Model:
         return {
             "name": self.name,
             "NAME": self.name.upper(),
-            "title": c_comment(describe_network(predictor.spec)),
+            "title": c_comment(predictor.title),
             "version": __version__,
             "model_hash": model_hash(self.graph),
             "scale_hash": scale_hash(predictor),
@@ -142,6 +149,8 @@ class Model:
         covered = ", ".join(f"{100 * c:g} %" for c in self.bundle.predictor.output.coverages)
         if covered:
             lines.append(f" *   lower, upper[i][h][t]  bounds of intervals meant to hold {covered} of the true values")
+        if self.graph.fed_back:
+            lines += [line.format(ticks=self.graph.window) for line in PLANT]
         return Code("\n".join(lines))
 
     def _enums(self) -> dict[str, str]:

@@ -116,6 +116,11 @@ def _gather(t: Tangents, layer: layers.Gather) -> list[str]:
     return [*lines, *t.calls.of(layer)]
 
 
+def _clip(t: Tangents, layer: layers.Clip) -> list[str]:
+    ends = (constant(layer, "low"), constant(layer, "high"))
+    return t.before(layer, "edp_clip_tangent", *t.values(layer), *t.changes(layer), *ends, layer.width)
+
+
 def _activate(t: Tangents, layer: layers.Activate) -> list[str]:
     slope = t.scratch(layer)
     first = call(f"edp_slope_{layer.function}", *t.values(layer), layer.size, slope)
@@ -251,10 +256,21 @@ def _prefix(t: Tangents, layer: memory.PrefixCorrection) -> list[str]:
     return [*lines, "}", *t.calls.of(layer)]
 
 
+def _feedback(t: Tangents, layer: memory.Feedback) -> list[str]:
+    return t.before(layer, "edp_copy_tangent", changed(layer, "last"), layer.size)
+
+
+def _feed(t: Tangents, layer: memory.Feed) -> list[str]:
+    source = layer.inputs[0]
+    size, into = t.graph.width_of(source), changed(layer.into, "last")
+    return [call("edp_copy_tangent", t.change(source), size, "d", into), *t.calls.of(layer)]
+
+
 TANGENTS: dict[type[Layer], Write] = {
     layers.Gather: _gather,
     layers.Standardise: _linear("edp_standardise_tangent", "scale"),
     layers.ScaleShift: _linear("edp_scale_tangent", "gain"),
+    layers.Clip: _clip,
     layers.Elementwise: _elementwise,
     layers.Activate: _activate,
     layers.Glu: _glu,
@@ -276,6 +292,8 @@ TANGENTS: dict[type[Layer], Write] = {
     memory.TrailingMean: _mean,
     memory.AttentionPool: _pool,
     memory.WindowAttention: _window,
+    memory.Feedback: _feedback,
+    memory.Feed: _feed,
     memory.PrefixCorrection: _prefix,
 }
 """By kind of layer."""

@@ -200,10 +200,6 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def _gather(p: _Part, *parts: Any) -> Any:
-    return _stack(parts)[p.columns]
-
-
 def _glu(p: _Part, x: Any) -> Any:
     value, gate = _split(_rows(x, p.rows), 2)
     return ca.vec(value * _sigmoid(gate))
@@ -290,10 +286,6 @@ def _cell(p: _Part, gates: Any, squash: Callable[[Any], Any]) -> Any:
     return p.m["h"]
 
 
-def _lstm(p: _Part, x: Any) -> Any:
-    return _cell(p, p.w["weight_x"] @ x + p.w["weight_h"] @ p.m["h"] + p.w["bias"], lambda c: c)
-
-
 def _layer_norm_lstm(p: _Part, x: Any) -> Any:
     driven = _normed(p.w["weight_x"] @ x, p.epsilon) * p.w["gain_x"]
     gates = driven + _normed(p.w["weight_h"] @ p.m["h"], p.epsilon) * p.w["gain_h"] + p.w["bias"]
@@ -363,8 +355,13 @@ def _prefix(p: _Part, x: Any) -> Any:
     return ca.MX(0, 1)
 
 
+def _feed(p: _Part, x: Any) -> Any:
+    p.everything[p.into]["last"] = x
+    return ca.MX(0, 1)
+
+
 LAYERS: dict[str, Callable[..., Any]] = {
-    "Gather": _gather,
+    "Gather": lambda p, *parts: _stack(parts)[p.columns],
     "Standardise": lambda p, x: (x - p.w["offset"]) / p.w["scale"],
     "ScaleShift": lambda p, x: x * p.w["gain"] + p.w["shift"],
     "Add": lambda p, a, b: a + b,
@@ -373,6 +370,7 @@ LAYERS: dict[str, Callable[..., Any]] = {
     "Divide": lambda p, a, b: a / b,
     "Minimum": lambda p, a, b: _keep_nan(a + b, ca.if_else(a > b, b, a)),
     "Maximum": lambda p, a, b: _keep_nan(a + b, ca.if_else(a < b, b, a)),
+    "Clip": lambda p, x: _keep_nan(x, ca.fmax(ca.fmin(x, p.w["high"]), p.w["low"])),
     "Activate": lambda p, x: FUNCTIONS[p.function](x),
     "Glu": _glu,
     "Accumulate": _accumulate,
@@ -384,7 +382,7 @@ LAYERS: dict[str, Callable[..., Any]] = {
     "Difference": _difference,
     "Starting": _starting,
     "Convolution": _convolution,
-    "Lstm": _lstm,
+    "Lstm": lambda p, x: _cell(p, p.w["weight_x"] @ x + p.w["weight_h"] @ p.m["h"] + p.w["bias"], lambda c: c),
     "LayerNormLstm": _layer_norm_lstm,
     "Gru": _gru,
     "MinGru": _min_gru,
@@ -392,6 +390,8 @@ LAYERS: dict[str, Callable[..., Any]] = {
     "TrailingMean": _trailing_mean,
     "AttentionPool": _attention_pool,
     "WindowAttention": _window_attention,
+    "Feedback": lambda p: p.m["last"],
+    "Feed": _feed,
     "PrefixCorrection": _prefix,
 }
 """By kind of layer."""

@@ -20,11 +20,19 @@ RULES = (
     "for each. With EDP_FMI_HEADERS the standard's own headers are used.",
 )
 
+PLANT = (
+    "It is a plant model: with the commands alone set it runs free on its own answers. To read a measured value "
+    "instead, set it, and its flag (the input whose name ends in _measured) to 1; it must always be finite.",
+    "Start it with {window} measured steps, which form its memory. Without any it rests at the means of its training "
+    "data.",
+)
+
 
 def page(about: About) -> bytes:
     """The page: what goes in and out, and the rules."""
     window = about.facts["window"]
-    rules = "".join(f"<li>{xml_text(t.format(step=about.step_s, window=window, name=about.name))}</li>" for t in RULES)
+    texts = RULES + (PLANT if "plant" in about.facts else ())
+    rules = "".join(f"<li>{xml_text(t.format(step=about.step_s, window=window, name=about.name))}</li>" for t in texts)
     rows = "".join(
         f"<tr><td>{xml_text(entry.name)}</td><td>{entry.causality}</td>"
         f"<td>{xml_text(entry.unit) if entry.form == 'real' else ''}</td><td>{xml_text(entry.description)}</td></tr>"

@@ -109,6 +109,8 @@ def _about(model: Model, listed: list[Variable], core: Mapping[str, str]) -> Abo
         state.update(text.encode() + b"\0")
     keys = ("model_hash", "scale_hash", "number_format", "window", "mode")
     facts = {key: str(described[key]) for key in keys}
+    if model.graph.fed_back:
+        facts["plant"] = f"{model.bundle.predictor.required} commands"
     facts["horizons_ticks"] = " ".join(map(str, model.bundle.task.horizons))
     token = "{" + str(uuid.UUID(bytes=state.digest())) + "}"
     return About(
@@ -121,6 +123,7 @@ def _header(model: Model, about: About) -> str:
     text = resources.files("edp.export.fmu").joinpath("templates/fmu_model.h.in").read_text()
     names = Code(", ".join(c_string(entry.name) for entry in about.listed if entry.causality == "input"))
     values: dict[str, object] = {"name": model.name, "NAME": model.name.upper(), "token": Code(about.token)}
+    values["required"] = model.bundle.predictor.required
     values |= {"rate": repr(about.rate_hz), "step": repr(about.step_s), "names": names}
     values["tangent"] = Code(TANGENT.format(model.name)) if about.derivatives else ""
     return fill(text, values)

@@ -198,6 +198,10 @@ def step_correction(nodes: Nodes, layer: memory.PrefixCorrection, state: Held, x
     }
 
 
+def _feedback(nodes: Nodes, layer: memory.Feedback, state: Held) -> tuple[str, dict[str, str]]:
+    return state["last"], {}
+
+
 STEPS: dict[type[Layer], Step] = {
     memory.Difference: _difference,
     memory.Starting: _starting,
@@ -210,5 +214,6 @@ STEPS: dict[type[Layer], Step] = {
     memory.TrailingMean: _trailing_mean,
     memory.AttentionPool: _attention_pool,
     memory.WindowAttention: _window_attention,
+    memory.Feedback: _feedback,
 }
-"""By kind of layer; the correction of a prefix reaches into other layers and is apart."""
+"""By kind of layer; the correction of a prefix and the feedback edge reach into other layers and are apart."""

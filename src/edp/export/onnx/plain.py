@@ -108,6 +108,12 @@ def _scale_shift(nodes: Nodes, layer: layers.ScaleShift, ticks: int, values: Seq
     return nodes.plus(nodes.times(values[0], layer.gain), layer.shift)
 
 
+def _clip(nodes: Nodes, layer: layers.Clip, ticks: int, values: Sequence[str], *_: object) -> str:
+    # The operator Clip takes one pair of limits for all numbers.
+    below = nodes.add("Min", values[0], nodes.constant(layer.high[None], "high"))
+    return nodes.add("Max", below, nodes.constant(layer.low[None], "low"))
+
+
 def _glu(nodes: Nodes, layer: layers.Glu, ticks: int, values: Sequence[str], *_: object) -> str:
     half = layer.size // 2
     value, gate = nodes.split(_rows(nodes, values[0], ticks, layer.rows, layer.size), [half, half], 1)
@@ -183,6 +189,7 @@ PLAIN: dict[type[Layer], Plain] = {
     layers.Gather: _gather,
     layers.Standardise: _standardise,
     layers.ScaleShift: _scale_shift,
+    layers.Clip: _clip,
     layers.Elementwise: lambda nodes, layer, ticks, values, widths: combine(nodes, layer.operation, *values),
     layers.Activate: lambda nodes, layer, ticks, values, widths: activate(nodes, layer.function, values[0]),
     layers.Glu: _glu,

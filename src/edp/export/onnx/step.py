@@ -63,7 +63,7 @@ def states_of(graph: Graph) -> list[State]:
 
 def refuse(layer: Layer) -> ExportError:
     """The error for a kind of layer that is not written."""
-    kinds: set[type[Layer]] = {*PLAIN, *STEPS, memory.PrefixCorrection}
+    kinds: set[type[Layer]] = {*PLAIN, *STEPS, memory.Feed, memory.PrefixCorrection}
     supported_kinds = sorted(kind.__name__ for kind in kinds)
     return ExportError(
         f"layer '{layer.name}' is a {type(layer).__name__}, which has no form in ONNX; these have: "
@@ -137,6 +137,8 @@ def _add_layer(
         numbers, fresh[layer.name] = step_correction(nodes, layer, layer_states[layer.name], input_names[0])
         for (owner, slot), part in corrections(nodes, graph, layer, numbers).items():
             fresh[owner] = dict(fresh[owner]) | {slot: nodes.add("Add", fresh[owner][slot], part)}
+    elif isinstance(layer, memory.Feed):
+        fresh[layer.into] = {"last": input_names[0]}
     elif type(layer) in STEPS:
         values[layer.name], fresh[layer.name] = STEPS[type(layer)](nodes, layer, layer_states[layer.name], *input_names)
     elif type(layer) in PLAIN:

@@ -46,10 +46,10 @@ class OnnxTarget:
         graph = float_graph(bundle.predictor, "ONNX")
         described, states = Description(name, bundle, graph), states_of(graph)
         targets, carried = len(bundle.task.targets), notes(described)
-        files = {
-            "step": step_model(graph, targets, f"{name}_step", carried, self.opset),
-            "window": window_model(graph, targets, f"{name}_window", carried, self.opset),
-        }
+        files = {"step": step_model(graph, targets, f"{name}_step", carried, self.opset)}
+        # A tick of a plant waits for the answer of the one before: nothing runs over a window at once.
+        if not graph.fed_back:
+            files["window"] = window_model(graph, targets, f"{name}_window", carried, self.opset)
         about = content(described, files, states, self.opset)
         tables = {"edp": with_full_starts(about, states), "golden": golden(bundle.predictor, graph.window)}
         contents = {f"{name}.json": as_json(about), f"{name}.mat": as_mat(tables)}

@@ -16,7 +16,6 @@ from edp.export.description import Description, as_json
 from edp.export.escape import Code, fill, markdown_text, shown_names, xml_text, yaml_scalar
 from edp.export.folder import write_export
 from edp.export.hashes import model_hash
-from edp.networks.predictor import describe as describe_network
 from edp.signals import Kind
 from edp.training.bundle import Bundle
 
@@ -27,6 +26,8 @@ JOINTS = {
     Kind.POSITION: "position",
     Kind.ANGLE: "position",
 }
+FREE = "constant:0"
+"""Source of a flag of a plant: its port reads the last answer."""
 PRESSURES = (Kind.PRESSURE, Kind.PILOT_PRESSURE)
 
 
@@ -45,7 +46,7 @@ class Ros2Target:
         blanks = _blanks(model, package, about)
 
         def filled(template: str) -> str:
-            title = describe_network(bundle.predictor.spec)
+            title = bundle.predictor.title
             escaped = {"title": (markdown_text if template.endswith(".md") else xml_text)(title)}
             return fill(here.joinpath(f"templates/{template}.in").read_text(), blanks | escaped)
 
@@ -91,9 +92,11 @@ def _plain(name: str) -> str:
 
 def _blanks(model: Model, package: str, about: Mapping[str, Any]) -> dict[str, object]:
     task, inputs = model.bundle.task, [entry["name"] for entry in about["inputs"]]
+    # Behind the measured values of a plant are their flags.
+    read = len(inputs) if not model.graph.fed_back else model.bundle.predictor.required + len(task.targets)
     sources = [
-        f"      - {yaml_scalar(f'{name}={_source(name, channel.kind)}')}"
-        for name, channel in zip(inputs, model.bundle.inputs, strict=True)
+        f"      - {yaml_scalar(f'{name}={_source(name, channel.kind) if at < read else FREE}')}"
+        for at, (name, channel) in enumerate(zip(inputs, model.bundle.inputs, strict=True))
     ]
     return {
         "name": model.name,

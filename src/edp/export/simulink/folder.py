@@ -19,7 +19,6 @@ from edp.export.hashes import model_hash, scale_hash
 from edp.export.simulink.native import Native, functions_for
 from edp.ir.base import Number
 from edp.networks.input_range import HOLD_TICKS, input_limits
-from edp.networks.predictor import describe as describe_network
 
 RULES = {
     "order": "inputs and targets in the order of this file, in SI units",
@@ -122,7 +121,7 @@ class Folder:
         return {
             "name": model.name,
             "NAME": model.name.upper(),
-            "title": markdown_text(describe_network(model.bundle.predictor.spec)),
+            "title": markdown_text(model.bundle.predictor.title),
             "version": __version__,
             "schema": SCHEMA,
             "model_hash": model_hash(graph),

@@ -236,6 +236,10 @@ def _layer_norm_lstm(native: Native, layer: memory.LayerNormLstm, x: Sequence[st
     return [f"norms = struct({named});", *_simple(call)(native, layer, x), *_simple("{y} = {s_h};")(native, layer, x)]
 
 
+def _feed(native: Native, layer: memory.Feed, x: Sequence[str]) -> list[str]:
+    return [f"{native.slot(layer.into, 'last')} = {x[0]};"]
+
+
 OPERATIONS = {
     BinaryOperation.ADD: "{y} = {0} + {1};",
     BinaryOperation.SUBTRACT: "{y} = {0} - {1};",
@@ -249,6 +253,7 @@ WRITERS: dict[type[Layer], Write] = {
     layers.Gather: _gather,
     layers.Standardise: _simple("{y} = ({0} - {offset}) ./ {scale};"),
     layers.ScaleShift: _simple("{y} = {gain} .* {0} + {shift};"),
+    layers.Clip: _simple("{y} = max(min({0}, {high}), {low});"),
     layers.Elementwise: lambda native, layer, x: _simple(OPERATIONS[layer.operation])(native, layer, x),
     layers.Activate: _activate,
     layers.Glu: _simple("{y} = glu({0}, {rows});"),
@@ -278,6 +283,8 @@ WRITERS: dict[type[Layer], Write] = {
         "[{y}, {s_keys}, {s_values}, {s_age}] = "
         "window_attention({0}, {1}, {2}, [{heads}, {window}], {s_keys}, {s_values}, {s_age});"
     ),
+    memory.Feedback: _simple("{y} = {s_last};"),
+    memory.Feed: _feed,
     memory.PrefixCorrection: _prefix,
 }
 """By kind of layer."""

@@ -50,8 +50,8 @@ class SimulinkTarget:
                 f"{LONGEST_NAME} must hold, give another one with --name"
             )
         model = make_model(name, bundle)
-        # There is no ONNX form in integer arithmetic.
-        window = self.window and not model.integer
+        # There is no ONNX form in integer arithmetic, and no window of a plant.
+        window = self.window and not model.integer and not model.graph.fed_back
         written = Folder(model, window)
         files: dict[str, bytes] = {file: text.encode() for file, text in written.texts().items()}
         files[f"{name}.json"] = as_json(written.content())

@@ -30,6 +30,7 @@ FLOAT = (layers.LayerNorm, layers.RowAttention, layers.Accumulate, memory.Window
 """Kinds that stay in single precision wherever they stand: they have no weights, or a few gains."""
 REFUSED = {
     memory.LayerNormLstm: "train with the cell 'lstm', or export in float32",
+    memory.Feedback: "export the plant in float32",
     memory.PrefixCorrection: "train with the initial state 'zero' or 'learned', or export in float32",
 }
 

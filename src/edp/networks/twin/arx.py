@@ -11,6 +11,8 @@ from edp.data.lags import LagTask
 from edp.data.ridge import ridge_solution
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.ir import Builder
+from edp.ir.memory import Convolution
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_TICKS, check_bounds, whole
@@ -82,6 +84,18 @@ class ArxTwin(Twin):
             answers[:, t] = answer = self.bounded(fed, solved[:, :velocities], solved[:, velocities:])
             rows = rows[:, :-1]
         return answers, {"answer": answer, "rows": rows}
+
+    def lower(self, build: Builder, commands: str, fed: str) -> str:
+        scales, solved = self.scales, solved_columns(self.channels)
+        offset = np.concatenate([scales.command_offset, scales.answer_offset]).astype(np.float64)
+        width = np.concatenate([scales.command_width, scales.answer_width]).astype(np.float64)
+        unit = scales.answer_width[solved].astype(np.float64)
+        weight, intercept = (self.numbers[name].astype(np.float64) for name in ("weight", "intercept"))
+        by_lag = weight.reshape(self.lags, len(offset), len(solved))
+        # In scaled numbers the sums of pressures do not cancel: single precision is enough.
+        bias = (intercept + np.einsum("lio,i->o", by_lag, offset) - scales.answer_offset[solved]) / unit
+        taps = (by_lag * width[:, None] / unit)[::-1].transpose(2, 0, 1)
+        return build.add(Convolution, "proposed", build.join("rows", commands, fed), weight=taps, bias=bias)
 
     def arrays(self) -> dict[str, Array]:
         return self.scales.arrays() | self.numbers

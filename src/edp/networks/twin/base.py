@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.errors import ConfigError, DataError
+from edp.errors import ConfigError, DataError, ExportError
+from edp.ir import Builder, Graph
+from edp.networks.twin.lowering import plant_graph
 from edp.networks.twin.scales import Array, TwinScales
 from edp.registry import Registry
 from edp.settings.bounds import MOST_TICKS, whole
@@ -55,6 +57,30 @@ class Twin(ABC):
     @abstractmethod
     def arrays(self) -> dict[str, Array]:
         """All of its numbers by name, scales included, for its file."""
+
+    def lower(self, build: Builder, commands: str, fed: str) -> str:
+        """Layers of its own: scaled velocities and pressures as they are before bounds act.
+
+        Args:
+            build: the layers in the making.
+            commands: scaled ``(command,)``.
+            fed: what the ports read, scaled ``(answer,)``.
+
+        Raises:
+            ExportError: the formulation has no form as layers; that of this class always.
+        """
+        raise ExportError(
+            f"a twin of class {type(self).__name__} has no form as a list of layers; run it with edp rollout, or train "
+            "one of another kind"
+        )
+
+    def graph(self) -> Graph:
+        """A tick as layers with a feedback edge, from which exported forms are made (see `plant_graph`).
+
+        Raises:
+            ExportError: the formulation has no such form.
+        """
+        return plant_graph(self)
 
     def reset(self, commands: Array, measured: Array) -> TwinState:
         """State after a measured stretch.

@@ -14,7 +14,10 @@ from torch.autograd.function import once_differentiable
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
+from edp.ir import Builder
+from edp.ir.layers import BinaryOperation, Dense
+from edp.ir.memory import Gru
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.steps import run_backward, run_forward
 from edp.settings.bounds import MOST_UNITS, check_bounds, whole
@@ -223,6 +226,25 @@ class RecurrentTwin(Twin):
             answer, h = saved[0][-1].copy(), saved[5][-1].copy()
         answers = np.concatenate(pieces, axis=1) * self.scales.answer_width + self.scales.answer_offset
         return np.asarray(answers, dtype=np.float32), {"answer": answer, "h": h}
+
+    def lower(self, build: Builder, commands: str, fed: str) -> str:
+        network, solved = self.network, solved_columns(self.channels)
+        arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
+        # The commands' part has the gates' biases; the inner bias is that of n alone.
+        inner = np.concatenate([np.zeros(2 * network.units, np.float32), arrays["inner_bias"]])
+        h = build.add(
+            Gru,
+            "memory",
+            build.join("read", commands, fed),
+            weight_x=np.concatenate([arrays["command_weight"], arrays["feedback_weight"].T], axis=1),
+            weight_h=arrays["h_weight"].T,
+            bias_x=arrays["bias"],
+            bias_h=inner,
+        )
+        unit = self.bounds.change[solved]
+        weight, bias = unit[:, None] * arrays["out_weight"].T[solved], unit * arrays["out_bias"][solved]
+        change = build.add(Dense, "change", h, weight=weight, bias=bias)
+        return build.combine("proposed", BinaryOperation.ADD, build.pick("before", fed, solved), change)
 
     def arrays(self) -> dict[str, Array]:
         weights = {name: weight.detach().numpy().copy() for name, weight in self.network.named_parameters()}

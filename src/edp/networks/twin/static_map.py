@@ -11,6 +11,9 @@ from edp.data.lags import LagTask
 from edp.data.ridge import RidgeSolution, ridge_solution
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.ir import Builder
+from edp.ir.layers import Activate, Dense, Function, ScaleShift
+from edp.ir.memory import Convolution
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, whole
@@ -101,6 +104,23 @@ class StaticTwin(Twin):
             fed = np.where(np.isnan(measured[:, t]), answer, measured[:, t])
             answers[:, t] = answer = self.bounded(fed, solved[:, :velocities], solved[:, velocities:])
         return answers, {"answer": answer, "commands": earlier[:, ticks:]}
+
+    def lower(self, build: Builder, commands: str, fed: str) -> str:
+        scales, solved, count = self.scales, solved_columns(self.channels), len(self.channels.commands)
+        if self.delay:
+            # Two taps: nothing of the present, all of the tick at the end of the delay.
+            taps = np.stack([np.eye(count), np.zeros((count, count))], axis=1)
+            options = {"weight": taps, "bias": np.zeros(count), "dilation": self.delay}
+            commands = build.add(Convolution, "earlier", commands, **options)
+        corners = self.numbers["corners"].astype(np.float64)
+        knots = len(corners)
+        each = build.pick("each", commands, list(range(count)) * knots)
+        shift = (scales.command_offset - corners).ravel()
+        past = build.add(ScaleShift, "past", each, gain=np.tile(scales.command_width, knots), shift=shift)
+        polygons = build.add(Activate, "polygons", past, function=Function.RELU, size=knots * count)
+        width = scales.answer_width[solved].astype(np.float64)
+        bias = (self.numbers["intercept"] - scales.answer_offset[solved]) / width
+        return build.add(Dense, "proposed", polygons, weight=(self.numbers["weight"] / width).T, bias=bias)
 
     def arrays(self) -> dict[str, Array]:
         return self.scales.arrays() | self.numbers

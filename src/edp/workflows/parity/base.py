@@ -50,7 +50,7 @@ class ParityCase:
     @property
     def window(self) -> int:
         """Ticks of a window."""
-        return int(self.bundle.predictor.spec.window)
+        return self.bundle.predictor.window
 
     def last_windows(self, count: int) -> tuple[list[Rows], Rows, Rows]:
         """Windows at the end of the recording, what PyTorch predicts from each alone, and what is allowed.

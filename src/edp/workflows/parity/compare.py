@@ -9,42 +9,75 @@ from pathlib import Path
 
 import numpy as np
 
+from edp.data.twin_channels import same_channels
 from edp.data.unlabelled import unlabelled
 from edp.errors import DataError, ExportError
-from edp.export.golden import Rows, at_thresholds, random_inputs, stream, tolerance
+from edp.export.golden import Rows, at_thresholds, grown_tolerance, random_inputs, stream, tolerance
 from edp.logs.source import DataSource
+from edp.networks.twin import TwinPlant
+from edp.recording import Recording
 from edp.training.bundle import Bundle
 from edp.workflows.parity.base import FORMS, Broken, Missing, ParityCase, Row, compared
 
+TICKS = 400
+"""Of the golden recording of a network."""
+FREE_S = 60.0
+"""Length of the free run of a plant, behind its measured prefix."""
 
-def golden_case(bundle: Bundle, ticks: int = 400, seed: int = 0) -> ParityCase:
-    """Smooth random inputs in the usual range of each channel.
+
+def golden_case(bundle: Bundle, ticks: int | None = None, seed: int = 0) -> ParityCase:
+    """Smooth random inputs in the usual range of each channel; a plant is measured for its prefix, then runs free.
+
+    Args:
+        bundle: the network.
+        ticks: length; by default `TICKS`, of a plant its prefix and `FREE_S`.
+        seed: of the inputs.
 
     Raises:
         DataError: fewer ticks than the window.
     """
-    return _case(bundle, random_inputs(bundle.predictor, ticks, seed))
+    return _case(bundle, random_inputs(bundle.predictor, ticks or _length(bundle), seed, mixed=False))
 
 
-def recorded_case(bundle: Bundle, source: DataSource, ticks: int = 400) -> ParityCase:
-    """The first ticks of the first recording of a source.
+def _length(bundle: Bundle) -> int:
+    predictor = bundle.predictor
+    return predictor.window + round(FREE_S * bundle.task.rate_hz) if isinstance(predictor, TwinPlant) else TICKS
+
+
+def recorded_case(bundle: Bundle, source: DataSource, ticks: int | None = None) -> ParityCase:
+    """The first ticks of the first recording of a source; a plant runs free on its commands, behind a measured prefix.
 
     Raises:
         DataError: a channel is missing or not finite, another rate, or fewer ticks than the window.
     """
+    ticks = ticks or _length(bundle)
+    if isinstance(bundle.predictor, TwinPlant):
+        return _case(bundle, _free_rows(bundle.predictor, source.read()[0], ticks))
     series = unlabelled(bundle.task, source.read()[0])
     return _case(bundle, np.ascontiguousarray(series.inputs[:ticks], dtype=np.float32))
 
 
+def _free_rows(plant: TwinPlant, recording: Recording, ticks: int) -> Rows:
+    """Inputs of a plant along a recording: measured for its prefix, free from there on."""
+    channels = plant.twin.channels
+    same_channels(channels, recording)
+    series = channels.task().series(recording, stop=ticks)
+    flags = np.zeros_like(series.targets)
+    flags[: plant.window] = 1.0
+    return np.concatenate([series.inputs, series.targets * flags, flags], axis=1, dtype=np.float32)
+
+
 def _case(bundle: Bundle, inputs: Rows) -> ParityCase:
     predictor = bundle.predictor
-    if len(inputs) < predictor.spec.window:
+    if len(inputs) < predictor.window:
         raise DataError(
-            f"golden recording: {len(inputs)} ticks; it must hold at least a window, {predictor.spec.window}: give "
+            f"golden recording: {len(inputs)} ticks; it must hold at least a window, {predictor.window}: give "
             "more ticks or a longer recording"
         )
     expected = stream(predictor, inputs)
     steps = at_thresholds(predictor, inputs)
+    if isinstance(predictor, TwinPlant):
+        return ParityCase(bundle, inputs, expected, grown_tolerance(predictor, inputs, expected))
     allowed = tolerance(predictor, inputs, expected)
     return ParityCase(bundle, inputs, expected, allowed + steps if steps.any() else allowed)
 

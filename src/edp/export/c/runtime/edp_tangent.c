@@ -87,6 +87,16 @@ void edp_maximum_tangent(const float *a, const float *b, const float *da, const 
     }
 }
 
+void edp_clip_tangent(const float *x, const float *dx, const float *low, const float *high, uint32_t n,
+                      edp_directions d, float *dy) {
+    for (uint32_t k = 0; k < d.count; k++) {
+        for (uint32_t i = 0; i < n; i++) {
+            const uint32_t at = k * d.stride + i;
+            dy[at] = ((x[i] < low[i]) || (x[i] > high[i])) ? 0.0f : dx[at];
+        }
+    }
+}
+
 void edp_slope_relu(const float *x, uint32_t n, float *slope) { edp_map_positive(x, n, slope); }
 
 void edp_slope_sigmoid(const float *x, uint32_t n, float *slope) {

@@ -34,6 +34,8 @@ void edp_minimum_tangent(const float *a, const float *b, const float *da, const 
                          edp_directions d, float *dy);
 void edp_maximum_tangent(const float *a, const float *b, const float *da, const float *db, uint32_t n,
                          edp_directions d, float *dy);
+void edp_clip_tangent(const float *x, const float *dx, const float *low, const float *high, uint32_t n,
+                      edp_directions d, float *dy); /* zero where a bound acts */
 
 /* Slopes of edp_map_... at x. */
 void edp_slope_relu(const float *x, uint32_t n, float *slope);

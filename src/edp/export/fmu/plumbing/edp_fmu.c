@@ -101,10 +101,10 @@ static int32_t left_out(const edp_fmu *f, double at, double size) {
     return ticks;
 }
 
-/* Inputs as the model reads them: what was not set or is no float becomes NaN, which it rejects. */
+/* Inputs as the model reads them: what must be set and was not, or is no float, becomes NaN, which it rejects. */
 static void read_inputs(const edp_fmu *f, float read[FMU_INPUTS]) {
     for (uint32_t i = 0; i < FMU_INPUTS; i++) {
-        const bool sound = f->now.given[i] && (fabs(f->now.inputs[i]) <= (double)FLT_MAX);
+        const bool sound = (f->now.given[i] || (i >= FMU_REQUIRED)) && (fabs(f->now.inputs[i]) <= (double)FLT_MAX);
         read[i] = sound ? (float)f->now.inputs[i] : NAN;
     }
 }
@@ -119,7 +119,7 @@ static void explain(const edp_fmu *f, const float read[FMU_INPUTS], bool rejecte
         (void)snprintf(text, TEXT, "a result was not finite");
     } else if (bad == FMU_INPUTS) {
         (void)snprintf(text, TEXT, "an input is beyond its limits");
-    } else if (f->now.given[bad]) {
+    } else if (f->now.given[bad] || (bad >= FMU_REQUIRED)) {
         (void)snprintf(text, TEXT, "input '%.100s' is %g", input_names[bad], f->now.inputs[bad]);
     } else {
         (void)snprintf(text, TEXT, "input '%.100s' was never set", input_names[bad]);

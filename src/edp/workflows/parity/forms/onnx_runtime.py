@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from edp.errors import ExportError
 from edp.export.onnx import OnnxTarget
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, Missing, ParityCase, Ran, called
 
@@ -79,6 +80,8 @@ class OnnxWindow:
 
     def run(self, case: ParityCase, folder: Path) -> Sequence[tuple[str, Ran]]:
         """See `edp.workflows.parity.base.Form`."""
+        if case.bundle.predictor.graph().fed_back:
+            raise ExportError("a plant is fed back: it has the graph of a tick alone")
         windows, expected, allowed = case.last_windows(WINDOWS)
         note = f"the last {len(windows)} windows, against PyTorch from reset"
         return _runs(

@@ -1,0 +1,96 @@
+"""A twin as a list of layers with a feedback edge: ports, scales, the trapezoidal rule, end stops and bounds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from edp.ir import Builder, Graph
+from edp.ir.base import INPUT
+from edp.ir.layers import Activate, BinaryOperation, Clip, Function, ScaleShift, Standardise
+from edp.ir.memory import Feed, Feedback
+
+if TYPE_CHECKING:
+    from edp.networks.twin.base import Twin
+    from edp.networks.twin.scales import Array
+
+ADD, MULTIPLY = BinaryOperation.ADD, BinaryOperation.MULTIPLY
+MEASURED = 0.5
+"""A flag above it means that a port reads what was measured."""
+
+
+def plant_graph(twin: Twin) -> Graph:
+    """A tick of a twin, from SI inputs to SI answers.
+
+    Inputs are the commands, a measured value for each answer, and a flag for each: 1 where the port reads what was
+    measured, 0 where it reads the last answer. A measured value must be finite even where nobody reads it. After a
+    reset the plant rests at the means of its training data.
+
+    Raises:
+        ExportError: the formulation has no form as layers.
+    """
+    scales, channels = twin.scales, twin.channels
+    commands, answers = len(channels.commands), len(channels.answers)
+    build = Builder(commands + 2 * answers)
+    logged = build.pick("logged", INPUT, range(commands))
+    command = build.add(Standardise, "commands", logged, offset=scales.command_offset, scale=scales.command_width)
+    with build.inside("ports"):
+        fed, last = _ports(build, twin, commands)
+    with build.inside("cell"):
+        proposed = twin.lower(build, command, fed)
+    with build.inside("answers"):
+        answer = _bounded(build, twin, fed, proposed)
+        # A map of the commands alone reads no port; an edge that leads nowhere would be memory for nothing.
+        if any(fed in layer.inputs for layer in build.layers):
+            build.add(Feed, "feed", answer, into=last)
+        result = build.add(ScaleShift, "decoded", answer, gain=scales.answer_width, shift=scales.answer_offset)
+    return build.graph({"prediction": result}, twin.prefix_ticks)
+
+
+def _ports(build: Builder, twin: Twin, commands: int) -> tuple[str, str]:
+    """What the ports read, scaled, and the layer that holds the last answers."""
+    scales, size = twin.scales, len(twin.channels.answers)
+    one = np.ones(size)
+    logged = build.pick("logged", INPUT, range(commands, commands + size))
+    measured = build.add(Standardise, "measured", logged, offset=scales.answer_offset, scale=scales.answer_width)
+    flags = build.pick("flags", INPUT, range(commands + size, commands + 2 * size))
+    # Exactly 0 or 1, whatever is fed: a product with it selects without rounding, in forms that have no condition.
+    above = build.add(ScaleShift, "above", flags, gain=one, shift=-MEASURED * one)
+    read = build.add(Activate, "read", above, function=Function.POSITIVE, size=size)
+    free = build.add(ScaleShift, "free", read, gain=-one, shift=one)
+    last = build.add(Feedback, "last", size=size)
+    parts = (build.combine("outer", MULTIPLY, read, measured), build.combine("own", MULTIPLY, free, last))
+    return build.combine("fed", ADD, *parts), last
+
+
+def _bounded(build: Builder, twin: Twin, fed: str, proposed: str) -> str:
+    """Answers within the bounds, scaled: `Twin.bounded` in layers."""
+    scales, channels = twin.scales, twin.channels
+    count, strokes = len(channels.velocities), len(channels.strokes)
+    low, high = ((end - scales.answer_offset) / scales.answer_width for end in (scales.low, scales.high))
+    free = [*range(count), *range(count + strokes, len(low))]
+    clipped = build.add(Clip, "bounded", proposed, low=low[free], high=high[free])
+    if not strokes:
+        return clipped
+    velocity, ends = build.pick("velocity", clipped, range(count)), slice(count, 2 * count)
+    both = build.combine("both_ends", ADD, build.pick("velocity_before", fed, range(count)), velocity)
+    zero = np.zeros(count)
+    moved = build.add(ScaleShift, "moved", both, gain=scales.trapezoid(channels), shift=zero)
+    stroke = build.combine("stroke", ADD, build.pick("stroke_before", fed, range(count, 2 * count)), moved)
+    velocity = _stopped(build, "open", stroke, velocity, high[ends], high[:count], 1.0)
+    velocity = _stopped(build, "closed", stroke, velocity, low[ends], low[:count], -1.0)
+    stroke = build.add(Clip, "held", stroke, low=low[ends], high=high[ends])
+    pressures = build.width(clipped) - count
+    rest = [build.pick("pressure", clipped, range(count, count + pressures))] if pressures else []
+    return build.join("together", velocity, stroke, *rest)
+
+
+def _stopped(build: Builder, name: str, stroke: str, velocity: str, stop: Array, most: Array, side: float) -> str:
+    """Velocities that do not go into an end stop: their bound is zero where a stroke is beyond it."""
+    one = np.ones(len(stop))
+    past = build.add(ScaleShift, f"past_{name}", stroke, gain=side * one, shift=-side * stop)
+    there = build.add(Activate, f"at_{name}", past, function=Function.POSITIVE, size=len(stop))
+    bound = build.add(ScaleShift, f"most_{name}", there, gain=-most, shift=most)
+    operation = BinaryOperation.MINIMUM if side > 0 else BinaryOperation.MAXIMUM
+    return build.combine(f"velocity_{name}", operation, velocity, bound)
