@@ -10,18 +10,23 @@ from edp.report.screening.pictures import write_pictures
 from edp.report.search.page import StudyReport, write_study_page
 from edp.report.transfer.facts import Transfer, read_transfer
 from edp.report.transfer.page import write_transfer_page
+from edp.report.twin.facts import FreeRunFacts, holds_free_runs
+from edp.report.twin.page import build_twin_report, write_twin_page
 from edp.report.twin.plots import write_rollout_plots
 
 __all__ = [
     "CompressionFacts",
     "Facts",
+    "FreeRunFacts",
     "StudyReport",
     "Transfer",
     "build_coverage_page",
     "build_report",
     "build_screening_page",
+    "build_twin_report",
     "comparison_rows",
     "headline",
+    "holds_free_runs",
     "read_compression",
     "read_facts",
     "read_transfer",
@@ -30,4 +35,5 @@ __all__ = [
     "write_rollout_plots",
     "write_study_page",
     "write_transfer_page",
+    "write_twin_page",
 ]

@@ -26,7 +26,8 @@ def write_rollout_plots(rollout: Recording, suffix: str, start_s: float, folder:
     """Write ``velocities``, ``strokes`` and ``pressures`` as SVG and PNG, a row for each channel.
 
     Args:
-        rollout: measured channels, and answers under the same names with `suffix` behind.
+        rollout: measured channels, answers under the same names with `suffix` behind, and the ends of their intervals
+            with ``_low`` and ``_high`` behind that, where there are some.
         suffix: of the names of answers.
         start_s: time of the log at the first row.
         folder: where to write; it is made.
@@ -54,8 +55,12 @@ def _draw(figure: Figure, rollout: Recording, columns: list[str], suffix: str, s
     for row, name in enumerate(columns):
         axes, facts = rows[row, 0], KINDS[rollout.channels[rollout.index(name)].kind]
         measured, answered = (facts.report_factor * rollout.column(n)[at] for n in (name, f"{name}{suffix}"))
+        ends = [f"{name}{suffix}_{end}" for end in ("low", "high")]
+        if all(end in rollout.channel_names for end in ends):
+            low, high = (facts.report_factor * rollout.column(end)[at] for end in ends)
+            axes.fill_between(time_s, low, high, color=BLUE, alpha=0.15, linewidth=0, label="interval")
         axes.plot(time_s, measured, color=DROPPED, linewidth=2.4, label="measured")
         axes.plot(time_s, answered, color=BLUE, linewidth=0.9, label="answered by the twin")
         axes.set(ylabel=f"{short_label(name)}\n[{facts.report_unit}]")
-    rows[0, 0].legend(frameon=False, fontsize=7, ncols=2)
+    rows[0, 0].legend(frameon=False, fontsize=7, ncols=3)
     rows[-1, 0].set(xlabel="Time in the log [s]")
