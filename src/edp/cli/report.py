@@ -11,7 +11,7 @@ from edp.cli.console import JsonFlag, emit, out
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Run folder of edp train.")],
+    run: Annotated[Path, typer.Argument(help="Run folder of edp train or edp twin.")],
     output: Annotated[Path | None, typer.Option("--out", help="The page; default: report.html in the run.")] = None,
     title: Annotated[str | None, typer.Option(help="Title of the page.")] = None,
     limit: Annotated[
@@ -19,14 +19,21 @@ def report(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write one offline page: predictions, errors, baselines, footprint, settings.
+    """Write one offline page: predictions, errors, baselines, footprint, settings; of a twin its free runs.
 
     Example: `edp report runs/first`
     """
-    from edp.report import build_report, headline, read_facts
+    from edp.errors import ConfigError
+    from edp.report import build_report, build_twin_report, headline, holds_free_runs, read_facts
     from edp.report.run.facts import main_horizon
     from edp.report.run.predictability import limit_line
 
+    if holds_free_runs(run):
+        if limit is not None:
+            raise ConfigError(f"--limit: '{run}' holds a twin, which looks no fixed time ahead; leave it out")
+        page = build_twin_report(run, output, title)
+        emit(as_json, {"report": str(page)}, lambda: out.print(f"report: {page.resolve()}"))
+        return
     page = build_report(run, output, title, limit)
     facts = read_facts(run, limit)
     line, least = headline(facts), limit_line(facts, main_horizon(facts))

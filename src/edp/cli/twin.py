@@ -44,7 +44,7 @@ def twin(
     def show() -> None:
         score_table(trained.scores)
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
-        out.print(f"next: edp rollout {folder} LOG --seconds 60")
+        out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
 
     emit(as_json, facts, show)
 
@@ -61,6 +61,7 @@ def rollout(
         Path | None, typer.Option("--out", help="File for measured and free-run values (.parquet, .csv, ...).")
     ] = None,
     plots: Annotated[Path | None, typer.Option(help="Folder for plots of the run (SVG and PNG).")] = None,
+    page: Annotated[Path | None, typer.Option(help="File for a page of the run with its intervals (HTML).")] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,
@@ -74,8 +75,8 @@ def rollout(
     """
     from edp.workflows.twin import rollout_log
 
-    result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file, plots)
-    written = {"file": file and str(file), "plots": plots and str(plots)}
+    result = rollout_log(run, source_of(log, signal_map, repair), seconds, start_s, measured, file, plots, page)
+    written = {"file": file and str(file), "plots": plots and str(plots), "page": page and str(page)}
     facts = {"start_s": result.start_s, "calibrated_s": result.calibrated_s, **written, **result.scores}
 
     def show() -> None:
@@ -87,6 +88,8 @@ def rollout(
             out.print(f"{result.recording.samples:,} ticks in {file}")
         if plots is not None:
             out.print(f"plots in {plots}")
+        if page is not None:
+            out.print(f"page: {page.resolve()}")
 
     emit(as_json, facts, show)
 

@@ -105,8 +105,17 @@ def read_scores(path: str | Path) -> dict[str, Any]:
     Raises:
         StorageError: it cannot be read, or a value in it has another form; the message names the value.
     """
+    return read_shaped(path, SCORES)
+
+
+def read_shaped(path: str | Path, shape: Shape) -> dict[str, Any]:
+    """The content of a JSON file of scores whose values have the forms that a shape tells.
+
+    Raises:
+        StorageError: it cannot be read, or a value in it has another form; the message names the value.
+    """
     content = read_object(path)
-    _check(content, SCORES, "", f"'{path}'")
+    _check(content, shape, "", f"'{path}'")
     return content
 
 

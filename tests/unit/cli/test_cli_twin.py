@@ -55,7 +55,7 @@ def test_a_run_holds_a_twin_its_settings_and_scores_beside_the_floors(edp, logs,
     assert (run / "twin" / "twin.json").read_bytes() == before
     shown = edp("twin", logs, "--out", run, *WORDS).out
     assert "velocity, mm/s" in shown
-    assert f"next: edp rollout {run}" in shown.replace("\n", " ")
+    assert f"next: edp report {run}, or edp rollout {run}" in shown.replace("\n", " ")
     history = (run / "history.jsonl").read_text().splitlines()
     assert len(history) == 2
     assert "units = 6" in (run / "config.toml").read_text()
@@ -156,9 +156,34 @@ def test_plots_of_a_rollout(edp, logs, trained, tmp_path):
     stems = ("velocities", "strokes", "pressures")
     assert sorted(path.name for path in folder.iterdir()) == sorted(f"{s}.{e}" for s in stems for e in ("svg", "png"))
     drawing = (folder / "velocities.svg").read_text()
-    for text in ("speed_1", "speed_2", "[mm/s]", "answered by the twin", "Time in the log [s]"):
+    for text in ("speed_1", "speed_2", "[mm/s]", "answered by the twin", "interval", "Time in the log [s]"):
         assert text in drawing
     assert "pressure_1" not in drawing
+
+
+def test_the_page_of_a_twin_and_that_of_one_run(edp, logs, trained, tmp_path):
+    file = tmp_path / "page.html"
+    assert edp("report", trained, "--out", file, "--json").json["report"] == str(file)
+    page = file.read_text()
+    for text in (
+        "free runs",
+        "Strokes off by",
+        "By recording, the worst first",
+        "at rest (idling)",
+        "actuators_",
+        "90 %",
+    ):
+        assert text in page
+    for part in ("velocities", "strokes", "pressures"):
+        assert f'id="figure-runs_{part}"' in page
+    assert 'id="figure-horizon"' in page
+    assert "told the commands in between" in page
+    words = ["rollout", trained, logs / "log_1.parquet", "--seconds", 3, "--from", 2, "--page", file]
+    assert f"page: {file}" in edp(*words).out.replace("\n", "")
+    assert "actuators_1 from 2 s" in file.read_text()
+    assert "--limit" in edp("report", trained, "--limit", file).err
+    (broken := shutil.copytree(trained, tmp_path / "broken") / "free_run.json").write_text('{"schema": 1}')
+    assert "of another version of EDP; run edp evaluate" in " ".join(edp("report", broken.parent).err.split())
 
 
 def test_channels_that_stay_measured(edp, logs, trained, tmp_path):
@@ -199,5 +224,4 @@ def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, t
     write_recording(replace(recording, rate_hz=25.0), slow)
     assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
     assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())
-    for command in ("report", "parity"):
-        assert "holds a twin" in " ".join(edp(command, trained).err.split())
+    assert "holds a twin, not a network" in " ".join(edp("footprint", trained).err.split())

@@ -115,8 +115,7 @@ def read_facts(run_folder: str | Path, limit: str | Path | None = None) -> Facts
         raise StorageError(f"no run folder at '{folder}'; give the folder that `edp train` wrote")
     if (folder / "twin" / "twin.json").is_file():
         raise StorageError(
-            f"'{folder}' holds a twin, which has no report page yet; its scores are in free_run.json, and edp rollout "
-            "runs it along a log"
+            f"'{folder}' holds a twin, not a network that predicts; edp report writes its page, edp rollout runs it"
         )
     absent = tuple(name for name in MAKERS if not (folder / name).is_file())
     if len(absent) == len(MAKERS):

@@ -31,9 +31,9 @@ from edp.workflows.twin.prepare_twin import driving_labels, prepared_twin
 
 SCORES = "free_run.json"
 SHOWN = "free_runs.safetensors"
-SHOWN_RUNS = 8
+SHOWN_RUNS = 6
 """Free runs on a page: a reader goes through a few."""
-SHOWN_TICKS = 1500
+SHOWN_TICKS = 1200
 """Points of a line on a page: more than its width resolves."""
 
 
@@ -105,7 +105,8 @@ def shown_runs(runs: FreeRuns, intervals: FreeRunIntervals | None) -> dict[str, 
     One run of each way of driving would need labels; one of each recording, evenly chosen, needs none.
     """
     ticks = runs.truth.shape[1]
-    at = np.unique(np.linspace(0, ticks - 1, SHOWN_TICKS).astype(np.int64))
+    stride = -(-ticks // SHOWN_TICKS)
+    at = np.arange(stride - 1, ticks, stride)
     arrays: dict[str, NDArray[Any]] = {"seconds": ((at + 1) / runs.channels.rate_hz).astype(np.float32)}
     if intervals is not None:
         arrays["half_width"] = intervals.at(at + 1).astype(np.float32)

@@ -16,10 +16,11 @@ from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.networks.twin import Twin
 from edp.recording import Recording
-from edp.report import write_rollout_plots
+from edp.report import FreeRunFacts, write_rollout_plots, write_twin_page
 from edp.settings.bounds import above, span
 from edp.signals import Channel
 from edp.training.twin_bundle import load_twin
+from edp.workflows.twin.judge_twin import channel_facts, shown_runs
 
 FREE = "_twin"
 """Behind the name of a channel, for what the twin answered in its place."""
@@ -55,6 +56,7 @@ def rollout_log(
     measured: Sequence[str] = (),
     out: str | Path | None = None,
     plots: str | Path | None = None,
+    page: str | Path | None = None,
 ) -> Rollout:
     """Let the twin of a run answer the commands of a log.
 
@@ -66,6 +68,7 @@ def rollout_log(
         measured: channels that stay measured throughout (mixed mode).
         out: file for `Rollout.recording`; its ending chooses the format.
         plots: folder for plots of it.
+        page: file for a page of it (HTML).
 
     Raises:
         EdpError: several logs, another rate or kind, times outside the log, or a channel that the twin does not answer.
@@ -102,6 +105,10 @@ def rollout_log(
         write_recording(result.recording, out)
     if plots is not None:
         write_rollout_plots(result.recording, FREE, (start + 1) / recording.rate_hz, plots)
+    if page is not None:
+        content = {"channels": channel_facts(twin.channels), "models": {"twin": result.scores}}
+        title = f"{recording.name} from {result.start_s:g} s"
+        write_twin_page(FreeRunFacts(title, content, shown_runs(runs, intervals)), page)
     return result
 
 

@@ -1,0 +1,341 @@
+"""What the judgement of a twin left on disk, as tables, key figures and sentences; kinds of channels stay apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+
+from edp.errors import StorageError
+from edp.evaluation.scores_file import (
+    COUNT,
+    NAME,
+    NUMBER,
+    REAL,
+    SIZE,
+    KeyedObject,
+    Leaf,
+    Listed,
+    NamedValues,
+    Shape,
+    read_shaped,
+)
+from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.report.common.wording import number, percent
+from edp.storage import read_object
+
+CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
+TWIN = "twin"
+PARTS = ("velocities", "strokes", "pressures")
+SITUATIONS = {"end_stops": "at an end stop", "rest": "at rest (idling)", "motion": "in motion"}
+MOST_ROWS = 40
+"""Recordings of a table, the worst first: nobody reads more."""
+UNIT = Leaf(lambda value: value is None or isinstance(value, str), "a text or null")
+BY_CHANNEL = KeyedObject(
+    {"unit": UNIT, "mean": NUMBER, "median": NUMBER, "by_channel": NamedValues(NUMBER)}, ("unit", "mean", "by_channel")
+)
+NRMSE = KeyedObject({"mean": NUMBER, "by_channel": NamedValues(NUMBER)}, ("mean", "by_channel"))
+AT = KeyedObject({"at_s": SIZE, **BY_CHANNEL.keys}, ("at_s", *BY_CHANNEL.needed))
+ERRORS: dict[str, Shape] = {
+    "runs": COUNT,
+    "velocity_mae": BY_CHANNEL,
+    "stroke_error": Listed(AT),
+    "pressure_nrmse": NRMSE,
+    "diverged": REAL,
+}
+SUMMARY = KeyedObject(ERRORS, tuple(ERRORS))
+LINE = KeyedObject(
+    {"unit": UNIT, "mean": Listed(NUMBER), "by_channel": NamedValues(Listed(NUMBER))}, ("unit", "by_channel")
+)
+SITUATION = KeyedObject(
+    {"share": REAL, "velocity_mae": BY_CHANNEL, "stroke_error": BY_CHANNEL, "pressure_nrmse": NRMSE},
+    ("share", "velocity_mae", "pressure_nrmse"),
+)
+COVERED = KeyedObject(
+    {"share": REAL, "by_channel": NamedValues(REAL), "half_width": BY_CHANNEL}, ("share", "half_width")
+)
+AHEAD = KeyedObject(
+    {
+        "seconds": SIZE,
+        "moments": COUNT,
+        "velocity_mae": BY_CHANNEL,
+        "stroke_error": BY_CHANNEL,
+        "pressure_nrmse": NRMSE,
+    },
+    ("seconds", "moments", "velocity_mae", "stroke_error", "pressure_nrmse"),
+)
+BESIDE = KeyedObject(
+    {
+        "label": NAME,
+        "seconds": SIZE,
+        "moments": COUNT,
+        "trained_on": Listed(NAME),
+        "errors": NamedValues(KeyedObject({"twin": BY_CHANNEL, "predictor": BY_CHANNEL}, ("twin", "predictor"))),
+    },
+    ("label", "seconds", "moments", "trained_on", "errors"),
+)
+MODEL = KeyedObject(
+    {
+        **ERRORS,
+        "recordings": COUNT,
+        "seconds": SIZE,
+        "by_horizon": KeyedObject({"seconds": Listed(SIZE), **dict.fromkeys(PARTS, LINE)}, ("seconds", *PARTS)),
+        "by_recording": NamedValues(SUMMARY),
+        "by_driving": NamedValues(SUMMARY),
+        "situations": NamedValues(SITUATION),
+        "intervals": KeyedObject(
+            {"coverage": REAL, "at": Listed(KeyedObject({"at_s": SIZE, **dict.fromkeys(PARTS, COVERED)}, ("at_s",)))},
+            ("coverage", "at"),
+        ),
+        "ahead": AHEAD,
+        "beside": BESIDE,
+    },
+    (*ERRORS, "recordings", "seconds", "by_horizon", "by_recording", "by_driving", "situations"),
+)
+CHANNEL = KeyedObject(
+    {"name": NAME, "description": NAME, "unit": NAME, "factor": SIZE}, ("name", "description", "unit", "factor")
+)
+SHAPE = KeyedObject(
+    {
+        "schema": COUNT,
+        "channels": KeyedObject(dict.fromkeys(PARTS, Listed(CHANNEL)), PARTS),
+        "models": NamedValues(MODEL, (TWIN,)),
+    },
+    ("schema", "channels", "models"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRunFacts:
+    """Content of ``free_run.json`` and of the runs beside it.
+
+    Attributes:
+        title: of the page.
+        content: plain values.
+        shown: ``seconds``, ``half_width`` where known, and ``NAME/answers``, ``NAME/truth`` ``(tick, answer)``, SI.
+        provenance: of the twin; empty where it is not at hand.
+    """
+
+    title: str
+    content: Mapping[str, Any]
+    shown: Mapping[str, NDArray[np.float32]]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def models(self) -> Mapping[str, Mapping[str, Any]]:
+        """The twin, then its floors."""
+        models: Mapping[str, Mapping[str, Any]] = self.content["models"]
+        return models
+
+    @property
+    def twin(self) -> Mapping[str, Any]:
+        """Scores of the twin."""
+        return self.models[TWIN]
+
+    def channels(self, part: str) -> Sequence[Mapping[str, Any]]:
+        """Name, description, unit and factor of the channels of a part."""
+        channels: Sequence[Mapping[str, Any]] = self.content["channels"][part]
+        return channels
+
+    def columns(self, part: str) -> range:
+        """Columns of a part in arrays of all answers."""
+        first = sum(len(self.channels(earlier)) for earlier in PARTS[: PARTS.index(part)])
+        return range(first, first + len(self.channels(part)))
+
+    @property
+    def names(self) -> list[str]:
+        """Recordings of the runs that are shown."""
+        return [key.removesuffix("/truth") for key in self.shown if key.endswith("/truth")]
+
+
+def holds_free_runs(folder: str | Path) -> bool:
+    """Whether a folder is the run folder of a twin, or one in it with the judgement of other recordings."""
+    return any((Path(folder) / name).is_file() for name in (CONTENT, "twin/twin.json"))
+
+
+def read_free_runs(folder: str | Path) -> FreeRunFacts:
+    """What `edp twin` or `edp evaluate` wrote into a run folder, or into a folder in it.
+
+    Raises:
+        StorageError: nothing, something of another version, or damaged content.
+    """
+    path = Path(folder)
+    if not (path / CONTENT).is_file():
+        raise StorageError(f"'{folder}' holds no {CONTENT}; run edp evaluate {folder}")
+    schema = read_object(path / CONTENT).get("schema")
+    if isinstance(schema, bool) or schema != SCHEMA:
+        raise StorageError(f"'{path / CONTENT}' is of another version of EDP; run edp evaluate {folder}")
+    content = read_shaped(path / CONTENT, SHAPE)
+    try:
+        shown = load_file(path / RUNS)
+    except (OSError, SafetensorError) as error:
+        raise StorageError(f"cannot read '{path / RUNS}' ({error}); run edp evaluate {folder}") from error
+    header = path / "twin" / "twin.json"
+    provenance = read_object(header).get("provenance") if header.is_file() else {}
+    facts = FreeRunFacts(path.resolve().name, content, shown, provenance if isinstance(provenance, dict) else {})
+    _check_arrays(facts, path / RUNS)
+    return facts
+
+
+def _check_arrays(facts: FreeRunFacts, path: Path) -> None:
+    """Refuse arrays that do not fit the channels or one another."""
+    ticks = facts.shown["seconds"].shape[0] if facts.shown.get("seconds", np.zeros(())).ndim == 1 else -1
+    expected = (ticks, sum(len(facts.channels(part)) for part in PARTS))
+    wrong = [name for name, values in facts.shown.items() if name != "seconds" and values.shape != expected]
+    wrong += [] if ticks > 1 else ["seconds"]
+    wrong += [f"{name}/answers" for name in facts.names if f"{name}/answers" not in facts.shown]
+    if wrong:
+        raise StorageError(f"'{path}' does not fit its scores: '{wrong[0][:80]}'; run edp evaluate again")
+
+
+def headline(facts: FreeRunFacts) -> str:
+    """The error of the strokes at the end of the runs, in one sentence."""
+    twin = facts.twin
+    last = twin["stroke_error"][-1] if twin["stroke_error"] else None
+    if last is None or last["mean"] is None:
+        return f"{twin['runs']} free runs of {twin['seconds']:g} s on commands alone"
+    return f"Strokes off by {number(last['mean'])} {last['unit']} after {last['at_s']:g} s on commands alone"
+
+
+def verdict(facts: FreeRunFacts) -> list[str]:
+    """What the runs are, and how far the floors are off."""
+    twin = facts.twin
+    lines = [
+        f"{twin['runs']} free runs of {twin['seconds']:g} s in {twin['recordings']} recordings that trained nothing."
+        if facts.provenance
+        else f"{twin['runs']} free runs of {twin['seconds']:g} s."
+    ]
+    for name, scores in facts.models.items():
+        if name != TWIN and scores["stroke_error"] and scores["stroke_error"][-1]["mean"] is not None:
+            last = scores["stroke_error"][-1]
+            lines.append(f"The floor {name} is off by {number(last['mean'])} {last['unit']} then.")
+    return lines
+
+
+def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, what it is."""
+    twin = facts.twin
+    velocity = twin["velocity_mae"]
+    rows = [(number(velocity["mean"]), velocity["unit"] or "", "mean absolute error of the velocities")]
+    rows += [
+        (number(row["mean"]), row["unit"] or "", f"stroke error after {row['at_s']:g} s")
+        for row in (*twin["stroke_error"][:1], *twin["stroke_error"][-1:])
+    ]
+    rows.append((number(twin["pressure_nrmse"]["mean"]), "", "error of the pressures in their deviations (NRMSE)"))
+    rows.append((percent(twin["diverged"]), "", "of the runs diverged"))
+    intervals = twin.get("intervals")
+    if intervals is not None and intervals["at"]:
+        shares = [row[part]["share"] for row in intervals["at"] for part in PARTS if part in row]
+        meant = f"of the truth in intervals meant for {percent(intervals['coverage'])}"
+        rows.append((f"{percent(min(shares))} to {percent(max(shares))}", "", meant))
+    return rows
+
+
+def sheets_of(facts: FreeRunFacts) -> dict[str, Sheet]:
+    """Every table by name; those of which nothing is known are left out."""
+    twin = facts.twin
+    sheets = [
+        _summary_sheet("models", "The twin and its floors", "Model", facts.models, frozenset({0})),
+        _summary_sheet("recordings", "By recording, the worst first", "Recording", _worst(twin["by_recording"])),
+        _summary_sheet("driving", "By way of driving", "Way of driving", twin["by_driving"]),
+        _situation_sheet(twin),
+        *([_coverage_sheet(twin["intervals"])] if "intervals" in twin else []),
+        *([_ahead_sheet(facts)] if "ahead" in twin else []),
+        *([_beside_sheet(twin["beside"])] if "beside" in twin else []),
+    ]
+    return {sheet.name: sheet for sheet in sheets if sheet.rows}
+
+
+def _worst(summaries: Mapping[str, Any]) -> dict[str, Any]:
+    """The recordings with the largest errors first, by the strokes at the end, or else by the velocities."""
+
+    def size(summary: Mapping[str, Any]) -> float:
+        last = summary["stroke_error"][-1] if summary["stroke_error"] else summary["velocity_mae"]
+        return float(last["mean"] if last["mean"] is not None else max(last["by_channel"].values(), default=0.0))
+
+    ranked = sorted(summaries.items(), key=lambda entry: -size(entry[1]))
+    return dict(ranked[:MOST_ROWS])
+
+
+def _summary_sheet(
+    name: str, caption: str, first: str, summaries: Mapping[str, Any], marked: frozenset[int] = frozenset()
+) -> Sheet:
+    """A row of errors for each of several sets of runs."""
+    rows: list[tuple[Value, ...]] = []
+    heads: list[tuple[str, str]] = []
+    for label, entry in summaries.items():
+        strokes = entry["stroke_error"]
+        heads = [(f"Stroke after {row['at_s']:g} s", row["unit"] or "") for row in strokes]
+        velocity = entry["velocity_mae"]
+        cells = (velocity["mean"], *(row["mean"] for row in strokes), entry["pressure_nrmse"]["mean"])
+        rows.append((label, entry["runs"], *cells, percent(entry["diverged"])))
+    unit = next((entry["velocity_mae"]["unit"] for entry in summaries.values()), None) or ""
+    titles = [("Velocity MAE", unit), *heads, ("Pressure NRMSE", "")]
+    shown = [Column(title, u, figures(row[2 + i] for row in rows)) for i, (title, u) in enumerate(titles)]
+    count = Column("Runs", "", figures([], decimals=0))
+    return Sheet(name, caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked)
+
+
+def _situation_sheet(twin: Mapping[str, Any]) -> Sheet:
+    rows: list[tuple[Value, ...]] = []
+    for name, row in twin["situations"].items():
+        strokes = row.get("stroke_error", {"mean": None, "unit": None})
+        cells = (row["velocity_mae"]["mean"], strokes["mean"], row["pressure_nrmse"]["mean"])
+        rows.append((SITUATIONS.get(name, name), percent(row["share"]), *cells))
+    velocity = next((r["velocity_mae"]["unit"] for r in twin["situations"].values() if r["velocity_mae"]["unit"]), "")
+    stroke = next((r["stroke_error"]["unit"] for r in twin["situations"].values() if r.get("stroke_error")), "") or ""
+    titles = [("Velocity MAE", velocity), ("Stroke error", stroke), ("Pressure NRMSE", "")]
+    shown = [Column(title, unit, figures(row[2 + i] for row in rows)) for i, (title, unit) in enumerate(titles)]
+    heads = (Column("What the actuator did"), Column("Share of the time"), *shown)
+    return Sheet("situations", "At end stops, at rest and in motion", heads, tuple(rows))
+
+
+def _coverage_sheet(intervals: Mapping[str, Any]) -> Sheet:
+    parts = [part for part in PARTS if intervals["at"] and part in intervals["at"][0]]
+    rows: list[tuple[Value, ...]] = []
+    heads: list[Column] = [Column("After")]
+    for part in parts:
+        unit = intervals["at"][0][part]["half_width"]["unit"] or ""
+        widths = figures(row[part]["half_width"]["mean"] for row in intervals["at"])
+        heads += [Column(f"{part.capitalize()} inside"), Column("half width", unit, widths)]
+    for row in intervals["at"]:
+        cells = [cell for part in parts for cell in (percent(row[part]["share"]), row[part]["half_width"]["mean"])]
+        rows.append((f"{row['at_s']:g} s", *cells))
+    caption = f"Share of the free runs whose truth lies in intervals meant to hold {percent(intervals['coverage'])}"
+    return Sheet("intervals", caption, tuple(heads), tuple(rows))
+
+
+def _ahead_sheet(facts: FreeRunFacts) -> Sheet:
+    rows: list[tuple[Value, ...]] = []
+    for name, scores in facts.models.items():
+        if "ahead" in scores:
+            ahead = scores["ahead"]
+            rows.append((name, *(ahead[key]["mean"] for key in ("velocity_mae", "stroke_error", "pressure_nrmse"))))
+    first = facts.twin["ahead"]
+    units = (first["velocity_mae"]["unit"] or "", first["stroke_error"]["unit"] or "", "")
+    titles = ("Velocity MAE", "Stroke error", "Pressure NRMSE")
+    shown = [Column(t, u, figures(r[1 + i] for r in rows)) for i, (t, u) in enumerate(zip(titles, units, strict=True))]
+    caption = f"{first['seconds']:g} s ahead of measured ports, told the commands in between"
+    return Sheet("ahead", caption, (Column("Model"), *shown), tuple(rows), frozenset({0}))
+
+
+def _beside_sheet(beside: Mapping[str, Any]) -> Sheet:
+    rows: list[tuple[Value, ...]] = [
+        (part, row["twin"]["unit"], row["twin"]["mean"], row["predictor"]["mean"])
+        for part, row in beside["errors"].items()
+    ]
+    both = figures(value for row in rows for value in row[2:])
+    heads = (
+        Column("MAE of"),
+        Column("Unit"),
+        Column("Twin, told the commands", "", both),
+        Column(beside["label"], "", both),
+    )
+    caption = f"Beside a look-ahead predictor, {beside['seconds']:g} s ahead at the same {beside['moments']:,} moments"
+    return Sheet("beside", caption, heads, tuple(rows))

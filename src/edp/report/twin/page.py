@@ -1,0 +1,73 @@
+"""The page of a twin: one offline HTML file of its free runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from edp.report.common.templates import template
+from edp.report.common.wording import duration, moment, unbroken
+from edp.report.run.page import shown
+from edp.report.twin import facts as words
+from edp.report.twin.facts import FreeRunFacts, read_free_runs
+from edp.report.twin.figures import twin_plots
+from edp.storage import write_bytes
+
+
+def build_twin_report(run_folder: str | Path, output: str | Path | None = None, title: str | None = None) -> Path:
+    """Write the page of a twin as one HTML file that opens with no network.
+
+    Args:
+        run_folder: folder of `edp twin`, or one in it that `edp evaluate` wrote.
+        output: where to write; ``report.html`` in the folder by default.
+        title: of the page; the folder's name by default.
+
+    Returns:
+        The file written.
+
+    Raises:
+        StorageError: the folder cannot be read, or the page cannot be written.
+    """
+    target = Path(output) if output is not None else Path(run_folder) / "report.html"
+    return write_twin_page(read_free_runs(run_folder), target, title)
+
+
+def write_twin_page(facts: FreeRunFacts, target: str | Path, title: str | None = None) -> Path:
+    """Write the page of free runs that are at hand.
+
+    Raises:
+        StorageError: the page cannot be written.
+    """
+    write_bytes(Path(target), render(facts, title).encode("utf-8", "replace"))
+    return Path(target)
+
+
+def render(facts: FreeRunFacts, title: str | None = None) -> str:
+    """The page's text."""
+    plots = twin_plots(facts)
+    context: dict[str, Any] = {
+        "title": title or facts.title,
+        "headline": unbroken(words.headline(facts)),
+        "verdict": words.verdict(facts),
+        "tiles": words.tiles(facts),
+        "sheets": {name: sheet.table() for name, sheet in words.sheets_of(facts).items()},
+        "provenance": provenance_rows(facts.provenance),
+        "parts": [part for part in words.PARTS if f"runs_{part}" in plots],
+        **shown(plots),
+    }
+    return template("twin.html.jinja").render(**context)
+
+
+def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Where the twin comes from, as name and text."""
+    data = provenance.get("data")
+    seconds = provenance.get("seconds")
+    rows = [
+        ("Recordings", str(data.get("source", "")) if isinstance(data, dict) else ""),
+        ("Trained in", duration(seconds) if isinstance(seconds, int | float) else ""),
+        ("Written", moment(provenance.get("created"))),
+        ("Command", str(provenance.get("command", ""))),
+        ("EDP", str(provenance.get("edp_version", ""))),
+    ]
+    return [(name, text) for name, text in rows if text]

@@ -1,0 +1,128 @@
+"""The page of a twin: what it shows, kinds of channels apart, and names that are only names."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from edp.data.twin_channels import TwinChannels
+from edp.errors import StorageError
+from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores
+from edp.networks.twin import calibrate
+from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles
+from edp.report.twin.figures import twin_plots
+from edp.report.twin.page import render
+from edp.signals import Channel, Kind
+from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
+
+HOSTILE = "</script><img src=x onerror=alert(1)>"
+SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), covered_at_s=(0.2, 1.0))
+
+
+def judged(strokes=True, name="boom"):
+    """Scores and runs of a twin of one cylinder with noise for errors, in two recordings."""
+    stroke = (Channel(f"{name} stroke", Kind.POSITION),) if strokes else ()
+    channels = TwinChannels(
+        (Channel("u", Kind.RATIO),), (Channel(name, Kind.VELOCITY),), stroke, (Channel("p", Kind.PRESSURE),), 10.0
+    )
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(4, 30, len(channels.answers))).astype(np.float32)
+    answers = truth + rng.normal(0, 1e-3, truth.shape).astype(np.float32)
+    size = 3 * np.ones(len(channels.answers), np.float32)
+    runs = FreeRuns(channels, ("a", "a", name, name), answers, truth, truth[:, 0], -size, size)
+    intervals = calibrate(answers - truth, 0.9)
+    scores = free_run_scores(runs, SPEC, intervals, {"a": "dig", name: "grade"})
+    return {"twin": scores, "static": free_run_scores(runs, SPEC)}, runs, intervals
+
+
+def facts_of(**options):
+    scores, runs, intervals = judged(**options)
+    content = {"schema": 2, "channels": channel_facts(runs.channels), "models": json.loads(json.dumps(scores))}
+    return FreeRunFacts("m22", content, shown_runs(runs, intervals))
+
+
+def test_each_kind_of_channel_has_its_own_unit_and_figure():
+    facts = facts_of()
+    plots = twin_plots(facts)
+    assert set(plots) == {"runs_velocities", "runs_strokes", "runs_pressures", "horizon"}
+    titles = [note.text for note in plots["horizon"].figure.layout.annotations]
+    assert titles == ["Velocities [mm/s]", "Strokes [mm]", "Pressures [bar]"]
+    assert "mm after 1 s" in headline(facts).replace("\xa0", " ")
+    assert [unit for _, unit, what in tiles(facts) if "error" in what] == ["mm/s", "mm", "mm", ""]
+
+
+def test_a_run_is_drawn_with_its_interval():
+    facts = facts_of()
+    figure = twin_plots(facts)["runs_velocities"].figure
+    low, high, truth, answers = figure.data[:4]
+    assert high.fill == "tonexty"
+    assert len(truth.y) == 30
+    np.testing.assert_allclose((np.array(high.y) + low.y) / 2, answers.y, rtol=1e-2, atol=2.0)
+    assert [trace.visible for trace in figure.data[::4]] == [True, False]
+    assert (np.array(high.y) > low.y).all()
+
+
+def test_tables_say_what_the_scores_hold():
+    facts = facts_of()
+    sheets = sheets_of(facts)
+    assert list(sheets) == ["models", "recordings", "driving", "situations", "intervals"]
+    assert [row[0] for row in sheets["driving"].rows] == ["dig", "grade"]
+    assert sheets["models"].rows[0][2] == facts.twin["velocity_mae"]["mean"]
+    assert sheets["intervals"].rows[1][2] == facts.twin["intervals"]["at"][1]["velocities"]["half_width"]["mean"]
+    worst = [max(row[3:5]) for row in sheets["recordings"].rows]
+    assert len(worst) == 2
+
+
+def test_a_twin_without_strokes_has_a_page_too():
+    facts = facts_of(strokes=False)
+    assert "runs_strokes" not in twin_plots(facts)
+    assert "Strokes off by" in render(facts)
+
+
+def test_names_are_text_on_the_page():
+    page = render(facts_of(name=HOSTILE), title=HOSTILE)
+    assert "onerror=alert(1)>" not in page.replace("&gt;", "")
+    assert "<img src=x" not in page
+
+
+@pytest.fixture
+def folder(tmp_path):
+    scores, runs, intervals = judged()
+    write_scores(tmp_path, scores, runs, intervals)
+    return tmp_path
+
+
+def test_what_was_written_is_read(folder):
+    facts = read_free_runs(folder)
+    assert facts.names == ["a", "boom"]
+    assert render(replace(facts, title="m22")).count('class="figure"') == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content.update(schema=1), "of another version of EDP"),
+        (lambda content: content["models"].pop("twin"), "the key 'twin'"),
+        (lambda content: content["models"]["twin"]["velocity_mae"].update(mean="low"), "models.twin.velocity_mae.mean"),
+        (lambda content: content["models"]["twin"]["stroke_error"][0].pop("unit"), "the key 'unit'"),
+        (lambda content: content["channels"]["pressures"].append({"name": 3}), "channels.pressures"),
+        (lambda content: content["channels"]["pressures"].clear(), "does not fit its scores"),
+    ],
+)
+def test_damaged_scores_are_refused_with_what_is_wrong(folder, change, message):
+    content = json.loads((folder / "free_run.json").read_text())
+    change(content)
+    (folder / "free_run.json").write_text(json.dumps(content))
+    with pytest.raises(StorageError, match=message):
+        read_free_runs(folder)
+
+
+def test_damaged_runs_are_refused(folder):
+    (folder / "free_runs.safetensors").write_bytes(save({"seconds": np.zeros(1, np.float32)}))
+    with pytest.raises(StorageError, match="does not fit its scores: 'seconds'"):
+        read_free_runs(folder)
+    (folder / "free_runs.safetensors").write_bytes(b"x")
+    with pytest.raises(StorageError, match="cannot read"):
+        read_free_runs(folder)
