@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Generator
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import compiled
 import numpy as np
 import process_guard
+import processor_time
 import pytest
 import torch
 
@@ -164,16 +166,24 @@ def task_of(form: Form, model: ModelSpec) -> Task:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--no-processes", action="store_true", help="leave out what starts processes, and refuse them")
+    parser.addoption("--processor-times", action="store_true", help="print where the processor time goes")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Fill the cache of compiled code before workers start: side by side each would compile its own variant."""
     if config.getoption("--no-processes"):
         process_guard.install()
+    if config.getoption("--processor-times"):
+        config.pluginmanager.register(processor_time)
     cache = config.rootpath / ".pytest_cache" / "compiled"
     compiled.install(cache)
     if not hasattr(config, "workerinput"):
         compiled.warm_numba(cache)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Files that `--no-processes` leaves out whole are not imported: their libraries cost each worker seconds."""
+    return True if config.getoption("--no-processes") and process_guard.leaves_out(collection_path) else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

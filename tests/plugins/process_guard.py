@@ -80,7 +80,7 @@ class ProcessStartedError(BaseException):
 def starts_processes(item: pytest.Item) -> bool:
     """Whether a test's folder or one of its fixtures starts processes."""
     place = _place(item)
-    of_folder = place.startswith(tuple(f"{folder}/" for folder in (*FOLDERS, "unit/api"))) or _in_unit(place, FILES)
+    of_folder = _in_folders(place) or _in_unit(place, FILES)
     of_name = any(name in item.name for name in NAMES)
     return of_folder or of_name or bool(FIXTURES & set(getattr(item, "fixturenames", ())))
 
@@ -88,6 +88,18 @@ def starts_processes(item: pytest.Item) -> bool:
 def takes_long(item: pytest.Item) -> bool:
     """Whether a test trains networks for seconds: none of the quick check either."""
     return _in_unit(_place(item), TRAINING)
+
+
+def leaves_out(path: Path) -> bool:
+    """Whether no test of a file belongs to the quick check: it need not be imported, nor what it imports."""
+    place = path.relative_to(HERE).as_posix() if path.is_relative_to(HERE) and path.suffix == ".py" else ""
+    return _in_folders(place) or _in_unit(place, FILES | TRAINING)
+
+
+def _in_folders(place: str) -> bool:
+    return place.startswith(tuple(f"{folder}/" for folder in (*FOLDERS, "unit/api"))) and not place.endswith(
+        "conftest.py"
+    )
 
 
 def _place(item: pytest.Item) -> str:
