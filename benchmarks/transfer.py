@@ -27,7 +27,7 @@ from common import finish, in_folder, kept, parser
 from edp.config.experiment import load_experiment
 from edp.data.prepared import Prepared, prepare
 from edp.networks.predictor import build_model
-from edp.report.common.drawing import write_drawings
+from edp.report.common.picture import write_drawings
 from edp.sim.data_set import find_data_set_limit
 from edp.sim.physics.soil import material_names
 from edp.sim.predictability import LimitSpec

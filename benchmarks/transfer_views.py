@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from common import Verdict, table, verdict
-from edp.report.common.drawing import BLUE, DROPPED, INK
+from edp.report.common.chart import BLUE, DROPPED, INK
 from edp.workflows.transfer import METHODS
 
 HORIZON = "10"

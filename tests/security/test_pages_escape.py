@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edp.report.common.drawing import NOT_XML, write_drawings
+from edp.report.common.picture import NOT_XML, write_drawings
 from edp.report.common.sheets import Column, Sheet
 from edp.report.common.templates import template
 from edp.report.common.wording import in_cell, in_markdown, printable

@@ -1,18 +1,17 @@
-"""The report of a run: `facts` reads, `figures` computes, `plots` draws, `page` writes one offline HTML file."""
+"""The report of a run: `facts` reads, `figures` computes, `charts` describes, `page` writes one offline HTML file."""
 
 from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.compression.page import write_compression_page
 from edp.report.coverage.page import build_coverage_page
 from edp.report.run.facts import Facts, comparison_rows, headline, read_facts
 from edp.report.run.page import build_report
-from edp.report.screening.page import build_screening_page
-from edp.report.screening.pictures import write_pictures
+from edp.report.screening.page import build_screening_page, write_screening_pictures
 from edp.report.search.page import StudyReport, write_study_page
 from edp.report.transfer.facts import Transfer, read_transfer
 from edp.report.transfer.page import write_transfer_page
+from edp.report.twin.charts import write_rollout_plots
 from edp.report.twin.facts import FreeRunFacts, holds_free_runs
 from edp.report.twin.page import build_twin_report, write_twin_page
-from edp.report.twin.plots import write_rollout_plots
 
 __all__ = [
     "CompressionFacts",
@@ -31,8 +30,8 @@ __all__ = [
     "read_facts",
     "read_transfer",
     "write_compression_page",
-    "write_pictures",
     "write_rollout_plots",
+    "write_screening_pictures",
     "write_study_page",
     "write_transfer_page",
     "write_twin_page",

@@ -99,7 +99,7 @@ def test_screen_proposes_and_a_training_uses_it(edp, logs, tmp_path, small):
 def test_screen_tries_the_sets_and_draws(edp, logs, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "edp.workflows.feature_selection.select.write_pictures", lambda found, folder: drawn.append(folder)
+        "edp.workflows.feature_selection.select.write_screening_pictures", lambda found, folder: drawn.append(folder)
     )
     (tmp_path / "mine.toml").write_text('channels = ["speed", "dice"]')
     (tmp_path / "tiny.toml").write_text(

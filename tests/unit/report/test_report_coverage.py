@@ -9,8 +9,9 @@ from edp.data.coverage import cover
 from edp.data.splits import ByTime
 from edp.recording import Recording
 from edp.report import build_coverage_page
+from edp.report.common.interactive import plots
+from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.page import headline, render_coverage, verdict
-from edp.report.coverage.plots import coverage_plots
 from edp.signals import EXTRA_CHANNELS, TABLE_A1, VOCABULARY, Channel, Kind
 
 
@@ -37,7 +38,7 @@ def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
     assert "://" not in text.split("<script>")[0]
     assert "a &lt;b&gt;data&lt;/b&gt; set" in text
     names = ["spectrum", "excitation", "occupancy", "joint_command", "joint_head", "joint_rod", "joint_velocities"]
-    assert list(figures_of(text)) == names == list(coverage_plots(found))
+    assert list(figures_of(text)) == names == list(plots(coverage_charts(found)))
     assert all(f'id="figure-{name}"' in text for name in names)
     assert "Not examined" not in text
     for words in ("Reversals", "Both pumps shared", "Power limit", "From test to training", "of 216 cells", "not met"):
@@ -46,7 +47,7 @@ def test_the_page_shows_every_picture_and_loads_nothing(tmp_path):
 
 def test_six_maps_show_every_cell_of_three_strokes():
     found = cover([machine_like()])
-    figure = coverage_plots(found)["occupancy"].figure
+    figure = plots(coverage_charts(found))["occupancy"].figure
     assert len(figure.data) == 6
     total = sum(np.nansum(trace.customdata) for trace in figure.data)
     assert total == pytest.approx(100.0)

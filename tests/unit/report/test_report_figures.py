@@ -3,10 +3,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from edp.report.common.style import BLUE, GREY
+from edp.report.common.chart import BLUE, GREY
+from edp.report.common.interactive import plots
 from edp.report.run import figures
+from edp.report.run.charts import run_charts
 from edp.report.run.facts import NETWORK, TRUTH, read_facts
-from edp.report.run.plots import plots_of
+
+
+def plots_of(facts):
+    return plots(run_charts(facts))
 
 
 @pytest.fixture

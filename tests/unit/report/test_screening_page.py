@@ -20,11 +20,11 @@ from edp.data.screening import (
     Stability,
     Value,
 )
-from edp.report import build_screening_page, write_pictures
-from edp.report.common.drawing import write_drawings
-from edp.report.screening import pictures
+from edp.report import build_screening_page, write_screening_pictures
+from edp.report.common.interactive import plots
+from edp.report.common.picture import write_pictures
+from edp.report.screening.charts import screening_charts
 from edp.report.screening.page import headline, render_screening, sentence, verdict
-from edp.report.screening.plots import screening_plots
 from edp.report.screening.views import lag_ranges, lag_views, matrix_views, stability_views
 
 NAMES = ("v", "u<b>", "late", "noise")
@@ -158,7 +158,7 @@ def test_views_leave_out_what_says_nothing():
 
 
 def test_pictures_are_written_in_two_formats(tmp_path):
-    written = write_pictures(screening(), tmp_path / "a")
+    written = write_screening_pictures(screening(), tmp_path / "a")
     names = {path.name for path in written}
     assert len(written) == len(names) == 2 * (4 + 1 + 5 + 2)
     some = {"matrix_spearman.svg", "matrix_information.png", "lags_v.svg", "stability_lag.png", "value.svg"}
@@ -175,11 +175,8 @@ def test_names_that_mean_something_elsewhere(tmp_path, odd):
     curves = tuple(replace(entry, target=odd) for entry in found.lags)
     found = replace(found, targets=(odd,), lags=curves)
     assert "<script>;" not in render_screening(found, odd)
-    drawings = pictures._drawings(found)
-    (lags,) = [name for name in drawings if name.startswith("lags_")]
-    first, again = (
-        [path.read_bytes() for path in write_drawings(tmp_path / part, {lags: drawings[lags]})] for part in "ab"
-    )
+    lags = [chart for chart in screening_charts(found) if chart.name == "lags"]
+    first, again = ([path.read_bytes() for path in write_pictures(tmp_path / part, lags)] for part in "ab")
     assert first == again
     assert len(list(tmp_path.rglob("*.svg"))) == 2
 
@@ -189,7 +186,7 @@ def test_a_screening_of_many_channels_stays_readable_and_small():
     text = render_screening(screening(names), "many")
     specs = figures_of(text)
     assert specs["matrices"]["figure"]["layout"]["height"] == 1500
-    assert len(specs["lags"]["figure"]["data"]) == 16
+    assert len(specs["lags"]["figure"]["data"]) == 2 * 16  # a curve and its best lag
     assert all(len(trace["y"]) <= 40 for trace in specs["stability"]["figure"]["data"])
     assert len(text) < 8_000_000
 
@@ -197,7 +194,7 @@ def test_a_screening_of_many_channels_stays_readable_and_small():
 def test_nothing_but_a_proposal_is_a_page_too():
     found = screening()
     bare = replace(found, lags=(), stability=(), importance=(), values=(), clusters=(), flags=())
-    assert list(screening_plots(bare)) == ["matrices"]
+    assert list(plots(screening_charts(bare))) == ["matrices"]
     text = render_screening(bare, "bare")
     assert 'id="flags"' not in text
     assert 'id="clusters"' not in text

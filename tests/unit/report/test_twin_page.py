@@ -11,8 +11,9 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import StorageError
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores
 from edp.networks.twin import calibrate
+from edp.report.common.interactive import plots
+from edp.report.twin.charts import twin_charts
 from edp.report.twin.facts import FreeRunFacts, headline, read_free_runs, sheets_of, tiles
-from edp.report.twin.figures import twin_plots
 from edp.report.twin.page import render
 from edp.signals import Channel, Kind
 from edp.workflows.twin.judge_twin import channel_facts, shown_runs, write_scores
@@ -43,11 +44,15 @@ def facts_of(**options):
     return FreeRunFacts("m22", content, shown_runs(runs, intervals))
 
 
+def plots_of(facts):
+    return plots(twin_charts(facts))
+
+
 def test_each_kind_of_channel_has_its_own_unit_and_figure():
     facts = facts_of()
-    plots = twin_plots(facts)
-    assert set(plots) == {"runs_velocities", "runs_strokes", "runs_pressures", "horizon"}
-    titles = [note.text for note in plots["horizon"].figure.layout.annotations]
+    drawn = plots_of(facts)
+    assert set(drawn) == {"runs_velocities", "runs_strokes", "runs_pressures", "horizon"}
+    titles = [note.text for note in drawn["horizon"].figure.layout.annotations]
     assert titles == ["Velocities [mm/s]", "Strokes [mm]", "Pressures [bar]"]
     assert "mm after 1 s" in headline(facts).replace("\xa0", " ")
     assert [unit for _, unit, what in tiles(facts) if "error" in what] == ["mm/s", "mm", "mm", ""]
@@ -55,7 +60,7 @@ def test_each_kind_of_channel_has_its_own_unit_and_figure():
 
 def test_a_run_is_drawn_with_its_interval():
     facts = facts_of()
-    figure = twin_plots(facts)["runs_velocities"].figure
+    figure = plots_of(facts)["runs_velocities"].figure
     low, high, truth, answers = figure.data[:4]
     assert high.fill == "tonexty"
     assert len(truth.y) == 30
@@ -77,7 +82,7 @@ def test_tables_say_what_the_scores_hold():
 
 def test_a_twin_without_strokes_has_a_page_too():
     facts = facts_of(strokes=False)
-    assert "runs_strokes" not in twin_plots(facts)
+    assert "runs_strokes" not in plots_of(facts)
     assert "Strokes off by" in render(facts)
 
 

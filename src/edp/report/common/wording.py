@@ -48,6 +48,11 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else "\ufffd" for c in text)
 
 
+def printable_lines(text: str) -> str:
+    """The same for text of several lines."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 def short_label(name: str) -> str:
     """A name as a picture shows it: at most 32 characters, the middle of a longer one left out."""
     if len(name) <= LABEL_START + 1 + LABEL_END:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from edp.report.common.drawing import write_drawings
+from edp.report.common.picture import write_pictures
 from edp.report.common.sheets import Sheet, write_sheets
 from edp.report.common.templates import template
 from edp.report.common.wording import unbroken
 from edp.report.compression import facts as words
+from edp.report.compression.charts import compression_charts
 from edp.report.compression.facts import CompressionFacts, read_compression
-from edp.report.compression.plots import compression_plots, drawings
 from edp.report.run.page import shown
 from edp.storage import write_bytes
 
@@ -31,7 +31,7 @@ def write_compression_page(folder: str | Path, pictures: bool = True) -> Path:
     write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
     write_sheets(facts.folder / "tables", tables)
     if pictures:
-        write_drawings(facts.folder / "pictures", drawings(facts))
+        write_pictures(facts.folder / "pictures", compression_charts(facts))
     return page
 
 
@@ -46,7 +46,6 @@ def sheets(facts: CompressionFacts) -> list[Sheet]:
 
 def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
     """The page's text."""
-    plots = compression_plots(facts)
     context: dict[str, Any] = {
         "title": facts.folder.resolve().name,
         "headline": unbroken(words.headline(facts)),
@@ -57,6 +56,6 @@ def render(facts: CompressionFacts, tables: list[Sheet]) -> str:
         "held_out": next((sheet.table() for sheet in tables if sheet.name == "held_out_test"), None),
         "opened": facts.content["held_out_test"].get("opened", ""),
         "budget": facts.content["budget"],
-        **shown(plots),
+        **shown(compression_charts(facts)),
     }
     return template("compression.html.jinja").render(**context)

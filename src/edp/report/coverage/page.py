@@ -12,7 +12,7 @@ from edp.logs import DataQuality
 from edp.report.common.tables import TextTable
 from edp.report.common.templates import template
 from edp.report.common.wording import MISSING, listed, number, percent, unbroken, whole
-from edp.report.coverage.plots import coverage_plots
+from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
 from edp.storage import write_bytes
@@ -37,7 +37,7 @@ def build_coverage_page(coverage: Coverage, output: str | Path, title: str, qual
 
 def render_coverage(coverage: Coverage, title: str, quality: DataQuality | None = None) -> str:
     """The page's text."""
-    plots = coverage_plots(coverage)
+    charts = coverage_charts(coverage)
     context: dict[str, Any] = {
         "title": title,
         "size": f"{coverage.recordings} recording{'s' * (coverage.recordings != 1)}, {number(coverage.hours, 2)} h at "
@@ -45,7 +45,7 @@ def render_coverage(coverage: Coverage, title: str, quality: DataQuality | None 
         "headline": unbroken(headline(coverage)),
         "verdict": verdict(coverage),
         "tiles": tiles(coverage),
-        **shown(plots),
+        **shown(charts),
         "wanted": wanted_table(coverage),
         "found": coverage,
         "quality": {} if quality is None else quality_tables(quality),

@@ -1,6 +1,6 @@
 """What a notebook shows of recordings, predictions, scores and studies: tables as HTML, figures that stand alone."""
 
-from edp.report.notebook.plots import BandLine, prediction_figure, recordings_figure, score_figure, study_figure
+from edp.report.notebook.figures import BandLine, prediction_figure, recordings_figure, score_figure, study_figure
 from edp.report.notebook.tables import html_of, score_tables, study_html, text_of
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What each figure shows, as plain data: aligned, downsampled, binned. `plots` draws it."""
+"""What each figure shows, as plain data: aligned, downsampled, binned. `charts` says how it looks."""
 
 from __future__ import annotations
 

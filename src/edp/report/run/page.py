@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,14 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from edp.report.common import tables
-from edp.report.common.style import Plot
+from edp.report.common.chart import Chart
+from edp.report.common.interactive import plots
 from edp.report.common.templates import template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
+from edp.report.run.charts import DOTS_AT_MOST, run_charts
 from edp.report.run.choice import candidates_table, model_tables, promise_table, read_choice
 from edp.report.run.foundation import contexts_sheet, machines_sheet, parts_sheet
-from edp.report.run.plots import DOTS_AT_MOST, plots_of
 from edp.storage import write_bytes
 
 
@@ -56,7 +57,6 @@ def render(facts: run.Facts, title: str | None = None) -> str:
 
 def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
     """Everything the template shows."""
-    plots = plots_of(facts)
     task = (facts.scores or {}).get("task", {})
     network = run.label_of(facts, run.NETWORK) if run.NETWORK in facts.models else ""
     return {
@@ -75,7 +75,7 @@ def context(facts: run.Facts, title: str | None = None) -> dict[str, Any]:
         "choice": choice_of(facts),
         "unseen": foundation_tables(facts),
         "worst": tables.worst_recordings_table(facts),
-        **shown(plots),
+        **shown(run_charts(facts)),
         "checks": tables.budget_checks(facts),
         "budget": (facts.footprint or {}).get("budget", {}).get("name", ""),
         "parts": tables.parts_table(facts),
@@ -109,11 +109,12 @@ def foundation_tables(facts: run.Facts) -> dict[str, tables.TextTable]:
     return {sheet.name: sheet.table() for sheet in sheets}
 
 
-def shown(plots: Mapping[str, Plot]) -> dict[str, Any]:
-    """What every page needs to show its plots offline: them, their data, the style and the scripts."""
+def shown(charts: Iterable[Chart]) -> dict[str, Any]:
+    """What every page needs to show its figures offline: them, their data, the style and the scripts."""
+    drawn = plots(charts)
     return {
-        "plots": plots,
-        "specs": script_json([plot.spec() for plot in plots.values()]),
+        "plots": drawn,
+        "specs": script_json([plot.spec() for plot in drawn.values()]),
         "style": Markup(asset("page.css")),
         "script": Markup(asset("page.js")),
         "plotly": Markup(get_plotlyjs()),

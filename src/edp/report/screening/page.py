@@ -8,12 +8,13 @@ from typing import Any
 
 from edp.data.screening import FlagKind, ScreeningResult
 from edp.logs import DataQuality
+from edp.report.common.picture import write_pictures
 from edp.report.common.templates import template
 from edp.report.common.wording import duration, listed, number, unbroken, whole
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
 from edp.report.screening import tables as tables
-from edp.report.screening.plots import screening_plots
+from edp.report.screening.charts import screening_charts
 from edp.report.screening.views import best_groups, joined
 from edp.storage import write_bytes
 
@@ -44,6 +45,22 @@ def build_screening_page(
     return target
 
 
+def write_screening_pictures(screening: ScreeningResult, folder: str | Path) -> list[Path]:
+    """Write every picture as SVG and PNG: matrices, lag curves by target, stability, importance, linear value.
+
+    Args:
+        screening: the screening.
+        folder: where to write; it is made.
+
+    Returns:
+        the files, in order.
+
+    Raises:
+        StorageError: the folder or a file cannot be written.
+    """
+    return write_pictures(folder, screening_charts(screening))
+
+
 def render_screening(
     screening: ScreeningResult,
     title: str,
@@ -52,7 +69,7 @@ def render_screening(
     notes: Sequence[str] = (),
 ) -> str:
     """The page's text."""
-    plots = screening_plots(screening)
+    charts = screening_charts(screening)
     hours = screening.samples / screening.rate_hz / 3600
     context: dict[str, Any] = {
         "title": title,
@@ -61,7 +78,7 @@ def render_screening(
         "headline": unbroken(headline(screening)),
         "verdict": verdict(screening, quality),
         "tiles": tiles(screening),
-        **shown(plots),
+        **shown(charts),
         "found": screening,
         "ahead": f"{screening.horizon} samples ({1e3 * screening.horizon / screening.rate_hz:g} ms)",
         "kept": tables.kept_table(screening),

@@ -1,4 +1,4 @@
-"""What the pictures of a screening show, as plain arrays; `screening_plots` and `pictures` only draw it."""
+"""What the figures of a screening show, as plain arrays; `charts` says how they look."""
 
 from __future__ import annotations
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from edp.report.common.picture import write_pictures
 from edp.report.common.sheets import Sheet
 from edp.report.common.templates import template
 from edp.report.common.wording import in_markdown, number, unbroken
 from edp.report.run.page import shown
 from edp.report.search import words as words
+from edp.report.search.charts import study_charts
 from edp.report.search.facts import StudyFacts, facts_of, reading
-from edp.report.search.pictures import write_study_pictures
-from edp.report.search.plots import study_plots
 from edp.report.search.tables import sheets
 from edp.storage import make_folder, write_bytes
 
@@ -61,7 +61,7 @@ def write_study_page(study: Mapping[str, Any], out: str | Path, pictures: bool =
     for name, sheet in tables.items():
         table_files.append(make_folder(folder / "tables") / f"{name}.csv")
         write_bytes(table_files[-1], sheet.csv().encode("utf-8", "replace"))
-    drawn = reading("study.json", lambda: write_study_pictures(facts, folder / "pictures")) if pictures else []
+    drawn = reading("study.json", lambda: write_pictures(folder / "pictures", study_charts(facts))) if pictures else []
     return StudyReport(target, document, tuple(table_files), tuple(drawn))
 
 
@@ -72,7 +72,6 @@ def _contents(facts: StudyFacts) -> tuple[str, str, dict[str, Sheet]]:
 
 def render_study(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
     """The page's text."""
-    plots = study_plots(study)
     context: dict[str, Any] = {
         "title": study.title,
         "about": _about(study),
@@ -84,7 +83,7 @@ def render_study(study: StudyFacts, tables: Mapping[str, Sheet]) -> str:
         "missing": words.missing,
         "study": study,
         "score": SCORE,
-        **shown(plots),
+        **shown(study_charts(study)),
         "tables": {name: sheet.table() for name, sheet in tables.items()},
         "settings": words.settings(study),
     }

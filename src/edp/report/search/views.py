@@ -1,4 +1,4 @@
-"""What the pictures of a study show, as plain values; `study_plots` and `study_pictures` only draw it."""
+"""What the figures of a study show, as plain values; `charts` says how they look."""
 
 from __future__ import annotations
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from edp.report.common.drawing import write_drawings
+from edp.report.common.picture import write_pictures
 from edp.report.common.sheets import Sheet, write_sheets
 from edp.report.common.templates import template
 from edp.report.common.wording import unbroken
 from edp.report.run.page import shown
 from edp.report.transfer import facts as words
+from edp.report.transfer.charts import picture_charts, transfer_charts
 from edp.report.transfer.facts import Transfer, read_transfer
-from edp.report.transfer.plots import drawings, transfer_plots
 from edp.storage import write_bytes
 
 
@@ -31,13 +31,12 @@ def write_transfer_page(folder: str | Path, pictures: bool = True) -> Path:
     write_bytes(page, render(facts, tables).encode("utf-8", "replace"))
     write_sheets(facts.folder / "tables", tables)
     if pictures:
-        write_drawings(facts.folder / "pictures", drawings(facts))
+        write_pictures(facts.folder / "pictures", picture_charts(facts))
     return page
 
 
 def render(facts: Transfer, tables: list[Sheet]) -> str:
     """The page's text."""
-    plots = transfer_plots(facts)
     context: dict[str, Any] = {
         "title": facts.folder.resolve().name,
         "network": facts.content["network"],
@@ -48,6 +47,6 @@ def render(facts: Transfer, tables: list[Sheet]) -> str:
         "pairs": [sheet.table() for sheet in tables if sheet.name.startswith("pair")],
         "methods": [sheet.table() for sheet in tables if sheet.name.startswith("methods")],
         "both": words.SOURCE in facts.domains,
-        **shown(plots),
+        **shown(transfer_charts(facts)),
     }
     return template("transfer.html.jinja").render(**context)

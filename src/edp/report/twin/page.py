@@ -10,8 +10,8 @@ from edp.report.common.templates import template
 from edp.report.common.wording import duration, moment, unbroken
 from edp.report.run.page import shown
 from edp.report.twin import facts as words
+from edp.report.twin.charts import twin_charts
 from edp.report.twin.facts import FreeRunFacts, read_free_runs
-from edp.report.twin.figures import twin_plots
 from edp.storage import write_bytes
 
 
@@ -45,7 +45,7 @@ def write_twin_page(facts: FreeRunFacts, target: str | Path, title: str | None =
 
 def render(facts: FreeRunFacts, title: str | None = None) -> str:
     """The page's text."""
-    plots = twin_plots(facts)
+    figures = shown(twin_charts(facts))
     context: dict[str, Any] = {
         "title": title or facts.title,
         "headline": unbroken(words.headline(facts)),
@@ -53,8 +53,8 @@ def render(facts: FreeRunFacts, title: str | None = None) -> str:
         "tiles": words.tiles(facts),
         "sheets": {name: sheet.table() for name, sheet in words.sheets_of(facts).items()},
         "provenance": provenance_rows(facts.provenance),
-        "parts": [part for part in words.PARTS if f"runs_{part}" in plots],
-        **shown(plots),
+        "parts": [part for part in words.PARTS if f"runs_{part}" in figures["plots"]],
+        **figures,
     }
     return template("twin.html.jinja").render(**context)
 

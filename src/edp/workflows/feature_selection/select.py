@@ -19,7 +19,7 @@ from edp.logs.formats.base import is_truth
 from edp.logs.resolve import resolve
 from edp.logs.source import DataSource
 from edp.recording import Recording
-from edp.report import build_screening_page, write_pictures
+from edp.report import build_screening_page, write_screening_pictures
 from edp.signals import VOCABULARY, SignalMap
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import command_line
@@ -129,7 +129,7 @@ def select_features(
     if trials is not None:
         files["trials"] = folder / "trials"
     if order.pictures:
-        write_pictures(screening, folder / "pictures")
+        write_screening_pictures(screening, folder / "pictures")
         files["pictures"] = folder / "pictures"
     title = source.path.resolve().stem
     tried = None if trials is None else trials.to_json()

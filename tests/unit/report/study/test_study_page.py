@@ -9,9 +9,10 @@ import pytest
 
 from edp.errors import EdpError, StorageError
 from edp.report import write_study_page
+from edp.report.common.interactive import plots
+from edp.report.search.charts import study_charts
 from edp.report.search.facts import NUMBERS, facts_of
 from edp.report.search.page import render_study, study_text
-from edp.report.search.plots import study_plots
 from edp.report.search.tables import identifiers, sheets
 from edp.report.search.views import PointView, arm_views, forests, front, point_views, top_of, tracks
 from edp.report.search.words import caveats, decided, headline, missing, tiles, verdict
@@ -28,6 +29,10 @@ PHASES = (
     "exploration",
     "compression",
 )
+
+
+def plots_of(facts):
+    return plots(study_charts(facts))
 
 
 def page_of(study):
@@ -121,8 +126,8 @@ def test_a_study_that_is_only_partly_done(request, unfinished, mode, last):
         known = name in facts.facts
         assert known == (PHASES.index(name) < place)
         assert known or lines[1][0].startswith(("Under way: ", "Has not begun."))
-    assert ("variance" in study_plots(facts)) == (place > 0)
-    assert ("confirmation" in study_plots(facts)) == (place > 4)
+    assert ("variance" in plots_of(facts)) == (place > 0)
+    assert ("confirmation" in plots_of(facts)) == (place > 4)
     assert f"{place} of 8 phases are decided" in headline(facts) or place > 5
     assert f"The search is running in phase {NUMBERS[last]}" in " ".join(verdict(facts))
     ended = sum(held["status"] != "waiting" for held in study["history"])
@@ -192,7 +197,7 @@ def test_the_history_keeps_failures_apart(sound):
     assert sum(len(view.places) for view in views) == len(sound["history"])
     top = top_of(score for view in views for score in view.scores)
     assert top < 20
-    named = {trace.name: trace for trace in study_plots(facts_of(sound))["history"].figure.data}
+    named = {trace.name: trace for trace in plots_of(facts_of(sound))["history"].figure.data}
     assert len(named["failed"].x) == sum(held["score"] is None for held in sound["history"])
     assert len(named["above the scale"].x) == 1
     assert [len(view.places) for view in views if view.heading == "Phase 4, test sessions"] == [4]
@@ -209,7 +214,7 @@ def test_what_was_pruned_is_no_failure(sound, tmp_path):
     sound["history"][place] |= {"status": "pruned", "score": None, "rung": 50}
     sound["phases"][1]["pruned"] = 1
     facts = facts_of(sound)
-    named = {trace.name: trace for trace in study_plots(facts)["history"].figure.data}
+    named = {trace.name: trace for trace in plots_of(facts)["history"].figure.data}
     assert named["pruned"].x == (place + 1,)
     assert len(named["failed"].x) == failed
     assert tiles(facts)[0][2] == f"trainings, 1 of them pruned, {failed} of them failed"

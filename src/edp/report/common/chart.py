@@ -1,0 +1,344 @@
+"""What a figure shows, as plain data: `interactive` draws it on a page, `picture` into files."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+INK, SOFT, RULE, FRAME = "#26303a", "#66717d", "#e4e8ec", "#c4cbd2"
+BLUE, GREY, DROPPED = "#0b57d0", "#3c4650", "#b4bcc5"
+MUTED = ("#c9892f", "#5a9c8c", "#a97da0", "#8b929a", "#a5a04a", "#b9705c")
+SHADES = (*MUTED, GREY)
+"""Colours of series that are equals: the network's blue is not among them."""
+LINES = (BLUE, *SHADES)
+DASHES: tuple[Dash, ...] = ("solid", "dash", "dot", "dashdot")
+SEQUENTIAL = ("#f7fafe", "#b7d0f7", "#6d9fec", "#2567d3", "#062c74")
+DIVERGING = ("#7a4a06", "#d79a3c", "#ffffff", "#6d9fec", "#062c74")
+"""Negative in the muted orange of the house, positive in its blue; equal steps look equally strong."""
+ROUND_TICKS = tuple((float(step * 10**power), f"{step * 10 ** (power % 3)}{unit}")
+                    for power, unit in zip(range(1, 10), ("", "", "k", "k", "k", "M", "M", "M", "G"))
+                    for step in (1, 2, 5))  # fmt: skip
+"""Ticks of a logarithmic axis of costs: 10, 20, 50 ... 1k ... 5G."""
+
+Dash = Literal["solid", "dash", "dot", "dashdot"]
+Symbol = Literal["", "circle", "ring", "diamond", "square", "triangle", "x", "cross", "star", "tick", "dash"]
+SYMBOLS: tuple[Symbol, ...] = ("diamond", "square", "triangle", "x", "cross", "star")
+"""Symbols of series that are equals: colour is never the only difference."""
+Values = Sequence[float | None] | NDArray[np.floating]
+Positions = Sequence[float | None] | Sequence[str] | NDArray[np.floating] | NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class Evenly:
+    """Positions at a fixed step, which take no room on a page."""
+
+    start: float
+    step: float
+
+
+@dataclass(frozen=True)
+class ChartAxis:
+    """One axis of a panel.
+
+    Attributes:
+        title: with its unit.
+        titled_by: choice whose option is the title in a picture, where nobody can choose.
+        kind: ``names`` has one position for each name, in the order in which the marks name them.
+        limits: both ends, None for those of the data.
+        ticks: position and text; none leaves them to the renderer.
+        from_zero: whether zero is in sight.
+        upside_down: whether values grow downwards or to the left.
+        grid: whether hairlines cross the panel; None draws those of vertical axes.
+        zero: colour of a line at zero; empty for none.
+        shown: whether there is more of it than its positions.
+        slant: degrees by which tick texts are turned.
+        small: whether tick texts are small.
+    """
+
+    title: str = ""
+    titled_by: str = ""
+    kind: Literal["linear", "log", "names"] = "linear"
+    limits: tuple[float, float] | None = None
+    ticks: tuple[tuple[float, str], ...] = ()
+    from_zero: bool = False
+    upside_down: bool = False
+    grid: bool | None = None
+    zero: str = ""
+    shown: bool = True
+    slant: int = 0
+    small: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mark:
+    """What a panel can hold.
+
+    Attributes:
+        name: in the legend; marks of one name share an entry, and an empty name has none.
+        group: marks that the reader hides together; empty for those of the same name.
+        when: option by choice for which it is shown; a choice that is not named does not matter.
+        second: whether it belongs to the second vertical axis.
+        hover: text at a point of a page, with ``{x}``, ``{y}`` and ``{label}`` as in `str.format`; None for no text.
+        labels: text a point, for `hover`.
+        remark: instead of the name beside that text; None for the name.
+    """
+
+    name: str = ""
+    group: str = ""
+    when: Mapping[str, str] = field(default_factory=dict)
+    second: bool = False
+    hover: str | None = "{y:.4g}"
+    labels: Sequence[str] = ()
+    remark: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSeries(Mark):
+    """Points, joined by a line, marked by symbols, or both.
+
+    Attributes:
+        x, y: positions; None or NaN breaks the line.
+        low, high: ends of a horizontal interval at each point; empty for none.
+        colour: of line and symbols.
+        width: of the line in pixels; 0 for none.
+        dash: of the line.
+        step: ``after`` keeps a value up to the next position, ``middle`` to the middle between both.
+        symbol, size: of the points, in pixels; empty for none.
+        edge: colour of a frame around the symbols; empty for none.
+        opacity: 0 to 1.
+        filled: whether the area to zero is tinted.
+        clipped: whether what lies beyond the axes is cut off.
+        rank: position in the legend, lower first.
+    """
+
+    x: Positions | Evenly
+    y: Positions
+    low: Values = ()
+    high: Values = ()
+    colour: str = BLUE
+    width: float = 0.0
+    dash: Dash = "solid"
+    step: Literal["", "after", "middle"] = ""
+    symbol: Symbol = ""
+    size: float = 7.0
+    edge: str = ""
+    opacity: float = 1.0
+    filled: bool = False
+    clipped: bool = True
+    rank: int = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Range(Mark):
+    """The area between two lines over the same positions."""
+
+    x: Positions | Evenly
+    low: NDArray[np.floating]
+    high: NDArray[np.floating]
+    colour: str = BLUE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bars(Mark):
+    """Bars from zero.
+
+    Attributes:
+        positions: where they stand: names or numbers.
+        values: how far they reach.
+        colours: of each bar.
+        horizontal: whether they lie.
+        low, high: ends of an interval at each bar; empty for none.
+        valued: whether the value stands at the end of each bar.
+        width: share of a position that a bar takes.
+    """
+
+    positions: Positions
+    values: Values
+    colours: Sequence[str]
+    horizontal: bool = False
+    low: Values = ()
+    high: Values = ()
+    valued: bool = False
+    width: float = 0.66
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cells(Mark):
+    """A matrix as colours.
+
+    Attributes:
+        x, y: positions of columns and rows: names or numbers.
+        values: ``(row, column)``, which colours show; NaN stays white.
+        shown: the same in the reader's unit, for `hover` as ``{label}``; None where `values` are.
+        scale: colours from the lowest to the highest.
+        ends: values of the first and last colour.
+        unit: above the bar of colours.
+        ticks: of that bar; none leaves them to the renderer.
+        written: whether each cell holds its value.
+        gap: whether a white hairline parts the cells.
+        barred: whether the bar of colours stands beside; panels of one scale need one.
+    """
+
+    x: Positions
+    y: Positions
+    values: NDArray[np.floating]
+    shown: NDArray[np.floating] | None = None
+    scale: tuple[str, ...] = SEQUENTIAL
+    ends: tuple[float, float] = (0.0, 1.0)
+    unit: str = ""
+    ticks: tuple[tuple[float, str], ...] = ()
+    written: bool = False
+    gap: bool = False
+    barred: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texts(Mark):
+    """Words at points of a panel, right of them and, if `raised`, above them."""
+
+    x: Positions
+    y: Positions
+    texts: Sequence[str]
+    raised: bool = False
+    colour: str = INK
+    hover: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuideLine(Mark):
+    """A line across a panel at a position of one axis, or up to `to` a band; it belongs to every choice."""
+
+    x: float | None = None
+    y: float | None = None
+    to: float | None = None
+    colour: str = SOFT
+    width: float = 1.0
+    dash: Dash = "solid"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Marks in one pair of axes, with a second vertical axis where one is given; later marks lie above."""
+
+    marks: tuple[Mark, ...]
+    x: ChartAxis = field(default_factory=ChartAxis)
+    y: ChartAxis = field(default_factory=ChartAxis)
+    title: str = ""
+    second: ChartAxis | None = None
+
+    def of(self, chosen: Mapping[str, str]) -> Panel:
+        """The panel with the marks of the options chosen."""
+        return replace(self, marks=tuple(mark for mark in self.marks if fits(mark, chosen)))
+
+
+@dataclass(frozen=True)
+class Control:
+    """A choice above a figure.
+
+    Attributes:
+        key: by which marks name it (`Mark.when`).
+        label: beside the selector.
+        options: key and text of each; the first is shown first.
+        keeps_zoom: whether another option keeps the axes where the reader left them.
+        alone: whether a single option is shown, too.
+    """
+
+    key: str
+    label: str
+    options: tuple[tuple[str, str], ...]
+    keeps_zoom: bool = False
+    alone: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure: panels, row by row, and the choices that a reader has.
+
+    Attributes:
+        name: on a page.
+        panels: all of them.
+        file: name of its pictures, with ``{key}`` for the option of a choice; empty writes none.
+        title: of a picture, with the texts of options in the same way; a page has headings of its own.
+        columns: panels beside each other.
+        choices: of the reader; a picture is made for each combination.
+        across: choice whose options a picture shows side by side instead.
+        height: on a page, pixels.
+        inches: width and height of a picture; with `across` those of one option.
+        legend: where it stands.
+        shares: of the height that the rows, or of the width that the columns take, where they differ.
+        together: whether panels share their horizontal axis, and the pointer shows all series at a position.
+    """
+
+    name: str
+    panels: tuple[Panel, ...]
+    file: str = ""
+    title: str = ""
+    columns: int = 1
+    choices: tuple[Control, ...] = ()
+    across: str = ""
+    height: int = 440
+    inches: tuple[float, float] = (9.0, 4.4)
+    legend: Literal["top", "right", "none"] = "top"
+    shares: tuple[float, ...] = ()
+    together: bool = False
+
+    @property
+    def rows(self) -> int:
+        """Rows of panels."""
+        return -(-len(self.panels) // self.columns)
+
+    def first(self) -> Chart:
+        """The chart with the first option of each choice, where nobody can choose another."""
+        chosen = {control.key: control.options[0][0] for control in self.choices}
+        return replace(self, panels=tuple(panel.of(chosen) for panel in self.panels), choices=())
+
+    def pictures(self) -> Iterator[Chart]:
+        """One chart without choices for each picture: `name` is the file's, `title` and axes say what was chosen."""
+        across = next((control for control in self.choices if control.key == self.across), None)
+        chosen_by = [control for control in self.choices if control is not across]
+        for options in itertools.product(*(control.options for control in chosen_by)):
+            texts = {control.key: text for control, (_, text) in zip(chosen_by, options)}
+            chosen = {control.key: key for control, (key, _) in zip(chosen_by, options)}
+            panels = [_titled(panel.of(chosen), texts) for panel in self.panels]
+            width, height = self.inches
+            if across is not None:
+                parts = [(text, panel.of({across.key: key})) for key, text in across.options for panel in panels]
+                panels = [replace(panel, title=text) for text, panel in parts if panel.marks]
+                width = max(width * len(panels), 7.0)  # one panel alone still has room for a title
+            if any(panel.marks for panel in panels):
+                yield replace(
+                    self, name=_filled(self.file, chosen), title=_filled(self.title, texts), panels=tuple(panels),
+                    columns=len(panels) if across else self.columns, choices=(), inches=(width, height),
+                )  # fmt: skip
+
+
+def fits(mark: Mark, chosen: Mapping[str, str]) -> bool:
+    """Whether a mark is shown for the options chosen."""
+    return all(mark.when.get(key, option) == option for key, option in chosen.items())
+
+
+def with_unit(text: str, unit: str) -> str:
+    """An axis title, its unit in brackets."""
+    return f"{text} [{unit}]" if unit else text
+
+
+def finite(value: float, digits: int = 5) -> float | None:
+    """A value of a few digits, so that a page stays small; None where there is none."""
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+
+
+def _titled(panel: Panel, texts: Mapping[str, str]) -> Panel:
+    x = panel.x
+    return replace(panel, x=replace(x, title=texts[x.titled_by])) if x.titled_by in texts else panel
+
+
+def _filled(text: str, values: Mapping[str, str]) -> str:
+    for key, value in values.items():
+        text = text.replace(f"{{{key}}}", value)
+    return text

@@ -1,0 +1,132 @@
+"""Figures of a search for a smaller network: the size profile of figures 4.5 and 4.6, and the front."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from edp.report.common.chart import (
+    BLUE,
+    DROPPED,
+    GREY,
+    MUTED,
+    ROUND_TICKS,
+    RULE,
+    SOFT,
+    Bars,
+    Chart,
+    ChartAxis,
+    Control,
+    DataSeries,
+    Mark,
+    Panel,
+    Symbol,
+    with_unit,
+)  # fmt: skip
+from edp.report.compression.facts import COSTS, CompressionFacts
+
+AHEAD, COST = "horizon", "cost"
+STAGES: tuple[tuple[str, str, Symbol, float, str], ...] = (
+    ("before", "MAE in float32", "ring", 13, GREY),
+    ("scores", "MAE in its format", "circle", 7, BLUE),
+)
+"""Key of the scores, name, symbol, its size and its colour."""
+
+
+def compression_charts(facts: CompressionFacts) -> list[Chart]:
+    """Every figure."""
+    return [profile_chart(facts), front_chart(facts)]
+
+
+def profile_chart(facts: CompressionFacts) -> Chart:
+    """Parameters as bars and MAE before and after (left), composite scores with the front marked (right)."""
+    indices = facts.smallest()
+    rows = [facts.rows[index] for index in indices]
+    names = [row["name"] for row in rows]
+    unit, front = facts.content["unit"], facts.content["front"]
+    sizes = [row["resource_usage"]["parameters"] for row in rows]
+    left: list[Mark] = [
+        Bars(positions=names, values=sizes, colours=[RULE] * len(rows), name="parameters", hover="{y:,}"),
+    ]
+    right: list[Mark] = []
+    for horizon in facts.horizons:
+        when = {AHEAD: horizon}
+        for key, name, symbol, size, colour in STAGES:
+            values = [facts.mae(row, horizon, key) for row in rows]
+            left.append(DataSeries(
+                x=names, y=values, name=name, symbol=symbol, size=size, colour=colour, second=True, when=when
+            ))  # fmt: skip
+        right.append(Bars(
+            positions=names, values=[row["scores"][horizon]["composite"] for row in rows], when=when,
+            colours=[BLUE if index in front else DROPPED for index in indices],
+        ))  # fmt: skip
+    across = ChartAxis(kind="names", slant=60)
+    error = ChartAxis(with_unit("Mean absolute error", unit), kind="log", ticks=_ticks(facts), grid=False)
+    panels = (
+        Panel(tuple(left), across, ChartAxis("Parameters", kind="log", ticks=ROUND_TICKS), second=error),
+        Panel(tuple(right), across, ChartAxis(with_unit("Composite score, the front in blue", unit))),
+    )
+    choice = Control(AHEAD, "Horizon", tuple((horizon, facts.ahead(horizon)) for horizon in facts.horizons))
+    return Chart(
+        "profile", panels, file="profile_k{horizon}", title="{horizon}", columns=2, choices=(choice,), height=480,
+        inches=(max(8.0, 0.5 * len(rows) + 4), 4.2),
+    )  # fmt: skip
+
+
+def front_chart(facts: CompressionFacts) -> Chart:
+    """Error over that of the teacher against a cost, with the limit of the budget."""
+    groups = list(dict.fromkeys(row["label"] for row in facts.rows))
+    errors = [_percent(row) for row in facts.rows]
+    marks: list[Mark] = []
+    for cost in COSTS:
+        when = {COST: cost}
+        line = _front(facts, cost)
+        marks.append(DataSeries(
+            x=[x for x, _ in line], y=[y for _, y in line], name="front", width=2, step="after", when=when, hover=None
+        ))  # fmt: skip
+        for position, group in enumerate(groups):
+            rows = [row for row in facts.rows if row["label"] == group]
+            marks.append(DataSeries(
+                x=[facts.cost(row, cost) for row in rows], y=[_percent(row) for row in rows], name=group, when=when,
+                symbol="circle", size=9, colour=MUTED[position % len(MUTED)], labels=[row["name"] for row in rows],
+                hover="{label}: {y:+.2f} %, {x:,}",
+            ))  # fmt: skip
+        limit = facts.content["budget"][cost]
+        marks.append(DataSeries(
+            x=[limit, limit], y=[min(errors), max(errors)], name="budget", width=2, colour=SOFT, dash="dot", when=when,
+            hover=None,
+        ))  # fmt: skip
+    panel = Panel(
+        tuple(marks),
+        ChartAxis("Cost", titled_by=COST, kind="log", ticks=ROUND_TICKS, grid=True),
+        ChartAxis("Error over the teacher's [%]"),
+    )
+    choices = (Control(COST, "Cost", tuple(COSTS.items())),)
+    return Chart("front", (panel,), file="front_{cost}", title="Error against cost", choices=choices)
+
+
+def _ticks(facts: CompressionFacts) -> tuple[tuple[float, str], ...]:
+    """Five round errors for each horizon, evenly spread on a logarithmic axis."""
+    ticks = set()
+    for horizon in facts.horizons:
+        values = [facts.mae(row, horizon) for row in facts.rows]
+        low, high = min(values), max(values)
+        # A perfect error of zero has no place on a logarithmic axis.
+        ticks |= {float(f"{low * (high / low) ** (step / 4):.2g}") for step in range(5)} if low > 0 else set()
+    apart: list[float] = []
+    for tick in sorted(ticks):
+        # Texts of ticks that differ by less than a twelfth would cover each other.
+        apart += [tick] if not apart or tick > 1.08 * apart[-1] else []
+    return tuple((tick, f"{tick:.3g}") for tick in apart)
+
+
+def _percent(row: Any) -> float:
+    return 100 * (float(row["error"]) - 1)
+
+
+def _front(facts: CompressionFacts, cost: str) -> list[tuple[float, float]]:
+    """Points that no other one betters in error at no greater cost."""
+    line: list[tuple[float, float]] = []
+    for x, y in sorted((facts.cost(row, cost), _percent(row)) for row in facts.rows):
+        if not line or y < line[-1][1]:
+            line.append((x, y))
+    return line

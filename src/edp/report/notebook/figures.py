@@ -1,0 +1,131 @@
+"""Figures for a notebook: one choice of what is shown each, so that they need no script around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, closest
+from edp.recording import Recording
+from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, with_unit
+from edp.report.common.interactive import plot
+from edp.report.common.wording import short_label
+from edp.report.run.charts import horizon_chart
+from edp.report.run.facts import Facts
+from edp.report.run.figures import downsample
+from edp.report.search.charts import study_charts
+from edp.report.search.facts import StudyFacts
+from edp.signals import KINDS, UNITS, Channel
+
+POINTS = 4000
+"""Of a drawn line; longer ones lose samples, but no peaks."""
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True, eq=False)
+class BandLine:
+    """A target over time, SI units.
+
+    Attributes:
+        channel: the target.
+        predicted: float ``(time,)`` at the tick that it speaks of; NaN where nothing was said.
+        measured: the same; None where it was not recorded.
+        lower, upper: bounds of an interval; None where there is none.
+    """
+
+    channel: Channel
+    predicted: Array
+    measured: Array | None = None
+    lower: Array | None = None
+    upper: Array | None = None
+
+
+def recordings_figure(recording: Recording, channels: Sequence[str]) -> go.Figure:
+    """Channels of a recording over time, a row each, in the units of reports."""
+    columns = [recording.channels[recording.index(name)] for name in channels]
+    panels = []
+    for channel in columns:
+        values = recording.column(channel.name)
+        panels.append(_row(channel, [_line(channel, values, recording.rate_hz, short_label(channel.name), BLUE, 1.4)]))
+    return plot(replace(_rows("recordings", panels), legend="none")).figure
+
+
+def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> go.Figure:
+    """Predictions over what was measured, a row a target, with the interval where there is one."""
+    panels = []
+    for line in lines:
+        marks: list[Mark] = []
+        if line.lower is not None and line.upper is not None:
+            # Both bounds at the same places, or the area between them would not close.
+            shown = np.union1d(downsample(line.lower, POINTS // 2), downsample(line.upper, POINTS // 2))
+            low, high = (_in_report_unit(bound, line.channel)[shown] for bound in (line.lower, line.upper))
+            marks.append(Range(x=_seconds(shown, rate_hz), low=_small(low), high=_small(high), name="Interval"))
+        if line.measured is not None:
+            marks.append(_line(line.channel, line.measured, rate_hz, "Measured", GREY, 2.6))
+        marks.append(_line(line.channel, line.predicted, rate_hz, "Predicted", BLUE, 1.5))
+        panels.append(_row(line.channel, marks))
+    return plot(_rows("predictions", panels), title=short_label(title)).figure
+
+
+def score_figure(facts: Facts) -> go.Figure:
+    """Mean absolute error of every judged model, against the horizon where there are several."""
+    chart = horizon_chart(facts)
+    if chart is None:
+        raise ConfigError("there are no scores to draw; judge the predictor first")
+    return plot(chart).figure
+
+
+def study_figure(study: StudyFacts, name: str | None = None) -> go.Figure:
+    """A figure of a study by name; without one the first that there are facts for.
+
+    Raises:
+        ConfigError: there is no such figure, or no phase is decided yet.
+    """
+    charts = {chart.name: chart for chart in study_charts(study)}
+    if not charts:
+        raise ConfigError(f"the study of '{study.title}' has nothing to draw yet: no phase of it is decided")
+    if name is not None and name not in charts:
+        raise ConfigError(f"this study has no figure '{name}'{closest(name, charts)}")
+    # Nothing in a notebook can choose, so that it shows the first option alone.
+    return plot(charts[name or next(iter(charts))].first()).figure
+
+
+def _rows(name: str, panels: Sequence[Panel]) -> Chart:
+    # Many rows are lower, so that they fit a screen.
+    height = 90 + (215 if len(panels) <= 4 else 130) * len(panels)
+    return Chart(name, tuple(panels), height=height, together=True)
+
+
+def _row(channel: Channel, marks: Sequence[Mark]) -> Panel:
+    return Panel(tuple(marks), ChartAxis("Time [s]"), title=with_unit(short_label(channel.name), _unit(channel)[0]))
+
+
+def _line(channel: Channel, values: Array, rate_hz: float, name: str, colour: str, width: float) -> DataSeries:
+    shown = downsample(values, POINTS)
+    y = _small(_in_report_unit(values, channel)[shown])
+    return DataSeries(x=_seconds(shown, rate_hz), y=y, name=name, colour=colour, width=width)
+
+
+def _seconds(samples: NDArray[np.intp], rate_hz: float) -> NDArray[np.float32]:
+    return (samples / rate_hz).astype(np.float32)
+
+
+def _small(values: Array) -> NDArray[np.float32]:
+    return values.astype(np.float32)
+
+
+def _unit(channel: Channel) -> tuple[str, float]:
+    """The unit of reports and its factor; the SI unit where a factor alone does not lead there (degrees Celsius)."""
+    facts = KINDS[channel.kind]
+    unit = UNITS.get(facts.report_unit)
+    # A factor alone does not lead from kelvin to degrees Celsius.
+    shifted = unit is not None and unit.offset != 0
+    return (facts.si_unit, 1.0) if shifted else (facts.report_unit, facts.report_factor)
+
+
+def _in_report_unit(values: Array, channel: Channel) -> Array:
+    return np.asarray(values * _unit(channel)[1], dtype=np.float64)

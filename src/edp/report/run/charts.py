@@ -1,0 +1,248 @@
+"""Figures of a run: each takes the plain data of `figures` and says how they look."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from edp.report.common.chart import (
+    BLUE,
+    GREY,
+    INK,
+    MUTED,
+    SYMBOLS,
+    Bars,
+    Chart,
+    ChartAxis,
+    Control,
+    DataSeries,
+    Evenly,
+    GuideLine,
+    Mark,
+    Panel,
+    with_unit,
+)  # fmt: skip
+from edp.report.common.wording import short_label
+from edp.report.run import figures
+from edp.report.run.facts import NETWORK, TRUTH, Facts, horizon_text, label_of
+
+DOTS_AT_MOST = 40  # recordings; above that a rank curve, names on hover
+
+
+def run_charts(facts: Facts) -> list[Chart]:
+    """Every figure that the run has data for."""
+    makers = (prediction_chart, residual_chart, horizon_chart, speed_chart, recording_chart, learning_chart)
+    return [chart for chart in (maker(facts) for maker in makers) if chart is not None]
+
+
+def colour(facts: Facts, model: str) -> str:
+    """The network is blue and the truth dark grey everywhere; a baseline keeps one muted colour in all figures."""
+    if model in (NETWORK, TRUTH):
+        return BLUE if model == NETWORK else GREY
+    # Colours repeat when the baselines outnumber them; marks and names still tell them apart.
+    return MUTED[_place(facts, model) % len(MUTED)]
+
+
+def _place(facts: Facts, model: str) -> int:
+    names = [name for name in facts.models if name != NETWORK]
+    return names.index(model) if model in names else len(names)
+
+
+def name_of(facts: Facts, model: str) -> str:
+    """A model in a legend."""
+    return "Measured" if model == TRUTH else short_label(label_of(facts, model))
+
+
+def _look(facts: Facts, model: str) -> dict[str, Any]:
+    """Name, line, symbol and legend place of a model in the figures of errors."""
+    network = model == NETWORK
+    return {
+        "name": name_of(facts, model),
+        "colour": colour(facts, model),
+        "width": 2.6 if network else 1.4,
+        # Colour is never the only difference.
+        "symbol": "circle" if network else SYMBOLS[_place(facts, model) % len(SYMBOLS)],
+        "size": 8 if network else 7,
+        "rank": 1 if network else 10 + _place(facts, model),
+    }
+
+
+def _error_axis(facts: Facts) -> ChartAxis:
+    return ChartAxis(with_unit("Mean absolute error", facts.unit), from_zero=True)
+
+
+def _horizons(facts: Facts, horizons: Sequence[int], keeps_zoom: bool = False) -> Control:
+    return Control(
+        "horizon", "Horizon", tuple((str(k), f"{horizon_text(facts, k)} ahead") for k in horizons), keeps_zoom
+    )
+
+
+def _network_last(models: Mapping[str, Any]) -> list[str]:
+    """Models in the order in which they are drawn: the network above all others."""
+    return sorted(models, key=lambda name: name == NETWORK)
+
+
+def prediction_chart(facts: Facts) -> Chart | None:
+    """Prediction against truth: one row per output, one shared time axis."""
+    lines = figures.prediction_lines(facts)
+    if not lines:
+        return None
+    marks: list[list[Mark]] = [[] for _ in facts.targets]
+    for line in lines:
+        when = {"recording": line.recording, "extent": line.extent}
+        when |= {} if line.horizon is None else {"horizon": str(line.horizon)}
+        width = 3.0 if line.model == TRUTH else 1.6 if line.model == NETWORK else 1.1
+        marks[line.target].append(DataSeries(
+            x=Evenly(line.start, line.step) if line.x is None else line.x, y=line.y, name=name_of(facts, line.model),
+            colour=colour(facts, line.model), width=width,
+            opacity=1.0 if line.model == NETWORK else 0.75, rank={TRUTH: 1, NETWORK: 2}.get(line.model, 3), when=when,
+        ))  # fmt: skip
+    time = ChartAxis("Time [s]" if facts.rate_hz else "Sample")
+    titles = [with_unit(target.description, target.unit) for target in facts.targets]
+    panels = [Panel(tuple(row), time, title=title) for title, row in zip(titles, marks, strict=True)]
+    recordings = list(dict.fromkeys(line.recording for line in lines))
+    longest = max(len(facts.predictions[name][TRUTH]) for name in recordings) / (facts.rate_hz or 1.0)
+    stretch = min(len(line.y) * line.step for line in lines if line.extent == figures.EXCERPT and line.horizon is None)
+    unit = "s" if facts.rate_hz else "samples"
+    extents = (
+        (figures.EXCERPT, f"busiest {stretch:.0f} {unit}, every sample"),
+        (figures.WHOLE, "whole recording, downsampled"),
+    )
+    choices = (
+        Control("recording", "Recording", tuple((name, name or "recording") for name in recordings), alone=True),
+        _horizons(facts, figures.headline_first(facts), keeps_zoom=True),
+        Control("extent", "Shown", extents if longest > stretch else extents[:1], alone=True),
+    )
+    return Chart("predictions", tuple(panels), choices=choices, height=90 + 215 * len(panels), together=True)
+
+
+def residual_chart(facts: Facts) -> Chart | None:
+    """Residual histograms: one panel per output."""
+    histograms = figures.residual_histograms(facts)
+    if not histograms:
+        return None
+    columns = min(len(facts.targets), 3)
+    marks: list[list[Mark]] = [[] for _ in facts.targets]
+    for item in histograms:
+        network = item.model == NETWORK
+        name, unit = name_of(facts, item.model), facts.targets[item.target].unit
+        remark = (
+            f"{name}\nmean {item.mean:.3g}, deviation {item.deviation:.3g} {unit}\n"
+            f"{100 * item.outside:.1f} % beyond the axis"
+        )
+        marks[item.target].append(DataSeries(
+            x=item.centres.astype(np.float32), y=(100 * item.share).astype(np.float32), name=name, step="middle",
+            colour=colour(facts, item.model), width=1.8 if network else 1.2, filled=network, remark=remark,
+            when={"horizon": str(item.horizon)}, hover=f"{{x:.3g}} {unit}: {{y:.2f}} %",
+        ))  # fmt: skip
+    panels = []
+    for index, (target, row) in enumerate(zip(facts.targets, marks, strict=True)):
+        up = ChartAxis("" if index % columns else "Share of samples [%]", from_zero=True)
+        panels.append(Panel(tuple(row), ChartAxis(with_unit("Residual", target.unit)), up, target.description))
+    height = 60 + 260 * -(-len(panels) // columns)
+    choices = (_horizons(facts, figures.headline_first(facts)),)
+    return Chart("residuals", tuple(panels), columns=columns, choices=choices, height=height)
+
+
+def horizon_chart(facts: Facts) -> Chart | None:
+    """Error against horizon; with one horizon, a bar per model."""
+    curves = figures.horizon_curves(facts)
+    if not curves:
+        return None
+    if max(len(curve) for curve in curves.values()) == 1:
+        order = sorted(curves, key=lambda name: -curves[name][0][1])
+        bars = Bars(
+            positions=[name_of(facts, name) for name in order], values=[curves[name][0][1] for name in order],
+            valued=True,
+            colours=[colour(facts, name) for name in order], horizontal=True, hover=None,
+        )  # fmt: skip
+        panel = Panel((bars,), _error_axis(facts), ChartAxis(kind="names", grid=False))
+        return Chart("horizon", (panel,), height=90 + 34 * len(order), legend="none")
+    marks = []
+    for name in _network_last(curves):
+        x, y = zip(*curves[name], strict=True)
+        marks.append(DataSeries(x=x, y=y, **_look(facts, name)))
+    across = ChartAxis("Horizon [ms]" if facts.rate_hz else "Horizon [samples]", from_zero=True)
+    return Chart("horizon", (Panel(tuple(marks), across, _error_axis(facts)),), height=340, together=True)
+
+
+def speed_chart(facts: Facts) -> Chart | None:
+    """Error by speed band, over the share of samples in each band."""
+    horizons = [k for k in figures.headline_first(facts) if figures.speed_bands(facts, k)]
+    if not horizons:
+        return None
+    errors: list[Mark] = []
+    counts: list[Mark] = []
+    for horizon in horizons:
+        bands, when = figures.speed_bands(facts, horizon), {"horizon": str(horizon)}
+        for name in _network_last(bands):
+            labels = [f"{row['low']:g}–{row['high']:g}" for row in bands[name]]
+            errors.append(DataSeries(x=labels, y=[row["mae"] for row in bands[name]], when=when, **_look(facts, name)))
+        rows = next(iter(bands.values()))
+        total = sum(row["count"] or 0 for row in rows) or 1
+        counts.append(Bars(
+            positions=[f"{row['low']:g}–{row['high']:g}" for row in rows], colours=["#d3dae1"] * len(rows), when=when,
+            values=[100 * (row["count"] or 0) / total for row in rows], hover="{y:.3g} % of the samples", remark="",
+        ))  # fmt: skip
+    across = ChartAxis(with_unit("Speed band", facts.unit), kind="names")
+    panels = (Panel(tuple(errors), across, _error_axis(facts)), Panel(tuple(counts), across, ChartAxis("Samples [%]")))
+    choices = (_horizons(facts, horizons),)
+    return Chart("speed", panels, choices=choices, height=400, shares=(0.76, 0.24), together=True)
+
+
+def recording_chart(facts: Facts) -> Chart | None:
+    """Error by recording: dots in rows, or with many recordings a curve over their rank."""
+    horizons = [k for k in figures.headline_first(facts) if figures.recording_errors(facts, k)[0]]
+    if not horizons:
+        return None
+    first, _ = figures.recording_errors(facts, horizons[0])
+    dots = len(first) <= DOTS_AT_MOST
+    marks: list[Mark] = []
+    for horizon in horizons:
+        order, errors = figures.recording_errors(facts, horizon)
+        when = {"horizon": str(horizon)}
+        # Rows stand in the order of the first mark: the network's largest error at the bottom.
+        marks += [DataSeries(x=[0.0] * len(first), y=first, when=when, hover=None)] if dots else []
+        for name in _network_last(errors):
+            network = name == NETWORK
+            look = _look(facts, name) | {"size": (11 if network else 8) if dots else 5}
+            look |= {"width": 0.0} if dots or not network else {"symbol": ""}
+            coordinates: dict[str, Any] = (
+                {"x": errors[name], "y": order} if dots else {"x": list(range(1, len(order) + 1)), "y": errors[name]}
+            )
+            hover = "{label}: {x:.4g}" if dots else "{label}: {y:.4g}"
+            marks.append(DataSeries(**coordinates, labels=order, hover=hover, when=when, **look))
+    choices = (_horizons(facts, horizons),)
+    if dots:
+        rows = ChartAxis(kind="names", upside_down=True, grid=True)
+        panel = Panel(tuple(marks), replace(_error_axis(facts), grid=True), rows)
+        return Chart("recordings", (panel,), choices=choices, height=110 + 24 * len(first))
+    panel = Panel(tuple(marks), ChartAxis("Recordings, sorted by the network's error"), _error_axis(facts))
+    return Chart("recordings", (panel,), choices=choices, height=360)
+
+
+def learning_chart(facts: Facts) -> Chart | None:
+    """Loss and validation error by epoch; a dotted line at the epoch whose weights were kept."""
+    curves = figures.learning_curves(facts)
+    if not curves["epoch"]:
+        return None
+    symbol = "circle" if len(curves["epoch"]) < 30 else ""
+    rates = ["" if rate is None else f" (learning rate {rate:.2g})" for rate in curves["learning_rate"]]
+    shared: dict[str, Any] = {"x": curves["epoch"], "width": 2, "symbol": symbol, "size": 5, "labels": rates}
+    shared["hover"] = "{y:.4g}{label}"
+    best_epoch: tuple[Mark, ...] = (GuideLine(x=curves["best"][0], colour=INK, dash="dot"),) if curves["best"] else ()
+    loss = (
+        DataSeries(y=curves["train_loss"], name="Training loss", colour=MUTED[3], **shared),
+        DataSeries(y=curves["validation_loss"], name="Validation loss", colour=BLUE, **shared),
+    )
+    error = DataSeries(y=curves["validation_mae"], remark="Validation error", colour=BLUE, **shared)
+    ticks = figures.log_ticks([*curves["train_loss"], *curves["validation_loss"]])
+    up = ChartAxis(kind="log" if ticks else "linear", ticks=tuple((tick, f"{tick:g}") for tick in ticks))
+    panels = (
+        Panel((*best_epoch, *loss), ChartAxis("Epoch"), up, "Loss"),
+        Panel((*best_epoch, error), ChartAxis("Epoch"), title=with_unit("Validation error", facts.unit)),
+    )
+    return Chart("learning", panels, columns=2, height=340)

@@ -1,0 +1,132 @@
+"""Figures of a transfer: predictions and errors before and after (figures 4.8 to 4.11), and all methods by target."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from edp.report.common.chart import (
+    BLUE,
+    GREY,
+    MUTED,
+    Bars,
+    Chart,
+    ChartAxis,
+    Control,
+    DataSeries,
+    Evenly,
+    Mark,
+    Panel,
+    Texts,
+    with_unit,
+)  # fmt: skip
+from edp.report.common.wording import short_label
+from edp.report.transfer.facts import SOURCE, TARGET, Transfer
+
+AHEAD, RECORDING = "horizon", "recording"
+DOMAINS = {TARGET: "On the target's logs", SOURCE: "On the source's recordings"}
+
+
+def transfer_charts(facts: Transfer) -> list[Chart]:
+    """Every figure of the page: before and after in one."""
+    return [prediction_chart(facts, facts.pair), error_chart(facts, facts.pair), method_chart(facts)]
+
+
+def picture_charts(facts: Transfer) -> list[Chart]:
+    """The figures of the thesis, one for before and one for after; predictions of the first recording."""
+    charts = []
+    for method in facts.pair:
+        label = facts.methods[method]["label"]
+        course = prediction_chart(facts, (method,))
+        name = course.choices[0].options[0][0]
+        panels = tuple(panel.of({RECORDING: name}) for panel in course.panels)
+        course = replace(course, panels=panels, choices=course.choices[1:], title=f"{label}, {name}, {{horizon}}")
+        charts += [replace(course, file=f"prediction_{method}_k{{horizon}}"), error_chart(facts, (method,))]
+        charts[-1] = replace(charts[-1], title=f"{label}, {{horizon}}", file=f"errors_{method}_k{{horizon}}")
+    return charts
+
+
+def _look(facts: Transfer, method: str) -> tuple[str, str, float]:
+    """Name, colour and width of a method's curve."""
+    label = facts.methods[method]["label"]
+    return (label, BLUE, 1.6) if method == facts.content["method"] else (label, MUTED[0], 1.4)
+
+
+def _horizons(facts: Transfer) -> Control:
+    return Control(AHEAD, "Horizon", tuple((horizon, facts.ahead(horizon)) for horizon in facts.horizons))
+
+
+def prediction_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
+    """Measured and predicted, a row for each target (figures 4.8 and 4.10)."""
+    names = [key.removesuffix("/truth") for key in facts.shown if key.endswith("/truth")]
+    curves = [("truth", ("Measured", GREY, 3.0)), *((method, _look(facts, method)) for method in methods)]
+    panels = []
+    for column, target in enumerate(facts.targets):
+        marks: list[Mark] = []
+        for name in names:
+            time_s = Evenly(float(facts.shown[f"{name}/start"][0]), 1 / facts.content["task"]["rate_hz"])
+            for order, horizon in enumerate(facts.horizons):
+                for key, (label, colour, width) in curves:
+                    values = (facts.shown[f"{name}/{key}"][:, order, column] * target["factor"]).round(3)
+                    when = {RECORDING: name, AHEAD: horizon}
+                    marks.append(DataSeries(x=time_s, y=values, name=label, colour=colour, width=width, when=when))
+        title = with_unit(short_label(facts.name(target)), target["unit"])
+        panels.append(Panel(tuple(marks), ChartAxis("Time in the test part [s]"), title=title))
+    choice = Control(RECORDING, "Recording", tuple((name, name) for name in names), alone=True)
+    return Chart(
+        "predictions", tuple(panels), choices=(choice, _horizons(facts)), height=90 + 215 * len(panels),
+        inches=(8.0, 1.9 * len(panels) + 0.8), together=True,
+    )  # fmt: skip
+
+
+def error_chart(facts: Transfer, methods: Sequence[str]) -> Chart:
+    """Distribution of the errors, a panel for each target (figures 4.9 and 4.11); a dotted line is the bias."""
+    panels: list[Panel] = []
+    for target in facts.targets:
+        marks: list[Mark] = []
+        for horizon, by_target in facts.content["distributions"].items():
+            distribution, when = by_target[target["name"]], {AHEAD: horizon}
+            edges = np.array(distribution["edges"])
+            for method in methods:
+                scores, (label, colour, width) = facts.score(method, horizon, target["name"]), _look(facts, method)
+                shares = (100 * np.array(distribution["shares"][method])).round(4)
+                remark = f"{label}, bias {scores['bias']:.3g}, skew {scores['skew']:.2f}"
+                marks.append(DataSeries(
+                    x=((edges[:-1] + edges[1:]) / 2).round(4), y=shares, name=label, colour=colour, width=width,
+                    step="middle", filled=True, when=when, hover="{x:.3g}: {y:.2f} %", remark=remark,
+                ))  # fmt: skip
+                marks.append(DataSeries(
+                    x=[scores["bias"]] * 2, y=[0.0, float(shares.max())], colour=colour, width=1.2, dash="dot",
+                    group=label, when=when, hover=None,
+                ))  # fmt: skip
+                if len(methods) == 1:
+                    words = f"bias {scores['bias']:.2f}\nskew {scores['skew']:.2f}"
+                    marks.append(Texts(x=[edges[0]], y=[0.92 * shares.max()], texts=[words], when=when))
+        across = ChartAxis(with_unit("Error", target["unit"]))
+        up = ChartAxis("" if panels else "Share of samples [%]", from_zero=True)
+        panels.append(Panel(tuple(marks), across, up, short_label(facts.name(target))))
+    return Chart(
+        "errors", tuple(panels), columns=len(panels), choices=(_horizons(facts),), height=340,
+        inches=(2.8 * len(panels) + 0.6, 3.0),
+    )  # fmt: skip
+
+
+def method_chart(facts: Transfer) -> Chart:
+    """MAE of every method by target, in each domain that it was judged in."""
+    panels = []
+    for domain in facts.domains:
+        marks: list[Mark] = []
+        for horizon in facts.horizons:
+            order = sorted(facts.methods, key=lambda name: facts.score(name, horizon)["mae"])
+            labels = [facts.methods[name]["label"] for name in order]
+            for index, target in enumerate(facts.targets):
+                values = [facts.score(name, horizon, target["name"], domain)["mae"] for name in order]
+                marks.append(Bars(
+                    positions=labels, values=values, colours=[MUTED[index % len(MUTED)]] * len(values),
+                    name=short_label(facts.name(target)), when={AHEAD: horizon},
+                ))  # fmt: skip
+        up = ChartAxis(with_unit("Mean absolute error", facts.unit))
+        panels.append(Panel(tuple(marks), ChartAxis(kind="names"), up, DOMAINS[domain]))
+    return Chart("methods", tuple(panels), choices=(_horizons(facts),), height=120 + 240 * len(panels))
