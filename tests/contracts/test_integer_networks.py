@@ -10,10 +10,11 @@ import torch
 
 from edp.data.series import Series
 from edp.errors import ExportError
-from edp.ir import base
+from edp.ir import base, memory
 from edp.ir.reference import Reference
 from edp.ir.w8a16 import Integers, calibrate, quantise
-from edp.ir.w8a16.quantise import FLOAT, LOWER, REFUSED
+from edp.ir.w8a16.parts import FLOAT
+from edp.ir.w8a16.quantise import LOWER, REFUSED
 from edp.ir.w8a16.single import OVER_TIME
 from edp.networks.integer import IntegerPredictor
 from edp.networks.running import stream_intervals, stream_predictions
@@ -116,7 +117,7 @@ def test_every_kind_of_layer_is_known():
         if kind.__module__.startswith("edp.ir.") and ".w8a16." not in kind.__module__
     }
     kinds |= {kind for parent in kinds for kind in parent.__subclasses__()}
-    known = set(LOWER) | set(OVER_TIME) | set(REFUSED)
+    known = {*LOWER, *OVER_TIME, *REFUSED, memory.Feed}
     assert {kind for kind in kinds if not kind.__name__.startswith("_")} <= known
 
 

@@ -74,7 +74,7 @@ def test_matlab_code_follows_pytorch_for_a_long_time(network, matlab_folder_of, 
 
 
 def test_every_kind_of_layer_has_matlab_code():
-    assert set(WRITERS) == set(STEPS) | {memory.PrefixCorrection}
+    assert set(WRITERS) == set(STEPS) | {memory.Feed, memory.PrefixCorrection}
 
 
 def test_names_of_matlab_are_their_own():

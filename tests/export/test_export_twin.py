@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edp.errors import ConfigError
 from edp.export import make_target
 from edp.export.golden import grown_tolerance, random_inputs, stream
 from edp.ir.reference import Reference
 from edp.networks.input_range import usual_range
 from edp.networks.twin import TWINS
 from edp.networks.twin.recurrent import Recurrent
-from edp.testing.twins import sample_twin
+from edp.testing.twins import sample_actuators, sample_twin
 from edp.training.twin_bundle import TwinBundle, plant_bundle
+from edp.workflows.deployment import in_integers
 
 DRIVER = Path(__file__).with_name("tangent_driver.c")
 SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -23,7 +25,7 @@ HOSTILE = ('x*/ int y; /*"\\', "??/\n#error no", "%n ${name} `id`", "speed_1_mea
 STEP = 1e-6
 
 
-def bundle_of(name, hostile=False):
+def twin_of(name, hostile=False):
     spec = Recurrent(units=5) if name == "recurrent" else TWINS[name]()
     twin, _, _ = sample_twin(spec)
     if hostile:
@@ -46,7 +48,7 @@ def built(c, bundle, folder, program, *flags):
 
 @pytest.mark.parametrize("name", list(TWINS))
 def test_c_answers_what_the_twin_answers(c, name, tmp_path):
-    bundle = bundle_of(name)
+    bundle = twin_of(name)
     plant = bundle.predictor
     program = built(c, bundle, tmp_path, "host_test.c", "-O1")
     rows = random_inputs(plant, 400, seed=6)
@@ -57,15 +59,45 @@ def test_c_answers_what_the_twin_answers(c, name, tmp_path):
     assert b"all tests passed" in c.run(program)
 
 
+class Recordings:
+    """Stands for logs."""
+
+    def read(self):
+        return [sample_actuators(seed=seed) for seed in (3, 4)]
+
+
+@pytest.mark.parametrize("name", list(TWINS))
+def test_integers_are_those_of_the_reference(c, name, tmp_path):
+    bundle = twin_of(name)
+    whole = in_integers(bundle, Recordings())
+    c.need("gcc")
+    make_target("c").write(whole, "predictor", tmp_path)
+    own = [*c.sources(tmp_path), "host_test.c"]
+    c.run("gcc", *c.flags, "-O1", "-I", tmp_path, *own, "-lm", "-o", "program", folder=tmp_path)
+    rows = random_inputs(whole.predictor, 200, seed=9)
+    expected = stream(whole.predictor, rows)
+    assert np.array_equal(c.stream(tmp_path / "program", rows), expected)
+    assert b"all tests passed" in c.run(tmp_path / "program")
+    measured = slice(0, whole.predictor.window)
+    apart = np.abs(expected - stream(bundle.predictor, rows))[measured] / bundle.predictor.twin.scales.answer_width
+    # Weights of the floors cancel, lag by lag and corner by corner: eight bits are few for them.
+    assert apart.max() < (0.1 if name == "recurrent" else 0.5)
+
+
+def test_integers_of_a_network_are_made_by_edp_quantise(bundle_of):
+    with pytest.raises(ConfigError, match="edp quantise"):
+        in_integers(bundle_of("lstm"), Recordings())
+
+
 def test_names_of_channels_stay_text_and_the_fuzzer_finds_nothing(c, tmp_path):
-    bundle = bundle_of("recurrent", hostile=True)
+    bundle = twin_of("recurrent", hostile=True)
     built(c, bundle, tmp_path, "fuzz.c", "-DREPLAY", *SANITISED)
     (tmp_path / "bytes").write_bytes(np.random.default_rng(0).bytes(4000))
     assert b"every rule held" in c.run(tmp_path / "program", tmp_path / "bytes")
 
 
 def test_tangents_go_round_the_feedback_edge(c, tmp_path):
-    bundle = bundle_of("recurrent")
+    bundle = twin_of("recurrent")
     plant = bundle.predictor
     program = built(c, bundle, tmp_path, DRIVER, "-O0")
     rows = random_inputs(plant, 60, seed=7)

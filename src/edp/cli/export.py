@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from edp.cli.console import JsonFlag, emit, out
+from edp.cli.train import MapOption, RepairOption, source_of
 from edp.errors import ConfigError
 
 
@@ -29,6 +30,12 @@ def export(
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="Option of the form, such as opset=11 of onnx; may be repeated.")
     ] = None,
+    w8a16: Annotated[
+        Path | None,
+        typer.Option(help="Of a twin: logs on which it is brought into W8A16, for forms around the C code."),
+    ] = None,
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
     forms: Annotated[
         bool, typer.Option("--forms", callback=_list_forms, is_eager=True, help="List the forms and end.")
     ] = False,
@@ -40,7 +47,8 @@ def export(
     """
     from edp.workflows.deployment import export_bundle, unheld_adaptation
 
-    files = export_bundle(bundle, to, folder, name, dict(map(_option, changes or [])))
+    source = None if w8a16 is None else source_of(w8a16, signal_map, repair)
+    files = export_bundle(bundle, to, folder, name, dict(map(_option, changes or [])), source)
 
     def show() -> None:
         for file in files:

@@ -7,15 +7,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edp.config.experiment import load_experiment
+from edp.data.twin_channels import same_channels
+from edp.errors import ConfigError
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import Footprint, check_possible, footprint
 from edp.evaluation.mac_check import check_counted
 from edp.export import TARGETS, make_target
 from edp.ir.rls import Adaptation
+from edp.ir.w8a16 import calibrate
+from edp.logs.source import DataSource
 from edp.networks.integer import IntegerPredictor
 from edp.networks.narrow import student
 from edp.networks.predictor import ModelSpec, Predictor, build_model, describe
+from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.training import load_bundle
 from edp.training.bundle import Bundle, blank_scaler
 from edp.training.twin_bundle import holds_twin, load_twin, plant_bundle
@@ -58,13 +65,41 @@ def export_bundle(
     folder: str | Path,
     name: str = "predictor",
     options: Mapping[str, object] | None = None,
+    calibration: DataSource | None = None,
 ) -> list[Path]:
     """Write a bundle or the bundle of a run folder in the form `to`; returns the files, the one to read first in front.
+
+    Args:
+        path: bundle, or run folder.
+        to: name of the form.
+        folder: where to.
+        name: of the network in the files.
+        options: of the form.
+        calibration: of a twin, recordings on which it is brought into W8A16.
 
     Raises:
         EdpError: not a bundle, an unknown form or option, or a network or name that this form cannot hold.
     """
-    return make_target(to, options).write(load_exported(path), name, Path(folder))
+    target, bundle = make_target(to, options), load_exported(path)
+    return target.write(bundle if calibration is None else in_integers(bundle, calibration), name, Path(folder))
+
+
+def in_integers(bundle: Bundle, calibration: DataSource) -> Bundle:
+    """A twin whose cell computes in W8A16; formats and weights are chosen on recordings in which all is measured.
+
+    Raises:
+        ConfigError: not a twin.
+        DataError: a channel is missing, not finite or of another kind, or the rate is another one.
+    """
+    plant = bundle.predictor
+    if not isinstance(plant, TwinPlant):
+        raise ConfigError("only a twin is brought into W8A16 while it is exported; a network by edp quantise RUN")
+    channels, rows = plant.twin.channels, []
+    for recording in calibration.read():
+        same_channels(channels, recording)
+        series = channels.task().series(recording)
+        rows.append(np.concatenate([series.inputs, series.targets, np.ones_like(series.targets)], axis=1))
+    return replace(bundle, predictor=IntegerTwinPlant(plant, calibrate(plant.graph(), rows)))
 
 
 def load_exported(path: str | Path) -> Bundle:

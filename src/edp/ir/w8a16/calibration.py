@@ -15,7 +15,8 @@ from edp.ir.memory import Rotation
 from edp.ir.reference import Reference
 from edp.ir.w8a16.balance import balanced
 from edp.ir.w8a16.moments import InputMoments
-from edp.ir.w8a16.quantise import Formats, formats, integer_part, quantise, weights_of
+from edp.ir.w8a16.parts import integer_part
+from edp.ir.w8a16.quantise import Formats, formats, quantise, weights_of
 from edp.ir.w8a16.single import OVER_TIME
 
 # 500 ticks are 5 s at 100 Hz: longer than the networks remember, so that a piece shows steady values.

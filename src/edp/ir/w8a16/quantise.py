@@ -20,17 +20,14 @@ from edp.ir.layers import BinaryOperation, Function
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
 from edp.ir.w8a16.balance import balanced
+from edp.ir.w8a16.parts import integer_part
 from edp.ir.w8a16.rounding import WeightRounding
 from edp.ir.w8a16.rows import halves, rows, to_gates
 
 Ranges = Mapping[str, float]
 """Largest magnitude of each value, and of each slot as ``layer/slot``."""
-# Norms and attentions need sums of squares and quotients that 16-bit formats would spoil.
-FLOAT = (layers.LayerNorm, layers.RowAttention, layers.Accumulate, memory.WindowAttention)
-"""Kinds that stay in single precision wherever they stand: they have no weights, or a few gains."""
 REFUSED = {
     memory.LayerNormLstm: "train with the cell 'lstm', or export in float32",
-    memory.Feedback: "export the plant in float32",
     memory.PrefixCorrection: "train with the initial state 'zero' or 'learned', or export in float32",
 }
 
@@ -175,32 +172,6 @@ def _initial(graph: Graph, finished: Graph, work: _Work) -> dict[tuple[str, str]
             fixed_values = fixed.to_fixed(values, work.slots[key], largest)
             start[key] = fixed_values.astype(np.int16 if small else np.int32)
     return start
-
-
-def integer_part(graph: Graph) -> set[str]:
-    """Layers that are computed in integer arithmetic: after the scaling of the inputs, up to the last weights.
-
-    Functions and selections of integers behind the last weights belong to it too.
-    """
-    scaled: set[str] = set()
-    before: set[str] = set()
-    for layer in graph.layers:
-        if isinstance(layer, layers.Standardise) or scaled & set(layer.inputs):
-            scaled.add(layer.name)
-    # Backwards: what no weights read any more is cheap and stays in single precision.
-    for layer in reversed(graph.layers):
-        if layer.macs or layer.name in before:
-            before |= set(layer.inputs) | {layer.name}
-    inside: set[str] = set()
-    for layer in graph.layers:
-        if layer.name not in scaled or isinstance(layer, (layers.Standardise, *FLOAT)):
-            continue
-        # The exponential leaves 16 bits quickly; it stays in single precision.
-        exponential = isinstance(layer, layers.Activate) and layer.function is Function.EXP
-        light = isinstance(layer, layers.Activate | layers.Gather) and set(layer.inputs) <= inside
-        if not exponential and (layer.name in before or light):
-            inside.add(layer.name)
-    return inside - {INPUT}
 
 
 def _within(frac: int, finest: int) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.ir import memory
 from edp.ir.base import INPUT, Graph, Layer, Number
 from edp.ir.descent import reached_leaves
 from edp.ir.layers import Function
@@ -55,11 +56,22 @@ class Integers:
 
     def values(self, inputs: NDArray[np.floating]) -> dict[str, Any]:
         """Feed ticks; returns the value of every layer and the input."""
+        if not self.graph.fed_back:
+            return self._together(inputs)
+        # A tick of a plant waits for the answer of the one before.
+        ticks = [self._together(inputs[at : at + 1]) for at in range(len(inputs))]
+        return {name: np.concatenate([tick[name] for tick in ticks]) for name in (ticks[0] if ticks else ())}
+
+    def _together(self, inputs: NDArray[np.floating]) -> dict[str, Any]:
+        """All ticks at once, layer by layer."""
         values: dict[str, Any] = {INPUT: np.asarray(inputs, dtype=np.float32)}
         for layer in self.graph.layers:
             layer_inputs = [values[name] for name in layer.inputs]
             if isinstance(layer, quantised.Quantise):
                 values[layer.name] = self._quantised(layer, layer_inputs[0])
+                continue
+            if isinstance(layer, memory.Feed):
+                self.memory[layer.into]["last"] = layer_inputs[0][-1]
                 continue
             kind = type(layer)
             run = INTEGER_STEPS[kind] if kind in INTEGER_STEPS else OVER_TIME[kind]

@@ -230,11 +230,17 @@ def _trees(layer: layers.TreeSums, m: Memory, x: Rows) -> Rows:
     return summed(reached_leaves(layer.feature, layer.threshold, layer.leaf, x))
 
 
+def _clip(layer: layers.Clip, m: Memory, x: Rows) -> Rows:
+    below = np.where(x > layer.high, layer.high, x)
+    return np.asarray(np.where(below < layer.low, layer.low, below))
+
+
 Run = Callable[..., Any]
 OVER_TIME: dict[type[Layer], Run] = {
     layers.Gather: gather,
     layers.Standardise: lambda layer, m, x: (x - layer.offset) / layer.scale,
     layers.ScaleShift: lambda layer, m, x: x * layer.gain + layer.shift,
+    layers.Clip: _clip,
     layers.Elementwise: lambda layer, m, a, b: OPERATIONS[layer.operation](a, b),
     layers.Activate: lambda layer, m, x: FUNCTIONS[layer.function](x),
     layers.Glu: _glu,
@@ -246,5 +252,6 @@ OVER_TIME: dict[type[Layer], Run] = {
     memory.Starting: _starting,
     memory.TrailingMean: _trailing_mean,
     memory.WindowAttention: _window,
+    memory.Feedback: lambda layer, m: m["last"][None],
 }
 """Many ticks of a kind of layer: (layer, memory, inputs ...) to its value; the memory is brought on."""

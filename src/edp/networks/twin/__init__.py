@@ -3,12 +3,13 @@
 from edp.networks.twin import arx, recurrent, static_map  # noqa: F401  registers the formulations
 from edp.networks.twin.base import TWINS, Twin, TwinSpec, TwinState, even_starts
 from edp.networks.twin.intervals import FreeRunIntervals, calibrate
-from edp.networks.twin.plant import TwinPlant
+from edp.networks.twin.plant import IntegerTwinPlant, TwinPlant
 from edp.networks.twin.scales import TwinScales, fit_scales
 
 __all__ = [
     "TWINS",
     "FreeRunIntervals",
+    "IntegerTwinPlant",
     "Twin",
     "TwinPlant",
     "TwinScales",

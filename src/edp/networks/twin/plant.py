@@ -16,7 +16,9 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ExportError
 from edp.ir import Graph
 from edp.ir.reference import Reference
+from edp.ir.w8a16 import Formats, quantise
 from edp.networks.frontend import FrontEnd, TargetTransform
+from edp.networks.integer import IntegerPredictor
 from edp.networks.outputs import Point
 from edp.networks.predictor import Predictor
 from edp.networks.streaming import State, Streaming
@@ -112,6 +114,23 @@ class TwinPlant(Predictor):
         """Commands, measured values, flags."""
         answers = len(self.twin.channels.answers)
         return len(self.twin.channels.commands), answers, answers
+
+
+class IntegerTwinPlant(IntegerPredictor, TwinPlant):
+    """The same whose cell computes in W8A16; ports, integration, end stops and bounds stay in single precision.
+
+    Args:
+        source: the float plant.
+        chosen: formats of its values.
+
+    Raises:
+        ExportError: its formulation has no integer form.
+    """
+
+    def __init__(self, source: TwinPlant, chosen: Formats) -> None:
+        integers = quantise(source.graph(), chosen)
+        TwinPlant.__init__(self, source.twin, source.title)
+        self.formats, self.integers = chosen, integers
 
 
 def plant_inputs(channels: TwinChannels) -> tuple[Channel, ...]:

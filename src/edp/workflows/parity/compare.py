@@ -14,6 +14,7 @@ from edp.data.unlabelled import unlabelled
 from edp.errors import DataError, ExportError
 from edp.export.golden import Rows, at_thresholds, grown_tolerance, random_inputs, stream, tolerance
 from edp.logs.source import DataSource
+from edp.networks.integer import IntegerPredictor
 from edp.networks.twin import TwinPlant
 from edp.recording import Recording
 from edp.training.bundle import Bundle
@@ -76,7 +77,7 @@ def _case(bundle: Bundle, inputs: Rows) -> ParityCase:
         )
     expected = stream(predictor, inputs)
     steps = at_thresholds(predictor, inputs)
-    if isinstance(predictor, TwinPlant):
+    if isinstance(predictor, TwinPlant) and not isinstance(predictor, IntegerPredictor):
         return ParityCase(bundle, inputs, expected, grown_tolerance(predictor, inputs, expected))
     allowed = tolerance(predictor, inputs, expected)
     return ParityCase(bundle, inputs, expected, allowed + steps if steps.any() else allowed)

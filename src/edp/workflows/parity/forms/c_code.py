@@ -15,6 +15,7 @@ from edp.export.c import CTarget
 from edp.export.golden import Rows, stream
 from edp.ir.w8a16 import calibrate
 from edp.networks.integer import IntegerPredictor
+from edp.networks.twin import IntegerTwinPlant, TwinPlant
 from edp.training.bundle import Bundle
 from edp.workflows.parity.base import FORMS, NAME, ROUNDS, ParityCase, Ran, called, need
 
@@ -94,7 +95,11 @@ class WholeNumbers:
         predictor = case.bundle.predictor
         if isinstance(predictor, IntegerPredictor):
             return []  # the form `c` is that already
-        whole = IntegerPredictor(predictor, calibrate(predictor.graph(), [case.inputs]))
+        chosen = calibrate(predictor.graph(), [case.inputs])
+        if isinstance(predictor, TwinPlant):
+            whole: IntegerPredictor = IntegerTwinPlant(predictor, chosen)
+        else:
+            whole = IntegerPredictor(predictor, chosen)
         predictions, seconds = streamed(replace(case.bundle, predictor=whole), case.inputs, folder)
         expected = stream(whole, case.inputs)
         deviations = np.abs(expected - case.expected).max() / float(predictor.code.width.max())
