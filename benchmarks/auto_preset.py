@@ -2,7 +2,8 @@
 
 `edp train` with no settings but the task, on each set of ``examples/real``: its root-mean-square error on the test part
 beside the stated linear floor, beside the best of all baselines fitted in the same run, and beside the error that
-left-out data promised. Nothing is chosen per set, and the test part is opened once a seed.
+left-out data promised. Nothing is chosen per set, and the test part is opened once a seed. The full form also distils
+each committee (`edp distil --units 64`) and holds its student against it.
 
 The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
 """
@@ -26,11 +27,14 @@ from edp.evaluation.baselines import BASELINES
 from edp.settings.tree import read_toml
 from edp.storage import read_json
 from edp.workflows.auto import load_auto, train_auto
+from edp.workflows.compression import DistilRequest, DistilSpec, distil
 from edp.workflows.train_evaluate import DataSource, evaluate
 from real_recordings import EXAMPLES, QUICK, QUICK_SETS, rmse, shared_folder
 
 KEPT = 0.1
 """How far the test error may lie from the promise."""
+STUDENT_UNITS, STUDENT_LOSS = 64, 0.02
+"""Width of a student's two perceptrons, and how much more error than its committee it may have."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class Task:
         rival: the best baseline of the same run, by the test part.
         rival_name: which one.
         promise: what left-out data promised.
+        student: of the committee's student; None where none was made.
     """
 
     title: str
@@ -53,13 +58,17 @@ class Task:
     rival: float
     rival_name: str
     promise: float
+    student: float | None
 
 
-def run_set(entry: dict[str, Any], seeds: Sequence[int], changes: Sequence[str]) -> tuple[list[Task], dict[str, Any]]:
+def run_set(
+    entry: dict[str, Any], seeds: Sequence[int], changes: Sequence[str], distilled: bool
+) -> tuple[list[Task], dict[str, Any]]:
     """Train and judge one set with every seed; its tasks, and what was chosen in how many seconds."""
     judged: list[dict[str, Any]] = []
     promised: list[dict[str, Any]] = []
-    notes: dict[str, Any] = {"chosen": [], "seconds": []}
+    taught: list[dict[str, Any]] = []
+    notes: dict[str, Any] = {"chosen": [], "seconds": [], "student": []}
     for seed in seeds:
         with tempfile.TemporaryDirectory() as folder:
             began = time.perf_counter()
@@ -69,6 +78,11 @@ def run_set(entry: dict[str, Any], seeds: Sequence[int], changes: Sequence[str])
             notes["chosen"].append(facts["chosen"])
             promised.append(facts["candidates"][facts["chosen"]]["promise"])
             judged.append(read_json(evaluate(Path(folder) / "run", baselines=tuple(BASELINES)) / "scores.json"))
+            if distilled and facts["chosen"] == "committee":
+                request = DistilRequest(spec=DistilSpec(units=STUDENT_UNITS))
+                student = distil(Path(folder) / "run", request, Path(folder) / "student").predictor
+                notes["student"].append(sum(weights.numel() for weights in student.parameters()))
+                taught.append(read_json(evaluate(Path(folder) / "student", baselines=()) / "scores.json"))
     tasks = []
     for target, horizon, persistence, linear in entry["rows"]:
         errors = {
@@ -79,7 +93,9 @@ def run_set(entry: dict[str, Any], seeds: Sequence[int], changes: Sequence[str])
         best = min(errors, key=lambda model: errors[model])
         promise = float(np.median([one[str(horizon)][target] for one in promised]))
         floor = min(persistence, linear)
-        tasks.append(Task(entry["title"], target, horizon, ours, floor, errors[best], best, promise))
+        student = [rmse(scores, "network", target, horizon) for scores in taught]
+        of_student = float(np.median(student)) if student else None
+        tasks.append(Task(entry["title"], target, horizon, ours, floor, errors[best], best, promise, of_student))
     return tasks, notes
 
 
@@ -105,6 +121,11 @@ def verdicts_of(tasks: Sequence[Task], quick: bool) -> list[Verdict]:
         for (name, number), goal in zip(met.items(), goals, strict=True)
     ]
     rows.append(verdict("error relative to the floor, geometric mean over sets", mean, 1.0, "<= 0.8", "ratio", quick))
+    students = [task.student / task.ours for task in tasks if task.student is not None]
+    if students:
+        close = sum(ratio <= 1 + STUDENT_LOSS for ratio in students)
+        name = "students at most 2 % behind their committee"
+        rows.append(verdict(name, close, count - 5, ">= 1", "tasks", quick))
     worst = max(task.ours / task.rival for task in tasks)
     rows.append(verdict("worst error relative to the best rival", worst, 1.0, "<= 1.02", "ratio", quick))
     return rows
@@ -112,14 +133,18 @@ def verdicts_of(tasks: Sequence[Task], quick: bool) -> list[Verdict]:
 
 def show(tasks: Sequence[Task], notes: dict[str, dict[str, Any]]) -> None:
     """Print a row a task, and a row a set."""
-    headings = ["set", "target", "k", "ours", "ours/floor", "best rival", "ours/rival", "promise/ours"]
+    headings = ["set", "target", "k", "ours", "ours/floor", "best rival", "ours/rival", "promise/ours", "student/ours"]
     lines = []
     for t in tasks:
         ratios = (t.ours / t.floor, t.rival_name, t.ours / t.rival, t.promise / t.ours)
-        lines.append([t.title, t.target, t.horizon, t.ours, *ratios])
+        student = "" if t.student is None else f"{t.student / t.ours:.3f}"
+        lines.append([t.title, t.target, t.horizon, t.ours, *ratios, student])
     table(headings, lines)
     print()
-    table(["set", "chosen", "training, s"], [[name, *map(str, note.values())] for name, note in notes.items()])
+    table(
+        ["set", "chosen", "training, s", "student, parameters"],
+        [[name, *map(str, note.values())] for name, note in notes.items()],
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -137,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if chosen.quick and entry["data"] not in QUICK_SETS:
             continue
         print(f"{entry['settings']} ...", file=sys.stderr, flush=True)
-        found, notes[entry["title"]] = run_set(entry, seeds, QUICK if chosen.quick else ())
+        found, notes[entry["title"]] = run_set(entry, seeds, QUICK if chosen.quick else (), not chosen.quick)
         tasks += found
     show(tasks, notes)
     kept = {"seeds": list(seeds), "sets": notes, "tasks": [vars(task) for task in tasks]}

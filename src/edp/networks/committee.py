@@ -113,8 +113,8 @@ class Committee(Streaming):
         """The groups of perceptrons."""
         return [group for group in self.groups if isinstance(group, Members)]
 
-    def _readers(self) -> dict[str, Streaming]:
-        """What reads the bank, in the order of the representation."""
+    def readers(self) -> dict[str, Streaming]:
+        """What reads the bank, by name, in the order of the representation."""
         readers: dict[str, Streaming] = {f"group{at}": group for at, group in enumerate(self.members)}
         further = {"radial": self.radial, "trees": self.trees}
         return readers | {name: part for name, part in further.items() if part is not None}
@@ -124,16 +124,16 @@ class Committee(Streaming):
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         bank, state = self.bank(x, state)
-        return torch.cat([bank, *(part(bank, ())[0] for part in self._readers().values())], dim=-1), state
+        return torch.cat([bank, *(part(bank, ())[0] for part in self.readers().values())], dim=-1), state
 
     def lower(self, build: Builder, x: str) -> str:
         with build.inside("bank"):
             bank = self.bank.lower(build, x)
         parts = []
-        for name, part in self._readers().items():
+        for name, part in self.readers().items():
             with build.inside(name):
                 parts.append(part.lower(build, bank))
         return build.join("representation", bank, *parts)
 
     def costs(self) -> list[Cost]:
-        return self.bank.costs() + [cost for part in self._readers().values() for cost in part.costs()]
+        return self.bank.costs() + [cost for part in self.readers().values() for cost in part.costs()]

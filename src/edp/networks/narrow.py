@@ -6,6 +6,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from edp.errors import ConfigError
+from edp.networks.backbones import CommitteeSpec
 from edp.networks.predictor import ModelSpec
 
 
@@ -19,7 +20,8 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
     """A network of the same parts, all widths scaled from those of `model` to `units`, with fewer convolution levels.
 
     The thesis's students (Table 4.9): half or a quarter of the teacher's units, channels and head width, and of three
-    convolution levels the first two. Trees of a committee are left out.
+    convolution levels the first two. A committee keeps one
+    perceptron of each activation, and neither trees nor radial basis functions.
 
     Args:
         model: the teacher's specs.
@@ -28,7 +30,8 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
             (a pure TCN keeps all, since its receptive field must span the window).
 
     Raises:
-        ConfigError: units below 1 or above the teacher's, or levels that the teacher does not have.
+        ConfigError: units below 1 or above the teacher's, levels that the teacher does not have, or a committee without
+            perceptrons.
     """
     full = width_of(model)
     if not 1 <= units <= full:
@@ -44,6 +47,14 @@ def student(model: ModelSpec, units: int, levels: int | None = None) -> ModelSpe
     if "trees" in names:
         # A student learns by gradients, which no tree does: its trees would give zero for good.
         changed["trees"] = 0
+    if isinstance(model.backbone, CommitteeSpec):
+        if not model.backbone.activations:
+            raise ConfigError(
+                "student: a committee without perceptrons (activations = []) has no width; it is a linear model and "
+                "tables already, export it as it is"
+            )
+        # Many members and nearness to typical rows steady what is fitted to noise; what a teacher says has none.
+        changed |= {"members": 1, "centres": 0}
     if "channels" in names:
         channels = model.backbone.channels  # type: ignore[attr-defined]
         if levels is None:

@@ -26,7 +26,7 @@ from edp.training.objective import Objective
 from edp.training.outcome import Diverged, Fitted, TrainingError, TrainingProgress
 from edp.training.ridge_start import start_bypass
 from edp.training.spec import TrainingSpec, by_gradient, check_training, thread_count
-from edp.training.strategy import BatchContext, EpisodicStrategy, TrainingStrategy
+from edp.training.strategy import BatchContext, DirectFit, EpisodicStrategy, TrainingStrategy
 from edp.training.validation import calibrate, validation_scores
 
 
@@ -36,7 +36,7 @@ def fit(
     spec: TrainingSpec,
     run: KeyedRun | None = None,
     on_event: Callable[[TrainingProgress], None] | None = None,
-    strategy: TrainingStrategy | None = None,
+    strategy: TrainingStrategy | DirectFit | None = None,
 ) -> Fitted:
     """Train on ``data.train``, choose by ``data.validation``; ``data.test`` is not touched.
 
@@ -46,8 +46,8 @@ def fit(
         spec: how to train.
         run: where the training writes; where given, a checkpoint after each epoch makes it resumable.
         on_event: called with progress.
-        strategy: weights to begin with, or a teacher; it is part of what the key of `run` must tell apart. A strategy
-            knows no folds: with it a committee trains by gradient, too (`by_gradient`).
+        strategy: weights to begin with, a teacher, or what fits the network by itself; it is part of what the key of
+            `run` must tell apart. A strategy knows no folds: with it a committee trains by gradient (`by_gradient`).
 
     Raises:
         ConfigError: settings that contradict one another.
@@ -58,6 +58,11 @@ def fit(
     tell = on_event or (lambda event: None)
     if spec.bagging is not None and strategy is None:
         return fit_in_folds(data, model, spec, run.folder if run else None, tell)
+    if isinstance(strategy, DirectFit):
+        direct = strategy.fit_network(data, model, spec, tell)
+        if run is not None:
+            run.folder.write_history(direct.history)
+        return direct
     spec = by_gradient(spec)
     fitted = Loop(data, model, spec, run, strategy).fit(tell)
     best = max((row["epoch"] for row in fitted.history if row["best"]), default=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -13,8 +13,9 @@ from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.task import Task
 from edp.networks.losses import Prediction
-from edp.networks.predictor import Predictor
+from edp.networks.predictor import ModelSpec, Predictor
 from edp.training.objective import Objective
+from edp.training.outcome import Fitted, TrainingProgress
 from edp.training.spec import TrainingSpec
 
 
@@ -65,6 +66,21 @@ class TrainingStrategy(Protocol):
 
     def end(self, net: Predictor) -> None:
         """Take back what `begin` did to the network beside its weights; it has the best ones now."""
+        ...
+
+
+@runtime_checkable
+class DirectFit(Protocol):
+    """Fits the network by itself, without the loop over chunks."""
+
+    def fit_network(
+        self, data: Prepared, model: ModelSpec, spec: TrainingSpec, on_event: Callable[[TrainingProgress], None]
+    ) -> Fitted:
+        """Train the network of `model` on ``data.train`` and ``data.validation``.
+
+        Raises:
+            EdpError: the data or settings cannot be used.
+        """
         ...
 
 

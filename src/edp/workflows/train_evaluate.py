@@ -43,7 +43,7 @@ from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
 from edp.training.fit import fit
 from edp.training.spec import check_fitted_parts, check_training, thread_count
-from edp.training.strategy import TrainingStrategy
+from edp.training.strategy import DirectFit, TrainingStrategy
 
 SHOWN_RECORDINGS = 6
 # 60,000 ticks are ten minutes at 100 Hz: more than a picture can show.
@@ -108,7 +108,7 @@ class StrategyFactory:
     """
 
     facts: Mapping[str, Any]
-    strategy: Callable[[Prepared], TrainingStrategy]
+    strategy: Callable[[Prepared], TrainingStrategy | DirectFit]
     frozen: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -99,7 +99,7 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
         f"training: {rows:,} rows of {bank.columns:,} columns and {outputs:,} outputs",
         "make training.bagging.rows smaller, or the backbone's lags fewer",
     )
-    columns = np.concatenate([_columns(net, part)[list(of)] for part, of in zip(stretches, chosen, strict=True)])
+    columns = np.concatenate([bank_rows(net, part)[list(of)] for part, of in zip(stretches, chosen, strict=True)])
     targets = np.concatenate(
         [
             standard_targets(net, part)[0].flatten(1).numpy()[list(of)]
@@ -123,8 +123,8 @@ def table_of(net: Predictor, data: Prepared, spec: BaggingSpec) -> Table:
     return Table(columns, targets, blocked_folds(lengths, spec.folds, gap), stride, tuple(starts))
 
 
-def _columns(net: Predictor, part: Series) -> NDArray[np.float32]:
-    """What the bank gives of a whole stretch, ``(time, column)``."""
+def bank_rows(net: Predictor, part: Series) -> NDArray[np.float32]:
+    """What the bank of a committee gives of a whole stretch, as a stream from its first tick, ``(time, column)``."""
     bank = committee_of(net).bank
     like = next(net.parameters())
     rows = []

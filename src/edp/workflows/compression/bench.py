@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from edp.data.prepared import Prepared
@@ -11,10 +11,11 @@ from edp.data.series import Series
 from edp.networks.narrow import student, width_of
 from edp.networks.predictor import ModelSpec, Predictor
 from edp.training.fit import fit
-from edp.training.spec import TrainingSpec
-from edp.training.strategy import TrainingStrategy
+from edp.training.spec import TrainingSpec, by_gradient
+from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.committee import committee_start
 from edp.workflows.compression.distillation import Distillation, DistillationSpec
+from edp.workflows.compression.imitation import CommitteeImitation, imitates
 from edp.workflows.compression.pruning import prune
 from edp.workflows.compression.qat import QuantisationAware, RoundingSpec
 
@@ -31,7 +32,7 @@ class CompressionRequest:
         units: its width; that of the teacher keeps all of it.
         levels: convolution levels; None as `student` chooses.
         pruned: begin with what pruning leaves of the teacher, which needs all its levels.
-        distillation: the objective.
+        distillation: the objective; None for `DistillationSpec()`, and for rows where `imitates` holds.
         rounding: what is rounded in training, which goes on from `of`.
         of: the order whose network a rounded training goes on from; None for the teacher itself.
     """
@@ -40,7 +41,7 @@ class CompressionRequest:
     units: int
     levels: int | None = None
     pruned: bool = False
-    distillation: DistillationSpec = field(default_factory=DistillationSpec)
+    distillation: DistillationSpec | None = None
     rounding: RoundingSpec | None = None
     of: CompressionRequest | None = None
 
@@ -58,24 +59,31 @@ class CompressionRequest:
 
     def training(self, spec: TrainingSpec) -> TrainingSpec:
         """How it is trained, where a network is trained with `spec`."""
-        if self.rounding is None:
-            return spec
-        return tuning(spec)
+        spec = by_gradient(spec)  # a student is taught; there are no folds of truth
+        return spec if self.rounding is None else tuning(spec)
 
     def strategy(
         self, teachers: Sequence[Predictor], data: Prepared, start: Predictor | None, further: Sequence[Series] = ()
-    ) -> TrainingStrategy:
+    ) -> TrainingStrategy | DirectFit:
         """What the training has besides its data; `start` is the network of `of`.
 
         Raises:
             ConfigError: teachers that contradict one another, or a network that cannot be pruned.
         """
         model = self.model(teachers[0].spec)
+        if self.on_rows(teachers):
+            return CommitteeImitation(teachers[0], further)
         narrow = prune(teachers[0], model, data.train) if self.pruned else committee_start(teachers[0], model, data)
         strategy = Distillation(teachers, self.distillation, further, narrow)
         if self.rounding is None:
             return strategy
         return QuantisationAware(teachers[0] if start is None else start, strategy, self.rounding)
+
+    def on_rows(self, teachers: Sequence[Predictor]) -> bool:
+        """Whether the student learns on rows of the teacher's bank: a committee's does where no objective is given."""
+        if self.distillation is not None or self.rounding is not None or self.pruned:
+            return False
+        return imitates(teachers, self.model(teachers[0].spec))
 
 
 def tuning(spec: TrainingSpec) -> TrainingSpec:

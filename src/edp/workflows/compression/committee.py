@@ -1,4 +1,4 @@
-"""Students of committees: fewer and narrower perceptrons, taught by gradient what all learners together say."""
+"""Students of committees: fewer and narrower perceptrons, taught what all learners together say."""
 
 from __future__ import annotations
 
@@ -9,32 +9,28 @@ from edp.networks.committee import Committee
 from edp.networks.predictor import ModelSpec, Predictor, build_model
 
 
-def committee_start(teacher: Predictor, model: ModelSpec, data: Prepared) -> Predictor | None:
-    """A student that begins with the teacher's linear model and radial basis functions, and with silent perceptrons.
+def committee_start(teacher: Predictor, model: ModelSpec, data: Prepared, seed: int = 0) -> Predictor | None:
+    """A student that begins with the teacher's linear model and with silent perceptrons.
 
     Args:
         teacher: the committee; another backbone gives None.
         model: the student's settings.
         data: what it is trained on.
+        seed: of the perceptrons' first weights.
     """
     if not isinstance(teacher.backbone, Committee):
         return None
-    net = build_model(data.task, model, data.scaler(), seed=0)
+    net = build_model(data.task, model, data.scaler(), seed)
     backbone, source = net.backbone, teacher.backbone
     if not isinstance(backbone, Committee):
         return None
     net.front.load_state_dict(teacher.front.state_dict())
     net.code.load_state_dict(teacher.code.state_dict())
     backbone.bank.load_state_dict(source.bank.state_dict())
-    if backbone.radial is not None and source.radial is not None:
-        backbone.radial.load_state_dict(source.radial.state_dict())
     heads, taught = net.heads, teacher.heads
-    columns, near = source.bank.columns, 0 if source.radial is None else source.radial.count
-    hidden = [sum(group.members * group.units for group in part.members) for part in (backbone, source)]
+    columns = source.bank.columns
     with torch.no_grad():
         heads.weights[0].zero_()
         heads.weights[0][:, :columns] = taught.weights[0][:, :columns]
-        own, theirs = (columns + count for count in hidden)
-        heads.weights[0][:, own : own + near] = taught.weights[0][:, theirs : theirs + near]
         heads.biases[0].copy_(taught.biases[0])
     return net

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from edp.settings.tree import SettingsTree
 from edp.storage.runs import read_provenance
 from edp.training import Bundle, TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
-from edp.training.strategy import TrainingStrategy
+from edp.training.spec import TrainingSpec
+from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import CompressionRequest
 from edp.workflows.compression.distillation import DistillationSpec
 from edp.workflows.compression.qat import RoundingSpec
@@ -39,7 +40,7 @@ class DistilSpec:
         units: width of the student.
         levels: convolution levels; None for one less than the teacher has.
         pruned: begin with what pruning leaves of the teacher.
-        objective: what is minimised.
+        objective: what is minimised, in chunks; None for the usual one, and for rows of a committee's bank.
 
     Raises:
         ConfigError: a value out of range, or a pruned student with levels of its own.
@@ -48,7 +49,7 @@ class DistilSpec:
     units: int
     levels: int | None = None
     pruned: bool = False
-    objective: DistillationSpec = field(default_factory=DistillationSpec)
+    objective: DistillationSpec | None = None
 
     def __post_init__(self) -> None:
         check_bounds("distil", self, units=whole(1, MOST_UNITS), levels=whole(1, MOST_LEVELS))
@@ -107,11 +108,29 @@ def distil(
     series, digests = _unlabelled(teacher, request.further, frozen)
     facts = order_facts(order) | {"teachers": [weights_digest(net) for net in teachers], "further": digests}
 
-    def strategy(data: Prepared) -> TrainingStrategy:
+    def strategy(data: Prepared) -> TrainingStrategy | DirectFit:
         return order.strategy(teachers, data, None, series)
 
-    student_experiment = replace(experiment, model=model)
+    if order.on_rows(teachers):
+        _refuse_settings_of_chunks(experiment.training, read_run(run)[1].training)
+    student_experiment = replace(experiment, model=model, training=order.training(experiment.training))
     return train(source or own, student_experiment, out, on_event, StrategyFactory(facts, strategy, frozen))
+
+
+def _refuse_settings_of_chunks(asked: TrainingSpec, before: TrainingSpec) -> None:
+    """Refuse settings that a training on rows does not read."""
+    read = {"seed", "threads"}
+    changed = [
+        part.name
+        for part in fields(TrainingSpec)
+        if part.name not in read and getattr(asked, part.name) != getattr(before, part.name)
+    ]
+    if changed:
+        raise ConfigError(
+            f"training.{', training.'.join(changed)}: the student of a committee learns on rows of its bank, and reads "
+            "training.seed and training.threads alone; leave them out, or give an objective to train in chunks, for "
+            "example --set distil.objective.truth=0.5"
+        )
 
 
 def read_run(run: str | Path, changes: Sequence[Change] = ()) -> tuple[Predictor, Experiment, DataSource]:
@@ -155,7 +174,8 @@ def _run_folder(run: str | Path) -> Path:
 
 def order_facts(order: CompressionRequest) -> dict[str, Any]:
     """Plain values that decide what an order teaches."""
-    plain = asdict(order.distillation) | {"soft": _loss(order.distillation)}
+    spec = order.distillation
+    plain = None if spec is None else asdict(spec) | {"soft": _loss(spec)}
     rounding: RoundingSpec | None = order.rounding
     return {
         "units": order.units,

@@ -22,7 +22,7 @@ from edp.storage.ledger import Ledger
 from edp.storage.runs import RunFolder, run_key
 from edp.training import TrainingProgress, load_bundle
 from edp.training.bundle import weights_digest
-from edp.training.strategy import TrainingStrategy
+from edp.training.strategy import DirectFit, TrainingStrategy
 from edp.workflows.compression.bench import Bench, CompressionRequest
 from edp.workflows.compression.distil import frozen_sessions, order_facts, read_run
 from edp.workflows.compression.formats.base import FORMATS, Deployed, deploy
@@ -143,7 +143,7 @@ class DiskBench(Bench):
             if bundle.provenance.get("strategy") == facts:
                 return bundle.predictor
 
-        def strategy(data: Prepared) -> TrainingStrategy:
+        def strategy(data: Prepared) -> TrainingStrategy | DirectFit:
             return order.strategy([self.teacher], data, start)
 
         model, training = order.model(self.teacher.spec), order.training(self.training)
