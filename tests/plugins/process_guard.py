@@ -49,6 +49,7 @@ TRAINING = frozenset(
         *(
             "test_bagging",
             "test_context",
+            "test_search_rungs",
             "test_starting_channels",
             "test_distillation",
             "test_discriminative",
