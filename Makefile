@@ -2,6 +2,9 @@
 PYTHON ?= python3
 WORKERS ?= 2
 BIN := .venv/bin
+# Python keeps the bytecode of what it imports, also where the caller's environment forbids it: without it each worker and
+# each of the tests' hundreds of child processes compiles some thousand sources anew, which takes as long as they run.
+export PYTHONDONTWRITEBYTECODE :=
 READY := .venv/.ready
 INSTALL := pip install --quiet --no-deps
 BENCHMARKS = $(filter-out benchmarks/common.py benchmarks/decoys.py benchmarks/m22_truth.py benchmarks/onnx_rivals.py benchmarks/score_worlds.py,$(wildcard benchmarks/*.py))

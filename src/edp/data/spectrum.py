@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 Array = NDArray[np.float64]
 LAGS = 50
@@ -86,8 +85,11 @@ def density(stretches: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
     fitting = [u for u in stretches if len(u) >= size]
     if not fitting:
         return np.zeros(0), np.zeros((0, stretches[0].shape[1]))
+    # Imported at first use: scipy.signal imports scipy.stats, half a second of the start of every command.
+    from scipy.signal import welch
+
     # By stretch: a segment across two recordings would hold a jump that nobody commanded.
-    parts = [signal.welch(u, rate_hz, nperseg=size, axis=0) for u in fitting]
+    parts = [welch(u, rate_hz, nperseg=size, axis=0) for u in fitting]
     power = np.average([p for _, p in parts], axis=0, weights=[len(u) for u in fitting])
     return np.asarray(parts[0][0][1:]), np.asarray(power[1:])
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 from edp.data.prepared import Prepared
 from edp.data.series import Series
@@ -268,7 +268,7 @@ class _Ruler:
             return Growth(mean, mean, mean)
         # Stretches of unequal length weigh by their ticks: the error of such a mean, then Student's t.
         error = math.sqrt(float(share**2 @ (values - mean) ** 2) * count / (count - 1))
-        reach = float(stats.t.ppf(0.5 + COVERAGE / 2, count - 1)) * error
+        reach = float(stdtrit(count - 1, 0.5 + COVERAGE / 2)) * error
         return Growth(mean, mean - reach, mean + reach)
 
     def table(self, errors: Array) -> dict[str, dict[str, float]]:

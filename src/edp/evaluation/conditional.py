@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
 from scipy.cluster import hierarchy
 
 Array = NDArray[np.float64]
@@ -136,7 +136,9 @@ def collinear(parts: Sequence[NDArray[np.float32]], least: float = 0.9, rows: in
     moving = np.flatnonzero(values.std(axis=0) > 0)
     if len(moving) < 2:
         return []
-    ranks = stats.rankdata(values[:, moving], axis=0)
+    from scipy.stats import rankdata  # late: see edp.stats.effects
+
+    ranks = rankdata(values[:, moving], axis=0)
     # Rank correlation: a bent copy is still a copy.
     apart = 1.0 - np.abs(np.corrcoef(ranks, rowvar=False))
     # Complete linkage: every pair of a group is correlated, not a chain of neighbours.

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtrc, nctdtrinc
-from scipy.stats import rankdata
 
 from edp.errors import DataError
 from edp.stats.checks import Array, finite
@@ -114,6 +113,9 @@ def kendalls_w(scores: ArrayLike) -> Concordance:
     if array.ndim != 2 or min(array.shape) < 2:
         raise DataError(f"the scores have shape {array.shape}; give at least two splits of at least two modules")
     splits, modules = array.shape
+    # Imported at first use: scipy.stats takes half a second, and every command imports this room.
+    from scipy.stats import rankdata
+
     ranks = rankdata(array, axis=1)
     ties = sum(float((counts**3 - counts).sum()) for counts in (np.unique(row, return_counts=True)[1] for row in ranks))
     spread = float(np.square(ranks.sum(axis=0) - splits * (modules + 1) / 2).sum())

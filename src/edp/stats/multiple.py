@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import false_discovery_control
 
 from edp.errors import DataError, closest
 from edp.stats.checks import Array, finite
@@ -21,6 +20,8 @@ def benjamini_hochberg(p: ArrayLike) -> Array:
     Raises:
         DataError: empty, or values outside 0 to 1.
     """
+    from scipy.stats import false_discovery_control  # late: see edp.stats.effects
+
     array, _, _ = _sorted(p)
     return np.asarray(false_discovery_control(array, axis=-1, method="bh"), dtype=np.float64)
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
-from scipy.stats import f as f_distribution
 
 from edp.errors import DataError
 from edp.stats.checks import finite, tested_cells
@@ -94,6 +93,8 @@ class _MeanSquare:
 
 def _difference_interval(first: _MeanSquare, second: _MeanSquare, tail: float) -> tuple[float, float]:
     """Interval for the difference of two expected mean squares."""
+    from scipy.stats import f as f_distribution  # late: see edp.stats.effects
+
     between, df1, within, df2 = first.value, first.freedom, second.value, second.freedom
     g1, h1 = 1.0 - df1 / chdtri(df1, tail), df1 / chdtri(df1, 1.0 - tail) - 1.0
     g2, h2 = 1.0 - df2 / chdtri(df2, tail), df2 / chdtri(df2, 1.0 - tail) - 1.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from edp.data.screening.compiled import compiled, spread
 from edp.data.screening.result import Array, GroupImportance
@@ -214,7 +214,7 @@ def _listed(increases: Array, members: Sequence[Sequence[str]], targets: Sequenc
         middle = values.mean(axis=1)
         positive = max(float(np.maximum(middle, 0.0).sum()), 1e-30)
         # Pieces are the units: rows of one recording depend on one another.
-        half = student.ppf(0.975, values.shape[1] - 1) * values.std(axis=1, ddof=1) / math.sqrt(values.shape[1])
+        half = stdtrit(values.shape[1] - 1, 0.975) * values.std(axis=1, ddof=1) / math.sqrt(values.shape[1])
         for g, group in enumerate(members):
             importances.append(
                 GroupImportance(

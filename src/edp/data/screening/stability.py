@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from edp.data.screening.compiled import spread
 from edp.data.screening.information import Information
@@ -193,13 +193,13 @@ def relations_of(lagged: Lagged, places: NDArray[np.int64], metrics: Metrics, le
     count = len(pieces)
     # The chance level between pieces guards the correlation already, as the largest of many draws over all lags; some
     # ten of them are independent.
-    bound = float(student.ppf(1.0 - level / 20.0 / linear.shape[1], count - 1))
-    bound_information = float(student.ppf(1.0 - level / linear.size, count - 1))
+    bound = float(stdtrit(count - 1, 1.0 - level / 20.0 / linear.shape[1]))
+    bound_information = float(stdtrit(count - 1, 1.0 - level / linear.size))
     with np.errstate(invalid="ignore"):
         # Pieces of unlike manoeuvres differ so much that a real relation may be unsure among few of them: far above
         # all draws of chance, less will do.
         sure = (np.abs(linear) > ABOVE_CHANCE * chance) & (linear_t > bound)
-        clear = (np.abs(linear) > CLEARLY * chance) & (linear_t > float(student.ppf(0.995, count - 1)))
+        clear = (np.abs(linear) > CLEARLY * chance) & (linear_t > float(stdtrit(count - 1, 0.995)))
         by_lag = (np.abs(linear) > LEAST_CORRELATION) & (sure | clear)
         by_information = (information > LEAST_INFORMATION) & (information_t > bound_information)
     return Relations(linear, chance.copy(), linear_t, information, information_t, by_lag | by_information)

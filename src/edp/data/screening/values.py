@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from edp.data.screening.compiled import spread
 from edp.data.screening.lagged import Lagged
@@ -132,7 +132,7 @@ def linear_values(
 def _interval(values: Array, middle: float) -> tuple[float, float, float]:
     """The pooled figure with a 95 % t interval from the pieces."""
     error = values.std(ddof=1) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-    half = float(student.ppf(0.975, max(len(values) - 1, 1)) * error)
+    half = float(stdtrit(max(len(values) - 1, 1), 0.975) * error)
     return middle, middle - half, middle + half
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from edp.config.experiment import Experiment, FeatureSettings
 from edp.data.features import FEATURE_SETS, Derived
@@ -321,5 +321,5 @@ def _difference(ours: Mapping[str, float], reference: Mapping[str, float]) -> Pa
     gaps = np.array([ours[name] - reference[name] for name in reference])
     mean = float(gaps.mean())
     # Pairs by recording: recordings differ more than feature sets do.
-    reach = float(stats.t.ppf(0.5 + COVERAGE / 2, len(gaps) - 1)) * float(gaps.std(ddof=1)) / math.sqrt(len(gaps))
+    reach = float(stdtrit(len(gaps) - 1, 0.5 + COVERAGE / 2)) * float(gaps.std(ddof=1)) / math.sqrt(len(gaps))
     return PairedDifference(mean, mean - reach, mean + reach)
