@@ -341,7 +341,7 @@ class FreeRunValidation:
         DataError: no stretch is longer than the prefix.
     """
 
-    def __init__(self, twin: RecurrentTwin, series: Sequence[Series], ticks: int, lanes: int) -> None:
+    def __init__(self, twin: Twin, series: Sequence[Series], ticks: int, lanes: int) -> None:
         self.twin, prefix = twin, twin.prefix_ticks
         longest = max((part.samples for part in series), default=0)
         ticks = min(ticks, longest - prefix - 1)

@@ -14,14 +14,20 @@ from edp.data.prepared import Prepared
 from edp.evaluation.free_run import calibrated
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
+from edp.networks.twin.grey.datasheet import BASIS, datasheet, datasheet_text
+from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.recurrent import RecurrentTwin
+from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.free_run import FittedTwin, FreeRunProgress, fit_free_runs
+from edp.training.grey_fit import fit_grey_box
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
 FOLDER = "twin"
+DATASHEET = "datasheet"
+"""Numbers of a grey box with units and intervals, as JSON and as text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +84,14 @@ def train_twin(
             keyed = KeyedRun(run, key)
             fitted = fit_free_runs(twin, data.train, data.validation, experiment.training, on_event, keyed)
             run.write_history(fitted.history)
+        elif isinstance(twin, GreyTwin):
+            tell("fitting the grey box to free runs")
+            fit = fit_grey_box(twin, data.train, data.validation, experiment.training.seed, on_event)
+            fitted = FittedTwin(fit.twin, fit.history, fit.seconds)
+            run.write_history(fitted.history)
+            rows = datasheet(twin.table, fit.twin.numbers, fit.information)
+            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": rows})
+            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows).encode())
         else:
             fitted = FittedTwin(twin, [], time.process_time() - started)
         tell("calibrating intervals")

@@ -1,0 +1,44 @@
+"""Where each number of a grey box lies in the flat arrays that its compiled code reads and writes.
+
+Units there are m, s, MPa, MN and Gg (10^6 kg), in which pressures, forces and masses are numbers of a like size.
+
+One hydraulic network: nodes are the head chambers of all actuators, their rod chambers, the pump lines, then two of
+constant pressure, tank and supply. Every opening is an edge from node to node.
+"""
+
+from __future__ import annotations
+
+# numbers of one actuator, from `actuator_at[i]`
+(
+    HEAD_AREA, ROD_AREA, HEAD_DEAD, ROD_DEAD, PISTON_LEAK, SPOOL_LEAK, HEAD_RELIEF, ROD_RELIEF,
+    CUSHION_LENGTH, CUSHION_LEAST, COULOMB, STATIC, STRIBECK, VISCOUS, BRISTLE, BRISTLE_DAMPING,
+    STOP_LOW, STOP_HIGH, STOP_STIFFNESS, ASYMMETRY,
+) = range(20)  # fmt: skip
+ACTUATOR_VALUES = 20
+
+# of one pump, from `pump_at[m]`
+FLOW, LEAST, LAG, LINE, BYPASS, BYPASS_CLOSED, RELIEF = range(7)
+PUMP_VALUES = 7
+
+# of the circuit, from `circuit_at`
+(
+    BULK, AIR, TANK, SUPPLY, MAKE_UP, PORT_SLOPE, RELIEF_SLOPE, POWER, PLAY, DEMAND_START, DEMAND_SPAN,
+) = range(11)  # fmt: skip
+CIRCUIT_VALUES = 11
+
+# valve_at[j, ...]: place of each number of a valve, by direction where there are two; -1: the valve has none
+DELAY, PILOT_LAG, SPOOL_LAG, BAND, GAIN, INTO, OUT_OF, REGENERATION = 0, 1, 2, 3, 5, 7, 9, 11
+VALVE_PLACES = 13
+
+# valves[j, ...]: pilot (two lags), play, spool (two lags), as shares of full, extension positive
+PILOT_1, PILOT_2, PLAYED, SPOOL_1, SPOOL = range(5)
+VALVE_STATES = 5
+
+# own tangents of a valve: by its delay, lags and the play
+BY_DELAY, BY_PILOT_LAG, BY_SPOOL_LAG, BY_PLAY = range(4)
+OWN = 4
+
+ATMOSPHERE = 0.1013
+"""MPa; pressures are gauge."""
+LEAST_ABSOLUTE = 1e-3
+"""MPa, below which no oil is left that could boil."""

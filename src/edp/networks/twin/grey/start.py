@@ -1,0 +1,132 @@
+"""Where a fit of a grey box starts: the balance of forces, solved for the load by least squares on what was measured.
+
+    A_A p_A = A_B p_B + M v' + grad U(s) + F_C sign(v) + F_v v
+
+It is linear in all that is not known, so it needs no starting values of its own. Pose-dependent inertia is left to the
+fit on free runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.numbers import NumberTable
+
+Array = NDArray[np.float64]
+REACH = 2
+"""Ticks before and after over which velocities are differenced: noise falls, and swings of a few Hz stay."""
+FEW = 40_000
+"""Rows that are solved for at most."""
+SHARE_RANGE = (0.2, 1.0)
+"""Of rod area by head area; what is moments outside is not believed."""
+
+
+def load_start(
+    table: NumberTable,
+    train: Sequence[Series],
+    columns: Sequence[tuple[int, int, int, int]],
+    z_of: tuple[Array, Array],
+    rate_hz: float,
+    declared: Sequence[bool],
+) -> Array:
+    """Nominal numbers, those of the load in index of the plausible ones where all is measured.
+
+    Args:
+        table: of numbers.
+        train: training stretches.
+        columns: of velocity, stroke, head and rod pressure of each cylinder among the answers; -1: not measured.
+        z_of: middle and scale of the strokes.
+        rate_hz: samples per second.
+        declared: whether the areas of each cylinder are known.
+    """
+    values = table.nominal
+    if any(column < 0 for entry in columns for column in entry):
+        return values
+    rows = _rows(train, columns, rate_hz)
+    speed, pull, stroke, head, rod = (np.moveaxis(rows[:, :, k], 0, 0) for k in range(5))
+    n, exponents = len(columns), table.exponents
+    z = (stroke - z_of[0]) * z_of[1]
+    inertia = [(a, c) for a in range(n) for c in range(a + 1)]
+    width = len(inertia) + len(exponents) - 1 + 3 * n
+    matrix, goal = np.zeros((n, len(z), width)), np.zeros((n, len(z)))
+    for i in range(n):
+        a = table.actuator_at[i]
+        for k, (p, r) in enumerate(inertia):
+            if i in (p, r):
+                matrix[i, :, k] = pull[:, r if i == p else p]
+        for b in range(1, len(exponents)):
+            e = exponents[b]
+            if e[i]:
+                lower = e - (np.arange(n) == i)
+                matrix[i, :, len(inertia) + b - 1] = e[i] * z_of[1][i] * np.prod(z**lower, axis=1)
+        own = len(inertia) + len(exponents) - 1 + 3 * i
+        matrix[i, :, own] = np.tanh(speed[:, i] / values[a + at.STRIBECK])
+        matrix[i, :, own + 1] = speed[:, i]
+        goal[i] = values[a + at.HEAD_AREA] * head[:, i]
+        if declared[i]:
+            goal[i] -= values[a + at.ROD_AREA] * rod[:, i]
+        else:
+            matrix[i, :, own + 2] = rod[:, i]
+        size = max(float(goal[i].std()), 1e-9)
+        matrix[i] /= size
+        goal[i] /= size
+    solution = _ridge(matrix.reshape(-1, width), goal.reshape(-1))
+    return _taken(table, solution, inertia, declared, values)
+
+
+def _taken(
+    table: NumberTable, solution: Array, inertia: list[tuple[int, int]], declared: Sequence[bool], values: Array
+) -> Array:
+    """The solution in its places, as far as it can be believed."""
+    n = len(table.actuator_at)
+    mass = np.zeros((n, n))
+    for k, (p, r) in enumerate(inertia):
+        mass[p, r] = mass[r, p] = solution[k]
+    moments, vectors = np.linalg.eigh(mass)
+    # At least 200 kg along each direction: noise must not make an inertia negative.
+    low = np.linalg.cholesky((vectors * np.maximum(moments, 2e-4)) @ vectors.T)
+    for k, (p, r) in enumerate(inertia):
+        values[table.inertia_at + k * table.inertia_terms] = low[p, r]
+    potential = len(table.exponents) - 1
+    values[table.potential_at : table.potential_at + potential] = solution[len(inertia) : len(inertia) + potential]
+    for i in range(n):
+        a, own = table.actuator_at[i], len(inertia) + potential + 3 * i
+        for index, value in ((at.COULOMB, solution[own]), (at.VISCOUS, solution[own + 1])):
+            values[a + index] = np.clip(value, 0.2 * values[a + index], 5.0 * values[a + index])
+        if not declared[i]:
+            share = np.clip(solution[own + 2] / values[a + at.HEAD_AREA], *SHARE_RANGE)
+            values[a + at.ROD_AREA] = share * values[a + at.HEAD_AREA]
+    return values
+
+
+def _rows(train: Sequence[Series], columns: Sequence[tuple[int, int, int, int]], rate_hz: float) -> Array:
+    """Velocity, acceleration, stroke, head and rod pressure ``(row, cylinder, 5)``, far from the stops."""
+    parts = []
+    every = max(1, sum(series.samples for series in train) // FEW)
+    for series in train:
+        values = series.targets.astype(np.float64)
+        middle = values[REACH:-REACH]
+        part = np.empty((len(middle), len(columns), 5))
+        for i, (speed, stroke, head, rod) in enumerate(columns):
+            part[:, i, 0] = middle[:, speed]
+            part[:, i, 1] = (values[2 * REACH :, speed] - values[: -2 * REACH, speed]) * rate_hz / (2 * REACH)
+            part[:, i, 2] = middle[:, stroke]
+            part[:, i, 3], part[:, i, 4] = middle[:, head] / 1e6, middle[:, rod] / 1e6
+        parts.append(part[::every])
+    rows = np.concatenate(parts)
+    low, high = rows[:, :, 2].min(axis=0), rows[:, :, 2].max(axis=0)
+    inside = ((rows[:, :, 2] > low + 0.02 * (high - low)) & (rows[:, :, 2] < high - 0.02 * (high - low))).all(axis=1)
+    return rows[inside] if inside.sum() > 0.1 * len(rows) else rows
+
+
+def _ridge(matrix: Array, goal: Array) -> Array:
+    """Least squares on columns of one size."""
+    size = np.sqrt(np.square(matrix).mean(axis=0))
+    scaled = matrix / np.maximum(size, 1e-12)
+    normal = scaled.T @ scaled + 1e-6 * len(goal) * np.eye(matrix.shape[1])
+    return np.asarray(np.linalg.solve(normal, scaled.T @ goal) / np.maximum(size, 1e-12))

@@ -1,0 +1,397 @@
+"""A grey box: pumps, valves, cylinders and their load as differential equations, with numbers fitted to free runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.elements import (
+    CylinderElement,
+    Elements,
+    PumpElement,
+    ValveElement,
+    check_elements,
+    default_elements,
+)
+from edp.networks.twin.grey.numbers import KNOTS, NumberTable, Travel, number_table
+from edp.networks.twin.grey.run import run_lanes
+from edp.networks.twin.grey.start import load_start
+from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
+from edp.settings.bounds import (
+    MOST_BATCH,
+    MOST_NAMES,
+    MOST_UPDATES,
+    SHARE,
+    WEIGHT,
+    above,
+    check_bounds,
+    check_count,
+    whole,
+)
+
+Doubles = NDArray[np.float64]
+LONGEST_DELAY_S = 0.3
+"""Of a command; a fit cannot find a longer one."""
+LONGEST_STEP_S = 0.0125
+"""Of an implicit step: swings of a load of several Hz keep their damping."""
+REST_MPA = 2.0
+"""Where a chamber that is not measured starts in the prefix."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyFitSpec:
+    """How the numbers of a grey box are fitted (`edp.training.grey_fit`).
+
+    Attributes:
+        lengths_s: lengths of the free runs, stage after stage.
+        rounds: rounds of each stage; every one draws other stretches.
+        steps: Gauss-Newton steps in a round.
+        lanes: free runs of a round at most.
+        ticks: of all free runs of a round together, about.
+        memory: share of what a round knows that counts in the next one, beside its own stretches.
+        stroke_weight: of an error of a stroke in its deviations, beside those of velocities and pressures.
+        delta: where the Huber loss turns from a square to a line, in weighted deviations.
+        validate_every: rounds from one validation to the next.
+        validation_s: length of a free run of the validation.
+        validation_runs: how many there are.
+
+    Raises:
+        ConfigError: a value out of range, or stages that do not fit one another.
+    """
+
+    lengths_s: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
+    rounds: tuple[int, ...] = (8, 6, 6, 4)
+    steps: int = 3
+    lanes: int = 256
+    ticks: int = 12_000
+    memory: float = 0.5
+    stroke_weight: float = 5.0
+    delta: float = 0.2
+    validate_every: int = 2
+    validation_s: float = 10.0
+    validation_runs: int = 32
+
+    def __post_init__(self) -> None:
+        length, count = above(0.0, 600.0), whole(1, MOST_UPDATES)
+        bounds = {"lengths_s": length, "validation_s": length, "rounds": count, "steps": count, "ticks": count}
+        bounds |= {"lanes": whole(1, MOST_BATCH), "validation_runs": whole(1, MOST_BATCH), "validate_every": count}
+        check_bounds("grey box fit", self, stroke_weight=WEIGHT, delta=WEIGHT, memory=SHARE, **bounds)
+        check_count("grey box fit", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
+        if len(self.lengths_s) != len(self.rounds):
+            raise ConfigError(
+                f"grey box fit: {len(self.lengths_s)} lengths_s and {len(self.rounds)} rounds; one number of rounds "
+                "for each length must hold"
+            )
+
+
+@TWINS.register("greybox")
+@dataclass(frozen=True, kw_only=True)
+class GreyBox:
+    """Elements of a hydraulic machine; without any, names and kinds of the channels say what there is.
+
+    Attributes:
+        cylinders: with their channels.
+        valves: spools between pumps and cylinders.
+        pumps: with their lines; none: valves are fed at constant pressure.
+        inertia_degree: of the polynomials of the strokes that stand for the root of the inertia.
+        potential_degree: of the polynomial that stands for gravity.
+        prefix_ticks: measured ticks before a free run.
+        fit: how its numbers are fitted.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    cylinders: tuple[CylinderElement, ...] = ()
+    valves: tuple[ValveElement, ...] = ()
+    pumps: tuple[PumpElement, ...] = ()
+    inertia_degree: int = 2
+    potential_degree: int = 4
+    prefix_ticks: int = 30
+    fit: GreyFitSpec = field(default_factory=GreyFitSpec)
+
+    def __post_init__(self) -> None:
+        degree = whole(0, 4)
+        check_bounds("grey box", self, inertia_degree=degree, potential_degree=whole(1, 6), prefix_ticks=PREFIX)
+        for name in ("cylinders", "valves", "pumps"):
+            check_count("grey box", name, getattr(self, name), MOST_NAMES)
+
+    def elements(self, channels: TwinChannels) -> Elements:
+        """Connected elements.
+
+        Raises:
+            ConfigError: a port that is not connected, or pressures that no element has.
+        """
+        if self.cylinders or self.valves or self.pumps:
+            elements = Elements(self.pumps, self.cylinders, self.valves)
+        else:
+            elements = default_elements(channels)
+        check_elements(elements, channels)
+        return elements
+
+    def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> GreyTwin:
+        """With plausible numbers; where all is measured, its load balances the forces that were measured."""
+        elements = self.elements(channels)
+        table = self._table(elements, channels, scales)
+        commands = np.concatenate([series.inputs for series in train])
+        full = [_full(commands[:, _sides(valve, channels)]) for valve in elements.valves]
+        arrays = {"numbers": table.nominal.astype(np.float32), "full": np.array(full, np.float32)}
+        twin = self.build(channels, scales, arrays)
+        declared = [cylinder.areas is not None for cylinder in elements.cylinders]
+        values = load_start(table, train, twin.wiring.columns, twin.wiring.z_of, channels.rate_hz, declared)
+        return twin.with_numbers(values)
+
+    def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
+        """All numbers, and the full command of each valve."""
+        elements = self.elements(channels)
+        travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.cylinders)
+        table = number_table(elements, travels, [1.0] * len(elements.pumps), self._degrees)
+        return {"numbers": (len(table.numbers),), "full": (len(elements.valves),)}
+
+    def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
+        """The grey box with these numbers."""
+        elements = self.elements(channels)
+        table = self._table(elements, channels, scales)
+        numbers = arrays["numbers"].astype(np.float64)
+        if not (numbers[table.positive] > 0).all():
+            raise ValueError("one of its numbers is not positive")
+        wiring = Wiring.of(elements, channels, scales)
+        return GreyTwin(channels, scales, self, (table, wiring), numbers, arrays["full"])
+
+    @property
+    def _degrees(self) -> tuple[int, int]:
+        return self.inertia_degree, self.potential_degree
+
+    def _table(self, elements: Elements, channels: TwinChannels, scales: TwinScales) -> NumberTable:
+        names = [channel.name for channel in channels.answers]
+        count = len(channels.velocities)
+
+        def highest(name: str) -> float:
+            return float(scales.high[names.index(name)]) / HIGHEST / 1e6 if name else 30.0
+
+        travels = []
+        for cylinder in elements.cylinders:
+            i = names.index(cylinder.velocity)
+            low, high = (scales.low[count + i], scales.high[count + i]) if channels.strokes else (-0.5, 0.5)
+            fastest = float(scales.high[i]) / FASTEST
+            travels.append(Travel(float(low), float(high), fastest, (highest(cylinder.head), highest(cylinder.rod))))
+        pumps = [highest(pump.pressure) * HIGHEST for pump in elements.pumps]
+        return number_table(elements, travels, pumps, self._degrees)
+
+
+def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:
+    names = [channel.name for channel in channels.commands]
+    return [names.index(name) for name in (valve.extend, valve.retract) if name]
+
+
+def _full(commands: Array) -> float:
+    """The largest command; a command that never moved is full at 1."""
+    return float(np.abs(commands).max()) or 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Wiring:
+    """Which channel is which state of the grey box.
+
+    Attributes:
+        sides: columns of the commands that extend and retract ``(valve, 2)``; -1: none.
+        actuator: of each valve; `pump` its pump, -1: supply.
+        pump: of each valve.
+        ports: kind (velocity, stroke, pressure) and number of the state behind each answer ``(answer, 2)``.
+        columns: answers of velocity, stroke, head and rod pressure of each cylinder; -1: not measured.
+        z_of: middle of the strokes (m) and scale to -1..1; a scale of 0 where a stroke is not measured.
+        nodes: pressures that are states.
+    """
+
+    sides: NDArray[np.int64]
+    actuator: NDArray[np.int64]
+    pump: NDArray[np.int64]
+    ports: NDArray[np.int64]
+    columns: tuple[tuple[int, int, int, int], ...]
+    z_of: tuple[Doubles, Doubles]
+    nodes: int
+
+    @staticmethod
+    def of(elements: Elements, channels: TwinChannels, scales: TwinScales) -> Wiring:
+        """The wiring of connected elements."""
+        names = [channel.name for channel in channels.answers]
+        commands = [channel.name for channel in channels.commands]
+        speeds = [channel.name for channel in channels.velocities]
+        n, count = len(elements.cylinders), len(speeds)
+        column = {name: i for i, name in enumerate(names)} | {"": -1}
+        ports = np.zeros((len(names), 2), np.int64)
+        columns, middle, scale = [], np.zeros(n), np.zeros(n)
+        for i, cylinder in enumerate(elements.cylinders):
+            speed = speeds.index(cylinder.velocity)
+            stroke = count + speed if channels.strokes else -1
+            head, rod = column[cylinder.head], column[cylinder.rod]
+            columns.append((speed, stroke, head, rod))
+            for answer, kind, which in ((speed, 0, i), (stroke, 1, i), (head, 2, i), (rod, 2, n + i)):
+                if answer >= 0:
+                    ports[answer] = kind, which
+            if stroke >= 0:
+                low, high = float(scales.low[stroke]), float(scales.high[stroke])
+                middle[i], scale[i] = 0.5 * (low + high), 2.0 / (high - low)
+        for m, pump in enumerate(elements.pumps):
+            if pump.pressure:
+                ports[column[pump.pressure]] = 2, 2 * n + m
+        cylinders = [cylinder.name for cylinder in elements.cylinders]
+        pumps = [pump.name for pump in elements.pumps]
+        sides = [(commands.index(v.extend), commands.index(v.retract) if v.retract else -1) for v in elements.valves]
+        return Wiring(
+            np.array(sides),
+            np.array([cylinders.index(v.actuator) for v in elements.valves]),
+            np.array([pumps.index(v.supply) if v.supply else -1 for v in elements.valves]),
+            ports,
+            tuple(columns),
+            (middle, scale),
+            2 * n + len(pumps),
+        )
+
+    @property
+    def whole(self) -> bool:
+        """Whether every state of the load is measured."""
+        return len(self.ports) == self.nodes + 2 * len(self.columns)
+
+
+@dataclass(frozen=True, eq=False)
+class RunTarget:
+    """What errors of free runs are summed up against, in units of the grey box.
+
+    Attributes:
+        truth: ``(lane, tick, answer)``; row t is the machine after the command of tick t.
+        weight: of the errors ``(answer,)``.
+        delta: where the Huber loss turns to a line, in weighted errors.
+        counts: see `edp.networks.twin.grey.run.run_lanes`.
+        normal: matrix, gradient and losses, as there.
+    """
+
+    truth: Doubles
+    weight: Doubles
+    delta: float
+    counts: tuple[int, int, int]
+    normal: tuple[Doubles, Doubles, Doubles]
+
+
+EMPTY = (np.zeros((0, 0)), np.zeros(0), np.zeros(0))
+
+
+class GreyTwin(Twin):
+    """State: ``answer`` in SI units, and in units of `edp.networks.twin.grey.layout` what the elements remember."""
+
+    def __init__(
+        self,
+        channels: TwinChannels,
+        scales: TwinScales,
+        spec: GreyBox,
+        parts: tuple[NumberTable, Wiring],
+        numbers: Doubles,
+        full: Array,
+    ) -> None:
+        super().__init__(channels, scales, spec.prefix_ticks)
+        self.spec, (self.table, self.wiring) = spec, parts
+        self.numbers, self.full = numbers, full
+
+    def with_numbers(self, numbers: Doubles) -> GreyTwin:
+        """The same elements with other numbers, rounded as they are kept."""
+        rounded = numbers.astype(np.float32).astype(np.float64)
+        return GreyTwin(self.channels, self.scales, self.spec, (self.table, self.wiring), rounded, self.full)
+
+    @property
+    def units(self) -> Doubles:
+        """Of each answer in SI units: pressures in MPa are numbers of the size of the others."""
+        return np.where(self.wiring.ports[:, 0] == 2, 1e6, 1.0)
+
+    @property
+    def form(self) -> tuple[NDArray[np.int64], ...]:
+        """Places of valves and elements, as compiled code reads them."""
+        table, wiring = self.table, self.wiring
+        return table.valve_at, wiring.actuator, wiring.pump, table.actuator_at, table.pump_at
+
+    @property
+    def time(self) -> tuple[float, int]:
+        """Length of a tick in seconds, and implicit steps in it."""
+        tick = 1.0 / self.channels.rate_hz
+        return tick, max(1, int(np.ceil(tick / LONGEST_STEP_S - 1e-9)))
+
+    def demands(self, commands: Array) -> Doubles:
+        """Signed commands of the valves as shares of full ``(batch, tick, valve)``, extension positive."""
+        extend, retract = self.wiring.sides.T
+        signed = commands[..., extend].astype(np.float64)
+        signed -= np.where(retract >= 0, commands[..., retract], 0.0)
+        return np.ascontiguousarray(np.clip(signed / self.full, -1.0, 1.0))
+
+    def rest(self, demands: Doubles, measured: Array) -> tuple[Doubles, ...]:
+        """States of machines at rest: y, strokes, bristles, displacements, valves and history.
+
+        Args:
+            demands: ``(batch, valve)``.
+            measured: ``(batch, answer)``, SI units.
+        """
+        wiring, batch, n = self.wiring, len(demands), len(self.wiring.columns)
+        y, strokes = np.zeros((batch, wiring.nodes + n)), np.tile(wiring.z_of[0], (batch, 1))
+        y[:, : wiring.nodes] = REST_MPA
+        for column, (kind, which) in enumerate(wiring.ports):
+            values = measured[:, column] / self.units[column]
+            if kind == 1:
+                strokes[:, which] = values
+            else:
+                y[:, which + (wiring.nodes if kind == 0 else 0)] = values
+        longest = round(LONGEST_DELAY_S * self.channels.rate_hz) + 2
+        least = [self.numbers[index + at.LEAST] for index in self.table.pump_at]
+        return (
+            y,
+            strokes,
+            np.zeros((batch, n)),
+            np.tile(np.array(least), (batch, 1)),
+            np.repeat(demands[:, :, None], at.VALVE_STATES, axis=2),
+            np.repeat(demands[:, None], longest, axis=1),
+        )
+
+    def initial_state(self, command: Array, measured: Array) -> TwinState:
+        rest = self.rest(self.demands(command[:, None])[:, 0], measured)
+        named = {name: values.astype(np.float32) for name, values in zip(STATES, rest, strict=True)}
+        return {"answer": measured.astype(np.float32)} | named
+
+    def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
+        now = tuple(np.array(state[name], np.float64, order="C") for name in ("answer", *STATES))
+        now[0][:] /= self.units
+        answers = np.empty(measured.shape)
+        self.lanes(self.numbers, self.demands(commands), measured / self.units, now, answers=answers)
+        after = {name: values.astype(np.float32) for name, values in zip(STATES, now[1:], strict=True)}
+        rounded = answers.astype(np.float32)
+        return rounded, {"answer": rounded[:, -1].copy()} | after
+
+    def lanes(
+        self,
+        numbers: Doubles,
+        demands: Doubles,
+        measured: Doubles,
+        state: tuple[Doubles, ...],
+        answers: Doubles | None = None,
+        judge: RunTarget | None = None,
+        full: bool = False,
+    ) -> None:
+        """`edp.networks.twin.grey.run.run_lanes` with these elements: a free run, or the errors of one."""
+        nothing = np.zeros((0, 0, 0))
+        judged = judge or RunTarget(nothing, np.zeros(len(self.wiring.ports)), 1.0, (0, 0, 1), EMPTY)
+        limits = (self.scales.low / self.units, self.scales.high / self.units, self.units)
+        run_lanes(
+            demands, measured, judged.truth, state, judged.counts, (judged.weight, judged.delta), limits,
+            (numbers, KNOTS, *self.wiring.z_of), self.form, self.wiring.ports, self.table.places, self.table.exponents,
+            self.time, full, nothing if answers is None else answers, judged.normal,
+        )  # fmt: skip
+
+    def arrays(self) -> dict[str, Array]:
+        return self.scales.arrays() | {"numbers": self.numbers.astype(np.float32), "full": self.full}
+
+
+STATES = ("pressures_and_velocities", "strokes", "bristles", "displacements", "valves", "history")

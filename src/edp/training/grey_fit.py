@@ -1,0 +1,206 @@
+"""Fitting a grey box to free runs: Gauss-Newton with exact tangents, from measured starts everywhere, several starts.
+
+A grey box has some hundred numbers of very different influence. Gauss-Newton steps, damped by Levenberg and Marquardt's
+rule, find the valleys between them in tens of iterations, where steps along a gradient take thousands. Each round draws
+new stretches, first short, then longer: a bad start cannot carry a long run astray at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.errors import DataError
+from edp.networks.twin.greybox import GreyTwin, RunTarget
+from edp.training.free_run import FreeRunProgress, FreeRunValidation
+
+Doubles = NDArray[np.float64]
+FINEST = 0.02
+"""Error in deviations that a fit is taken to leave: it weighs the data against what is plausible."""
+LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
+FARTHEST = 1.5
+"""Plausible deviations that one step may move a number: beyond it a linear model says nothing."""
+TRIES = 4
+"""Steps, each damped more, after which a round gives up and draws other stretches."""
+
+
+@dataclass(eq=False)
+class _Round:
+    """Stretches of one round, in units of the grey box."""
+
+    demands: Doubles
+    measured: Doubles
+    truth: Doubles
+    counts: tuple[int, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class GreyFit:
+    """A fitted grey box.
+
+    Attributes:
+        twin: with the numbers of the best validation.
+        history: a row per validation.
+        seconds: processor time.
+        information: of the coordinates in which it was fitted: inverse covariance by the data that the last rounds
+            saw, without what was thought plausible before ``(number, number)``.
+    """
+
+    twin: GreyTwin
+    history: list[dict[str, Any]]
+    seconds: float
+    information: Doubles
+
+
+class _Problem:
+    """Losses of free runs by the coordinates of the numbers."""
+
+    def __init__(self, twin: GreyTwin, train: Sequence[Series], stroke_weight: float, delta: float) -> None:
+        self.twin, self.delta = twin, delta / FINEST
+        # Coordinates begin at the start of the twin, which knows more than the nominal numbers.
+        self.begin = twin.numbers.copy()
+        channels = twin.channels
+        counts = (len(channels.velocities), len(channels.strokes), len(channels.pressures))
+        each = np.repeat([1.0, stroke_weight, 1.0], counts)
+        self.weight = each * twin.units / twin.scales.answer_width.astype(np.float64) / FINEST
+        self.series = [part for part in train if part.samples > twin.prefix_ticks + 2]
+        self.plausible = np.where(twin.table.positive, twin.table.width, 1.0)
+
+    def draw(self, ticks: int, lanes: int, rng: np.random.Generator) -> _Round:
+        """Stretches with starts everywhere."""
+        prefix = self.twin.prefix_ticks
+        usable = [part for part in self.series if part.samples > prefix + ticks]
+        if not usable:
+            raise DataError(
+                f"no stretch is longer than prefix and free run, {prefix + ticks} ticks; give longer recordings, or "
+                "shorter free runs (twin.lengths_s)"
+            )
+        starts = np.array([part.samples - prefix - ticks for part in usable], dtype=np.float64)
+        which = rng.choice(len(usable), lanes, p=starts / starts.sum())
+        length = prefix + ticks
+        commands, answers = [], []
+        for part in (usable[i] for i in which):
+            first = int(rng.integers(0, part.samples - length))
+            commands.append(part.inputs[first : first + length])
+            answers.append(part.targets[first : first + length + 1])
+        values = np.stack(answers) / self.twin.units
+        measured = values[:, :-1].copy()
+        measured[:, prefix + 1 :] = np.nan
+        # Rows that count lie apart: neighbouring errors of a run say the same.
+        counts = (prefix, prefix if self.twin.wiring.whole else 0, max(1, ticks // 10))
+        truth = np.ascontiguousarray(values[:, 1:])
+        return _Round(self.twin.demands(np.stack(commands)), measured, truth, counts)
+
+    def numbers(self, theta: Doubles) -> Doubles:
+        """Numbers by coordinates in plausible deviations."""
+        table = self.twin.table
+        grown = self.begin * np.exp(np.clip(theta * self.plausible, -12.0, 12.0))
+        return np.where(table.positive, grown, self.begin + table.width * theta)
+
+    def losses(self, theta: Doubles, drawn: _Round, full: bool) -> tuple[Doubles, Doubles, Doubles]:
+        """Matrix and gradient by the coordinates, and the loss of each lane."""
+        twin, numbers = self.twin, self.numbers(theta)
+        size = len(numbers) if full else 0
+        rest = twin.rest(drawn.demands[:, 0], (drawn.measured[:, 0] * twin.units).astype(np.float32))
+        state = (drawn.measured[:, 0].copy(), *(np.ascontiguousarray(values, dtype=np.float64) for values in rest))
+        normal = (np.zeros((size, size)), np.zeros(size), np.zeros(len(drawn.demands)))
+        judged = RunTarget(drawn.truth, self.weight, self.delta, drawn.counts, normal)
+        twin.lanes(numbers, drawn.demands, drawn.measured, state, judge=judged, full=full)
+        matrix, gradient, losses = normal
+        if full:
+            table = self.twin.table
+            slope = np.where(table.positive, numbers * self.plausible, table.width)
+            matrix, gradient = matrix * slope * slope[:, None], gradient * slope
+        return matrix, gradient, np.nan_to_num(losses, nan=1e12, posinf=1e12)
+
+
+def fit_grey_box(
+    twin: GreyTwin,
+    train: Sequence[Series],
+    validation: Sequence[Series],
+    seed: int,
+    on_event: Callable[[FreeRunProgress], None] | None = None,
+) -> GreyFit:
+    """Fit the numbers of a grey box to free runs; free runs of the validation part choose among the rounds.
+
+    Args:
+        twin: with the numbers to start from.
+        train: training stretches.
+        validation: stretches that choose.
+        seed: of the stretches.
+        on_event: called after each round.
+
+    Raises:
+        DataError: stretches that are too short.
+    """
+    spec = twin.spec.fit
+    rng, began = np.random.default_rng(seed), time.process_time()
+    problem = _Problem(twin, train, spec.stroke_weight, spec.delta)
+    judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
+    theta = np.zeros(len(twin.numbers))
+    best, chosen, history = np.inf, theta, list[dict[str, Any]]()
+    rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
+    damping, information = 1.0, np.zeros((len(theta), len(theta)))
+    memory = np.zeros_like(information)
+    for done, length_s in enumerate(rounds, 1):
+        ticks = max(1, round(length_s * twin.channels.rate_hz))
+        lanes = max(8, min(spec.lanes, spec.ticks // ticks))
+        drawn = problem.draw(ticks, lanes, rng)
+        before = theta
+        theta, damping, matrix = _improve(problem, theta, drawn, damping, spec.steps, memory)
+        # The first stage begins far away, where a linear model says little about the end.
+        memory = spec.memory * (memory + matrix) if length_s != spec.lengths_s[0] else memory
+        if done != len(rounds) and done % spec.validate_every and length_s == rounds[min(done, len(rounds) - 1)]:
+            continue
+        judge.twin = twin.with_numbers(problem.numbers(theta))
+        error = judge.error()
+        if error < best:
+            best, chosen, information = error, theta, memory + matrix
+        seconds = time.process_time() - began
+        moved = float(np.sqrt(np.mean((theta - before) ** 2)))
+        row = {"update": done, "length_s": length_s, "validation": error, "best": chosen is theta, "moved": moved}
+        history.append(row | {"damping": damping, "seconds": round(seconds, 2)})
+        if on_event is not None:
+            left = seconds * sum(rounds[done:]) / sum(rounds[:done])
+            on_event(FreeRunProgress(done, len(rounds), length_s, left, error, chosen is theta))
+    final = twin.with_numbers(problem.numbers(chosen))
+    return GreyFit(final, history, time.process_time() - began, information)
+
+
+def _improve(
+    problem: _Problem, theta: Doubles, drawn: _Round, damping: float, steps: int, memory: Doubles
+) -> tuple[Doubles, float, Doubles]:
+    """Damped Gauss-Newton steps on one round; the matrix of the last one comes back as well.
+
+    `memory` is what earlier rounds knew: without it each round would fit its own few stretches, noise included.
+    """
+    begin = theta
+
+    def known_cost(tried: Doubles) -> float:
+        return 0.5 * float(tried @ tried + (tried - begin) @ memory @ (tried - begin))
+
+    matrix, gradient, losses = problem.losses(theta, drawn, True)
+    cost = float(losses.sum()) + known_cost(theta)
+    for step in range(steps):
+        if step:
+            matrix, gradient, losses = problem.losses(theta, drawn, True)
+        pull = gradient + theta + memory @ (theta - begin)
+        system = matrix + memory + np.eye(len(theta))
+        for _ in range(TRIES):
+            change = -np.linalg.solve(system + np.diag(damping * np.diag(system)), pull)
+            change *= min(1.0, FARTHEST / max(float(np.abs(change).max()), 1e-12))
+            tried = theta + change
+            new = float(problem.losses(tried, drawn, False)[2].sum()) + known_cost(tried)
+            if new < cost:
+                theta, cost, damping = tried, new, max(damping / 4.0, LEAST_DAMPING)
+                break
+            damping = min(damping * 5.0, MOST_DAMPING)
+        else:
+            break
+    return theta, damping, matrix

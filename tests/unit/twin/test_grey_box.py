@@ -1,0 +1,205 @@
+"""Grey boxes: exact tangents, physics that must hold, elements that must connect, numbers that a fit finds again."""
+
+import numpy as np
+import pytest
+
+from edp.config.twin import load_twin_experiment, twin_toml
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels, twin_channels
+from edp.errors import ConfigError
+from edp.networks.twin import fit_scales
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
+from edp.networks.twin.grey.elements import CylinderElement, PumpElement, ValveElement
+from edp.networks.twin.grey.numbers import monomials
+from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
+from edp.signals import Channel, Kind
+from edp.testing.twins import sample_actuators
+from edp.training.grey_fit import fit_grey_box
+
+PREFIX = 30
+
+
+def bench_channels():
+    """A cylinder with stroke, both chambers and its pump, at 100 Hz."""
+    return TwinChannels(
+        (Channel("lever", Kind.RATIO),),
+        (Channel("speed", Kind.VELOCITY),),
+        (Channel("place", Kind.POSITION),),
+        (Channel("head", Kind.PRESSURE), Channel("rod", Kind.PRESSURE), Channel("line", Kind.PRESSURE)),
+        100.0,
+    )
+
+
+BENCH = GreyBox(
+    cylinders=(CylinderElement(name="ram", velocity="speed", head="head", rod="rod", bore=0.1, rod_diameter=0.06),),
+    valves=(ValveElement(name="valve", actuator="ram", extend="lever", supply="pump"),),
+    pumps=(PumpElement(name="pump", pressure="line"),),
+    inertia_degree=1,
+    potential_degree=2,
+    prefix_ticks=PREFIX,
+    fit=GreyFitSpec(lengths_s=(0.1, 0.4), rounds=(3, 2), lanes=24, ticks=600, validation_s=2.0, validation_runs=4),
+)
+
+
+def bench_series(ticks=800, seed=0):
+    """Levers of a bench, and plausible values that set the scales."""
+    rng = np.random.default_rng(seed)
+    lever = np.repeat(rng.uniform(-1, 1, ticks // 40 + 1), 40)[:ticks]
+    low, high = np.array([-0.5, 0.0, 0.0, 0.0, 1e6]), np.array([0.5, 1.0, 2e7, 2e7, 2e7])
+    targets = rng.uniform(low, high, (ticks, 5))
+    return Series("levers", lever[:, None].astype(np.float32), targets.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A grey box of the bench, and what it does on levers of its own: a machine with known numbers."""
+    channels, levers = bench_channels(), [bench_series(seed=seed) for seed in range(4)]
+    twin = BENCH.start(channels, fit_scales(channels, levers), levers, 0)
+    table, numbers = twin.table, twin.table.nominal
+    numbers[table.inertia_at], numbers[table.potential_at] = 0.07, 0.01  # 4.9 t, 20 kN
+    machine = twin.with_numbers(numbers)
+    start = np.tile(np.array([0.0, 0.5, 5e6, 5e6, 5e6], np.float32), (len(levers), 1))
+    commands = np.stack([series.inputs for series in levers])
+    state = machine.initial_state(commands[:, 0], start)
+    answers, _ = machine.rollout(commands[:, :-1], state)
+    rows = np.concatenate([start[:, None], answers], axis=1)
+    return machine, [Series(f"run {i}", commands[i], rows[i]) for i in range(len(levers))]
+
+
+def errors(twin, numbers, series, starts, full, ticks=8):
+    """Matrix, gradient and losses of free runs of `ticks`."""
+    rows = [slice(first, first + PREFIX + ticks + 1) for first in starts]
+    values = np.stack([series.targets[row] for row in rows]) / twin.units
+    demands = twin.demands(np.stack([series.inputs[row] for row in rows])[:, :-1])
+    measured = values[:, :-1].copy()
+    measured[:, PREFIX + 1 :] = np.nan
+    rest = twin.rest(demands[:, 0], (measured[:, 0] * twin.units).astype(np.float32))
+    state = (measured[:, 0].copy(), *(np.ascontiguousarray(part, dtype=np.float64) for part in rest))
+    count = len(numbers) if full else 0
+    normal = (np.zeros((count, count)), np.zeros(count), np.zeros(len(starts)))
+    weight = twin.units / twin.scales.answer_width.astype(np.float64)
+    target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, (PREFIX, 0, 1), normal)
+    twin.lanes(numbers, demands, measured, state, judge=target, full=full)
+    return normal
+
+
+def test_tangents_are_those_of_differences(bench):
+    machine, runs = bench
+    table = machine.table
+    rng = np.random.default_rng(1)
+    numbers = np.where(
+        table.positive, machine.numbers * np.exp(rng.normal(0, 0.1, len(machine.numbers))), machine.numbers
+    )
+    # Away from a whole number of ticks, where the interpolated dead time has a corner.
+    numbers[table.valve_at[0, at.DELAY]] = 0.0363
+    starts = (60, 230, 410)
+    _, gradient, _ = errors(machine, numbers, runs[1], starts, True)
+    size = np.where(table.positive, np.abs(numbers), table.width)
+    for which in range(len(numbers)):
+        step = np.zeros(len(numbers))
+        step[which] = 1e-5 * size[which]
+        sides = [errors(machine, numbers + sign * step, runs[1], starts, False)[2].sum() for sign in (1, -1)]
+        difference = (sides[0] - sides[1]) / 2e-5
+        assert gradient[which] * size[which] == pytest.approx(
+            difference, rel=2e-4, abs=2e-6 * np.abs(gradient * size).max()
+        ), table.numbers[which].label
+
+
+def test_oil_holds_a_load_behind_closed_spools_and_moves_it_behind_open_ones(bench):
+    machine, _ = bench
+    start = np.array([[0.0, 0.5, 6e6, 5e6, 3e6]], np.float32)
+    moved = {}
+    for lever in (-0.8, 0.0, 0.8):
+        commands = np.full((1, 200, 1), lever, np.float32)
+        answers, _ = machine.rollout(commands, machine.initial_state(0 * commands[:, 0], start))
+        moved[lever] = answers[0, -1, 1] - answers[0, 20, 1]
+    assert abs(moved[0.0]) < 5e-3
+    assert moved[0.8] > 0.1
+    assert moved[-0.8] < -0.1
+
+
+def test_a_fit_finds_a_machine_again(bench):
+    machine, runs = bench
+    table = machine.table
+    rng = np.random.default_rng(3)
+    begin = machine.numbers.copy()
+    for name in ("into_extend_25", "into_extend_45", "out_of_retract_25", "full_flow", "viscous"):
+        which = [number.name for number in table.numbers].index(name)
+        begin[which] *= np.exp(rng.choice([-0.4, 0.4]))
+    before = errors(machine, begin, runs[3], (50, 300, 500), False, ticks=60)[2].sum()
+    result = fit_grey_box(machine.with_numbers(begin), runs[:2], runs[2:3], seed=0)
+    fitted = result.twin
+    after = errors(machine, fitted.numbers, runs[3], (50, 300, 500), False, ticks=60)[2].sum()
+    assert after < 0.05 * before
+    best = [row["validation"] for row in result.history if row["best"]]
+    assert best[-1] == min(row["validation"] for row in result.history)
+    rows = {f"{row['element']}.{row['name']}": row for row in datasheet(table, fitted.numbers, result.information)}
+    assert rows["pump.full_flow"]["unit"] == "m^3/s"
+    assert rows["valve.into_extend_25"]["excited"]
+    assert all(row["low"] <= row["value"] <= row["high"] for row in rows.values())
+    # Nothing ran into a cushion of a stop, and no port relief opened.
+    assert not rows["ram.head_relief"]["excited"]
+    assert "(" in datasheet_text(list(rows.values()))
+
+
+def test_monomials_are_sorted_by_degree():
+    assert monomials(2, 2).tolist() == [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]
+    assert len(monomials(3, 4)) == 35
+
+
+def test_elements_of_a_settings_file_come_back(tmp_path):
+    text = """
+[twin]
+kind = "greybox"
+cylinders = [{ name = "ram", velocity = "speed", bore = 0.1, rod_diameter = 0.05 }]
+valves = [{ name = "valve", actuator = "ram", extend = "lever" }]
+"""
+    (tmp_path / "bench.toml").write_text(text)
+    experiment = load_twin_experiment(tmp_path / "bench.toml")
+    (tmp_path / "again.toml").write_text(twin_toml(experiment))
+    assert load_twin_experiment(tmp_path / "again.toml") == experiment
+    assert experiment.twin.cylinders[0].areas == pytest.approx((np.pi / 400, np.pi / 400 * 0.75))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"valves": ()}, "cylinder 'ram' has no valve"),
+        ({"pumps": ()}, "port 'supply' of valve 'valve' is 'pump', which is no pump of this twin"),
+        (
+            {"valves": (ValveElement(name="valve", actuator="rma", extend="lever"),)},
+            "port 'actuator' of valve 'valve' is 'rma', which is no cylinder of this twin.*ram",
+        ),
+        (
+            {"valves": (ValveElement(name="valve", actuator="ram", extend="levre"),)},
+            "port 'extend' of valve 'valve' is 'levre', which is no command.*lever",
+        ),
+        (
+            {"cylinders": (CylinderElement(name="ram", velocity="speed", head="head", rod="head"),)},
+            "'head' is connected to cylinder 'ram' and to cylinder 'ram', port 'rod'",
+        ),
+        (
+            {"cylinders": (CylinderElement(name="ram", velocity="speed", head="head"),)},
+            "no element has the channel 'rod'",
+        ),
+    ],
+)
+def test_elements_that_do_not_connect_are_named(changes, message):
+    fields = {"cylinders": BENCH.cylinders, "valves": BENCH.valves, "pumps": BENCH.pumps} | changes
+    with pytest.raises(ConfigError, match=message):
+        GreyBox(**fields).shapes(bench_channels())
+
+
+def test_a_rod_as_thick_as_its_bore_is_refused():
+    with pytest.raises(ConfigError, match=r"rod_diameter = 0\.1 m is not below bore"):
+        CylinderElement(name="ram", velocity="speed", bore=0.1, rod_diameter=0.1)
+
+
+def test_names_and_kinds_tell_the_elements_of_sample_actuators():
+    elements = GreyBox().elements(twin_channels(sample_actuators()))
+    assert [(c.velocity, c.head, c.rod) for c in elements.cylinders] == [
+        ("speed_1", "pressure_1", ""),
+        ("speed_2", "pressure_2", ""),
+    ]
+    assert [(v.extend, v.supply) for v in elements.valves] == [("lever_1", ""), ("lever_2", "")]
