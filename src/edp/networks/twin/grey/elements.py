@@ -205,14 +205,17 @@ def check_elements(elements: Elements, channels: TwinChannels) -> None:
             if which in ("head", "rod"):
                 port(here, which, getattr(cylinder, which), parts["pressure"], "pressure", False)
             own(here, which, getattr(cylinder, which))
-        if not any(valve.actuator == cylinder.name for valve in elements.valves):
-            raise ConfigError(f'grey box: {here} has no valve; give one with actuator = "{cylinder.name}"')
     for valve in elements.valves:
         here = f"valve '{valve.name}'"
         port(here, "actuator", valve.actuator, [c.name for c in elements.cylinders], "cylinder", True)
         port(here, "supply", valve.supply, [p.name for p in elements.pumps], "pump", False)
         port(here, "extend", valve.extend, commands, "command", True)
         port(here, "retract", valve.retract, commands, "command", False)
+    for cylinder in elements.cylinders:
+        if not any(valve.actuator == cylinder.name for valve in elements.valves):
+            raise ConfigError(
+                f"grey box: cylinder '{cylinder.name}' has no valve; give one with this name at its port 'actuator'"
+            )
     for name in (*parts["velocity"], *parts["pressure"]):
         if name not in used:
             raise ConfigError(
