@@ -1,6 +1,7 @@
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 from edp.config.experiment import load_experiment, read_toml
 from edp.errors import ConfigError
 from edp.logs.source import load_data_set
+from edp.recording import Recording
+from edp.signals import Channel, Kind
 from edp.workflows.train_evaluate import DataSource
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +34,7 @@ def scripts():
     folder = str(ROOT / "benchmarks")
     sys.path.insert(0, folder)
     try:
-        yield {name: script(name) for name in ("real_recordings", "published_leagues")}
+        yield {name: script(name) for name in ("real_recordings", "published_leagues", "twin_leagues")}
     finally:
         sys.path.remove(folder)
 
@@ -83,12 +86,38 @@ def test_an_unset_variable_is_named(monkeypatch):
         DataSource.of(REAL / "faster.toml").read()
 
 
-@pytest.mark.parametrize("name", ["real_recordings", "published_leagues"])
+@pytest.mark.parametrize("name", ["real_recordings", "published_leagues", "twin_leagues"])
 def test_without_recordings_it_says_so_and_succeeds(name, scripts, tmp_path, capsys):
     scripts[name].main(["--shared", str(tmp_path / "nowhere")])
     lines = capsys.readouterr().out.strip().splitlines()
     assert lines[0].startswith("skipped:")
     assert json.loads(lines[-1])["skipped"] is True
+
+
+def test_a_set_becomes_a_machine_with_one_actuator(scripts):
+    twins = scripts["twin_leagues"]
+    assert set(twins.SETS) == {entry["data"] for entry in LISTED["leagues"]}
+    rng = np.random.default_rng(0)
+    stroke = np.cumsum(rng.normal(size=200)).astype(np.float32)
+    values = np.stack([rng.normal(size=200), stroke, rng.normal(size=200)], axis=1).astype(np.float32)
+    names = [(Kind.GENERIC, name) for name in ("u", "x", "p")]
+    recording = Recording("log", tuple(Channel(name, kind) for kind, name in names), values, 2.0, "here")
+    pressure = twins.machine(recording, twins.SETS["sjoberg.toml"])
+    assert pressure.channel_names == ("command", "velocity")
+    assert np.array_equal(pressure.column("velocity"), values[:, 2])
+    made = twins.machine(recording, replace(twins.SETS["emps.toml"], stroke="x"))
+    assert made.channel_names == ("command", "velocity", "stroke")
+    np.testing.assert_allclose(made.column("velocity")[1:], 2.0 * np.diff(stroke), rtol=1e-4)
+    assert made.column("velocity")[0] == 0
+    channels = twins.twin_channels(made)
+    assert [c.name for c in channels.answers] == ["velocity", "stroke"]
+    part = channels.task().series(made)
+    floor = twins.TWINS["arx"](lags=2, prefix_ticks=10)
+    twin = floor.start(channels, twins.fit_scales(channels, [part]), [part], 0)
+    state = twin.reset(part.inputs[None, :10], part.targets[None, :10])
+    answers = twin.rollout(part.inputs[None, 10:-1], state)[0][0, :, 1]
+    expected = np.sqrt(np.mean((answers - part.targets[11:, 1]) ** 2))
+    assert twins.free_run_rmse(twin, part, "stroke") == pytest.approx(expected, rel=1e-5)
 
 
 def model(error: float) -> dict:
