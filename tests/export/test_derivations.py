@@ -1,4 +1,4 @@
-"""Derived channels with spans in every exported form, in single precision and in whole numbers."""
+"""Derived channels with spans in every exported form, in single precision and in integers."""
 
 import numpy as np
 import pytest

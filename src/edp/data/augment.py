@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.registry import Registry
-from edp.settings.bounds import MOST_TICKS, above, check_bounds, whole
+from edp.settings.bounds import MOST_TICKS, above, check_bounds, integer
 
 
 class AugmentationSpec(Protocol):
@@ -71,7 +71,7 @@ class WindowShift:
     most: int = 2
 
     def __post_init__(self) -> None:
-        check_bounds("window_shift", self, most=whole(1, MOST_TICKS))
+        check_bounds("window_shift", self, most=integer(1, MOST_TICKS))
 
     def apply(self, part: Series, deviation: NDArray[np.float32], rng: np.random.Generator) -> Series:
         """Shift all inputs alike; the rows that are missing at one end repeat the last there."""

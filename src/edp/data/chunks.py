@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edp.data.augment import AugmentationSpec, input_deviation
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError
-from edp.settings.bounds import MOST_BATCH, MOST_TICKS, check_bounds, whole
+from edp.settings.bounds import MOST_BATCH, MOST_TICKS, check_bounds, integer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +47,11 @@ class ChunkSpec:
         check_bounds(
             "chunks",
             self,
-            length=whole(1, MOST_TICKS),
-            batch=whole(1, MOST_BATCH),
-            burn_in=whole(0, MOST_TICKS),
-            consecutive=whole(1, MOST_BATCH),
-            carried=whole(0, MOST_BATCH),
+            length=integer(1, MOST_TICKS),
+            batch=integer(1, MOST_BATCH),
+            burn_in=integer(0, MOST_TICKS),
+            consecutive=integer(1, MOST_BATCH),
+            carried=integer(0, MOST_BATCH),
         )
         if self.batch % self.consecutive:
             raise ConfigError(

@@ -11,7 +11,7 @@ import numpy as np
 from edp.errors import ConfigError, DataError
 from edp.recording import FloatArray, Recording
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
 from edp.signals import TABLE_A1, VOCABULARY, Kind
 
 STARTING = "starting"
@@ -133,7 +133,7 @@ class FeatureSet:
     starting_ticks: int = 5
 
     def __post_init__(self) -> None:
-        check_bounds(f"feature set '{self.name}'", self, starting_ticks=whole(1, MOST_TICKS))
+        check_bounds(f"feature set '{self.name}'", self, starting_ticks=integer(1, MOST_TICKS))
         for part in ("channels", "derived", "hidden", "starting"):
             check_count(f"feature set '{self.name}'", part, getattr(self, part), MOST_NAMES)
         names = [*self.channels, *self.starting, *self.hidden, *(d.name for d in self.derived)]

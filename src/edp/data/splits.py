@@ -13,7 +13,7 @@ import numpy as np
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, SEED, above, below, check_bounds, shown, span, whole
+from edp.settings.bounds import MOST_NAMES, SEED, above, below, check_bounds, integer, shown, span
 
 PARTS = ("train", "validation", "test")
 PART = below(0.0, 1.0)
@@ -168,7 +168,7 @@ class ByBlocks:
             "split",
             self,
             block_s=above(0.0, MOST_BLOCK_S),
-            every=whole(2, MOST_NAMES),
+            every=integer(2, MOST_NAMES),
             validation_share=PART,
         )
 

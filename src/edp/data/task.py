@@ -13,7 +13,7 @@ from edp.data.features import Derived, FeatureSet, column, kind_of
 from edp.data.series import Series
 from edp.errors import ConfigError, DataError, closest
 from edp.recording import MACHINE, Recording
-from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, MOST_TICKS, above, check_bounds, check_count, integer
 from edp.signals import Kind
 
 
@@ -50,7 +50,7 @@ def check_ends(task: Ends) -> None:
     if not task.targets:
         raise ConfigError("task: no targets; name at least one channel to predict")
     check_count("task", "horizons", task.horizons, MOST_HORIZONS, least=1)
-    check_bounds("task", task, horizons=whole(0, MOST_TICKS))
+    check_bounds("task", task, horizons=integer(0, MOST_TICKS))
     for part in ("targets", "integrate"):
         names = getattr(task, part)
         check_count("task", part, names, MOST_NAMES)

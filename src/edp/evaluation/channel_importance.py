@@ -26,7 +26,7 @@ from edp.errors import ConfigError, DataError, closest
 from edp.evaluation.conditional import OthersModel
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_predictions
-from edp.settings.bounds import MOST_NAMES, MOST_ROWS, MOST_TICKS, SEED, check_bounds, whole
+from edp.settings.bounds import MOST_NAMES, MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
 from edp.signals import KINDS
 
 Array = NDArray[np.float64]
@@ -62,10 +62,10 @@ class ChannelImportanceSpec:
         check_bounds(
             "channel importance",
             self,
-            repeats=whole(1, MOST_NAMES),
-            lags=whole(0, MOST_TICKS),
-            rows=whole(100, MOST_ROWS),
-            skip=whole(0, MOST_ROWS),
+            repeats=integer(1, MOST_NAMES),
+            lags=integer(0, MOST_TICKS),
+            rows=integer(100, MOST_ROWS),
+            skip=integer(0, MOST_ROWS),
             seed=SEED,
         )
         if 0 not in self.lags or min(self.lags) < 0:

@@ -10,7 +10,7 @@ from typing import Any
 from edp.errors import ConfigError, closest
 from edp.export.c.sizes import Sizes
 from edp.networks.streaming import Cost
-from edp.settings.bounds import check_bounds, whole
+from edp.settings.bounds import check_bounds, integer
 from edp.settings.tree import SettingsTree
 from edp.storage import read_toml
 
@@ -101,7 +101,7 @@ class Budget:
         if self.core not in CORES:
             raise ConfigError(f"budget: core = '{self.core}' is not known{closest(self.core, CORES)}")
         limits = ("cycles", "parameter_bytes", "ram_bytes", "flash_bytes")
-        check_bounds("budget", self, **dict.fromkeys(limits, whole(1, MOST_GRANTED)))
+        check_bounds("budget", self, **dict.fromkeys(limits, integer(1, MOST_GRANTED)))
 
 
 BUDGET_FILE = SettingsTree(what="budget")

@@ -14,7 +14,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
 from edp.evaluation.free_run_parts import by_channel, by_horizon, by_name, nrmse_by_channel, situations
 from edp.networks.twin import FreeRunIntervals, Twin, calibrate, even_starts
-from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_BATCH, MOST_NAMES, MOST_TICKS, above, between, check_bounds, check_count, integer
 
 Array = NDArray[np.float32]
 MOST_SECONDS = 86_400.0
@@ -54,9 +54,9 @@ class FreeRunJudgeSpec:
 
     def __post_init__(self) -> None:
         length = above(0.0, MOST_SECONDS)
-        count = whole(1, MOST_BATCH)
+        count = integer(1, MOST_BATCH)
         check_bounds("judge", self, seconds=length, at_s=length, starts=count, calibration_starts=count)
-        check_bounds("judge", self, covered_at_s=length, coverage=between(0.0, 1.0), ahead_ticks=whole(1, MOST_TICKS))
+        check_bounds("judge", self, covered_at_s=length, coverage=between(0.0, 1.0), ahead_ticks=integer(1, MOST_TICKS))
         check_count("judge", "at_s", self.at_s, MOST_NAMES, least=1)
         check_count("judge", "covered_at_s", self.covered_at_s, MOST_NAMES, least=1)
         check_count("judge", "floors", self.floors, MOST_NAMES)

@@ -17,7 +17,7 @@ from edp.errors import DataError
 from edp.evaluation.baselines import BASELINES, Baseline, BaselineTask
 from edp.networks.predictor import Predictor
 from edp.networks.running import stream_intervals, stream_predictions
-from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, whole
+from edp.settings.bounds import MOST_ROWS, MOST_TICKS, SEED, check_bounds, integer
 from edp.signals import KINDS
 from edp.stats.metrics import Scores, interval_scores, mean_scores, score, spread
 from edp.storage.memory import check_setting
@@ -26,7 +26,7 @@ Predictions = list[NDArray[np.float32]]
 B = TypeVar("B", bound=Baseline)
 # Six bins show where an error grows with speed and leave enough samples in each.
 SPEED_BINS = 6
-SKIP = whole(0, MOST_ROWS)
+SKIP = integer(0, MOST_ROWS)
 """Ticks that are not scored: a slice that begins with a negative one would score the last ticks alone."""
 
 
@@ -47,7 +47,7 @@ class JudgeSpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_bounds("judge", self, history=whole(1, MOST_TICKS), skip=SKIP, seed=SEED)
+        check_bounds("judge", self, history=integer(1, MOST_TICKS), skip=SKIP, seed=SEED)
         for name in self.baselines:
             _ = BASELINES[name]
 

@@ -35,7 +35,7 @@ from edp.settings.bounds import (
     below,
     check_bounds,
     check_count,
-    whole,
+    integer,
 )
 
 Blocks = Sequence[object]
@@ -65,8 +65,8 @@ class BackboneSpec(Protocol):
 
 
 BACKBONES: Registry[type] = Registry("backbone")
-UNITS, LAYERS = whole(1, MOST_UNITS), whole(1, MOST_LAYERS)
-CHANNELS, KERNEL = whole(1, MOST_CHANNELS), whole(1, MOST_KERNEL)
+UNITS, LAYERS = integer(1, MOST_UNITS), integer(1, MOST_LAYERS)
+CHANNELS, KERNEL = integer(1, MOST_CHANNELS), integer(1, MOST_KERNEL)
 DROPOUT = below(0.0, 1.0)
 
 
@@ -272,9 +272,9 @@ class CommitteeSpec:
         check_count("backbone", "lags", self.lags, MOST_LEVELS, least=1)
         check_lags(self.lags)
         check_count("backbone", "activations", self.activations, len(NON_LINEAR))
-        check_bounds("backbone", self, members=whole(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
-        check_bounds("backbone", self, trees=whole(0, MOST_TREES), tree_depth=whole(1, MOST_DEPTH))
-        check_bounds("backbone", self, centres=whole(0, MOST_CENTRES))
+        check_bounds("backbone", self, members=integer(1, MOST_NAMES), units=UNITS, layers=LAYERS, dropout=DROPOUT)
+        check_bounds("backbone", self, trees=integer(0, MOST_TREES), tree_depth=integer(1, MOST_DEPTH))
+        check_bounds("backbone", self, centres=integer(0, MOST_CENTRES))
         for name in self.activations:
             if name not in NON_LINEAR or self.activations.count(name) > 1:
                 raise ConfigError(

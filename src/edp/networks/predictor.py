@@ -23,7 +23,7 @@ from edp.networks.outputs import OUTPUTS, OutputSpec, Point
 from edp.networks.physics import PHYSICS, PhysicsBase, PhysicsSpec
 from edp.networks.size import MOST_PARAMETERS, MOST_STATE, size_at_most
 from edp.networks.streaming import Cost, State, Streaming, parameters_of, state_numbers
-from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, integer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class ModelSpec:
     physics: PhysicsSpec | None = None
 
     def __post_init__(self) -> None:
-        check_bounds("model", self, window=whole(1, MOST_TICKS))
+        check_bounds("model", self, window=integer(1, MOST_TICKS))
         check_count("model", "blocks", self.blocks, len(BLOCKS))
         offered = {*self.backbone.slots(), *OUTPUT_SLOTS}
         for block in self.blocks:

@@ -43,21 +43,21 @@ class Bound:
     Attributes:
         low: least value.
         high: largest value, finite.
-        whole: only integers.
+        integer: only integers.
         above: `low` itself is out.
         below: `high` itself is out.
     """
 
     low: float
     high: float
-    whole: bool = False
+    integer: bool = False
     above: bool = False
     below: bool = False
 
     def holds(self, value: Any) -> bool:
         """Whether a value is a number within; NaN, infinity, text and truth values are not."""
         # True is an Integral for Python, and no number for a user.
-        if isinstance(value, bool) or not isinstance(value, Integral if self.whole else Real):
+        if isinstance(value, bool) or not isinstance(value, Integral if self.integer else Real):
             return False
         number: Any = value  # integers beyond what a float holds compare as they are
         over = number > self.low if self.above else number >= self.low
@@ -67,13 +67,13 @@ class Bound:
     def rule(self, name: str) -> str:
         """The rule as a message says it."""
         first, second = "<" if self.above else "<=", "<" if self.below else "<="
-        kind = "integers, " if self.whole else ""
+        kind = "integers, " if self.integer else ""
         return f"{kind}{self.low:,.12g} {first} {name} {second} {self.high:,.12g}"
 
 
-def whole(low: int, high: int) -> Bound:
+def integer(low: int, high: int) -> Bound:
     """Integers from `low` to `high`, both included."""
-    return Bound(low, high, whole=True)
+    return Bound(low, high, integer=True)
 
 
 def span(low: float, high: float) -> Bound:
@@ -96,7 +96,7 @@ def between(low: float, high: float) -> Bound:
     return Bound(low, high, above=True, below=True)
 
 
-SEED = whole(0, MOST_SEED)
+SEED = integer(0, MOST_SEED)
 SHARE = span(0.0, 1.0)
 RATE = above(0.0, 1e38)
 """Of learning: what float32 holds. A rate that is too large for a network is reported as a training that diverged."""

@@ -18,7 +18,7 @@ import numpy as np
 from edp.errors import ConfigError
 from edp.recording import Recording
 from edp.sandbox.processes import begin_helper
-from edp.settings.bounds import above, check_bounds, span, whole
+from edp.settings.bounds import above, check_bounds, integer, span
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
 from edp.sim.machine.machine_files import load_machine
@@ -40,10 +40,10 @@ DEFAULT_MIX: Mapping[str, float] = {
 MOST_RECORDINGS, MOST_MINUTES, MOST_MACHINES, MOST_SEED = 100_000, 1e6, 1000, 2**63
 """Bounds of one data set; the plan of the most recordings takes some seconds."""
 BOUNDS = {
-    "recordings": whole(1, MOST_RECORDINGS),
+    "recordings": integer(1, MOST_RECORDINGS),
     "minutes": above(0.0, MOST_MINUTES),
-    "seed": whole(0, MOST_SEED - 1),
-    "family": whole(0, MOST_MACHINES),
+    "seed": integer(0, MOST_SEED - 1),
+    "family": integer(0, MOST_MACHINES),
     "scatter": above(0.0, WIDEST),
     "rate_hz": span(1.0, 1000.0),
     "step_s": above(0.0, LARGEST_STEP_S),

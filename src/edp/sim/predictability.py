@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
-from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, SEED, check_bounds, check_count, shown, whole
+from edp.settings.bounds import MOST_HORIZONS, MOST_NAMES, SEED, check_bounds, check_count, integer, shown
 from edp.signals import TABLE_A1
 from edp.sim.machine import layout as at
 from edp.sim.plan import ordered
@@ -67,10 +67,10 @@ class LimitSpec:
         check_bounds(
             "limit",
             self,
-            horizons=whole(1, MOST_AHEAD),
-            moments=whole(2, MOST_MOMENTS),
-            branches=whole(4, MOST_BRANCHES),
-            recordings=whole(1, MOST_NAMES),
+            horizons=integer(1, MOST_AHEAD),
+            moments=integer(2, MOST_MOMENTS),
+            branches=integer(4, MOST_BRANCHES),
+            recordings=integer(1, MOST_NAMES),
             seed=SEED,
         )
         if any(a >= b for a, b in pairwise(self.horizons)):

@@ -34,7 +34,7 @@ from edp.settings.bounds import (
     above,
     check_bounds,
     check_count,
-    whole,
+    integer,
 )
 from edp.storage.runs import KeyedRun
 from edp.training.checkpoint import FILE, Progress, Weights, damaged, load_checkpoint, save_checkpoint
@@ -95,11 +95,11 @@ class FreeRunSpec:
     patience: int = 8
 
     def __post_init__(self) -> None:
-        bounds = {"seed": SEED, "lanes": whole(1, MOST_BATCH), "updates": whole(1, MOST_UPDATES)}
+        bounds = {"seed": SEED, "lanes": integer(1, MOST_BATCH), "updates": integer(1, MOST_UPDATES)}
         bounds |= {"lengths_s": above(0.0, MOST_LENGTH_S), "validation_s": above(0.0, MOST_LENGTH_S)}
         bounds |= {"measured_share": SHARE, "mixed_share": SHARE, "warmup": SHARE, "clip": WEIGHT, "delta": WEIGHT}
         bounds |= {"stroke_weight": WEIGHT, "pressure_weight": WEIGHT}
-        bounds |= {"validate_every": whole(1, MOST_UPDATES), "patience": whole(0, MOST_UPDATES)}
+        bounds |= {"validate_every": integer(1, MOST_UPDATES), "patience": integer(0, MOST_UPDATES)}
         check_bounds("free runs", self, **bounds)
         check_count("free runs", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
         if len(self.lengths_s) != len(self.updates):

@@ -12,7 +12,7 @@ from torch import nn
 
 from edp.errors import ConfigError
 from edp.registry import Registry
-from edp.settings.bounds import DECAY, MOST_NAMES, MOST_UPDATES, RATE, below, check_bounds, check_count, shown, whole
+from edp.settings.bounds import DECAY, MOST_NAMES, MOST_UPDATES, RATE, below, check_bounds, check_count, integer, shown
 
 
 class OptimizerSpec(Protocol):
@@ -167,7 +167,7 @@ class Soap:
             weight_decay=DECAY,
             beta1=BETA,
             beta2=BETA,
-            refresh=whole(1, MOST_UPDATES),
+            refresh=integer(1, MOST_UPDATES),
         )
 
     def build(self, named: Iterable[tuple[str, nn.Parameter]]) -> torch.optim.Optimizer:

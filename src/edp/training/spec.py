@@ -25,8 +25,8 @@ from edp.settings.bounds import (
     above,
     check_bounds,
     check_count,
+    integer,
     span,
-    whole,
 )
 from edp.training.averages import AverageSpec, Exponential
 from edp.training.bagging.spec import BaggingSpec
@@ -104,12 +104,12 @@ class TrainingSpec:
             self,
             weight_power=span(-MOST_POWER, MOST_POWER),
             horizon_decay=above(0.0, 1.0),
-            epochs=whole(1, MOST_EPOCHS),
-            updates=whole(0, MOST_UPDATES),
-            patience=whole(0, MOST_EPOCHS),
+            epochs=integer(1, MOST_EPOCHS),
+            updates=integer(0, MOST_UPDATES),
+            patience=integer(0, MOST_EPOCHS),
             clip_norm=above(0.0, MOST_WEIGHT),
             seed=SEED,
-            threads=whole(0, MOST_THREADS),
+            threads=integer(0, MOST_THREADS),
         )
         check_count("training", "augmentations", self.augmentations, MOST_AUGMENTATIONS)
         if self.refit not in REFITS:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from edp.errors import ConfigError
-from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_NAMES, SEED, above, between, check_bounds, check_count, integer
 
 # Rows that estimates rest on: errors of information and rank estimates fall with their root, and time grows at least
 # in proportion (of nearest neighbours, ranks and trees); a million is far beyond what any of them gains from.
@@ -44,11 +44,11 @@ class ForestSpec:
         check_bounds(
             "screening.forest",
             self,
-            trees=whole(1, MOST_TREES),
-            samples=whole(1, MOST_SAMPLES),
-            tests=whole(1, MOST_SAMPLES),
-            repeats=whole(1, MOST_REPEATS),
-            leaf=whole(1, MOST_SAMPLES),
+            trees=integer(1, MOST_TREES),
+            samples=integer(1, MOST_SAMPLES),
+            tests=integer(1, MOST_SAMPLES),
+            repeats=integer(1, MOST_REPEATS),
+            leaf=integer(1, MOST_SAMPLES),
             share=above(0.0, 1.0),
             held_out=above(0.0, 0.8),
         )
@@ -95,14 +95,14 @@ class ScreeningSpec:
 
     def __post_init__(self) -> None:
         shares = dict.fromkeys(("collinear", "copy", "level"), between(0.0, 1.0))
-        rows = dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), whole(100, MOST_SAMPLES))
+        rows = dict.fromkeys(("information_samples", "rank_samples", "piece_samples"), integer(100, MOST_SAMPLES))
         check_bounds(
             "screening",
             self,
-            horizon=whole(0, MOST_LAG),
-            max_lag=whole(20, MOST_LAG),
-            pieces=whole(4, MOST_PIECES),
-            neighbours=whole(1, MOST_NEIGHBOURS),
+            horizon=integer(0, MOST_LAG),
+            max_lag=integer(20, MOST_LAG),
+            pieces=integer(4, MOST_PIECES),
+            neighbours=integer(1, MOST_NEIGHBOURS),
             seed=SEED,
             **rows,
             **shares,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError
-from edp.settings.bounds import check_bounds, span, whole
+from edp.settings.bounds import check_bounds, integer, span
 
 Array = NDArray[np.float32]
 FEATURE_LIMIT = 6.0
@@ -60,7 +60,7 @@ class AdaptationSpec:
 
     def __post_init__(self) -> None:
         reals = {entry.name: span(1e-3, 1e6) for entry in fields(self)[1:]}
-        check_bounds("adaptation", self, rank=whole(0, 64), **(reals | {"dead_zone": span(0.0, 1e6)}))
+        check_bounds("adaptation", self, rank=integer(0, 64), **(reals | {"dead_zone": span(0.0, 1e6)}))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -16,7 +16,7 @@ from edp.ir.layers import Activate, BinaryOperation, Dense, Function, LayerNorm
 from edp.ir.memory import UNSEEN, WindowAttention
 from edp.networks.blocks.base import BLOCKS, BlockSlot
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
-from edp.settings.bounds import MOST_CHANNELS, check_bounds, whole
+from edp.settings.bounds import MOST_CHANNELS, check_bounds, integer
 
 # Query rows per block of the banded softmax: memory stays linear in the sequence length, and little of a block is idle.
 BLOCK = 64
@@ -44,7 +44,7 @@ class AttentionBridge:
     heads: int = 4
 
     def __post_init__(self) -> None:
-        check_bounds("attention_bridge", self, heads=whole(1, MOST_CHANNELS))
+        check_bounds("attention_bridge", self, heads=integer(1, MOST_CHANNELS))
 
     def build(self, width: int, window: int) -> Streaming:
         """The bridge on `width` channels."""

@@ -12,7 +12,7 @@ from edp.errors import ConfigError
 from edp.ir import Builder
 from edp.networks.blocks.base import BLOCKS, BlockSlot, BranchMaker
 from edp.networks.streaming import Cost, State, Streaming
-from edp.settings.bounds import MOST_LEVELS, MOST_TICKS, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_LEVELS, MOST_TICKS, check_bounds, check_count, integer
 
 
 @BLOCKS.register("multi_scale_tcn")
@@ -35,7 +35,7 @@ class MultiScaleTcn:
 
     def __post_init__(self) -> None:
         check_count("multi_scale_tcn", "first_dilations", self.first_dilations, MOST_LEVELS)
-        check_bounds("multi_scale_tcn", self, first_dilations=whole(1, MOST_TICKS))
+        check_bounds("multi_scale_tcn", self, first_dilations=integer(1, MOST_TICKS))
         if len(self.first_dilations) < 2 or min(self.first_dilations) < 1:
             raise ConfigError(
                 f"multi_scale_tcn: first_dilations = {list(self.first_dilations)}; "

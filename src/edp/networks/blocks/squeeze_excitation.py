@@ -13,7 +13,7 @@ from edp.ir.layers import Activate, BinaryOperation, Dense, Function
 from edp.networks.blocks.base import BLOCKS, BlockSlot
 from edp.networks.streaming import Cost, Operation, State, Streaming, parameters_of
 from edp.networks.trailing import StreamingTrailingMean
-from edp.settings.bounds import MOST_CHANNELS, check_bounds, whole
+from edp.settings.bounds import MOST_CHANNELS, check_bounds, integer
 
 
 @BLOCKS.register("squeeze_excitation")
@@ -36,7 +36,7 @@ class SqueezeExcitation:
     reduction: int = 4
 
     def __post_init__(self) -> None:
-        check_bounds("squeeze_excitation", self, reduction=whole(1, MOST_CHANNELS))
+        check_bounds("squeeze_excitation", self, reduction=integer(1, MOST_CHANNELS))
 
     def build(self, width: int, window: int) -> Streaming:
         """The block on `width` channels."""

@@ -15,7 +15,7 @@ from edp.ir import Builder
 from edp.ir.memory import Convolution
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
 from edp.networks.twin.scales import Array, TwinScales
-from edp.settings.bounds import MOST_TICKS, check_bounds, whole
+from edp.settings.bounds import MOST_TICKS, check_bounds, integer
 
 PENALTY = 1e-6
 """Of the regression, per row on standardised inputs: neighbouring lags are nearly copies of each other."""
@@ -38,7 +38,7 @@ class Arx:
     prefix_ticks: int = 30
 
     def __post_init__(self) -> None:
-        check_bounds("arx", self, lags=whole(1, MOST_TICKS), prefix_ticks=PREFIX)
+        check_bounds("arx", self, lags=integer(1, MOST_TICKS), prefix_ticks=PREFIX)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
         """Fitted by least squares; there is nothing to draw."""

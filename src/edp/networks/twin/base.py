@@ -16,11 +16,11 @@ from edp.ir import Builder, Graph
 from edp.networks.twin.lowering import plant_graph
 from edp.networks.twin.scales import Array, TwinScales
 from edp.registry import Registry
-from edp.settings.bounds import MOST_TICKS, whole
+from edp.settings.bounds import MOST_TICKS, integer
 
 TwinState = dict[str, Array]
 """All that a twin remembers, by name; the first dimension is the batch. ``answer`` is what its free ports read next."""
-PREFIX = whole(1, MOST_TICKS)
+PREFIX = integer(1, MOST_TICKS)
 BEYOND = 0.05
 """Share of a stroke by which a measured start may lie beyond an end stop: noise and play, not another machine."""
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from edp.data.twin_channels import TwinChannels
-from edp.settings.bounds import MOST_ROWS, SHARE, whole
+from edp.settings.bounds import MOST_ROWS, SHARE, integer
 
 Array = NDArray[np.float32]
 KNOTS_A_DECADE = 12
 """Horizons of a decade at which widths are calibrated: neighbouring ticks of a run are nearly one tick."""
-TICKS = whole(1, MOST_ROWS)
+TICKS = integer(1, MOST_ROWS)
 
 
 @dataclass(frozen=True, eq=False)

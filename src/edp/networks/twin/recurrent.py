@@ -20,7 +20,7 @@ from edp.ir.memory import Gru
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.steps import run_backward, run_forward
-from edp.settings.bounds import MOST_UNITS, check_bounds, whole
+from edp.settings.bounds import MOST_UNITS, check_bounds, integer
 
 PIECE = 256
 """Ticks that a run without gradients keeps at once: the loop writes what only a backward run would read."""
@@ -43,7 +43,7 @@ class Recurrent:
     prefix_ticks: int = 30
 
     def __post_init__(self) -> None:
-        check_bounds("recurrent twin", self, units=whole(1, MOST_UNITS), prefix_ticks=PREFIX)
+        check_bounds("recurrent twin", self, units=integer(1, MOST_UNITS), prefix_ticks=PREFIX)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> RecurrentTwin:
         """An untrained one; its weights follow from the seed."""

@@ -16,7 +16,7 @@ from edp.ir.layers import Activate, Dense, Function, ScaleShift
 from edp.ir.memory import Convolution
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
 from edp.networks.twin.scales import Array, TwinScales
-from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, whole
+from edp.settings.bounds import MOST_TICKS, check_bounds, check_count, integer
 
 PENALTY = 1e-6
 """Of the regression, per row on standardised features: knots that no command passed stay flat."""
@@ -44,7 +44,7 @@ class StaticMap:
     prefix_ticks: int = 30
 
     def __post_init__(self) -> None:
-        check_bounds("static map", self, knots=whole(2, 1000), delays=whole(0, MOST_TICKS), prefix_ticks=PREFIX)
+        check_bounds("static map", self, knots=integer(2, 1000), delays=integer(0, MOST_TICKS), prefix_ticks=PREFIX)
         check_count("static map", "delays", self.delays, 100, least=1)
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:

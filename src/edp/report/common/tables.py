@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from edp.report.common.wording import MISSING, decimals_for, duration, moment, number, percent, whole
+from edp.report.common.wording import MISSING, count_text, decimals_for, duration, moment, number, percent
 from edp.report.run.facts import NETWORK, Facts, comparison_rows, horizon_text, label_of, main_horizon
 from edp.report.run.figures import recording_errors
 
@@ -148,7 +148,7 @@ def budget_checks(facts: Facts) -> list[Check]:
 
 
 def _amount(value: float | None) -> str:
-    return whole(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
+    return count_text(value) if value is None or abs(value) >= 100 or float(value).is_integer() else number(value)
 
 
 def parts_table(facts: Facts) -> TextTable | None:
@@ -158,7 +158,7 @@ def parts_table(facts: Facts) -> TextTable | None:
         return None
     keys = [key for key in ("parameters", "macs_tick", "macs_window") if any(row.get(key) is not None for row in rows)]
     names = {"parameters": ("Parameters", ""), "macs_tick": ("Per tick", "MAC"), "macs_window": ("Per window", "MAC")}
-    lines = tuple((str(row["part"]), *(whole(row.get(key)) for key in keys)) for row in rows)
+    lines = tuple((str(row["part"]), *(count_text(row.get(key)) for key in keys)) for row in rows)
     return TextTable("By part", (("Part", ""), *(names[key] for key in keys)), lines)
 
 
@@ -179,7 +179,7 @@ def footprint_rows(facts: Facts) -> list[tuple[str, str]]:
     values = dict(facts.footprint or {})
     values |= {row["number_format"]: row["parameter_bytes"] for row in values.get("estimates", [])}
     figures = [(label, values.get(key), unit) for key, (label, unit) in names.items()]
-    return [(label, f"{whole(value)} {unit}".rstrip()) for label, value, unit in figures if value is not None]
+    return [(label, f"{count_text(value)} {unit}".rstrip()) for label, value, unit in figures if value is not None]
 
 
 def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
@@ -201,7 +201,7 @@ def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
     add("Device", source.get("device"))
     add("Diverged", source.get("diverged"))
     add("Training time", duration(source["seconds"]) if "seconds" in source else None)
-    add("Parameters", whole(source["parameters"]) if "parameters" in source else None)
+    add("Parameters", count_text(source["parameters"]) if "parameters" in source else None)
     data = source.get("data", {})
     add("Data", data.get("source"))
     add("Data digest", data.get("digest"))
@@ -210,7 +210,7 @@ def provenance_rows(facts: Facts) -> list[tuple[str, str]]:
         part_facts = data.get(part)
         if isinstance(part_facts, Mapping):
             hours = f", {number(part_facts['hours'], 2)} h" if part_facts.get("hours") is not None else ""
-            add(part.capitalize(), f"{whole(part_facts.get('recordings'))} recordings{hours}")
+            add(part.capitalize(), f"{count_text(part_facts.get('recordings'))} recordings{hours}")
     for key, value in source.get("environment", {}).items():
         add(key.replace("_", " ").capitalize(), value)
     return rows
@@ -235,5 +235,5 @@ def key_figures(facts: Facts) -> list[tuple[str, str, str]]:
         fitting = sum(check.fits for check in checks)
         tiles.append((f"{fitting} of {len(checks)}", "", "budget limits met"))
     elif (facts.provenance or {}).get("parameters") is not None:
-        tiles.append((whole((facts.provenance or {})["parameters"]), "", "parameters"))
+        tiles.append((count_text((facts.provenance or {})["parameters"]), "", "parameters"))
     return [tile for tile in tiles if tile[0] != MISSING]

@@ -86,7 +86,7 @@ def in_markdown(text: str) -> str:
     return flat.replace("<", "&lt;").replace("](", "]\\(").replace("][", "]\\[")
 
 
-def whole(value: float | None) -> str:
+def count_text(value: float | None) -> str:
     """A count: no decimals, thousands separated."""
     return number(value, 0)
 

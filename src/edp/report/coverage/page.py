@@ -11,7 +11,7 @@ from edp.data.spectrum import FLAT_DB
 from edp.logs import DataQuality
 from edp.report.common.tables import TextTable
 from edp.report.common.templates import template
-from edp.report.common.wording import MISSING, listed, number, percent, unbroken, whole
+from edp.report.common.wording import MISSING, count_text, listed, number, percent, unbroken
 from edp.report.coverage.charts import coverage_charts
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
@@ -104,7 +104,7 @@ def tiles(coverage: Coverage) -> list[tuple[str, str, str]]:
         tiles.append((f"{coverage.singular[lags]:.2g}", "", f"smallest singular value of the inputs, {lags} lags"))
     turns = [axis.reversals for axis in coverage.activity if axis.reversals is not None]
     if turns:
-        tiles.append((whole(sum(turns)), "", "reversals of the commands"))
+        tiles.append((count_text(sum(turns)), "", "reversals of the commands"))
     if coverage.distance is not None:
         tiles.append(
             (percent(coverage.distance.beyond).rstrip(" %"), "%", "of the tests farther than 95 % of the training")
@@ -130,7 +130,7 @@ def wanted_table(coverage: Coverage) -> TextTable | None:
 def activity_table(coverage: Coverage) -> TextTable | None:
     """Commands by axis."""
     rows = tuple(
-        (axis.axis, whole(axis.reversals), whole(axis.crossings), percent(axis.active))
+        (axis.axis, count_text(axis.reversals), count_text(axis.crossings), percent(axis.active))
         for axis in coverage.activity
         if axis.reversals is not None
     )
@@ -147,7 +147,7 @@ def together_table(coverage: Coverage) -> TextTable | None:
 def events_table(coverage: Coverage) -> TextTable:
     """Events, recorded or not."""
     rows = tuple(
-        (_first_up(event.name), whole(event.count), percent(event.share), event.note or "recorded")
+        (_first_up(event.name), count_text(event.count), percent(event.share), event.note or "recorded")
         for event in coverage.events
     )
     return TextTable("How often", (("Event", ""), ("Count", ""), ("Share", "of the time"), ("Source", "")), rows)

@@ -6,7 +6,7 @@ import math
 
 from edp.logs import DataQuality, Finding, QualityReport
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, number, percent, whole
+from edp.report.common.wording import MISSING, count_text, number, percent
 
 SHOWN_CHANNELS = 400
 """Rows of the table of channels; the rest is in the JSON."""
@@ -30,8 +30,8 @@ def recordings_table(quality: DataQuality) -> TextTable:
             number(report.duration_s, 1),
             f"{report.rate_hz:g}",
             number(report.jitter, 3),
-            whole(sum(clock.gaps for clock in report.clocks)),
-            whole(sum(channel.missing for channel in report.channels)),
+            count_text(sum(clock.gaps for clock in report.clocks)),
+            count_text(sum(channel.missing for channel in report.channels)),
             _count(report, "warning"),
             report.verdict,
         )
@@ -95,7 +95,7 @@ def _key(finding: Finding) -> tuple[str, str, str, str]:
 
 
 def _count(report: QualityReport, severity: str) -> str:
-    return whole(sum(finding.severity == severity for finding in report.findings))
+    return count_text(sum(finding.severity == severity for finding in report.findings))
 
 
 def _where(names: list[str]) -> str:

@@ -10,7 +10,7 @@ from edp.data.screening import FlagKind, ScreeningResult
 from edp.logs import DataQuality
 from edp.report.common.picture import write_pictures
 from edp.report.common.templates import template
-from edp.report.common.wording import duration, listed, number, unbroken, whole
+from edp.report.common.wording import count_text, duration, listed, number, unbroken
 from edp.report.coverage.quality import quality_tables
 from edp.report.run.page import shown
 from edp.report.screening import tables as tables
@@ -135,8 +135,8 @@ def sentence(text: str) -> str:
 def tiles(screening: ScreeningResult) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what."""
     tiles = [
-        (whole(len(screening.proposal.kept)), "", f"of {len(screening.channels)} channels proposed"),
-        (whole(screening.proposal.window), "samples", "suggested memory W"),
+        (count_text(len(screening.proposal.kept)), "", f"of {len(screening.channels)} channels proposed"),
+        (count_text(screening.proposal.window), "samples", "suggested memory W"),
     ]
     counts = {kind: len({flag.channel for flag in screening.flags if flag.kind is kind}) for kind in FlagKind}
     words = {
@@ -145,5 +145,5 @@ def tiles(screening: ScreeningResult) -> list[tuple[str, str, str]]:
         FlagKind.ARTEFACT: "artefacts of a file",
         FlagKind.NOISE: "channels without any relation",
     }
-    tiles += [(whole(counts[kind]), "", text) for kind, text in words.items() if counts[kind]]
+    tiles += [(count_text(counts[kind]), "", text) for kind, text in words.items() if counts[kind]]
     return tiles

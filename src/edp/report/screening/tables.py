@@ -7,7 +7,7 @@ from typing import Any
 
 from edp.data.screening import ChannelVerdict, Flag, LagCurve, ScreeningResult
 from edp.report.common.tables import TextTable
-from edp.report.common.wording import MISSING, duration, number, percent, whole
+from edp.report.common.wording import MISSING, count_text, duration, number, percent
 from edp.report.screening.views import lag_ranges
 
 FLAG_WORDS = {
@@ -63,7 +63,7 @@ def flags_table(screening: ScreeningResult) -> TextTable:
             flag.channel,
             FLAG_WORDS.get(str(flag.kind), str(flag.kind)),
             flag.source or MISSING,
-            whole(flag.lag) if flag.source else MISSING,
+            count_text(flag.lag) if flag.source else MISSING,
             flag.evidence,
         )
         for flag in ranked
@@ -82,7 +82,7 @@ def ranges_table(screening: ScreeningResult) -> TextTable:
     rows = tuple(
         (
             row.group,
-            MISSING if row.low is None else f"{whole(row.low)} to {whole(row.high)}",
+            MISSING if row.low is None else f"{count_text(row.low)} to {count_text(row.high)}",
             number(row.median, 1),
             percent(row.leads),
             f"{row.certain} of {row.curves}",
@@ -139,7 +139,7 @@ def trials_table(trials: Mapping[str, Any]) -> TextTable:
             gap = (trial["difference"] or {}).get(horizon)
             cells.append(number(trial["error"][horizon], 3))
             cells.append(MISSING if gap is None else f"{number(gap['low'], 3, True)} to {number(gap['high'], 3, True)}")
-        rows.append((trial["name"], whole(len(trial["channels"])), whole(trial["parameters"]), *cells))
+        rows.append((trial["name"], count_text(len(trial["channels"])), count_text(trial["parameters"]), *cells))
     rows.append(
         (
             "persistence",

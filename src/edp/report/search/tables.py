@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from edp.report.common.sheets import Column, Sheet, Value, chance, figures, plainly
-from edp.report.common.wording import duration, moment, number, percent, whole
+from edp.report.common.wording import count_text, duration, moment, number, percent
 from edp.report.search.facts import StudyFacts, known, of_phase, real
 from edp.report.search.modules import modules_sheets, ordered, span
 from edp.report.search.smaller import smaller_sheet
@@ -132,7 +132,7 @@ def _spread(values: Sequence[float]) -> tuple[float | None, float | None]:
 
 
 def _count(value: Value) -> str:
-    return whole(value) if isinstance(value, int | float) else plainly(value)
+    return count_text(value) if isinstance(value, int | float) else plainly(value)
 
 
 def selection_sheet(study: StudyFacts) -> Sheet | None:
@@ -181,9 +181,9 @@ def holdout_sheet(study: StudyFacts, facts: Mapping[str, Any]) -> Sheet | None:
     test = facts["test"]
     rows: list[tuple[Value, ...]] = [
         ("Active modules", *(", ".join(short.get(name, name) for name in own) or "none" for _, own in arms)),
-        ("Parameters", *(_against(size, sizes[0], whole) for size in sizes)),
+        ("Parameters", *(_against(size, sizes[0], count_text) for size in sizes)),
         ("FP32 (MB)", *(number(4e-6 * size, 4) for size in sizes)),
-        ("MACs per tick", *(_against(value, work[0], whole) for value in work)),
+        ("MACs per tick", *(_against(value, work[0], count_text) for value in work)),
     ]
     for key, name in {"composite": "Composite", "mae": "MAE", "rmse": "RMSE", "p95": "P95", "p99": "P99"}.items():
         values = [known(test[arm][key]) for arm in ("baseline", "synthesis")]

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from edp.report.common.wording import duration, listed, number, percent, whole
+from edp.report.common.wording import count_text, duration, listed, number, percent
 from edp.report.search.facts import NUMBERS, StudyFacts, known, of_phase, real
 from edp.report.search.smaller import chosen_words
 from edp.report.search.views import titled
@@ -84,7 +84,7 @@ def _features(study: StudyFacts, facts: Mapping[str, Any]) -> str:
 @of_phase("calibration", "")
 def _baseline(study: StudyFacts, facts: Mapping[str, Any]) -> str:
     calibration = facts["backbones"][facts["backbone"]]
-    return f"The baseline is {titled(facts['backbone'])} with {whole(real(calibration['parameters']))} parameters."
+    return f"The baseline is {titled(facts['backbone'])} with {count_text(real(calibration['parameters']))} parameters."
 
 
 @of_phase("confirmation", "")
@@ -111,17 +111,17 @@ def tiles(study: StudyFacts) -> list[tuple[str, str, str]]:
     failed = sum(training.status not in ("done", "pruned") for training in study.history)
     trained = sum(phase.seconds for phase in study.phases)
     exceptions = [f"{count} of them {what}" for count, what in ((pruned, "pruned"), (failed, "failed")) if count]
-    tiles = [(whole(len(study.history)), "", ", ".join(["trainings", *exceptions]))]
+    tiles = [(count_text(len(study.history)), "", ", ".join(["trainings", *exceptions]))]
     if trained:
         clock = duration(sum(phase.wall_s for phase in study.phases))
         value, _, unit = duration(trained).partition(" ")
         tiles.append((value, unit, f"of training, {clock} by the clock"))
     if "confirmation" in study.facts:
         confirmed, asked = study.facts["confirmation"]["confirmed"], study.facts["screening"]["registered"]
-        tiles.append((whole(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
+        tiles.append((count_text(len(confirmed)), "", f"of {len(asked)} modules confirmed"))
     openings = len(study.openings)
     sealed = _count(len(study.test) + len(study.second), "session")
-    tiles.append((whole(openings), "", f"opening{'s' * (openings != 1)} of {sealed} set apart"))
+    tiles.append((count_text(openings), "", f"opening{'s' * (openings != 1)} of {sealed} set apart"))
     return tiles
 
 
@@ -144,7 +144,7 @@ def caveats(study: StudyFacts) -> list[str]:
         *_power(study),
         "Modules are tried on one baseline with one feature set; on another network they may do otherwise.",
         f"Winners were tuned further than the baseline ({_count(int(spec['joint_trials']), 'more question')} in phase "
-        f"4, {whole(int(spec['free_trials']))} in phase 5), so part of their gain may be tuning and not modules.",
+        f"4, {count_text(int(spec['free_trials']))} in phase 5), so part of their gain may be tuning and not modules.",
         "The best of many questions is the best partly by chance, so scores of winners on development sessions are too "
         "good. Only test sessions and fresh folds count.",
     ]
@@ -161,8 +161,8 @@ def _length(spec: Mapping[str, Any], updates: int) -> str:
     """How long a training is, in words."""
     epochs = int(spec.get("epochs", 1))
     if epochs == 1:
-        return f"{whole(updates)} updates"
-    each = f"{whole(updates // epochs)} updates" if updates else "one pass over the data"
+        return f"{count_text(updates)} updates"
+    each = f"{count_text(updates // epochs)} updates" if updates else "one pass over the data"
     return f"at most {epochs} epochs of {each}"
 
 
@@ -236,4 +236,4 @@ def _plain(value: object) -> str:
 
 
 def _count(many: int, what: str) -> str:
-    return f"{whole(many)} {what}{'s' * (many != 1)}"
+    return f"{count_text(many)} {what}{'s' * (many != 1)}"

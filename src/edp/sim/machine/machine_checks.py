@@ -32,15 +32,15 @@ class ParameterBound:
     low: float = -math.inf
     high: float = math.inf
     above: bool = False
-    whole: bool = False
+    integer: bool = False
 
     def holds(self, value: float) -> bool:
         """Whether the value lies within."""
         fits = (value > self.low if self.above else value >= self.low) and value <= self.high
-        return fits and (not self.whole or value == int(value))
+        return fits and (not self.integer or value == int(value))
 
     def __str__(self) -> str:
-        text = "an integer " if self.whole else ""
+        text = "an integer " if self.integer else ""
         if math.isinf(self.high):
             return f"{text}{'above' if self.above else 'at least'} {self.low:g}"
         return f"{text}{f'above {self.low:g} and at most' if self.above else f'from {self.low:g} to'} {self.high:g}"
@@ -49,7 +49,7 @@ class ParameterBound:
 ANY = ParameterBound()
 POSITIVE, NOT_NEGATIVE = ParameterBound(0.0, above=True), ParameterBound(0.0)
 SHARE, SOME_SHARE, DEAD = ParameterBound(0.0, 1.0), ParameterBound(0.0, 1.0, above=True), ParameterBound(0.0, 0.9)
-PUMP = ParameterBound(1.0, 2.0, whole=True)
+PUMP = ParameterBound(1.0, 2.0, integer=True)
 LENGTH, SMALL = ParameterBound(0.0, 30.0, above=True), ParameterBound(0.0, 1.0, above=True)
 FREQUENCY = ParameterBound(0.0, 500.0, above=True)
 BOUNDS: Mapping[str, ParameterBound] = {
@@ -71,7 +71,7 @@ BOUNDS: Mapping[str, ParameterBound] = {
     "bucket_linkage.lug": LENGTH,
     "bucket_linkage.lug_angle": ParameterBound(-2 * math.pi, 2 * math.pi),
     "bucket_linkage.closed_length": LENGTH,
-    "cylinders.count": ParameterBound(1.0, 4.0, whole=True),
+    "cylinders.count": ParameterBound(1.0, 4.0, integer=True),
     "cylinders.bore": SMALL,
     "cylinders.rod": SMALL,
     "cylinders.stroke": LENGTH,
@@ -148,14 +148,14 @@ BOUNDS: Mapping[str, ParameterBound] = {
     "sensors.pin_backlash": ParameterBound(0.0, 0.1),
     "sensors.pressure_range": NOT_NEGATIVE,
     "sensors.pressure_offset": SHARE,
-    "sensors.pressure_bits": ParameterBound(0.0, 32.0, whole=True),
+    "sensors.pressure_bits": ParameterBound(0.0, 32.0, integer=True),
     "sensors.pressure_lag": ParameterBound(0.0, 10.0),
     "sensors.pressure_drift": SHARE,
     "sensors.can_period": ParameterBound(0.0, 10.0),
     "sensors.can_latency": ParameterBound(0.0, 10.0),
     "sensors.can_jitter": ParameterBound(0.0, 10.0),
     "sensors.can_loss": SHARE,
-    "sensors.instance_seed": ParameterBound(0.0, 2.0**63, whole=True),
+    "sensors.instance_seed": ParameterBound(0.0, 2.0**63, integer=True),
 }
 """By `section.key`; a number without an entry must be finite."""
 FLOWING = ("meter_in_extend", "meter_in_retract", "meter_out_extend", "meter_out_retract")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edp.settings.bounds import MOST_BATCH, MOST_EPOCHS, MOST_ROWS, MOST_WEIGHT, above, check_bounds, span, whole
+from edp.settings.bounds import MOST_BATCH, MOST_EPOCHS, MOST_ROWS, MOST_WEIGHT, above, check_bounds, integer, span
 
 MOST_FOLDS = 100
 MOST_RATE = 1.0
@@ -50,15 +50,15 @@ class BaggingSpec:
         check_bounds(
             "training.bagging",
             self,
-            folds=whole(2, MOST_FOLDS),
-            steps=whole(1, MOST_EPOCHS),
-            batch=whole(1, MOST_BATCH),
+            folds=integer(2, MOST_FOLDS),
+            steps=integer(1, MOST_EPOCHS),
+            batch=integer(1, MOST_BATCH),
             learning_rate=above(0.0, MOST_RATE),
             weight_decay=span(0.0, MOST_WEIGHT),
             robust_width=span(0.0, MOST_WEIGHT),
-            checks=whole(1, MOST_EPOCHS),
-            rows=whole(100, MOST_ROWS),
+            checks=integer(1, MOST_EPOCHS),
+            rows=integer(100, MOST_ROWS),
             tree_rate=above(0.0, MOST_RATE),
-            tree_leaf=whole(1, MOST_ROWS),
-            tree_rows=whole(100, MOST_ROWS),
+            tree_leaf=integer(1, MOST_ROWS),
+            tree_rows=integer(100, MOST_ROWS),
         )

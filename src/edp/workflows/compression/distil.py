@@ -16,7 +16,7 @@ from edp.errors import ConfigError, StorageError
 from edp.logs.source import DataSource
 from edp.networks.losses import LOSSES
 from edp.networks.predictor import Predictor
-from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, whole
+from edp.settings.bounds import MOST_LEVELS, MOST_UNITS, check_bounds, integer
 from edp.settings.tree import SettingsTree
 from edp.storage.runs import read_provenance
 from edp.training import Bundle, TrainingProgress, load_bundle
@@ -52,7 +52,7 @@ class DistilSpec:
     objective: DistillationSpec | None = None
 
     def __post_init__(self) -> None:
-        check_bounds("distil", self, units=whole(1, MOST_UNITS), levels=whole(1, MOST_LEVELS))
+        check_bounds("distil", self, units=integer(1, MOST_UNITS), levels=integer(1, MOST_LEVELS))
         if self.pruned and self.levels is not None:
             raise ConfigError("a pruned student keeps all levels of its teacher; leave out the levels, or the pruning")
 

@@ -22,7 +22,7 @@ from edp.errors import ConfigError, closest
 from edp.logs.source import DataSource
 from edp.networks.streaming import parameters_of
 from edp.recording import Recording
-from edp.settings.bounds import SEED, check_bounds, check_count, whole
+from edp.settings.bounds import SEED, check_bounds, check_count, integer
 from edp.signals import Kind
 from edp.storage import make_folder, read_object, write_json
 from edp.training import Bundle, TrainingProgress
@@ -56,7 +56,7 @@ class TrialSpec:
     seeds: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        check_bounds("trials", self, random=whole(0, MOST_SETS), draw=SEED, seeds=SEED)
+        check_bounds("trials", self, random=integer(0, MOST_SETS), draw=SEED, seeds=SEED)
         check_count("trials", "seeds", self.seeds, MOST_SETS)
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ConfigError(f"trials: seeds = {list(self.seeds)}; at least one seed, each once, must hold")

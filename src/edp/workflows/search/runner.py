@@ -19,7 +19,7 @@ from edp.data.frozen import SECOND_TEST_SET, ByFrozen
 from edp.errors import ConfigError, DataError
 from edp.logs.source import DataSource
 from edp.recording import Recording
-from edp.settings.bounds import MOST_THREADS, above, check_bounds, whole
+from edp.settings.bounds import MOST_THREADS, above, check_bounds, integer
 from edp.signals import KINDS
 from edp.storage import make_folder, write_bytes
 from edp.storage.ledger import Ledger, Record
@@ -67,8 +67,8 @@ class Resources:
         check_bounds(
             "search",
             self,
-            workers=whole(0, MOST_THREADS),
-            threads=whole(1, MOST_THREADS),
+            workers=integer(0, MOST_THREADS),
+            threads=integer(1, MOST_THREADS),
             seconds=above(0.0, MOST_SECONDS),
             memory_mb=above(0.0, MOST_MB),
         )

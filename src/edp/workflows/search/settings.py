@@ -18,9 +18,9 @@ from edp.settings.bounds import (
     above,
     between,
     check_bounds,
+    integer,
     shown,
     span,
-    whole,
 )
 from edp.storage.study_file import MODES
 from edp.workflows.compression import FORMATS
@@ -59,7 +59,7 @@ class CompressionSpec:
     updates: int = 0
 
     def __post_init__(self) -> None:
-        bounds = {"units": whole(1, MOST_UNITS), "shares": above(0.0, 1.0), "updates": whole(0, MOST_UPDATES)}
+        bounds = {"units": integer(1, MOST_UNITS), "shares": above(0.0, 1.0), "updates": integer(0, MOST_UPDATES)}
         check_bounds("compression", self, **bounds)
         wrong = [] if self.shares else ["shares = [] (at least one)"]
         for name in self.formats:
@@ -176,14 +176,14 @@ class SearchSpec:
             *("variance_seeds", "trials", "trial_runs", "screening_repeats"),
             *("module_trials", "run_seeds", "joint_trials", "free_trials", "batch"),
         )
-        bounds = dict.fromkeys(counts, whole(1, MOST_TRAININGS)) | {"seed": SEED, "horizon": whole(0, MOST_TICKS)}
-        bounds |= {"epochs": whole(1, MOST_EPOCHS), "patience": whole(0, MOST_EPOCHS)}
+        bounds = dict.fromkeys(counts, integer(1, MOST_TRAININGS)) | {"seed": SEED, "horizon": integer(0, MOST_TICKS)}
+        bounds |= {"epochs": integer(1, MOST_EPOCHS), "patience": integer(0, MOST_EPOCHS)}
         check_bounds("search", self, epochs=bounds["epochs"])
         # Zero steps stand for passes over the data, which only several epochs know.
-        steps = whole(1 if self.epochs == 1 else 0, MOST_UPDATES)  # 0: passes over the data
+        steps = integer(1 if self.epochs == 1 else 0, MOST_UPDATES)  # 0: passes over the data
         bounds |= dict.fromkeys(("updates", "final_updates"), steps)
-        bounds |= dict.fromkeys(("folds", "variance_runs", "most_runs", "screening_runs"), whole(2, MOST_TRAININGS))
-        bounds |= {"warm_rounds": whole(0, MOST_TRAININGS), "least_gain": span(0.0, 1.0)}
+        bounds |= dict.fromkeys(("folds", "variance_runs", "most_runs", "screening_runs"), integer(2, MOST_TRAININGS))
+        bounds |= {"warm_rounds": integer(0, MOST_TRAININGS), "least_gain": span(0.0, 1.0)}
         bounds |= dict.fromkeys(("test_share", "second_share", "least_effect", "power", "alpha"), between(0.0, 1.0))
         bounds |= {"rungs": between(0.0, 1.0)}
         check_bounds("search", self, **bounds)

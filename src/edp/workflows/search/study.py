@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edp.errors import ConfigError
-from edp.settings.bounds import MOST_NAMES, check_bounds, whole
+from edp.settings.bounds import MOST_NAMES, check_bounds, integer
 from edp.storage import replacing
 from edp.workflows.search.space import Candidate, Choice, Range, Real, Space, Value, check, names
 
@@ -63,7 +63,7 @@ class SamplerSpec:
     def __post_init__(self) -> None:
         if self.kind not in SAMPLERS:
             raise ConfigError(f"sampler '{self.kind}'; {', '.join(SAMPLERS)} must hold")
-        check_bounds("sampler", self, startup=whole(1, MOST_NAMES))
+        check_bounds("sampler", self, startup=integer(1, MOST_NAMES))
 
 
 @dataclass

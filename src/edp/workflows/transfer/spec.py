@@ -13,8 +13,8 @@ from edp.settings.bounds import (
     WEIGHT,
     above,
     check_bounds,
+    integer,
     span,
-    whole,
 )
 
 MOST_STEPS = 10_000
@@ -78,15 +78,15 @@ class FinetuneSpec:
         check_bounds(
             "finetune",
             self,
-            **dict.fromkeys(("head_epochs", "epochs", "rounds"), whole(1, MOST_EPOCHS)),
+            **dict.fromkeys(("head_epochs", "epochs", "rounds"), integer(1, MOST_EPOCHS)),
             **dict.fromkeys(("head_rate", "backbone_rate", "rate"), RATE),
             **dict.fromkeys(("smoothness", "weight_decay"), DECAY),
             **dict.fromkeys(("source_weight", "reversal"), WEIGHT),
             depth_decay=above(0.0, 1.0),
             soft=above(0.0, 1.0),
-            batch=whole(1, MOST_BATCH),
-            patience=whole(0, MOST_EPOCHS),
-            rank=whole(1, MOST_UNITS),
+            batch=integer(1, MOST_BATCH),
+            patience=integer(0, MOST_EPOCHS),
+            rank=integer(1, MOST_UNITS),
             inner_rate=span(0.0, RATE.high),
-            inner_steps=whole(1, MOST_STEPS),
+            inner_steps=integer(1, MOST_STEPS),
         )

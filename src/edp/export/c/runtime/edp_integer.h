@@ -1,4 +1,4 @@
-/* Whole-number arithmetic of exported predictors: C99, 8-bit weights, 16-bit values, no heap, no globals.
+/* Integer arithmetic of exported predictors: C99, 8-bit weights, 16-bit values, no heap, no globals.
  *
  * A value is q 2^-frac with q in [-32767, 32767]. Accumulators are 32-bit; multiplier and shift of an output take them to
  * the format of the result: sum * multiplier * 2^-shift, rounded half up, saturated. Gates and scores have 16 fractional

@@ -219,7 +219,7 @@ FMI2_EXPORT fmi2Status FMI2(GetInteger)(fmi2Component c, const fmi2ValueReferenc
     edp_fmu_status done = (c == NULL) ? EDP_FMU_ERROR : EDP_FMU_OK;
     for (size_t i = 0; (i < nvr) && (done == EDP_FMU_OK); i++) {
         int32_t whole = 0;
-        done = edp_fmu_get_whole(of(c), vr[i], &whole);
+        done = edp_fmu_get_integer(of(c), vr[i], &whole);
         value[i] = (fmi2Integer)whole;
     }
     return (fmi2Status)done;

@@ -150,7 +150,7 @@ FMI3_EXPORT fmi3Status FMI3(GetInt32)(fmi3Instance instance, const fmi3ValueRefe
                                       size_t nValueReferences, fmi3Int32 values[], size_t nValues) {
     edp_fmu_status done = matched(instance, nValueReferences, nValues);
     for (size_t i = 0; (i < nValueReferences) && (done == EDP_FMU_OK); i++) {
-        done = edp_fmu_get_whole(of(instance), valueReferences[i], &values[i]);
+        done = edp_fmu_get_integer(of(instance), valueReferences[i], &values[i]);
     }
     return (fmi3Status)done;
 }

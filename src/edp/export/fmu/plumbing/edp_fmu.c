@@ -197,7 +197,7 @@ edp_fmu_status edp_fmu_set_real(edp_fmu *f, uint32_t ref, double value) {
     return EDP_FMU_OK;
 }
 
-edp_fmu_status edp_fmu_get_whole(const edp_fmu *f, uint32_t ref, int32_t *value) {
+edp_fmu_status edp_fmu_get_integer(const edp_fmu *f, uint32_t ref, int32_t *value) {
     uint32_t count;
     switch (ref) {
     case FMU_REF_STATUS:

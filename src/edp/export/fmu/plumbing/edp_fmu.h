@@ -79,7 +79,7 @@ edp_fmu_status edp_fmu_step(edp_fmu *f, double at, double size);
 
 edp_fmu_status edp_fmu_get_real(const edp_fmu *f, uint32_t ref, double *value);
 edp_fmu_status edp_fmu_set_real(edp_fmu *f, uint32_t ref, double value);
-edp_fmu_status edp_fmu_get_whole(const edp_fmu *f, uint32_t ref, int32_t *value);
+edp_fmu_status edp_fmu_get_integer(const edp_fmu *f, uint32_t ref, int32_t *value);
 edp_fmu_status edp_fmu_get_flag(const edp_fmu *f, uint32_t ref, bool *value);
 
 /* `kept` is made if it is NULL. States of another FMU are refused here and in what follows. */
