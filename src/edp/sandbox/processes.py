@@ -11,7 +11,7 @@ import time
 
 PR_SET_PDEATHSIG = 1
 LOOK_S = 0.5
-"""Between looks at the parent, where the system does not tell of its end."""
+"""Between checks of the parent, where the system does not tell of its end."""
 
 
 def die_with_parent(parent: int) -> None:

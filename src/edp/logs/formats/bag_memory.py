@@ -12,7 +12,7 @@ from edp.storage.memory import check_memory
 _COPIES = 3
 """A growing buffer is copied into one twice as large."""
 _STEP = 1 << 24
-"""Bytes between two looks at the memory that is left."""
+"""Bytes between two checks of the memory that is left."""
 
 
 class Size(NamedTuple):

@@ -49,10 +49,10 @@ def check_cell(backbone: str, cell: CellSpec, zoneout: float, families: Sequence
     if not below(0.0, 1.0).holds(zoneout):
         raise ConfigError(f"backbone '{backbone}': zoneout = {shown(zoneout)}; 0 <= zoneout < 1 must hold")
     if zoneout and not cell.zoneout:
-        able = ", ".join(name for name in CELLS if CELLS[name].zoneout)
+        supporting = ", ".join(name for name in CELLS if CELLS[name].zoneout)
         raise ConfigError(
             f"backbone '{backbone}': zoneout = {zoneout} with cell '{kind}', but zoneout keeps the h and c of an LSTM "
-            f"(thesis 3.2.4.1); set zoneout = 0, or take one of the cells {able}"
+            f"(thesis 3.2.4.1); set zoneout = 0, or take one of the cells {supporting}"
         )
 
 

@@ -218,7 +218,7 @@ def openings_sheet(study: StudyFacts) -> Sheet | None:
         for opening in study.openings
     )
     columns = (Column("When"), Column("Why"), Column("Trainings"), Column("Test set"))
-    return Sheet("openings", "Looks at the sessions set apart", columns, rows)
+    return Sheet("openings", "Openings of the sealed test sets", columns, rows)
 
 
 def phases_sheet(study: StudyFacts) -> Sheet | None:

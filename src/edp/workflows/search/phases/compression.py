@@ -90,7 +90,7 @@ class CompressionPhase:
         if chosen is None:
             # The second test set is not opened where nothing fits.
             return self.decide(context, plan, rows, None, ())
-        # Teacher and choice alone are judged there: more looks would make it a validation set.
+        # Teacher and choice alone are judged there: more evaluations would make it a validation set.
         final = [replace(recipe_of(context), final="float32"), _final(context, rows[chosen])]
         outcomes = yield [order_of(context, settings, recipe, context.second) for recipe in final]
         return self.decide(context, plan, rows, chosen, outcomes)
