@@ -181,7 +181,7 @@ def arithmetic_of(name: str, args: Iterable[Any], result: Tensor) -> int:
 
 
 def trace(predictor: Predictor, ticks: int, state: State | None = None) -> tuple[Trace, State]:
-    """A call whose operations are recorded, on `ticks` ticks of zeros from `state` or from reset, and the next state."""
+    """A call whose operations are recorded, on `ticks` zeros from `state` or from reset, and the next state."""
     # Zeros suffice: the operations of a tick do not depend on its numbers.
     like = next(predictor.parameters())
     x = like.new_zeros(1, ticks, predictor.front.inputs)
