@@ -33,6 +33,12 @@ def test_the_folder_does_not_count_but_flags_and_headers_do(key, tmp_path):
     assert len({key("one"), key("one", "-O2"), key("one", header="#define A 1"), key("one", output="other")}) == 4
 
 
+def test_a_compiler_may_be_called_by_its_whole_path(key, tmp_path):
+    key("one")
+    command = ["/usr/bin/gcc", "-O1", "a.c", "-o", "program"]
+    assert compiled.call_of(command, {**OPTIONS, "cwd": tmp_path / "one"}) is not None
+
+
 @pytest.mark.parametrize(
     ("command", "options"),
     [
