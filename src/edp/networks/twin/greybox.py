@@ -34,7 +34,7 @@ from edp.settings.bounds import (
     above,
     check_bounds,
     check_count,
-    whole,
+    integer,
 )
 
 Doubles = NDArray[np.float64]
@@ -80,9 +80,9 @@ class GreyFitSpec:
     validation_runs: int = 32
 
     def __post_init__(self) -> None:
-        length, count = above(0.0, 600.0), whole(1, MOST_UPDATES)
+        length, count = above(0.0, 600.0), integer(1, MOST_UPDATES)
         bounds = {"lengths_s": length, "validation_s": length, "rounds": count, "steps": count, "ticks": count}
-        bounds |= {"lanes": whole(1, MOST_BATCH), "validation_runs": whole(1, MOST_BATCH), "validate_every": count}
+        bounds |= {"lanes": integer(1, MOST_BATCH), "validation_runs": integer(1, MOST_BATCH), "validate_every": count}
         check_bounds("grey box fit", self, stroke_weight=WEIGHT, delta=WEIGHT, memory=SHARE, **bounds)
         check_count("grey box fit", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
         if len(self.lengths_s) != len(self.rounds):
@@ -119,8 +119,8 @@ class GreyBox:
     fit: GreyFitSpec = field(default_factory=GreyFitSpec)
 
     def __post_init__(self) -> None:
-        degree = whole(0, 4)
-        check_bounds("grey box", self, inertia_degree=degree, potential_degree=whole(1, 6), prefix_ticks=PREFIX)
+        degree = integer(0, 4)
+        check_bounds("grey box", self, inertia_degree=degree, potential_degree=integer(1, 6), prefix_ticks=PREFIX)
         for name in ("cylinders", "valves", "pumps"):
             check_count("grey box", name, getattr(self, name), MOST_NAMES)
 
@@ -257,7 +257,7 @@ class Wiring:
         )
 
     @property
-    def whole(self) -> bool:
+    def integer(self) -> bool:
         """Whether every state of the load is measured."""
         return len(self.ports) == self.nodes + 2 * len(self.columns)
 

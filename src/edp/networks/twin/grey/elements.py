@@ -11,7 +11,7 @@ from edp.data.roles import roles_of
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, closest
 from edp.recording import Recording
-from edp.settings.bounds import check_bounds, span, whole
+from edp.settings.bounds import check_bounds, integer, span
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class CylinderElement:
 
     def __post_init__(self) -> None:
         size = span(0.0, 10.0)
-        check_bounds(f"cylinder '{self.name}'", self, bore=size, rod_diameter=size, count=whole(1, 100))
+        check_bounds(f"cylinder '{self.name}'", self, bore=size, rod_diameter=size, count=integer(1, 100))
         if self.bore and self.rod_diameter >= self.bore:
             raise ConfigError(
                 f"cylinder '{self.name}': rod_diameter = {self.rod_diameter:g} m is not below bore = {self.bore:g} m"
