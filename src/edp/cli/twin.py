@@ -44,6 +44,8 @@ def twin(
     def show() -> None:
         score_table(trained.scores)
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
+        if (folder / "datasheet.txt").is_file():
+            out.print(f"numbers of the machine with units and intervals in {folder / 'datasheet.txt'}")
         out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
 
     emit(as_json, facts, show)
