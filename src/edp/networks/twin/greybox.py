@@ -257,7 +257,7 @@ class Wiring:
         )
 
     @property
-    def integer(self) -> bool:
+    def whole(self) -> bool:
         """Whether every state of the load is measured."""
         return len(self.ports) == self.nodes + 2 * len(self.columns)
 
