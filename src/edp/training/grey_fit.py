@@ -26,6 +26,8 @@ FINEST = 0.02
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6
 FARTHEST = 1.5
 """Plausible deviations that one step may move a number: beyond it a linear model says nothing."""
+APART = 0.3
+"""Spread of the further starts in plausible deviations: far enough for another valley, near enough to be simulated."""
 TRIES = 4
 """Steps, each damped more, after which a round gives up and draws other stretches."""
 
@@ -133,44 +135,86 @@ def fit_grey_box(
         twin: with the numbers to start from.
         train: training stretches.
         validation: stretches that choose.
-        seed: of the stretches.
+        seed: of the stretches and of the further starts.
         on_event: called after each round.
 
     Raises:
         DataError: stretches that are too short.
     """
-    spec = twin.spec.fit
-    rng, began = np.random.default_rng(seed), time.process_time()
+    spec, began = twin.spec.fit, time.process_time()
     problem = _Problem(twin, train, spec.stroke_weight, spec.delta)
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
-    theta = np.zeros(len(twin.numbers))
-    best, chosen, history = np.inf, theta, list[dict[str, Any]]()
     rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
-    damping, information = 1.0, np.zeros((len(theta), len(theta)))
-    memory = np.zeros_like(information)
-    for done, length_s in enumerate(rounds, 1):
-        ticks = max(1, round(length_s * twin.channels.rate_hz))
-        lanes = max(8, min(spec.lanes, spec.ticks // ticks))
-        drawn = problem.draw(ticks, lanes, rng)
-        before = theta
-        theta, damping, matrix = _improve(problem, theta, drawn, damping, spec.steps, memory)
+    total = len(rounds) + (spec.starts - 1) * spec.rounds[0]
+    history: list[dict[str, Any]] = []
+    done = 0
+
+    def advance(path: _Path, lengths: Sequence[float]) -> None:
+        nonlocal done
+        for number, length_s in enumerate(lengths, 1):
+            done += 1
+            before = path.theta
+            path.step(length_s)
+            # The last round of a stage is judged, whatever its number.
+            if number != len(lengths) and number % spec.validate_every and length_s == lengths[number]:
+                continue
+            judge.twin = twin.with_numbers(problem.numbers(path.theta))
+            better = path.judge(judge.error()) and path.least <= min(other.least for other in paths)
+            seconds = time.process_time() - began
+            moved = float(np.sqrt(np.mean((path.theta - before) ** 2)))
+            row = {"update": done, "start": path.number, "length_s": length_s, "validation": path.error, "best": better}
+            history.append(row | {"moved": moved, "damping": path.damping, "seconds": round(seconds, 2)})
+            if on_event is not None:
+                left = seconds * (total - done) / done
+                on_event(FreeRunProgress(done, total, length_s, left, path.error, better))
+
+    paths = [_Path(problem, number, seed) for number in range(spec.starts)]
+    for path in paths:
+        advance(path, rounds[: spec.rounds[0]])
+    # Which valley a start lies in shows after short runs; long ones of every start would cost as much again.
+    chosen = min(paths, key=lambda path: path.least)
+    advance(chosen, rounds[spec.rounds[0] :])
+    final = twin.with_numbers(problem.numbers(chosen.best))
+    return GreyFit(final, history, time.process_time() - began, chosen.information)
+
+
+class _Path:
+    """The way of one start through the rounds.
+
+    Attributes:
+        theta: where it stands, in plausible deviations of the numbers; `best` where its validation was least.
+        least: that validation's error.
+        information: of the numbers at `best`, as `GreyFit` has it.
+    """
+
+    def __init__(self, problem: _Problem, number: int, seed: int) -> None:
+        self.problem, self.number = problem, number
+        # Each start has stretches of its own; the first one begins at the balance of forces.
+        self.rng = np.random.default_rng([seed, number] if number else seed)
+        size = len(problem.begin)
+        self.theta = APART * self.rng.normal(size=size) if number else np.zeros(size)
+        self.best, self.least, self.error = self.theta, np.inf, np.inf
+        self.damping, self.matrix = 1.0, np.zeros((size, size))
+        self.memory, self.information = np.zeros((size, size)), np.zeros((size, size))
+
+    def step(self, length_s: float) -> None:
+        """One round on free runs of a length."""
+        spec = self.problem.twin.spec.fit
+        ticks = max(1, round(length_s * self.problem.twin.channels.rate_hz))
+        drawn = self.problem.draw(ticks, max(8, min(spec.lanes, spec.ticks // ticks)), self.rng)
+        self.theta, self.damping, self.matrix = _improve(
+            self.problem, self.theta, drawn, self.damping, spec.steps, self.memory
+        )
         # The first stage begins far away, where a linear model says little about the end.
-        memory = spec.memory * (memory + matrix) if length_s != spec.lengths_s[0] else memory
-        if done != len(rounds) and done % spec.validate_every and length_s == rounds[min(done, len(rounds) - 1)]:
-            continue
-        judge.twin = twin.with_numbers(problem.numbers(theta))
-        error = judge.error()
-        if error < best:
-            best, chosen, information = error, theta, memory + matrix
-        seconds = time.process_time() - began
-        moved = float(np.sqrt(np.mean((theta - before) ** 2)))
-        row = {"update": done, "length_s": length_s, "validation": error, "best": chosen is theta, "moved": moved}
-        history.append(row | {"damping": damping, "seconds": round(seconds, 2)})
-        if on_event is not None:
-            left = seconds * sum(rounds[done:]) / sum(rounds[:done])
-            on_event(FreeRunProgress(done, len(rounds), length_s, left, error, chosen is theta))
-    final = twin.with_numbers(problem.numbers(chosen))
-    return GreyFit(final, history, time.process_time() - began, information)
+        self.memory = spec.memory * (self.memory + self.matrix) if length_s != spec.lengths_s[0] else self.memory
+
+    def judge(self, error: float) -> bool:
+        """Take in a validation error of where it stands; whether it is the least so far."""
+        self.error = error
+        if error >= self.least:
+            return False
+        self.least, self.best, self.information = error, self.theta, self.memory + self.matrix
+        return True
 
 
 def _improve(

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.errors import ConfigError
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.elements import (
@@ -21,21 +20,12 @@ from edp.networks.twin.grey.elements import (
     check_elements,
     default_elements,
 )
+from edp.networks.twin.grey.fit_spec import GreyFitSpec
 from edp.networks.twin.grey.numbers import KNOTS, NumberTable, Travel, number_table
 from edp.networks.twin.grey.run import run_lanes
 from edp.networks.twin.grey.start import load_start
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
-from edp.settings.bounds import (
-    MOST_BATCH,
-    MOST_NAMES,
-    MOST_UPDATES,
-    SHARE,
-    WEIGHT,
-    above,
-    check_bounds,
-    check_count,
-    integer,
-)
+from edp.settings.bounds import MOST_NAMES, check_bounds, check_count, integer
 
 Doubles = NDArray[np.float64]
 LONGEST_DELAY_S = 0.3
@@ -44,52 +34,6 @@ LONGEST_STEP_S = 0.0125
 """Of an implicit step: swings of a load of several Hz keep their damping."""
 REST_MPA = 2.0
 """Where a chamber that is not measured starts in the prefix."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GreyFitSpec:
-    """How the numbers of a grey box are fitted (`edp.training.grey_fit`).
-
-    Attributes:
-        lengths_s: lengths of the free runs, stage after stage.
-        rounds: rounds of each stage; every one draws other stretches.
-        steps: Gauss-Newton steps in a round.
-        lanes: free runs of a round at most.
-        ticks: of all free runs of a round together, about.
-        memory: share of what a round knows that counts in the next one, beside its own stretches.
-        stroke_weight: of an error of a stroke in its deviations, beside those of velocities and pressures.
-        delta: where the Huber loss turns from a square to a line, in weighted deviations.
-        validate_every: rounds from one validation to the next.
-        validation_s: length of a free run of the validation.
-        validation_runs: how many there are.
-
-    Raises:
-        ConfigError: a value out of range, or stages that do not fit one another.
-    """
-
-    lengths_s: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
-    rounds: tuple[int, ...] = (8, 6, 6, 4)
-    steps: int = 3
-    lanes: int = 256
-    ticks: int = 12_000
-    memory: float = 0.5
-    stroke_weight: float = 5.0
-    delta: float = 0.2
-    validate_every: int = 2
-    validation_s: float = 10.0
-    validation_runs: int = 32
-
-    def __post_init__(self) -> None:
-        length, count = above(0.0, 600.0), integer(1, MOST_UPDATES)
-        bounds = {"lengths_s": length, "validation_s": length, "rounds": count, "steps": count, "ticks": count}
-        bounds |= {"lanes": integer(1, MOST_BATCH), "validation_runs": integer(1, MOST_BATCH), "validate_every": count}
-        check_bounds("grey box fit", self, stroke_weight=WEIGHT, delta=WEIGHT, memory=SHARE, **bounds)
-        check_count("grey box fit", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
-        if len(self.lengths_s) != len(self.rounds):
-            raise ConfigError(
-                f"grey box fit: {len(self.lengths_s)} lengths_s and {len(self.rounds)} rounds; one number of rounds "
-                "for each length must hold"
-            )
 
 
 @TWINS.register("greybox")

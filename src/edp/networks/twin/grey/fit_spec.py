@@ -1,0 +1,73 @@
+"""Settings of the fit of a grey box to free runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.errors import ConfigError
+from edp.settings.bounds import (
+    MOST_BATCH,
+    MOST_NAMES,
+    MOST_UPDATES,
+    SHARE,
+    WEIGHT,
+    above,
+    check_bounds,
+    check_count,
+    integer,
+)
+
+MOST_STARTS = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyFitSpec:
+    """How the numbers of a grey box are fitted (`edp.training.grey_fit`).
+
+    Attributes:
+        lengths_s: lengths of the free runs, stage after stage.
+        rounds: rounds of each stage; every one draws other stretches.
+        starts: from how many starts the first stage is fitted; the one with the least validation error goes on.
+        steps: Gauss-Newton steps in a round.
+        lanes: free runs of a round at most.
+        ticks: of all free runs of a round together, about.
+        memory: share of what a round knows that counts in the next one, beside its own stretches.
+        stroke_weight: of an error of a stroke in its deviations, beside those of velocities and pressures.
+        delta: where the Huber loss turns from a square to a line, in weighted deviations.
+        validate_every: rounds from one validation to the next.
+        validation_s: length of a free run of the validation.
+        validation_runs: how many there are.
+
+    Raises:
+        ConfigError: a value out of range, or stages that do not fit one another.
+    """
+
+    lengths_s: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
+    rounds: tuple[int, ...] = (8, 6, 6, 4)
+    starts: int = 3
+    steps: int = 3
+    lanes: int = 256
+    ticks: int = 12_000
+    memory: float = 0.5
+    stroke_weight: float = 5.0
+    delta: float = 0.2
+    validate_every: int = 2
+    validation_s: float = 10.0
+    validation_runs: int = 32
+
+    def __post_init__(self) -> None:
+        length, count = above(0.0, 600.0), integer(1, MOST_UPDATES)
+        bounds = {"lengths_s": length, "validation_s": length, "rounds": count, "steps": count, "ticks": count}
+        bounds |= {
+            "starts": integer(1, MOST_STARTS),
+            "lanes": integer(1, MOST_BATCH),
+            "validation_runs": integer(1, MOST_BATCH),
+            "validate_every": count,
+        }
+        check_bounds("grey box fit", self, stroke_weight=WEIGHT, delta=WEIGHT, memory=SHARE, **bounds)
+        check_count("grey box fit", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
+        if len(self.lengths_s) != len(self.rounds):
+            raise ConfigError(
+                f"grey box fit: {len(self.lengths_s)} lengths_s and {len(self.rounds)} rounds; one number of rounds "
+                "for each length must hold"
+            )
