@@ -221,8 +221,8 @@ def test_bounds_know_numbers():
     assert [bound.holds(v) for v in (0, 1, 2, 2.5, True, "1", None, math.nan, np.float64(1.5))] == [
         False, True, True, False, False, False, False, False, True,
     ]  # fmt: skip
-    assert Bound(0, MOST_SEED, whole=True).holds(np.int64(5))
-    assert not Bound(0, MOST_SEED, whole=True).holds(5.0)
+    assert Bound(0, MOST_SEED, integer=True).holds(np.int64(5))
+    assert not Bound(0, MOST_SEED, integer=True).holds(5.0)
 
 
 def prepared(task, ticks=400):
