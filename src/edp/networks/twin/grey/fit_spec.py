@@ -46,8 +46,8 @@ class GreyFitSpec:
     rounds: tuple[int, ...] = (8, 6, 6, 4)
     starts: int = 3
     steps: int = 3
-    lanes: int = 256
-    ticks: int = 12_000
+    lanes: int = 512
+    ticks: int = 40_000
     memory: float = 0.5
     stroke_weight: float = 5.0
     delta: float = 0.2
