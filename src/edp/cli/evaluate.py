@@ -25,7 +25,7 @@ def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder of edp train or edp twin.")],
     data: Annotated[Path | None, typer.Option(help="Other recordings to judge on; default: the held-out ones.")] = None,
     baselines: Annotated[
-        str | None, typer.Option(help="Comma-separated names, or 'none'; default: those of the settings.")
+        str | None, typer.Option(help="Comma-separated names, 'all' or 'none'; default: those of the settings.")
     ] = None,
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
@@ -54,7 +54,7 @@ def evaluate(
         return
     if predictor is not None:
         raise ConfigError(f"--predictor: '{run}' holds no twin; a twin is what a predictor is compared with")
-    names = None if baselines is None else [n for n in baselines.split(",") if n and n != "none"]
+    names = None if baselines is None else baseline_names(baselines)
     from edp.evaluation.guard import beaten_by
 
     folder, scores = run_evaluation(run, source, names, as_json)
@@ -76,6 +76,15 @@ def evaluate(
     emit(as_json, facts | importance_json, show)
     if beaten is not None:
         raise typer.Exit(BEATEN)
+
+
+def baseline_names(text: str) -> list[str]:
+    """Names of baselines from the text of ``--baselines``."""
+    if text == "all":
+        from edp.evaluation.baselines import BASELINES
+
+        return list(BASELINES)
+    return [name.strip() for name in text.split(",") if name.strip() and name.strip() != "none"]
 
 
 def is_twin(run: Path) -> bool:

@@ -6,6 +6,9 @@ import tomllib
 import numpy as np
 import pytest
 
+from edp.cli.evaluate import baseline_names
+from edp.evaluation.baselines import BASELINES
+
 SETTINGS = ("--set", "task.targets=['CylVels_1']", "--set", "task.horizons=[5]", "--minutes", "0.01")
 
 
@@ -109,3 +112,11 @@ def test_one_recording_is_divided_by_time(edp, tmp_path):
     assert ended.code == 0, ended.err
     split = tomllib.loads((tmp_path / "run" / "config.toml").read_text())["split"]
     assert split == {"kind": "time", "validation_share": 0.15, "test_share": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [("all", list(BASELINES)), ("none", []), ("", []), ("persistence, ridge_arx", ["persistence", "ridge_arx"])],
+)
+def test_baselines_are_named_or_all_or_none(text, names):
+    assert baseline_names(text) == names
