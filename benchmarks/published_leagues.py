@@ -61,11 +61,11 @@ def show(entry: dict[str, Any], found: dict[str, Any], quick: bool) -> None:
     print(f"The first {found['skip']} ticks ({found['skip_s']:g} s) start ours and are not scored.")
 
 
-def verdicts_of(entry: dict[str, Any], found: dict[str, Any], quick: bool) -> list[Verdict]:
-    """Ours against each rival that the entry names."""
+def verdicts_of(entry: dict[str, Any], found: dict[str, Any], quick: bool, model: str = "") -> list[Verdict]:
+    """Ours against each rival that the entry names; `model`: what the title adds where ours is not the default."""
     return [
         verdict(
-            f"{entry['title']}: against the published {name}",
+            f"{entry['title']}{model}: against the published {name}",
             found["median"],
             entry["published"][name],
             "<= 1",

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from common import Verdict, finish, parser, table, verdict
+from common import Verdict, finish, parser, table
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels, twin_channels
 from edp.logs.source import DataSource
@@ -33,8 +33,8 @@ from edp.settings.tree import read_toml
 from edp.signals import Channel, Kind
 from edp.training.free_run import FreeRunSpec, fit_free_runs
 from edp.training.optimizers import Soap
-from published_leagues import EXAMPLES, VARIABLE
-from real_recordings import shared_folder
+from published_leagues import verdicts_of
+from real_recordings import EXAMPLES, VARIABLE, shared_folder
 
 ESTIMATION = 0.8
 """Share of the estimation data that trains; the rest chooses."""
@@ -144,21 +144,6 @@ def measure(entry: dict[str, Any], which: LeagueSet, seeds: Sequence[int], quick
     return found | {"validation": validation, "processor_s": round(time.process_time() - began, 1)}
 
 
-def verdicts_of(entry: dict[str, Any], found: dict[str, Any], quick: bool) -> list[Verdict]:
-    """Ours against each rival that the league names."""
-    return [
-        verdict(
-            f"{entry['title']}, twin: against the published {name}",
-            found["median"],
-            entry["published"][name],
-            "<= 1",
-            entry["unit"],
-            quick,
-        )
-        for name in entry["rivals"]
-    ]
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     options = parser(__doc__ or "")
@@ -177,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         table(["method", "test RMSE"], sorted(rows, key=lambda pair: pair[1]))
         each = ", ".join(f"{value:.4g}" for value in found["ours"].values())
         print(f"by seed: {each}; {found['candidate']} of {found['validation']}; {found['processor_s']} processor s")
-        verdicts += verdicts_of(entry, found, given.quick)
+        verdicts += verdicts_of(entry, found, given.quick, ", twin")
         kept[entry["title"]] = found
     finish("twin_leagues", verdicts, given.seed, kept)
 
