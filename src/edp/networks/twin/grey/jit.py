@@ -14,4 +14,4 @@ compiler = Compiler(
     lambda: (_FOLDER / "layout.py", *files_with(_FOLDER, "from edp.networks.twin.grey.jit import")),
     {"nogil": True, "error_model": "numpy", "fastmath": _FASTMATH},
 )
-compiled, inlined = compiler.compiled, compiler.inlined
+compiled, inlined, inner = compiler.compiled, compiler.inlined, compiler.inner

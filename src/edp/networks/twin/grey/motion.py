@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.jit import compiled
+from edp.networks.twin.grey.jit import inner
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -22,7 +22,7 @@ NEGLIGIBLE = 6.5
 """Multiple of the Stribeck velocity beyond which its effect, exp(-42), is below rounding."""
 
 
-@compiled
+@inner
 def basis(z: Array, exponents: IntArray, scale: Array, table: Array, terms: tuple[Array, Array, Array]) -> None:
     """Monomials of the scaled strokes, their gradients and second derivatives by the strokes.
 
@@ -61,7 +61,7 @@ def basis(z: Array, exponents: IntArray, scale: Array, table: Array, terms: tupl
                 second[b, k, m] = second[b, m, k] = twice
 
 
-@compiled
+@inner
 def freeze_load(
     q: Array,
     places: tuple[int, int, int],
@@ -116,7 +116,7 @@ def freeze_load(
     _turning(q, places, v, terms, low, by_s, force, full)
 
 
-@compiled
+@inner
 def _turning(
     q: Array,
     places: tuple[int, int, int],
@@ -149,7 +149,7 @@ def _turning(
         _turning_by_state(q, places, v, second, (low, by_s), (dot, w, u, along), (total_s, total_v))
 
 
-@compiled
+@inner
 def _turning_by_numbers(
     places: tuple[int, int, int],
     v: Array,
@@ -180,7 +180,7 @@ def _turning_by_numbers(
             first_of_entry += count
 
 
-@compiled
+@inner
 def _turning_by_state(
     q: Array,
     places: tuple[int, int, int],
@@ -225,7 +225,7 @@ def _turning_by_state(
                 total_v[i, k] -= w_k * along[i, c] + w[c] * by_s[k, c, i]
 
 
-@compiled
+@inner
 def _second(q: Array, places: tuple[int, int, int], second: Array, k: int, own: Array) -> None:
     """Derivatives of the gradient of L by stroke `k` ``(actuator, actuator, stroke)``."""
     n = len(own)
@@ -239,7 +239,7 @@ def _second(q: Array, places: tuple[int, int, int], second: Array, k: int, own: 
             first_of_entry += places[1]
 
 
-@compiled
+@inner
 def friction(
     v: float, before: float, step: float, a: int, q: Array
 ) -> tuple[float, float, float, float, float, tuple[float, float, float, float, float, float, float]]:
@@ -286,7 +286,7 @@ def friction(
     return z, force, slope, rate * under - damping * fade / step, under, numbers
 
 
-@compiled
+@inner
 def bristle_slopes(
     v: float, before: float, step: float, a: int, q: Array
 ) -> tuple[float, tuple[float, float, float, float]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.jit import compiled, inlined
+from edp.networks.twin.grey.jit import inlined, inner
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -71,7 +71,7 @@ def cushion(distance: float, length: float, least: float) -> tuple[float, float,
     return least + (1.0 - least) * step, slope, -slope * r, 1.0 - step
 
 
-@compiled
+@inner
 def edge(
     f: int,
     t: int,
@@ -122,7 +122,7 @@ def edge(
     return area * g
 
 
-@compiled
+@inner
 def valve_flows(
     x: Array,
     strokes: Array,
@@ -175,7 +175,7 @@ def valve_flows(
                         net_q[node, again] += sign * share * whole
 
 
-@compiled
+@inner
 def port_flows(
     q: Array, p: Array, form: tuple[IntArray, ...], circuit: int, sums: tuple[Array, ...], full: bool
 ) -> None:
@@ -210,7 +210,7 @@ def port_flows(
             net_q[n + i, a + at.PISTON_LEAK] += p[i] - p[n + i]
 
 
-@compiled
+@inner
 def pump_flows(
     x: Array,
     displacement: Array,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.jit import compiled
+from edp.networks.twin.grey.jit import compiled, inner
 from edp.networks.twin.grey.steps import GAMMA, bristles, tick
 from edp.networks.twin.grey.valve import advance_valves, displace
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-@compiled
+@inner
 def _work(
     n: int, nodes: int, pumps: int, valves: int, numbers: int, terms: int, degree: int
 ) -> tuple[tuple[Array, ...], ...]:
@@ -47,7 +47,7 @@ def _work(
     return sums, out, loads, monomials, vectors, matrices, tangents
 
 
-@compiled
+@inner
 def _set_port(kind: int, which: int, value: float, y: Array, s: Array, nodes: int) -> None:
     """Write a measured velocity (0), stroke (1) or pressure (2) in index of the state."""
     if kind == 1:
@@ -58,7 +58,7 @@ def _set_port(kind: int, which: int, value: float, y: Array, s: Array, nodes: in
         y[which] = max(value, at.LEAST_ABSOLUTE - at.ATMOSPHERE)
 
 
-@compiled
+@inner
 def _follow(
     lane: tuple[Array, ...],
     tangents: tuple[Array, ...],
@@ -79,7 +79,7 @@ def _follow(
     bristles(y, z.copy(), tick_s, q, form[3], z, (t_z, t_z.copy(), t_y), full)
 
 
-@compiled
+@inner
 def _bound(
     y: Array, s: Array, before: tuple[Array, Array], ports: IntArray, limits: tuple[Array, ...], tick_s: float
 ) -> None:
@@ -101,7 +101,7 @@ def _bound(
                 y[index] = min(max(y[index], low), high)
 
 
-@compiled
+@inner
 def _feed(
     measured: Array,
     answer: Array,
@@ -126,7 +126,7 @@ def _feed(
             _set_port(kind, which, answer[c], y, s, nodes)
 
 
-@compiled
+@inner
 def _row(
     truth: Array,
     errors_of: tuple[Array, float],
@@ -250,7 +250,7 @@ def run_lanes(
             normal[1][:] += np.dot(counted.T, errors[:used])
 
 
-@compiled
+@inner
 def _rounded(lane: tuple[Array, ...], history: Array) -> None:
     """Keep a state as single precision would, so that a chunk and its ticks give the same bits."""
     y, s, z, d, valves = lane

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.jit import compiled, inlined
+from edp.networks.twin.grey.jit import inlined, inner
 from edp.networks.twin.grey.motion import friction
 from edp.networks.twin.grey.network import port_flows, pump_flows, valve_flows
 
@@ -38,7 +38,7 @@ def content(p: float, bulk: float, share: float) -> tuple[float, float, float, f
     return p - bulk * air, 1.0 + bulk * air * inverse, -air, -bulk * at.ATMOSPHERE * inverse
 
 
-@compiled
+@inner
 def _node_row(
     node: int,
     volume: float,
@@ -83,7 +83,7 @@ def _node_row(
     return rate * into / volume, rate * y[speed]
 
 
-@compiled
+@inner
 def pressure_rows(
     now: tuple[Array, Array, float],
     strokes: Array,
@@ -123,7 +123,7 @@ def pressure_rows(
             by_d[row, m] = -now[2] * q[circuit + at.BULK] / q[a + at.LINE] * q[a + at.FLOW]
 
 
-@compiled
+@inner
 def motion_rows(
     now: tuple[Array, Array, float],
     stroke: tuple[Array, Array, float],
@@ -200,7 +200,7 @@ def motion_rows(
             _inertia_slopes(i, w, change, low, by_low, places, value, by_s, by_q, nodes)
 
 
-@compiled
+@inner
 def _inertia_slopes(
     i: int,
     w: Array,
@@ -232,7 +232,7 @@ def _inertia_slopes(
             index += places[1]
 
 
-@compiled
+@inner
 def factorise(a: Array) -> None:
     """LU in index, without pivots: pressures come first, and their rows are dominated by the diagonal."""
     size = len(a)
@@ -245,7 +245,7 @@ def factorise(a: Array) -> None:
                     a[i, j] -= a[i, k] * a[k, j]
 
 
-@compiled
+@inner
 def solve(lu: Array, columns: Array) -> None:
     """Replace the columns ``(unknown, column)`` by the solutions."""
     size, count = columns.shape
@@ -266,7 +266,7 @@ def solve(lu: Array, columns: Array) -> None:
             columns[i, c] *= inverse
 
 
-@compiled
+@inner
 def assemble(
     now: tuple[Array, Array, float],
     x: Array,
@@ -302,7 +302,7 @@ def assemble(
     motion_rows(now, stroke, bristle, q, form, load, (places[0], places[1], places[2]), out, full, value)
 
 
-@compiled
+@inner
 def newton(
     now: tuple[Array, Array, float],
     x: Array,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.jit import compiled
+from edp.networks.twin.grey.jit import inner
 from edp.networks.twin.grey.motion import basis, bristle_slopes, freeze_load, friction
 from edp.networks.twin.grey.stage import assemble, content, factorise, newton, solve
 from edp.networks.twin.grey.valve import advance_valves, displace, own_places
@@ -21,7 +21,7 @@ AHEAD = (1.0 - GAMMA) / GAMMA
 """The base of the second stage lies on the line through the start and the first stage, this far beyond the latter."""
 
 
-@compiled
+@inner
 def _tangents_of_stage(
     solved: Array,
     base: Array,
@@ -100,7 +100,7 @@ def _tangents_of_stage(
     solve(by_y, solved)
 
 
-@compiled
+@inner
 def bristles(
     y: Array,
     base: Array,
@@ -128,7 +128,7 @@ def bristles(
             t_z[i, a + at.BRISTLE] += own[3]
 
 
-@compiled
+@inner
 def _contents(
     y: Array, t_y: Array, nodes: int, q: Array, circuit: int, contents: Array, t_contents: Array, full: bool
 ) -> None:
@@ -145,7 +145,7 @@ def _contents(
             t_contents[k, circuit + at.AIR] += by_air
 
 
-@compiled
+@inner
 def tick(
     lane: tuple[Array, ...],
     tangents: tuple[Array, ...],
@@ -227,7 +227,7 @@ def tick(
     return spent
 
 
-@compiled
+@inner
 def _move(
     s: Array,
     t_s: Array,
@@ -249,7 +249,7 @@ def _move(
                 t_s[i, k] = t_start[i, k] + weight * (before[1][i, k] + after[1][i, k])
 
 
-@compiled
+@inner
 def _freeze(
     s: Array,
     tangents: tuple[Array, Array],

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
-from edp.networks.twin.grey.jit import compiled, inlined
+from edp.networks.twin.grey.jit import inlined, inner
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -30,7 +30,7 @@ def delayed(history: Array, j: int, delay: float, step: float) -> tuple[float, f
     return newer + part * (older - newer), slope
 
 
-@compiled
+@inner
 def _lag(
     row: Array, which: int, goal: float, keep: float, slopes: Array, by_goal: Array, own: int, by_lag: float
 ) -> None:
@@ -42,7 +42,7 @@ def _lag(
     slopes[which, own] += behind * keep * by_lag
 
 
-@compiled
+@inner
 def advance_valves(
     valves: Array,
     slopes: Array,
@@ -77,7 +77,7 @@ def advance_valves(
         _lag(row, at.SPOOL, row[at.SPOOL_1], keep, mine, mine[at.SPOOL_1], at.BY_SPOOL_LAG, step / (lag * lag))
 
 
-@compiled
+@inner
 def own_places(j: int, valve_at: IntArray, play_at: int, places: IntArray) -> None:
     """Where the numbers of a valve's own tangents lie."""
     places[at.BY_DELAY] = valve_at[j, at.DELAY]
@@ -86,7 +86,7 @@ def own_places(j: int, valve_at: IntArray, play_at: int, places: IntArray) -> No
     places[at.BY_PLAY] = play_at
 
 
-@compiled
+@inner
 def displace(
     displacement: Array,
     tangents: Array,
