@@ -14,11 +14,13 @@ from edp.data.prepared import Prepared
 from edp.evaluation.free_run import calibrated
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
+from edp.networks.twin.elements import ElementsTwin
 from edp.networks.twin.grey.datasheet import BASIS, datasheet, datasheet_text
 from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.recurrent import RecurrentTwin
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
+from edp.training.elements_fit import fit_elements
 from edp.training.free_run import FittedTwin, FreeRunProgress, fit_free_runs
 from edp.training.grey_fit import fit_grey_box
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
@@ -92,6 +94,13 @@ def train_twin(
             rows = datasheet(twin.table, fit.twin.numbers, fit.information)
             write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": rows})
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows).encode())
+        elif isinstance(twin, ElementsTwin):
+            tell("fitting the elements to free runs")
+            found = fit_elements(twin, data.train, data.validation, experiment.training.seed, on_event)
+            fitted = FittedTwin(found.twin, found.history, found.seconds)
+            run.write_history(fitted.history)
+            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": found.rows})
+            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(found.rows).encode())
         else:
             fitted = FittedTwin(twin, [], time.process_time() - started)
         tell("calibrating intervals")

@@ -1,0 +1,205 @@
+"""Elements of small physical systems, as a settings file names them, how they connect, and the numbers they have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError, closest
+from edp.networks.twin.scales import TwinScales
+
+Doubles = NDArray[np.float64]
+MOST_ELEMENTS = 32
+"""Of a kind; tangents of all numbers run side by side, and twice the elements take four times as long."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TankElement:
+    """A tank that is filled by a pump or by another tank, and leaves through an orifice and over its edge.
+
+    Attributes:
+        name: that other tanks call it by.
+        source: channel that commands the pump, or name of the tank above.
+        level: stroke of the twin that measures it; empty: a state that forms in the prefix.
+    """
+
+    name: str
+    source: str
+    level: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MassElement:
+    """A mass (or inertia) with a drive and friction.
+
+    Attributes:
+        name: for readers.
+        command: channel of the drive.
+        velocity: channel.
+    """
+
+    name: str
+    command: str
+    velocity: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class LagElement:
+    """A pressure that follows a command with a lag of first order.
+
+    Attributes:
+        name: for readers.
+        command: channel.
+        pressure: channel.
+    """
+
+    name: str
+    command: str
+    pressure: str
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The elements of a system."""
+
+    tanks: tuple[TankElement, ...]
+    masses: tuple[MassElement, ...]
+    lags: tuple[LagElement, ...]
+
+
+@dataclass(frozen=True)
+class LumpedNumber:
+    """A number of an element.
+
+    Attributes:
+        element: that it belongs to.
+        name: of the number.
+        unit: SI.
+        nominal: plausible value.
+        width: plausible deviation; of a positive number that of its logarithm.
+        positive: whether it is.
+    """
+
+    element: str
+    name: str
+    unit: str
+    nominal: float
+    width: float
+    positive: bool = True
+
+
+def default_parts(channels: TwinChannels) -> Parts:
+    """A mass for each velocity and a lag for each pressure, driven by the commands in their order."""
+    commands = [channel.name for channel in channels.commands]
+
+    def command(i: int) -> str:
+        return commands[min(i, len(commands) - 1)]
+
+    speeds = channels.velocities
+    masses = tuple(MassElement(name=f"mass_{i + 1}", command=command(i), velocity=c.name) for i, c in enumerate(speeds))
+    lags = tuple(
+        LagElement(name=f"lag_{i + 1}", command=command(i), pressure=c.name) for i, c in enumerate(channels.pressures)
+    )
+    return Parts((), masses, lags)
+
+
+def check_parts(parts: Parts, channels: TwinChannels) -> None:
+    """Refuse elements that do not connect.
+
+    Raises:
+        ConfigError: which port of which element, and what is missing.
+    """
+    commands = [c.name for c in channels.commands]
+    speeds, strokes = ([c.name for c in part] for part in (channels.velocities, channels.strokes))
+    pressures = [c.name for c in channels.pressures]
+    owner: dict[str, str] = {}
+    names: set[str] = set()
+
+    def port(element: str, which: str, name: str, choices: Sequence[str], what: str) -> None:
+        if name not in choices:
+            came = f"is '{name}', which is no {what}{closest(name, choices)}" if name else "is not connected"
+            listed = ", ".join(choices) or "none (this twin has none)"
+            raise ConfigError(f"elements: port '{which}' of {element} {came}; connect it to one of {listed}")
+
+    def own(element: str, name: str) -> None:
+        if name in owner:
+            raise ConfigError(f"elements: '{name}' is connected to {owner[name]} and to {element}; one must hold")
+        owner[name] = element
+
+    every: list[TankElement | MassElement | LagElement] = [*parts.tanks, *parts.masses, *parts.lags]
+    for entry in every:
+        if entry.name in names:
+            raise ConfigError(f"elements: two are called '{entry.name}'; give each a name of its own")
+        names.add(entry.name)
+    above: list[str] = []
+    for tank in parts.tanks:
+        here = f"tank '{tank.name}'"
+        port(here, "source", tank.source, [*commands, *above], "command, and no tank named before it")
+        above.append(tank.name)
+        if tank.level:
+            port(here, "level", tank.level, strokes, "stroke of this twin")
+            own(here, speeds[strokes.index(tank.level)])
+    for mass in parts.masses:
+        here = f"mass '{mass.name}'"
+        port(here, "command", mass.command, commands, "command of this twin")
+        port(here, "velocity", mass.velocity, speeds, "velocity of this twin")
+        own(here, mass.velocity)
+    for lag in parts.lags:
+        here = f"lag '{lag.name}'"
+        port(here, "command", lag.command, commands, "command of this twin")
+        port(here, "pressure", lag.pressure, pressures, "pressure of this twin")
+        own(here, lag.pressure)
+    for name in (*speeds, *pressures):
+        if name not in owner:
+            raise ConfigError(
+                f"elements: no element has the channel '{name}'; connect it, or leave it out of [channels]"
+            )
+
+
+def lumped_numbers(parts: Parts, channels: TwinChannels, scales: TwinScales) -> list[LumpedNumber]:
+    """All numbers in a fixed order: tanks, masses, lags; plausible values follow from the scales of the channels."""
+    answers = [c.name for c in channels.answers]
+    commands = {c.name: float(w) for c, w in zip(channels.commands, scales.command_width, strict=True)}
+    rows: list[LumpedNumber] = []
+    measured = [answers.index(tank.level) for tank in parts.tanks if tank.level]
+    # A level crosses its own spread as fast as the changes from tick to tick say.
+    speed = [float(scales.change_width[i] / scales.answer_width[i]) * channels.rate_hz for i in measured]
+    rate = float(np.mean(speed)) if speed else 0.1 * channels.rate_hz
+    for tank in parts.tanks:
+        first = tank.source in commands
+        full = float(scales.high[answers.index(tank.level)]) if tank.level else 1.0
+        rows += [
+            LumpedNumber(tank.name, "inflow", "1/s", rate / (2.0 * commands[tank.source]) if first else rate, 1.0),
+            LumpedNumber(tank.name, "inflow_offset", "1", 0.0, commands[tank.source], False)
+            if first
+            else LumpedNumber(tank.name, "spilled_into", "1", 0.7, 0.5),
+            LumpedNumber(tank.name, "outflow", "1/s", rate, 1.0),
+            LumpedNumber(tank.name, "exponent", "1", 0.5, 0.4),
+            # Nothing tells how high a tank is whose level is not measured: it counts in shares of its height.
+            LumpedNumber(tank.name, "edge", "m", 1.03 * full, 0.1)
+            if tank.level
+            else LumpedNumber(tank.name, "start", "1", 0.6, 0.3),
+        ]
+    for mass in parts.masses:
+        i = answers.index(mass.velocity)
+        push = float(scales.answer_width[i]) * 2.0
+        rows += [
+            LumpedNumber(mass.name, "gain", "m/s^2", push / commands[mass.command], 1.0),
+            LumpedNumber(mass.name, "viscous", "1/s", 2.0, 0.7),
+            LumpedNumber(mass.name, "viscous_asymmetry", "1", 0.0, 0.2, False),
+            LumpedNumber(mass.name, "coulomb", "m/s^2", 0.2 * push, 1.0),
+            LumpedNumber(mass.name, "offset", "m/s^2", 0.0, 0.2 * push, False),
+        ]
+    for lag in parts.lags:
+        i = answers.index(lag.pressure)
+        wide = float(scales.answer_width[i])
+        rows += [
+            LumpedNumber(lag.name, "gain", "Pa", 0.0, wide / commands[lag.command], False),
+            LumpedNumber(lag.name, "offset", "Pa", float(scales.answer_offset[i]), wide, False),
+            LumpedNumber(lag.name, "lag", "s", 0.2, 1.0),
+        ]
+    return rows
