@@ -143,8 +143,8 @@ class ElementsTwin(Twin):
         if not self.hidden:
             return state
         first = np.asarray(measured, np.float64)[:, 0]
-        known = np.isfinite(np.asarray(measured)[:, 1:])
-        truth = np.where(known, np.asarray(measured, np.float64)[:, 1:], 0.0)
+        finite = np.isfinite(np.asarray(measured)[:, 1:])
+        truth = np.where(finite, np.asarray(measured, np.float64)[:, 1:], 0.0)
         begin = np.tile(self.starting_levels(self.numbers), (len(first), 1))
         levels, count = begin.copy(), len(self.hidden)
         for _ in range(4):
@@ -153,7 +153,7 @@ class ElementsTwin(Twin):
             for j in range(count):
                 tried = levels + 1e-20j * np.eye(count)[j]
                 answers = self.free_run(self.numbers, np.asarray(commands, np.float64)[:, :-1], first + 0j, tried)
-                scaled = np.where(known, (answers - truth) / self.scales.change_width, 0.0).reshape(len(first), -1)
+                scaled = np.where(finite, (answers - truth) / self.scales.change_width, 0.0).reshape(len(first), -1)
                 errors, slopes = [scaled.real], [*slopes, scaled.imag / 1e-20]
             slope = np.stack(slopes, axis=-1)
             matrix = slope.swapaxes(1, 2) @ slope + np.eye(count) / PRIOR**2
@@ -164,11 +164,11 @@ class ElementsTwin(Twin):
 
     def free_run(self, numbers: Values, commands: Doubles, answer: Values, hidden: Values) -> Values:
         """Answers ``(batch, tick, answer)`` by numbers ``(number,)`` or ``(batch, number)``; complex: with slopes."""
-        kept = []
+        answers = []
         for t in range(commands.shape[1]):
             answer, hidden = self.tick(numbers, commands[:, t], answer, hidden)
-            kept.append(answer)
-        return np.stack(kept, axis=1)
+            answers.append(answer)
+        return np.stack(answers, axis=1)
 
     def tick(self, numbers: Values, command: Doubles, answer: Values, hidden: Values) -> tuple[Values, Values]:
         """One tick from what the ports read and the levels that are not measured."""
@@ -205,12 +205,12 @@ class ElementsTwin(Twin):
                 velocity = velocity + step * (push - damping * velocity - coulomb * side) / (1.0 + step * steep)
             velocity = self._held(velocity, column)
             if self.channels.strokes:
-                place = count + column
-                low, high = float(self.scales.low[place]), float(self.scales.high[place])
-                stroke = answer[:, place] + 0.5 * (answer[:, column] + velocity) / self.channels.rate_hz
+                stroke_at = count + column
+                low, high = float(self.scales.low[stroke_at]), float(self.scales.high[stroke_at])
+                stroke = answer[:, stroke_at] + 0.5 * (answer[:, column] + velocity) / self.channels.rate_hz
                 into = ((stroke.real > high) & (velocity.real > 0)) | ((stroke.real < low) & (velocity.real < 0))
                 velocity = np.where(into, 0.0, velocity)
-                after[:, place] = self._held(stroke, place)
+                after[:, stroke_at] = self._held(stroke, stroke_at)
             after[:, column] = velocity
 
     def _fill_tanks(self, rows: Values, command: Doubles, answer: Values, after: Values, hidden: Values) -> Values:
@@ -226,10 +226,10 @@ class ElementsTwin(Twin):
         left = []
         for tank, level in zip(tanks, now, strict=True):
             if tank.level:
-                place = self.columns[tank.level]
-                after[:, place] = self._held(level, place)
-                speed = place - len(self.channels.velocities)
-                after[:, speed] = self._held((after[:, place] - answer[:, place]) * rate, speed)
+                stroke_at = self.columns[tank.level]
+                after[:, stroke_at] = self._held(level, stroke_at)
+                speed = stroke_at - len(self.channels.velocities)
+                after[:, speed] = self._held((after[:, stroke_at] - answer[:, stroke_at]) * rate, speed)
             else:
                 left.append(np.where(level.real < 0, 0.0, level))
         return np.stack(left, axis=1) if left else hidden

@@ -96,11 +96,11 @@ def train_twin(
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows).encode())
         elif isinstance(twin, ElementsTwin):
             tell("fitting the elements to free runs")
-            found = fit_elements(twin, data.train, data.validation, experiment.training.seed, on_event)
-            fitted = FittedTwin(found.twin, found.history, found.seconds)
+            elements_fit = fit_elements(twin, data.train, data.validation, experiment.training.seed, on_event)
+            fitted = FittedTwin(elements_fit.twin, elements_fit.history, elements_fit.seconds)
             run.write_history(fitted.history)
-            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": found.rows})
-            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(found.rows).encode())
+            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": elements_fit.rows})
+            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(elements_fit.rows).encode())
         else:
             fitted = FittedTwin(twin, [], time.process_time() - started)
         tell("calibrating intervals")
