@@ -43,8 +43,10 @@ def evaluate(
 
     Example: `edp evaluate runs/first` or `edp evaluate runs/first --data logs/monday --map mine.toml`
     """
+    from edp.training.twin_bundle import holds_twin
+
     source = None if data is None else source_of(data, signal_map, repair)
-    if is_twin(run):
+    if holds_twin(run):
         if baselines is not None or channel_importance:
             raise ConfigError(
                 f"'{run}' holds a twin, which has neither --baselines nor --channel-importance; leave them out: its "
@@ -85,11 +87,6 @@ def baseline_names(text: str) -> list[str]:
 
         return list(BASELINES)
     return [name.strip() for name in text.split(",") if name.strip() and name.strip() != "none"]
-
-
-def is_twin(run: Path) -> bool:
-    """Whether a folder is that of a twin, or the run folder around it."""
-    return any(path.is_file() for path in (run / "twin" / "twin.json", run / "twin.json"))
 
 
 def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | None, as_json: bool) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from edp.data.twin_channels import TwinChannels
 from edp.settings.bounds import MOST_ROWS, SHARE, integer
@@ -90,6 +89,9 @@ def calibrate(errors: Array, coverage: float) -> FreeRunIntervals:
         errors: of free runs ``(run, tick, answer)``, SI units, tick 1 first.
         coverage: share of runs that an interval is meant to hold.
     """
+    # Here, since every command with a network imports this module, and scipy.optimize takes a second.
+    from scipy.optimize import isotonic_regression
+
     runs, longest, answers = errors.shape
     count = 1 + math.ceil(KNOTS_A_DECADE * math.log10(longest)) if longest > 1 else 1
     ticks = np.unique(np.geomspace(1, longest, count).round().astype(np.int64))

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 
 def template(name: str) -> Template:
     """The template of a page by its file name."""
+    # Here, since every command that may write a page imports this module.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     environment = Environment(
         loader=PackageLoader("edp.report", "assets"),
         autoescape=True,

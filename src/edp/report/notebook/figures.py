@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from edp.errors import ConfigError, closest
 from edp.recording import Recording
 from edp.report.common.chart import BLUE, GREY, Chart, ChartAxis, DataSeries, Mark, Panel, Range, with_unit
-from edp.report.common.interactive import plot
 from edp.report.common.wording import short_label
 from edp.report.run.charts import horizon_chart
 from edp.report.run.facts import Facts
@@ -20,6 +19,9 @@ from edp.report.run.figures import downsample
 from edp.report.search.charts import study_charts
 from edp.report.search.facts import StudyFacts
 from edp.signals import KINDS, UNITS, Channel
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
 
 POINTS = 4000
 """Of a drawn line; longer ones lose samples, but no peaks."""
@@ -51,7 +53,7 @@ def recordings_figure(recording: Recording, channels: Sequence[str]) -> go.Figur
     for channel in columns:
         values = recording.column(channel.name)
         panels.append(_row(channel, [_line(channel, values, recording.rate_hz, short_label(channel.name), BLUE, 1.4)]))
-    return plot(replace(_rows("recordings", panels), legend="none")).figure
+    return _figure(replace(_rows("recordings", panels), legend="none"))
 
 
 def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> go.Figure:
@@ -68,7 +70,7 @@ def prediction_figure(lines: Sequence[BandLine], rate_hz: float, title: str) -> 
             marks.append(_line(line.channel, line.measured, rate_hz, "Measured", GREY, 2.6))
         marks.append(_line(line.channel, line.predicted, rate_hz, "Predicted", BLUE, 1.5))
         panels.append(_row(line.channel, marks))
-    return plot(_rows("predictions", panels), title=short_label(title)).figure
+    return _figure(_rows("predictions", panels), title=short_label(title))
 
 
 def score_figure(facts: Facts) -> go.Figure:
@@ -76,7 +78,7 @@ def score_figure(facts: Facts) -> go.Figure:
     chart = horizon_chart(facts)
     if chart is None:
         raise ConfigError("there are no scores to draw; judge the predictor first")
-    return plot(chart).figure
+    return _figure(chart)
 
 
 def study_figure(study: StudyFacts, name: str | None = None) -> go.Figure:
@@ -91,7 +93,7 @@ def study_figure(study: StudyFacts, name: str | None = None) -> go.Figure:
     if name is not None and name not in charts:
         raise ConfigError(f"this study has no figure '{name}'{closest(name, charts)}")
     # Nothing in a notebook can choose, so that it shows the first option alone.
-    return plot(charts[name or next(iter(charts))].first()).figure
+    return _figure(charts[name or next(iter(charts))].first())
 
 
 def _rows(name: str, panels: Sequence[Panel]) -> Chart:
@@ -129,3 +131,10 @@ def _unit(channel: Channel) -> tuple[str, float]:
 
 def _in_report_unit(values: Array, channel: Channel) -> Array:
     return np.asarray(values * _unit(channel)[1], dtype=np.float64)
+
+
+def _figure(chart: Chart, title: str = "") -> go.Figure:
+    # Plotly takes half a second to import, which `edp.read` alone should not cost.
+    from edp.report.common.interactive import plot
+
+    return plot(chart, title).figure

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from edp.report.common import tables
 from edp.report.common.chart import Chart
-from edp.report.common.interactive import plots
 from edp.report.common.templates import template
 from edp.report.common.wording import moment, unbroken
 from edp.report.run import facts as run
@@ -111,6 +109,11 @@ def foundation_tables(facts: run.Facts) -> dict[str, tables.TextTable]:
 
 def shown(charts: Iterable[Chart]) -> dict[str, Any]:
     """What every page needs to show its figures offline: them, their data, the style and the scripts."""
+    # Here, since every command that may write a page imports this module, and plotly takes half a second.
+    from plotly.offline import get_plotlyjs
+
+    from edp.report.common.interactive import plots
+
     drawn = plots(charts)
     return {
         "plots": drawn,

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 
 from edp.data.fold_ridge import FoldRidge, fold_ridge
 from edp.data.lags import DoubleArray
@@ -129,6 +128,9 @@ def _learners(work: FoldFit) -> list[Learner]:
 
 def _combine(work: FoldFit, learners: Sequence[Learner]) -> DoubleArray:
     """Weigh all models, write everything into the network, and give the predictions of rows that were left out."""
+    # Here, since every command that trains imports this module, and scipy.optimize takes a second.
+    from scipy.optimize import nnls
+
     models = [list(learner.left_out()) for learner in learners]
     every = [one for each in models for one in each]
     residual = work.residual
