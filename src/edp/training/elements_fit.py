@@ -71,7 +71,11 @@ class _Problem:
     def numbers(self, theta: NDArray[Any]) -> NDArray[Any]:
         """Numbers by coordinates in plausible deviations."""
         bent = self.width * theta
-        return np.asarray(np.where(self.positive, np.abs(self.nominal) * np.exp(bent), self.nominal + bent))
+        return np.asarray(
+            np.where(
+                self.positive, np.abs(self.nominal) * np.exp(np.where(self.positive, bent, 0)), self.nominal + bent
+            )
+        )
 
     def errors(self, theta: NDArray[Any], levels: NDArray[Any]) -> NDArray[Any]:
         """Weighted errors ``(run, tick * answer)`` of lanes with coordinates ``(run, number)``."""
