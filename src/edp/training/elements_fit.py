@@ -25,6 +25,10 @@ STEP = 1e-20
 TRIES = 8
 FARTHEST = 1.5
 """Largest change of a number in a step, in plausible deviations: the linear model holds no farther."""
+MOST_TICKS = 4096
+"""Of a run where no length is set: each tick of a pass is interpreted, some tenth of a millisecond."""
+MOST_VALUES = 20_000_000
+"""Complex answers of all lanes that are kept in a pass, 0.3 GB; with more runs, evenly chosen ones are fitted."""
 STILL = 1e-5
 """Share by which the cost falls in the last step."""
 
@@ -49,14 +53,28 @@ class _Problem:
         self.positive = np.array([n.positive for n in table])
         self.hidden = len(twin.hidden)
         longest = max(series.samples for series in train) - 1
-        ticks = round(twin.spec.length_s * twin.channels.rate_hz) or longest
-        cuts = [(part, at) for part in train for at in range(0, part.samples - ticks, ticks)]
+        asked = round(twin.spec.length_s * twin.channels.rate_hz)
+        ticks = asked or min(longest, MOST_TICKS)
+        # Whole recordings are as long as they are; asked lengths hold for every run.
+        shortest = ticks if asked else 2
+        cuts = [
+            (part, at)
+            for part in train
+            for at in range(0, part.samples - 1, ticks)
+            if part.samples - 1 - at >= shortest
+        ]
         if not cuts or ticks < 2:
             raise DataError(
-                f"no training stretch has a free run of {ticks / twin.channels.rate_hz:g} s; shorten twin.length_s"
+                f"elements: no training stretch has a free run of {ticks / twin.channels.rate_hz:g} s, the longest has "
+                f"{longest / twin.channels.rate_hz:g} s; shorten twin.length_s, to no less than two ticks"
             )
-        self.commands = np.stack([part.inputs[at : at + ticks] for part, at in cuts]).astype(np.float64)
-        rows = np.stack([part.targets[at : at + ticks + 1] for part, at in cuts]).astype(np.float64)
+        lanes = len(twin.table) + self.hidden
+        affordable = max(1, MOST_VALUES // (lanes * ticks * len(twin.channels.answers)))
+        if len(cuts) > affordable:
+            cuts = [cuts[i] for i in np.linspace(0, len(cuts) - 1, affordable).round().astype(int)]
+        # A run that ends early keeps its last command; what would be judged behind its end is not a number.
+        self.commands = np.stack([_padded(part.inputs[at : at + ticks], ticks, "edge") for part, at in cuts])
+        rows = np.stack([_padded(part.targets[at : at + ticks + 1], ticks + 1, "nan") for part, at in cuts])
         self.first, self.truth = rows[:, 0], rows[:, 1:]
         count, strokes = len(twin.channels.velocities), len(twin.channels.strokes)
         weight = 1.0 / (NOISE * twin.scales.answer_width.astype(np.float64))
@@ -88,6 +106,7 @@ class _Problem:
         first = np.repeat(self.first, repeats, axis=0).astype(theta.dtype)
         answers = self.twin.free_run(numbers, commands, first, hidden.astype(theta.dtype))
         missed = (answers - np.repeat(self.truth, repeats, axis=0)) * self.weight
+        missed[np.isnan(np.repeat(self.truth, repeats, axis=0))] = 0.0
         return np.asarray(missed.reshape(len(theta), -1))
 
     def cost(self, point: Doubles) -> float:
@@ -114,6 +133,14 @@ class _Problem:
             matrix[np.ix_(at, at)] += slopes @ slopes.T
             gradient[at] += slopes @ missed[run, 0].real
         return matrix, gradient
+
+
+def _padded(rows: NDArray[np.float32], ticks: int, by: str) -> Doubles:
+    """Rows as doubles, as many as asked: the last one again ("edge"), or NaN ("nan")."""
+    short, values = ticks - len(rows), rows.astype(np.float64)
+    if by == "edge":
+        return np.pad(values, ((0, short), (0, 0)), mode="edge")
+    return np.pad(values, ((0, short), (0, 0)), constant_values=np.nan)
 
 
 def _descend(problem: _Problem, point: Doubles, rounds: int) -> tuple[Doubles, Doubles]:

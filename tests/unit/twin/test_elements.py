@@ -5,7 +5,7 @@ import pytest
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.errors import ConfigError
+from edp.errors import ConfigError, DataError
 from edp.networks.twin import fit_scales
 from edp.networks.twin.elements import ElementsBox
 from edp.networks.twin.lumped.parts import LagElement, MassElement, TankElement
@@ -74,3 +74,35 @@ def test_elements_that_do_not_connect_are_refused(change, message):
     fields = {"tanks": TANKS.tanks, **change}
     with pytest.raises(ConfigError, match=message):
         ElementsBox(**fields).parts(CHANNELS)
+
+
+def cut(series, samples):
+    return Series(series.name, series.inputs[:samples], series.targets[:samples])
+
+
+def test_recordings_of_any_length_are_fitted_to_their_ends(tanks):
+    twin, _, series = tanks
+    problem = _Problem(twin, [series, cut(series, 60)])
+    assert problem.truth.shape[:2] == (2, 149)
+    assert np.isnan(problem.truth[1, 59:]).all()
+    assert np.isfinite(problem.truth[1, :59]).all()
+    # What the run says behind the end of its recording counts nowhere.
+    point = np.zeros(problem.size()[1])
+    alone = [_Problem(twin, [one]) for one in (series, cut(series, 60))]
+    assert problem.cost(point) == pytest.approx(sum(one.cost(np.zeros(one.size()[1])) for one in alone))
+
+
+def test_long_logs_are_fitted_in_as_many_runs_as_the_memory_holds(tanks, monkeypatch):
+    twin, _, series = tanks
+    monkeypatch.setattr("edp.training.elements_fit.MOST_TICKS", 20)
+    assert _Problem(twin, [series]).truth.shape[:2] == (8, 20)
+    monkeypatch.setattr("edp.training.elements_fit.MOST_VALUES", 3 * 11 * 20 * 2)
+    assert _Problem(twin, [series]).truth.shape[:2] == (3, 20)
+
+
+def test_a_length_that_no_stretch_has_is_refused(tanks):
+    twin, _, series = tanks
+    spec = ElementsBox(tanks=TANKS.tanks, length_s=600.0)
+    longer = spec.start(CHANNELS, twin.scales, [series], 0)
+    with pytest.raises(DataError, match=r"no training stretch has a free run of 600 s.*596 s"):
+        _Problem(longer, [cut(series, 150)])

@@ -52,7 +52,7 @@ class ElementsBox:
         prefix_ticks: measured ticks before a free run.
         starts: from how many starting values the fit begins.
         rounds: Gauss-Newton steps of each start at most.
-        length_s: of the free runs that are fitted; 0: whole recordings.
+        length_s: of the free runs that are fitted; 0: whole recordings, in runs of at most 4,096 ticks.
 
     Raises:
         ConfigError: a value out of range.

@@ -274,7 +274,7 @@ def test_missing_facts_name_their_phase(sound):
 def test_whatever_is_broken_gives_a_report_or_one_clear_error(request, mode, tmp_path, monkeypatch):
     whole = request.getfixturevalue(mode)
     rng = random.Random(7)
-    monkeypatch.setattr("edp.report.run.page.get_plotlyjs", str)
+    monkeypatch.setattr("plotly.offline.get_plotlyjs", str)
     messages = []
     for _ in range(24):
         study = copy.deepcopy(whole)
