@@ -4,8 +4,10 @@ Each set is a machine with one actuator: a command, and a velocity (backward dif
 its integral. Where the league scores what does not integrate anything (the pressure of the arm), that stands in the
 place of the velocity, alone: weights are chosen by the velocities of a twin. The twin is measured for a few ticks and
 then runs on the commands through the whole test recording. Candidates are trained on the first four fifths of the
-estimation data and chosen by a free run through the last fifth, with the first seed; the choice is trained with every
-seed. The median counts, and the spread is shown.
+estimation data and chosen by a free run through the last fifth, with the first seed: recurrent networks of some
+widths, and where the description of a set names its parts (two tanks, an axis with a drive) a twin of these elements.
+The choice is trained with every seed, and so is the best candidate of the other formulation, which is shown beside it.
+The median counts, and the spread is shown.
 
 The recordings are no part of the repository: their folder is given by --shared or EDP_SHARED_DATA.
 """
@@ -27,10 +29,13 @@ from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels, twin_channels
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, Twin, fit_scales
+from edp.networks.twin.elements import ElementsBox
+from edp.networks.twin.lumped.parts import MassElement, TankElement
 from edp.networks.twin.recurrent import Recurrent
 from edp.recording import Recording
 from edp.settings.tree import read_toml
 from edp.signals import Channel, Kind
+from edp.training.elements_fit import fit_elements
 from edp.training.free_run import FreeRunSpec, fit_free_runs
 from edp.training.optimizers import Soap
 from published_leagues import verdicts_of
@@ -39,6 +44,8 @@ from real_recordings import EXAMPLES, VARIABLE, shared_folder
 ESTIMATION = 0.8
 """Share of the estimation data that trains; the rest chooses."""
 FLOORS = ("static", "arx")
+Candidate = tuple[int, float] | ElementsBox
+"""Units of a recurrent twin and weight of errors of its stroke, or elements."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,8 @@ class LeagueSet:
         target: answer that the league scores.
         prefix_ticks: measured ticks before the free run.
         training: lengths and updates of the free runs.
-        candidates: units, and weight of errors of the stroke.
+        elements: what the description of the set says that it is made of; None where it names no parts.
+        candidates: recurrent twins.
     """
 
     command: str
@@ -61,6 +69,7 @@ class LeagueSet:
     target: str
     prefix_ticks: int
     training: FreeRunSpec
+    elements: ElementsBox | None = None
     candidates: tuple[tuple[int, float], ...] = field(default=((8, 10.0), (16, 10.0), (32, 10.0), (16, 1.0)))
 
 
@@ -72,9 +81,17 @@ def spec_of(lengths_s: tuple[float, ...], validation_s: float) -> FreeRunSpec:
     )  # fmt: skip
 
 
+TWO_TANKS = ElementsBox(
+    tanks=(TankElement(name="upper", source="command"), TankElement(name="lower", source="upper", level="stroke")),
+    prefix_ticks=5, starts=2, rounds=25,
+)  # fmt: skip
+AXIS = ElementsBox(
+    masses=(MassElement(name="axis", command="command", velocity="velocity"),),
+    prefix_ticks=20, starts=2, rounds=15, length_s=2.0,
+)  # fmt: skip
 SETS = {
-    "tanks.toml": LeagueSet("u", "y", "", "stroke", 5, spec_of((80.0, 240.0, 560.0), 600.0)),
-    "emps.toml": LeagueSet("u", "q", "", "stroke", 20, spec_of((0.2, 1.0, 3.0), 4.0)),
+    "tanks.toml": LeagueSet("u", "y", "", "stroke", 5, spec_of((80.0, 240.0, 560.0), 600.0), TWO_TANKS),
+    "emps.toml": LeagueSet("u", "q", "", "stroke", 20, spec_of((0.2, 1.0, 3.0), 4.0), AXIS),
     "sjoberg.toml": LeagueSet("u", "", "p", "velocity", 10, spec_of((10.0, 30.0, 60.0), 80.0)),
 }
 
@@ -104,44 +121,64 @@ def free_run_rmse(twin: Twin, part: Series, target: str) -> float:
 
 
 def trained(
-    channels: TwinChannels, parts: tuple[Series, Series], which: LeagueSet, candidate: tuple[int, float], seed: int
+    channels: TwinChannels, parts: tuple[Series, Series], which: LeagueSet, candidate: Candidate, seed: int
 ) -> Twin:
-    """A recurrent twin of a candidate's width, with the weights that were best in the last fifth."""
+    """A twin of a candidate, with the weights or starting values that were best in the last fifth."""
+    scales = fit_scales(channels, parts[:1])
+    if isinstance(candidate, ElementsBox):
+        return fit_elements(candidate.start(channels, scales, parts[:1], seed), parts[:1], parts[1:], seed).twin
     units, stroke_weight = candidate
     spec = Recurrent(units=units, prefix_ticks=which.prefix_ticks)
-    twin = spec.start(channels, fit_scales(channels, parts[:1]), parts[:1], seed)
+    twin = spec.start(channels, scales, parts[:1], seed)
     training = replace(which.training, seed=seed, stroke_weight=stroke_weight)
     return fit_free_runs(twin, parts[:1], parts[1:], training).twin
 
 
-def measure(entry: dict[str, Any], which: LeagueSet, seeds: Sequence[int], quick: bool) -> dict[str, Any]:
+def named(candidate: Candidate) -> str:
+    """How tables call it."""
+    if isinstance(candidate, ElementsBox):
+        return "elements"
+    return f"recurrent, {candidate[0]} units, stroke weight {candidate[1]:g}"
+
+
+def shortened(which: LeagueSet) -> LeagueSet:
+    """One candidate of each formulation, hardly trained."""
+    training = replace(which.training, updates=(20, 20, 20))
+    elements = which.elements and replace(which.elements, starts=1, rounds=2)
+    return replace(which, training=training, elements=elements, candidates=which.candidates[:1])
+
+
+def measure(entry: dict[str, Any], which: LeagueSet, seeds: Sequence[int]) -> dict[str, Any]:
     """Test errors of the chosen candidate, a figure a seed, and of the floors, in the unit of the league."""
     began = time.process_time()
     estimation, test = (machine(recording, which) for recording in DataSource.of(EXAMPLES / entry["data"]).read())
     channels = twin_channels(estimation)
     task, cut = channels.task(), round(ESTIMATION * estimation.samples)
     parts = (task.series(estimation, 0, cut), task.series(estimation, cut))
-    if quick:
-        which = replace(which, training=replace(which.training, updates=(20, 20, 20)), candidates=which.candidates[:1])
-    errors = {
-        candidate: free_run_rmse(trained(channels, parts, which, candidate, seeds[0]), parts[1], which.target)
-        for candidate in which.candidates
-    }
-    candidate = min(errors, key=lambda tried: errors[tried])
+    candidates: dict[str, list[Candidate]] = {"recurrent": list(which.candidates)}
+    if which.elements is not None:
+        candidates["elements"] = [which.elements]
+    firsts = {one: trained(channels, parts, which, one, seeds[0]) for each in candidates.values() for one in each}
+    errors = {one: free_run_rmse(twin, parts[1], which.target) for one, twin in firsts.items()}
     factor = 1000.0 if entry["unit"] == "mm" else 1.0
     judged = task.series(test)
-    ours = {
-        seed: factor * free_run_rmse(trained(channels, parts, which, candidate, seed), judged, which.target)
-        for seed in seeds
-    }
-    found: dict[str, Any] = {"ours": ours, "median": statistics.median(ours.values()), "candidate": candidate}
+    formulations: dict[str, Any] = {}
+    for name, each in candidates.items():
+        best = min(each, key=lambda one: errors[one])
+        twins = {seeds[0]: firsts[best]}
+        twins |= {seed: trained(channels, parts, which, best, seed) for seed in seeds[1:]}
+        by_seed = {seed: factor * free_run_rmse(twin, judged, which.target) for seed, twin in twins.items()}
+        shown = {"candidate": named(best), "validation": factor * errors[best], "ours": by_seed}
+        formulations[name] = shown | {"median": statistics.median(by_seed.values())}
+    chosen = min(formulations, key=lambda name: float(formulations[name]["validation"]))
+    found: dict[str, Any] = {**formulations[chosen], "chosen": chosen, "formulations": formulations}
     scales = fit_scales(channels, [task.series(estimation)])
     for name in FLOORS:
         spec = replace(TWINS[name](), prefix_ticks=which.prefix_ticks)
         floor = spec.start(channels, scales, [task.series(estimation)], seeds[0])
         found[name] = factor * free_run_rmse(floor, judged, which.target)
-    validation = {str(tried): error for tried, error in errors.items()}
-    return found | {"validation": validation, "processor_s": round(time.process_time() - began, 1)}
+    every = {named(one): factor * error for one, error in errors.items()}
+    return found | {"every_validation": every, "processor_s": round(time.process_time() - began, 1)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -156,12 +193,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     kept: dict[str, Any] = {}
     for entry in read_toml(EXAMPLES / "leagues.toml")["leagues"]:
         seeds = range(given.seed, given.seed + (1 if given.quick else given.seeds))
-        found = measure(entry, SETS[entry["data"]], seeds, given.quick)
+        which = SETS[entry["data"]]
+        found = measure(entry, shortened(which) if given.quick else which, seeds)
         print(f"\nFree run of a twin: {entry['title']}" + (" (quick: hardly trained)" if given.quick else ""))
-        rows = [*entry["published"].items(), ("TWIN", found["median"]), *((f"{n}, here", found[n]) for n in FLOORS)]
+        twins = [
+            (f"{'TWIN' if n == found['chosen'] else 'twin'}, {n}", f["median"])
+            for n, f in found["formulations"].items()
+        ]
+        rows = [*entry["published"].items(), *twins, *((f"{n}, here", found[n]) for n in FLOORS)]
         table(["method", "test RMSE"], sorted(rows, key=lambda pair: pair[1]))
-        each = ", ".join(f"{value:.4g}" for value in found["ours"].values())
-        print(f"by seed: {each}; {found['candidate']} of {found['validation']}; {found['processor_s']} processor s")
+        for name, one in found["formulations"].items():
+            each = ", ".join(f"{value:.4g}" for value in one["ours"].values())
+            print(f"{name} by seed: {each}; {one['candidate']}, {one['validation']:.4g} in the last fifth")
+        print(f"chosen: {found['chosen']}; {found['processor_s']} processor s")
         verdicts += verdicts_of(entry, found, given.quick, ", twin")
         kept[entry["title"]] = found
     finish("twin_leagues", verdicts, given.seed, kept)
