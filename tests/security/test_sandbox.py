@@ -222,7 +222,8 @@ def test_all_layers_hold_here_and_threads_still_run(hostile):
         ("fail", "name", r"cannot be read .KeyError: 'name'"),
         ("recursion", "", r"cannot be read .RecursionError"),
         ("allocate", 3000, r"reading it takes more than 0.537 GB of memory, the limit for a file of \d+ bytes"),
-        ("announce", 1500, r"1500 MB were had|machine has free"),
+        # More than a small file may have, and little enough that a busy machine fills it within the processor time.
+        ("announce", 700, r"700 MB were had|machine has free"),
     ],
 )
 @pytest.mark.parametrize("when", ["open", "load"])
