@@ -67,6 +67,9 @@ def test_slopes_are_those_of_differences(tanks):
         ({"tanks": (TankElement(name="a", source="pump", level="rate"),)}, "'level' of tank 'a' is 'rate'"),
         ({"masses": (MassElement(name="upper", command="pump", velocity="rate"),)}, "two are called 'upper'"),
         ({"masses": (MassElement(name="m", command="pump", velocity="rate"),)}, "'rate' is connected to tank"),
+        ({"tanks": (TankElement(name="\x1b[2J", source="pump", level="level"),)}, "must be 1 to 64 printable"),
+        ({"tanks": (TankElement(name="a" * 65, source="pump", level="level"),)}, "must be 1 to 64 printable"),
+        ({"tanks": (TankElement(name=" ", source="pump", level="level"),)}, "must be 1 to 64 printable"),
         ({"lags": (LagElement(name="l", command="pump", pressure="p"),)}, "none .this twin has none."),
     ],
 )  # fmt: skip

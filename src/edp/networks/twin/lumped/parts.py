@@ -15,6 +15,8 @@ from edp.networks.twin.scales import TwinScales
 Doubles = NDArray[np.float64]
 MOST_ELEMENTS = 32
 """Of a kind; tangents of all numbers run side by side, and twice the elements take four times as long."""
+LONGEST_NAME = 64
+"""Of an element: a line of the datasheet holds it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +134,11 @@ def check_parts(parts: Parts, channels: TwinChannels) -> None:
 
     every: list[TankElement | MassElement | LagElement] = [*parts.tanks, *parts.masses, *parts.lags]
     for entry in every:
+        if not (entry.name.strip() and entry.name.isprintable() and len(entry.name) <= LONGEST_NAME):
+            raise ConfigError(
+                f"elements: the name {ascii(entry.name)[:80]} must be 1 to {LONGEST_NAME} printable characters; the "
+                "datasheet shows it"
+            )
         if entry.name in names:
             raise ConfigError(f"elements: two are called '{entry.name}'; give each a name of its own")
         names.add(entry.name)
