@@ -15,7 +15,7 @@ from edp.report.run.choice import model_tables, read_choice
 from edp.report.run.facts import read_facts
 from edp.training import load_bundle
 from edp.workflows.auto import load_auto, train_auto
-from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half
+from edp.workflows.auto.candidates import CANDIDATES, Amount, spans_by_half, tree_plan
 from edp.workflows.auto.promise import Promise, choose
 from edp.workflows.train_evaluate import DataSource, evaluate, trained_run
 
@@ -250,6 +250,22 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     ]
     assert steps == sorted(steps)
     assert steps[0] < steps[-1]
+
+
+def test_trees_of_many_outputs_keep_most_of_the_rows():
+    """A budget goes first into rows, then into parts that are left out, then into trees; more minutes never mean less."""
+    amount = Amount(rows=31_000, shortest=1_000, features=12, outputs=24, horizon=10, minutes=5.0)
+    plan = tree_plan(amount)
+    assert plan.rows >= 15_000
+    assert plan.trees >= 80
+    assert plan.folds == 2
+    assert 0.1 < plan.rate <= 0.2
+    small = tree_plan(replace(amount, rows=1_000, outputs=3))
+    assert (small.trees, small.folds, small.rate) == (200, 5, 0.1)
+    plans = [tree_plan(replace(amount, minutes=minutes)) for minutes in (0.01, 1.0, 5.0, 20.0, 100.0)]
+    assert plans[0].trees == 0
+    assert [one.rows for one in plans[1:]] == sorted(one.rows for one in plans[1:])
+    assert (plans[-1].trees, plans[-1].folds, plans[-1].rows) == (200, 5, 30_000)
 
 
 def scores(network, **others):

@@ -21,6 +21,7 @@ from edp.networks.predictor import ModelSpec
 from edp.networks.running import stream_predictions
 from edp.recording import Recording
 from edp.signals import Channel, Kind
+from edp.training.bagging.boosting import TreeLearner
 from edp.training.bagging.fit import fit_bagged
 from edp.training.bagging.spec import BaggingSpec
 from edp.training.fit import fit
@@ -84,6 +85,8 @@ PARTS = {
     "perceptrons of two losses": ({"members": 8}, {"robust_width": 0.1}),
     "radial": ({"activations": (), "centres": 100}, {}),
     "trees": ({"activations": (), "trees": 60}, {}),
+    "trees that leave out two folds at a time": ({"activations": (), "trees": 60}, {"tree_folds": 2}),
+    "deep trees of few leaves": ({"activations": (), "trees": 60, "tree_depth": 7}, {"tree_leaves": 12}),
     "one tree": ({"activations": (), "trees": 1}, {}),
     "all": ({"members": 8, "centres": 100, "trees": 60}, {"robust_width": 0.1}),
 }
@@ -157,6 +160,38 @@ def test_no_threshold_of_a_tree_lies_between_values_that_differ_by_rounding():
     quantised = (features % 2 == 1)[: len(distance)]
     assert quantised.any()
     assert np.min(np.array(distance)[quantised]) > 1e-5
+
+
+@pytest.mark.parametrize("parts", [2, 3, 4, 9])
+def test_trees_see_no_row_that_they_are_judged_by(parts, monkeypatch):
+    """Nor one beside it: each run of trees is grown on rows that every fold of its part trains on."""
+    grown = []
+    kept = TreeLearner._grown
+
+    def grow(self, rows, target, rounds, judged):
+        grown.append((rows, judged))
+        return kept(self, rows, target, rounds, judged)
+
+    monkeypatch.setattr(TreeLearner, "_grown", grow)
+    outcome = fit_bagged(data_of(recording()), committee(activations=(), trees=1), spec(tree_folds=parts))
+    folds = outcome.table.folds
+    assert len(grown) == min(parts, folds.count) * outcome.table.targets.shape[1]
+    for rows, judged in grown:
+        for fold in np.unique(folds.owner[judged]):
+            assert set(rows) <= set(folds.training[fold])
+    judged_rows = np.concatenate([judged for _, judged in grown])
+    assert np.array_equal(np.bincount(judged_rows), np.full(len(folds.owner), outcome.table.targets.shape[1]))
+
+
+def test_a_tree_has_as_many_leaves_as_the_settings_say():
+    outcome = fit_bagged(
+        data_of(recording()), committee(activations=(), trees=20, tree_depth=6), spec(tree_leaves=5, tree_leaf=5)
+    )
+    trees = outcome.fitted.predictor.backbone.trees
+    splits = (trees.threshold < 1e30).sum(dim=-1)
+    assert splits.max() == 4
+    with pytest.raises(ConfigError, match="a tree of one leaf splits nothing"):
+        BaggingSpec(tree_leaves=1)
 
 
 def test_a_learner_of_noise_gets_no_share():

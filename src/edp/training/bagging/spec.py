@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from edp.errors import ConfigError
+from edp.networks.trees import MOST_DEPTH
 from edp.settings.bounds import MOST_BATCH, MOST_EPOCHS, MOST_ROWS, MOST_WEIGHT, above, check_bounds, integer, span
 
 MOST_FOLDS = 100
@@ -27,6 +29,9 @@ class BaggingSpec:
         rows: rows that train at most, evenly spread over longer recordings.
         tree_rate: share of each boosted tree's leaves that is added.
         tree_leaf: rows of a leaf at least.
+        tree_leaves: leaves of a tree at most, the ones that lower the error most; 0 for as many as the depth allows.
+        tree_folds: parts that trees leave out, each a run of neighbouring folds; fewer parts than `folds` take less
+            time, for trees are grown anew for each.
         tree_rows: rows that trees are grown on at most, drawn at random.
 
     Raises:
@@ -44,6 +49,8 @@ class BaggingSpec:
     # A tenth and twenty rows are scikit-learn's; twice the rate with fewer trees was no better on four measured sets.
     tree_rate: float = 0.1
     tree_leaf: int = 20
+    tree_leaves: int = 31  # scikit-learn's
+    tree_folds: int = 5
     tree_rows: int = 30_000
 
     def __post_init__(self) -> None:
@@ -60,5 +67,12 @@ class BaggingSpec:
             rows=integer(100, MOST_ROWS),
             tree_rate=above(0.0, MOST_RATE),
             tree_leaf=integer(1, MOST_ROWS),
+            tree_leaves=integer(0, 2**MOST_DEPTH),
+            tree_folds=integer(2, MOST_FOLDS),
             tree_rows=integer(100, MOST_ROWS),
         )
+        if self.tree_leaves == 1:
+            raise ConfigError(
+                "training.bagging: tree_leaves = 1, but a tree of one leaf splits nothing; 2 or more must hold, or 0 "
+                "for as many as the depth allows"
+            )
