@@ -253,7 +253,7 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
 
 
 def test_trees_of_many_outputs_keep_most_of_the_rows():
-    """A budget goes first into rows, then into parts that are left out, then into trees; more minutes never mean less."""
+    """A budget goes into rows first, then into left-out parts, then into trees; more minutes never mean less."""
     amount = Amount(rows=31_000, shortest=1_000, features=12, outputs=24, horizon=10, minutes=5.0)
     plan = tree_plan(amount)
     assert plan.rows >= 15_000
