@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from edp.config.experiment import load_experiment
-from edp.data.twin_channels import same_channels
+from edp.data.derived_velocities import matched
 from edp.errors import ConfigError
 from edp.evaluation.controller import Budget
 from edp.evaluation.footprint import Footprint, check_possible, footprint
@@ -96,8 +96,7 @@ def in_integers(bundle: Bundle, calibration: DataSource) -> Bundle:
         raise ConfigError("only a twin is brought into W8A16 while it is exported; a network by edp quantise RUN")
     channels, rows = plant.twin.channels, []
     for recording in calibration.read():
-        same_channels(channels, recording)
-        series = channels.task().series(recording)
+        series = channels.task().series(matched(channels, recording))
         rows.append(np.concatenate([series.inputs, series.targets, np.ones_like(series.targets)], axis=1))
     return replace(bundle, predictor=IntegerTwinPlant(plant, calibrate(plant.graph(), rows)))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edp.data.twin_channels import same_channels
+from edp.data.derived_velocities import matched
 from edp.data.unlabelled import unlabelled
 from edp.errors import DataError, ExportError
 from edp.export.golden import Rows, at_thresholds, grown_tolerance, random_inputs, stream, tolerance
@@ -61,8 +61,7 @@ def recorded_case(bundle: Bundle, source: DataSource, ticks: int | None = None) 
 def _free_rows(plant: TwinPlant, recording: Recording, ticks: int) -> Rows:
     """Inputs of a plant along a recording: measured for its prefix, free from there on."""
     channels = plant.twin.channels
-    same_channels(channels, recording)
-    series = channels.task().series(recording, stop=ticks)
+    series = channels.task().series(matched(channels, recording), stop=ticks)
     flags = np.zeros_like(series.targets)
     flags[: plant.window] = 1.0
     return np.concatenate([series.inputs, series.targets * flags, flags], axis=1, dtype=np.float32)

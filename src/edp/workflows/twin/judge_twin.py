@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from edp.config.twin import TwinExperiment, load_twin_experiment
+from edp.data.derived_velocities import matched
 from edp.data.prepared import Prepared
 from edp.data.series import Series
-from edp.data.twin_channels import TwinChannels, same_channels
+from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
 from edp.evaluation.ahead import Ahead, ahead_scores, look_ahead, predictor_scores
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
@@ -161,9 +162,7 @@ def evaluate_twin(
         )
     target = folder
     if source is not None:
-        recordings = source.read()
-        for recording in recordings:
-            same_channels(channels, recording)
+        recordings = [matched(channels, recording) for recording in source.read()]
         data = replace(data, test=[channels.task().series(recording) for recording in recordings])
         target = make_folder(folder / f"on_{source.path.stem}")
     scores, runs = judge_twin(bundle, experiment, data, driving_labels(recordings), tell)

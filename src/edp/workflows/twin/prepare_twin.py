@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from edp.config.twin import TwinExperiment
+from edp.data.derived_velocities import complete_velocities
 from edp.data.prepared import Prepared, prepare
 from edp.data.splits import FAMILY
 from edp.data.twin_channels import TwinChannels, same_channels, twin_channels
@@ -23,12 +24,13 @@ def prepare_twin(source: DataSource, experiment: TwinExperiment) -> tuple[TwinCh
 
 
 def prepared_twin(recordings: Sequence[Recording], experiment: TwinExperiment) -> tuple[TwinChannels, Prepared]:
-    """Cut recordings as `prepare_twin` does.
+    """Cut recordings as `prepare_twin` does; where they hold positions alone, velocities are derived from these.
 
     Raises:
         EdpError: recordings or settings that cannot be used.
     """
-    channels = twin_channels(recordings[0], experiment.channels)
+    recordings, settings = complete_velocities(recordings, experiment.channels)
+    channels = twin_channels(recordings[0], settings)
     for recording in recordings[1:]:
         same_channels(channels, recording)
     data = prepare(recordings, channels.task(), experiment.split, experiment.twin.prefix_ticks)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from edp.data.twin_channels import same_channels
+from edp.data.derived_velocities import matched
 from edp.errors import ConfigError, DataError, closest
 from edp.evaluation.free_run import MOST_SECONDS, FreeRunJudgeSpec, free_run_scores, runs_of
 from edp.logs import write_recording
@@ -75,8 +75,7 @@ def rollout_log(
     """
     bundle = load_twin(run)
     twin = bundle.twin
-    recording = _only(source.read())
-    same_channels(twin.channels, recording)
+    recording = matched(twin.channels, _only(source.read()))
     measured_columns = _columns(twin, measured)
     series = twin.channels.task().series(recording)
     start, ticks = _span(twin, recording, seconds, start_s)

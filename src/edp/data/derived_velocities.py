@@ -1,0 +1,81 @@
+"""Velocities of logs that hold positions alone: the change of each position from tick to tick."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from edp.data.roles import roles_of
+from edp.data.twin_channels import INTEGRAL, TwinChannels, TwinChannelSettings, same_channels
+from edp.errors import DataError
+from edp.recording import Recording
+from edp.signals import Channel, Kind
+
+SUFFIX = "_velocity"
+"""Behind the name of a position, for its change per second."""
+RATE_OF = {integral: velocity for velocity, integral in INTEGRAL.items()}
+"""Kind of the change per second of a position, by its kind."""
+
+
+def complete_velocities(
+    recordings: Sequence[Recording], settings: TwinChannelSettings
+) -> tuple[list[Recording], TwinChannelSettings]:
+    """Recordings and settings with a velocity for each position, where no velocity is recorded or named.
+
+    Positions are the strokes that the settings name, else every position and angle that commands nothing. Recordings
+    with a velocity, and those without a position, come back as they are.
+
+    Raises:
+        DataError: a recording has a channel of the name of such a velocity, or lacks a position.
+    """
+    first = recordings[0]
+    _ = roles_of(first, settings.commands)  # a command that is no channel is refused with the closest name
+    if settings.velocities or any(channel.kind in INTEGRAL for channel in first.channels):
+        return list(recordings), settings
+    positions = settings.strokes or tuple(
+        channel.name for channel in first.channels if channel.kind in RATE_OF and channel.name not in settings.commands
+    )
+    kinds = [first.channels[first.index(name)].kind for name in positions]
+    if not positions or any(kind not in RATE_OF for kind in kinds):
+        return list(recordings), settings
+    velocities = tuple(f"{name}{SUFFIX}" for name in positions)
+    completed = [_with_velocities(recording, positions) for recording in recordings]
+    return completed, replace(settings, velocities=velocities, strokes=positions)
+
+
+def matched(channels: TwinChannels, recording: Recording) -> Recording:
+    """A recording with all channels of a twin: velocities that were derived from positions in its training are derived.
+
+    Raises:
+        DataError: it lacks another channel, or measures one as another kind.
+    """
+    names = recording.channel_names
+    positions = [
+        stroke.name
+        for velocity, stroke in zip(channels.velocities, channels.strokes, strict=False)
+        if velocity.name == f"{stroke.name}{SUFFIX}" and velocity.name not in names and stroke.name in names
+    ]
+    completed = _with_velocities(recording, positions) if positions else recording
+    same_channels(channels, completed)
+    return completed
+
+
+def _with_velocities(recording: Recording, positions: Sequence[str]) -> Recording:
+    """The backward difference of each position, times the rate; zero at the first tick, where nothing came before."""
+    columns, channels = [recording.values], list(recording.channels)
+    for name in positions:
+        channel = recording.channels[recording.index(name)]
+        if f"{name}{SUFFIX}" in recording.channel_names:
+            raise DataError(
+                f"recording '{recording.name}' ({recording.source}): the velocity of '{name}' is to be derived, but "
+                f"there is a channel '{name}{SUFFIX}' of kind {recording.channels[recording.index(name + SUFFIX)].kind}"
+                "; name the velocities in the settings, channels.velocities = [...], or rename this channel"
+            )
+        position = recording.column(name).astype(np.float64)
+        velocity = np.diff(position, prepend=position[:1]) * recording.rate_hz
+        columns.append(velocity.astype(np.float32)[:, None])
+        kind = RATE_OF.get(channel.kind, Kind.GENERIC)
+        channels.append(Channel(f"{name}{SUFFIX}", kind, f"Change of {name} per second"))
+    return replace(recording, channels=tuple(channels), values=np.concatenate(columns, axis=1))
