@@ -97,8 +97,14 @@ def rollout(
 
 
 def score_table(models: dict[str, Any]) -> None:
-    """Print a row a model: errors of velocities, strokes by time, pressures, and the share of diverged runs."""
+    """Print a row a model: errors of velocities, strokes by time, pressures, and the share of diverged runs.
+
+    Actuators of different units have no mean over them: each has a table of its own.
+    """
     first = next(iter(models.values()))
+    if first["velocity_mae"].get("units"):
+        actuator_tables(models)
+        return
     velocity, strokes = first["velocity_mae"], first["stroke_error"]
     heads = [_with_unit("velocity", velocity), *(_with_unit(f"{row['at_s']:g} s", row) for row in strokes)]
     rows = []
@@ -107,6 +113,26 @@ def score_table(models: dict[str, Any]) -> None:
         rows.append([name, *cells, _number(scores["pressure_nrmse"]["mean"]), f"{scores['diverged']:.1%}"])
     out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over actuators and runs:")
     table("MAE of velocities, stroke error by time, NRMSE of pressures", ["", *heads, "pressure", "diverged"], rows)
+
+
+def actuator_tables(models: dict[str, Any]) -> None:
+    """Print a table an actuator: errors of its velocity and of its stroke by time, a row a model."""
+    first = next(iter(models.values()))
+    strokes = first["stroke_error"]
+    out.print(f"{first['runs']} free runs of {first['seconds']:g} s on commands alone, mean over runs:")
+    places = zip(first["velocity_mae"]["by_channel"], strokes[0]["by_channel"], strict=True)
+    for velocity, stroke in places:
+        unit, length = first["velocity_mae"]["units"][velocity], strokes[0].get("units", {}).get(stroke, "")
+        heads = ["", f"velocity, {unit}", *(f"{row['at_s']:g} s, {length}" for row in strokes), "diverged"]
+        rows = []
+        for name, scores in models.items():
+            errors = [scores["velocity_mae"]["by_channel"][velocity]]
+            errors += [row["by_channel"][stroke] for row in scores["stroke_error"]]
+            rows.append([name, *map(_number, errors), f"{scores['diverged']:.1%}"])
+        table(f"{velocity}: its MAE, and the error of {stroke} by time", heads, rows)
+    if first["pressure_nrmse"]["mean"] is not None:
+        listed = ", ".join(f"{name} {_number(one['pressure_nrmse']['mean'])}" for name, one in models.items())
+        out.print(f"NRMSE of pressures: {listed}")
 
 
 def error_table(scores: dict[str, Any]) -> None:

@@ -23,16 +23,24 @@ HORIZONS_A_DECADE = 6
 def by_channel(channels: Sequence[Channel], values: NDArray[Any], integral: bool = False) -> dict[str, Any]:
     """Mean of each channel in its unit of reports, and over all, with the median over runs, where the unit is one.
 
+    Where units differ, `units` has that of each channel.
+
     Args:
         channels: of the columns.
         values: SI units, ``(channel,)`` or ``(run, channel)``.
         integral: whether they are integrals of the channels over seconds.
     """
     facts = [KINDS[channel.kind] for channel in channels]
-    units = {_integrated(fact.report_unit) if integral else fact.report_unit for fact in facts}
+    unit_of = {
+        channel.name: _integrated(fact.report_unit) if integral else fact.report_unit
+        for channel, fact in zip(channels, facts, strict=True)
+    }
+    units = set(unit_of.values())
     by_run = np.atleast_2d(values * np.array([fact.report_factor for fact in facts]))
     plain: dict[str, Any] = {c.name: float(x) for c, x in zip(channels, by_run.mean(axis=0), strict=True)}
     row: dict[str, Any] = {"unit": units.pop() if len(units) == 1 else None, "by_channel": plain}
+    if len(unit_of) > 1 and row["unit"] is None:
+        row["units"] = unit_of
     row["mean"] = None if row["unit"] is None or not by_run.size else float(by_run.mean())
     if values.ndim == 2:
         row["median"] = None if row["unit"] is None else float(np.median(by_run))

@@ -15,6 +15,7 @@ from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import ModelSpec, build_model
+from edp.signals import Kind
 from edp.storage import read_object
 from edp.testing.twins import sample_actuators
 from edp.training.bundle import make_bundle, save_bundle
@@ -225,3 +226,28 @@ def test_several_logs_another_rate_and_no_twin_are_refused(edp, logs, trained, t
     assert "has 25 Hz, the task 50 Hz" in " ".join(edp("rollout", trained, slow).err.split())
     assert "is not a twin: it has no twin.json" in " ".join(edp("rollout", logs, logs / "log_1.parquet").err.split())
     assert "holds a twin, not a network" in " ".join(edp("footprint", trained).err.split())
+
+
+def test_a_log_of_positions_alone_of_two_kinds_has_a_table_an_actuator(edp, tmp_path):
+    """No velocity is recorded, and a slew angle has no unit in common with a stroke."""
+    names = ("stroke_1", "stroke_2")
+    (tmp_path / "logs").mkdir()
+    for seed in range(6):
+        log = sample_actuators(seed=seed, pressures=False)
+        chosen = [log.index(name) for name in ("lever_1", "lever_2", *names)]
+        channels = [log.channels[index] for index in chosen]
+        channels[-1] = replace(channels[-1], kind=Kind.ANGLE)
+        write_recording(
+            replace(log, channels=tuple(channels), values=log.values[:, chosen]),
+            tmp_path / "logs" / f"log_{seed}.parquet",
+        )
+    run = tmp_path / "run"
+    result = edp("twin", tmp_path / "logs", "--out", run, *WORDS)
+    assert result.code == 0, result.out
+    for name in names:
+        assert f"{name}_velocity: its MAE, and the error of {name} by time" in result.out
+    assert "deg/s" in result.out
+    log = tmp_path / "logs" / "log_0.parquet"
+    judged = edp("evaluate", run, "--data", log)
+    assert f"{names[0]}_velocity: its MAE" in judged.out
+    assert edp("rollout", run, log, "--seconds", 2).code == 0
