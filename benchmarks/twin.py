@@ -1,4 +1,4 @@
-"""How far off is a twin that runs free for a minute, beside the static valve map and ARX in the same run?
+"""How far off is a twin that runs free for a minute, beside the static valve map, ARX and N4SID in the same run?
 
 Machine M22 in free air, recordings that no training saw: a short measured prefix, then 60 s on commands alone. Goals
 are asked of the formulation, network or grey box, that has less error on the validation part. With --specialist it also
@@ -56,7 +56,7 @@ def main() -> None:
     if quick:
         training = replace(training, lengths_s=(0.1, 0.5, 2.0), updates=(200, 200, 60), validate_every=100)
     models: dict[str, tuple[Twin, float]] = {}
-    for name in experiment.judge.floors:
+    for name in (*experiment.judge.floors, "n4sid"):
         models[name] = (TWINS[name]().start(channels, scales, data.train, arguments.seed), 0.0)
     models["recurrent"] = trained(experiment, training, (channels, scales, data))
     models["greybox"] = fitted_grey_box((channels, scales, data), arguments.seed, quick)

@@ -1,0 +1,364 @@
+"""Subspace identification: a linear state-space model whose order, matrices and filter come from projections.
+
+    x(t+1) = A x(t) + B [u(t); 1] + K e(t),   y(t) = C x(t) + e(t)
+
+The column space of the observability matrix is that of future outputs, freed from future commands, as far as the past
+tells them: PO-MOESP, with past commands and outputs as instruments (Verhaegen 1994; Van Overschee and De Moor 1996,
+ch. 2 to 4). The answer to the command of tick t is the machine at t + 1, so nothing feeds through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+from edp.errors import DataError
+from edp.ir import Builder
+from edp.ir.layers import BinaryOperation, Clip, Dense
+from edp.ir.memory import Feed, Feedback
+from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, even_starts, solved_columns
+from edp.networks.twin.scales import Array, TwinScales
+from edp.settings.bounds import check_bounds, check_count, integer
+
+Doubles = NDArray[np.float64]
+MOST_ORDER, MOST_ROWS_BACK = 200, 100
+MOST_WINDOWS = 40_000
+"""Of long logs, evenly chosen: a factorisation of them takes seconds, and neighbouring windows say nearly the same."""
+CHUNK = 4096
+"""Windows that are factorised at once: bounds the memory."""
+SLOWEST = 0.999
+"""Largest modulus of a pole: 10 s at 100 Hz. Slower ones are drifts that the strokes, which are integrals, have."""
+FARTHEST = 1e4
+"""Bound of a state, which is of the size of 1: whatever is commanded, answers stay finite numbers."""
+STRETCHES, STRETCH_TICKS = 128, 150
+"""Stretches from which B is solved, each with an own start, and their length."""
+JUDGED_S, JUDGED_EACH = 10.0, 4
+"""Length of the free runs that choose the order, and how many there are in a recording."""
+KEPT_BACK = 5
+"""Every fifth recording is kept back from the models whose orders compete."""
+SMALL = 1e-9
+"""Share of the largest that a direction must have to be told from rounding."""
+LEAST_SHARE = 1e-4
+"""Of the largest singular value: states below it are noise, and filters of them amplify rounding."""
+LEAST_NOISE = 1e-2
+"""Of a sensor, in deviations: on exact data a filter would trust one sample more than the model."""
+
+
+@TWINS.register("n4sid")
+@dataclass(frozen=True, kw_only=True)
+class N4sid:
+    """A floor for every twin: subspace identification of velocities and pressures; strokes are integrals.
+
+    The order is the one whose free runs on a fifth of the training recordings, kept back meanwhile, have the least
+    error; a single order is taken as it is. Poles outside the unit circle are reflected into it, and those slower than
+    a modulus of 0.999 are shrunk to it, so the model is stable. B is solved for by least squares on simulated
+    stretches, K from the covariance of what is left by a Riccati equation.
+
+    Attributes:
+        orders: numbers of states to choose from; those beyond what the rows of outputs can tell are cut to that.
+        horizon: rows of past and of future, in ticks.
+        prefix_ticks: measured ticks before a free run.
+
+    Raises:
+        ConfigError: a value out of range, or no order.
+    """
+
+    orders: tuple[int, ...] = (4, 8, 16, 24, 40)
+    horizon: int = 20
+    prefix_ticks: int = 30
+
+    def __post_init__(self) -> None:
+        order, rows = integer(1, MOST_ORDER), integer(2, MOST_ROWS_BACK)
+        check_bounds("n4sid", self, orders=order, horizon=rows, prefix_ticks=PREFIX)
+        check_count("n4sid", "orders", self.orders, 100, least=1)
+
+    def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> Twin:
+        """Fitted by projections; there is nothing to draw.
+
+        Raises:
+            DataError: recordings that are too short for `horizon`.
+        """
+        most = len(solved_columns(channels)) * (self.horizon - 1)
+        orders = sorted({min(order, most) for order in self.orders})
+        chosen = orders[0] if len(orders) == 1 else self._chosen(channels, scales, train, orders)
+        solution = _Projections.of(_scaled(channels, scales, train), self.horizon)
+        return self._twin(channels, scales, solution, chosen)
+
+    def _chosen(
+        self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], orders: Sequence[int]
+    ) -> int:
+        fitted, judged = _divided(train, self.prefix_ticks + 2 * self.horizon + 2)
+        solution = _Projections.of(_scaled(channels, scales, fitted), self.horizon)
+        return min(orders, key=lambda order: _free_error(self._twin(channels, scales, solution, order), judged))
+
+    def _twin(self, channels: TwinChannels, scales: TwinScales, solution: _Projections, order: int) -> Twin:
+        shapes, matrices = self.shapes(channels), solution.model(order)
+        arrays = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+        for name, matrix in matrices.items():
+            arrays[name][: len(matrix), : matrix.shape[1]] = matrix
+        arrays["order"][0] = len(matrices["a"])
+        return self.build(channels, scales, arrays)
+
+    def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
+        """Order, A, B, C and K, with room for the largest order."""
+        most, solved = max(self.orders), len(solved_columns(channels))
+        sizes = {"a": (most, most), "b": (most, len(channels.commands) + 1), "c": (solved, most), "k": (most, solved)}
+        return {"order": (1,), **sizes}
+
+    def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> Twin:
+        """The model with these numbers."""
+        order = int(arrays["order"][0])
+        if not 1 <= order <= max(self.orders):
+            raise ValueError(f"its order is {order}; 1 to {max(self.orders)} must hold")
+        return N4sidTwin(channels, scales, self.prefix_ticks, {name: arrays[name] for name in self.shapes(channels)})
+
+
+class N4sidTwin(Twin):
+    """State: ``answer`` in SI units, and ``states`` of the model ``(batch, order)``.
+
+    What a port reads corrects the states by the Kalman gain; a free port reads its own last answer, which lies where
+    the model put it but for its bounds, and then corrects nothing.
+    """
+
+    def __init__(
+        self, channels: TwinChannels, scales: TwinScales, prefix_ticks: int, numbers: Mapping[str, Array]
+    ) -> None:
+        super().__init__(channels, scales, prefix_ticks)
+        self.numbers, self.order = dict(numbers), int(numbers["order"][0])
+        n, doubles = self.order, {name: values.astype(np.float64) for name, values in numbers.items()}
+        self.a, self.b = doubles["a"][:n, :n], doubles["b"][:n]
+        self.c, self.k = doubles["c"][:, :n], doubles["k"][:n]
+        solved = solved_columns(channels)
+        self._solved = solved
+        self._offset, self._width = scales.answer_offset[solved], scales.answer_width[solved]
+
+    def initial_state(self, command: Array, measured: Array) -> TwinState:
+        # At the means of the training data, as exported forms start; the prefix moves it.
+        return {"answer": measured, "states": np.zeros((len(measured), self.order), np.float32)}
+
+    def _commands(self, commands: Array) -> Doubles:
+        return _with_one((commands - self.scales.command_offset) / self.scales.command_width)
+
+    def _read(self, answers: Array) -> Doubles:
+        return np.asarray((answers[..., self._solved] - self._offset) / self._width, dtype=np.float64)
+
+    def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
+        count = len(self.channels.velocities)
+        answers, answer, states = np.empty_like(measured), state["answer"], state["states"]
+        for t in range(commands.shape[1]):
+            fed = np.where(np.isnan(measured[:, t]), answer, measured[:, t])
+            wide = states.astype(np.float64)
+            surprise = self._read(fed) - wide @ self.c.T
+            wide = wide @ self.a.T + self._commands(commands[:, t]) @ self.b.T + surprise @ self.k.T
+            states = np.clip(wide, -FARTHEST, FARTHEST).astype(np.float32)
+            solved = (states.astype(np.float64) @ self.c.T).astype(np.float32) * self._width + self._offset
+            answers[:, t] = answer = self.bounded(fed, solved[:, :count], solved[:, count:])
+        return answers, {"answer": answer, "states": states}
+
+    def lower(self, build: Builder, commands: str, fed: str) -> str:
+        last = build.add(Feedback, "states_before", size=self.order)
+        read = build.pick("read", fed, self._solved)
+        limit, inputs = np.full(self.order, FARTHEST), np.concatenate([self.b[:, :-1], self.k], axis=1)
+        kept = build.add(Dense, "kept", last, weight=self.a - self.k @ self.c, bias=self.b[:, -1])
+        rows = build.join("rows", commands, read)
+        driven = build.add(Dense, "driven", rows, weight=inputs, bias=np.zeros(self.order))
+        moved = build.combine("moved", BinaryOperation.ADD, kept, driven)
+        states = build.add(Clip, "states", moved, low=-limit, high=limit)
+        build.add(Feed, "feed_states", states, into=last)
+        return build.add(Dense, "proposed", states, weight=self.c, bias=np.zeros(len(self._solved)))
+
+    def arrays(self) -> dict[str, Array]:
+        return self.scales.arrays() | self.numbers
+
+
+Pair = tuple[Doubles, Doubles]
+"""Commands, behind them a one, and solved answers of a stretch, scaled ``(tick, command + 1)``, ``(tick, answer)``."""
+
+
+def _with_one(commands: Array) -> Doubles:
+    """Scaled commands ``(..., command)`` and a column of ones: the mean of a velocity is not zero."""
+    wide = np.ones((*commands.shape[:-1], commands.shape[-1] + 1))
+    wide[..., :-1] = commands
+    return wide
+
+
+@dataclass(frozen=True, eq=False)
+class _Projections:
+    """What a model of any order needs of the data.
+
+    Attributes:
+        horizon: rows of past and of future.
+        pairs: the stretches.
+        left: left singular vectors of what the past tells of the freed future ``(horizon * answer, rank)``.
+        sizes: their singular values.
+        by_past: future outputs by past commands and outputs ``(horizon * answer, horizon * (command + answer))``.
+    """
+
+    horizon: int
+    pairs: tuple[Pair, ...]
+    left: Doubles
+    sizes: Doubles
+    by_past: Doubles
+
+    @staticmethod
+    def of(pairs: Sequence[Pair], horizon: int) -> _Projections:
+        """One QR factorisation of all windows, stacked over the stretches.
+
+        Raises:
+            DataError: fewer windows than one has numbers.
+        """
+        commands, answers = pairs[0][0].shape[1], pairs[0][1].shape[1]
+        future, past, outputs = horizon * commands, horizon * (commands + answers), horizon * answers
+        triangle = np.zeros((0, future + past + outputs))
+        windows = 0
+        for u, y in _windows(pairs, horizon):
+            count = len(u)
+            windows += count
+            parts = (u[:, horizon:], u[:, :horizon], y[:, :horizon], y[:, horizon:])
+            rows = np.concatenate([part.reshape(count, -1) for part in parts], axis=1)
+            triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, rows]), mode="r"))
+        if windows < triangle.shape[1]:
+            raise DataError(
+                f"n4sid: {windows} windows of {2 * horizon} ticks came; {triangle.shape[1]} at least must hold: give "
+                "longer recordings, or set a smaller twin.horizon"
+            )
+        own, across = (
+            triangle[future : future + past, future : future + past],
+            triangle[future : future + past, -outputs:],
+        )
+        left, sizes, _ = np.linalg.svd(across.T, full_matrices=False)
+        by_past = np.linalg.lstsq(own, across, rcond=SMALL)[0].T
+        return _Projections(horizon, tuple(pairs), left, sizes, by_past)
+
+    def model(self, order: int) -> dict[str, Doubles]:
+        """A, B, C and K of an order, or of the highest that the data tell from rounding."""
+        order = min(order, int((self.sizes > LEAST_SHARE * self.sizes[0]).sum()))
+        answers = self.pairs[0][1].shape[1]
+        root = np.sqrt(self.sizes[:order] / self.sizes[0])
+        seen = self.left[:, :order] * root
+        to_states = (self.left[:, :order] / root).T @ self.by_past
+        c = seen[:answers]
+        a = _stable(np.linalg.lstsq(seen[:-answers], seen[answers:], rcond=SMALL)[0])
+        b = _inputs_of(self.pairs, a, c)
+        now, later, u, y = _states(self.pairs, self.horizon, to_states)
+        return {"a": a, "b": b, "c": c, "k": _gain(a, c, later - now @ a.T - u @ b.T, y - now @ c.T)}
+
+
+def _windows(pairs: Sequence[Pair], horizon: int) -> Iterator[Pair]:
+    """Windows of past and future ``(window, 2 horizon, channel)``, in chunks."""
+    length = 2 * horizon
+    usable = [pair for pair in pairs if len(pair[0]) >= length]
+    total = sum(len(u) - length + 1 for u, _ in usable)
+    every = max(1, total // MOST_WINDOWS)
+    for u, y in usable:
+        views = [np.moveaxis(sliding_window_view(part, length, axis=0)[::every], 2, 1) for part in (u, y)]
+        for first in range(0, len(views[0]), CHUNK):
+            yield views[0][first : first + CHUNK], views[1][first : first + CHUNK]
+
+
+def _states(pairs: Sequence[Pair], horizon: int, to_states: Doubles) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+    """States as the past tells them at the middle of each window and a tick later, and its command and output."""
+    columns: list[tuple[Doubles, ...]] = []
+    for u, y in _windows(pairs, horizon):
+        pasts = [
+            np.concatenate([part[:, at : at + horizon].reshape(len(u), -1) for part in (u, y)], axis=1) for at in (0, 1)
+        ]
+        columns.append((pasts[0] @ to_states.T, pasts[1] @ to_states.T, u[:, horizon], y[:, horizon]))
+    now, later, command, output = (np.concatenate(column) for column in zip(*columns, strict=True))
+    return now, later, command, output
+
+
+def _stable(a: Doubles) -> Doubles:
+    """Poles outside the unit circle reflected, slow ones shrunk to `SLOWEST`."""
+    poles, vectors = np.linalg.eig(a)
+    modulus = np.abs(poles)
+    inside = np.minimum(np.where(modulus > 1.0, 1.0 / np.maximum(modulus, SMALL), modulus), SLOWEST)
+    if (inside == modulus).all():
+        return a
+    moved = poles * inside / np.maximum(modulus, SMALL)
+    return np.real(vectors @ np.diag(moved) @ np.linalg.inv(vectors))
+
+
+def _inputs_of(pairs: Sequence[Pair], a: Doubles, c: Doubles) -> Doubles:
+    """B by least squares: outputs of stretches are linear in it, and in the state at their start, which drops out."""
+    order, commands, answers = len(a), pairs[0][0].shape[1], len(c)
+    length = min(STRETCH_TICKS, max(len(u) for u, _ in pairs))
+    starts = [(u, y, first) for u, y in pairs for first in range(0, len(u) - length + 1, length)]
+    chosen = [starts[i] for i in np.unique(np.linspace(0, len(starts) - 1, STRETCHES).astype(np.int64))]
+    powers = np.empty((length, answers, order))
+    powers[0] = c
+    for t in range(1, length):
+        powers[t] = powers[t - 1] @ a
+    own = np.linalg.qr(powers.reshape(-1, order))[0]
+    normal, right = np.zeros((order * commands,) * 2), np.zeros(order * commands)
+    for u, y, first in chosen:
+        driven, rows = np.zeros((order, order * commands)), np.empty((length, answers, order * commands))
+        for t in range(length):
+            rows[t] = c @ driven
+            driven = a @ driven + np.kron(np.eye(order), u[first + t])
+        flat, goal = rows.reshape(length * answers, -1), y[first : first + length].reshape(-1)
+        flat = flat - own @ (own.T @ flat)
+        normal += flat.T @ flat
+        right += flat.T @ (goal - own @ (own.T @ goal))
+    # A command that never moved leaves its column at zero.
+    normal += SMALL * max(float(np.trace(normal)) / len(normal), SMALL) * np.eye(len(normal))
+    return np.asarray(np.linalg.solve(normal, right).reshape(order, commands))
+
+
+def _gain(a: Doubles, c: Doubles, process: Doubles, output: Doubles) -> Doubles:
+    """Steady Kalman gain of the noise that is left in states ``(row, state)`` and outputs ``(row, answer)``."""
+    # Here, since every command with a network imports this module, and scipy.linalg takes time.
+    from scipy.linalg import solve_discrete_are
+
+    rows = len(process)
+    q, r, s = process.T @ process / rows, output.T @ output / rows, process.T @ output / rows
+    # Never singular: exact data leave no noise, and a filter of none is not defined.
+    q += SMALL * np.eye(len(q))
+    r += LEAST_NOISE**2 * np.eye(len(r))
+    p = solve_discrete_are(a.T, c.T, q, r, s=s)
+    return np.asarray(np.linalg.solve(c @ p @ c.T + r, (a @ p @ c.T + s).T).T)
+
+
+def _scaled(channels: TwinChannels, scales: TwinScales, series: Sequence[Series]) -> list[Pair]:
+    solved = solved_columns(channels)
+    offset, width = scales.answer_offset[solved], scales.answer_width[solved]
+    return [
+        (
+            _with_one((part.inputs - scales.command_offset) / scales.command_width),
+            ((part.targets[:, solved] - offset) / width).astype(np.float64),
+        )
+        for part in series
+    ]
+
+
+def _divided(train: Sequence[Series], least: int) -> tuple[list[Series], list[Series]]:
+    """Every fifth recording kept back; of a single one its last fifth."""
+    if len(train) >= KEPT_BACK:
+        judged = [part for i, part in enumerate(train) if i % KEPT_BACK == KEPT_BACK - 1 and part.samples >= least]
+        if judged:
+            return [part for i, part in enumerate(train) if i % KEPT_BACK != KEPT_BACK - 1], judged
+    longest = max(train, key=lambda part: part.samples)
+    cut = min(longest.samples - longest.samples // KEPT_BACK, max(longest.samples - least, 1))
+    first, last = (
+        Series(longest.name, longest.inputs[rows], longest.targets[rows]) for rows in (slice(cut), slice(cut, None))
+    )
+    return [*(part for part in train if part is not longest), first], [last]
+
+
+def _free_error(twin: Twin, judged: Sequence[Series]) -> float:
+    """Mean absolute error of free runs, each solved answer in its deviations."""
+    ticks = min(round(JUDGED_S * twin.channels.rate_hz), max(part.samples for part in judged) - twin.prefix_ticks - 1)
+    length, prefix = twin.prefix_ticks + ticks, twin.prefix_ticks
+    runs = even_starts(twin, judged, length + 1, JUDGED_EACH)
+    commands = np.stack([part.inputs[first : first + length] for part, first in runs])
+    truth = np.stack([part.targets[first : first + length + 1] for part, first in runs])
+    state = twin.reset(commands[:, :prefix], truth[:, :prefix])
+    answers, _ = twin.rollout(commands[:, prefix:], state)
+    error = np.abs(answers - truth[:, prefix + 1 :]) / twin.scales.answer_width
+    return float(error[..., solved_columns(twin.channels)].mean())
