@@ -19,6 +19,7 @@ from edp.cli import (
     export,
     finetune,
     footprint,
+    identify,
     inspect,
     parity,
     pretrain,
@@ -52,6 +53,7 @@ app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.command("twin")(twin.twin)
 app.command("rollout")(twin.rollout)
+app.command("identify")(identify.identify)
 app.add_typer(search.app, name="search")
 app.command("distil")(distil.distil)
 app.command("compress")(compress.compress)

@@ -36,7 +36,7 @@ def twin(
 
     experiment = load_twin_experiment(config, changes)
     with progress(as_json) as shown:
-        display = _Display(shown, Steps(as_json))
+        display = FitDisplay(shown, as_json)
         trained = train_twin(source_of(data, signal_map, repair), experiment, folder, display.on_event, display.on_step)
     seconds = trained.bundle.provenance["seconds"]
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
@@ -198,19 +198,21 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-class _Display:
-    """Shows what is at work, and how far the training is."""
+class FitDisplay:
+    """Shows what is at work, and how far a fit to free runs is."""
 
-    def __init__(self, shown: Progress, steps: Steps) -> None:
-        self.shown, self.steps = shown, steps
-        self.bar = shown.add_task("twin", total=1.0, note="")
+    def __init__(self, shown: Progress, quiet: bool, what: str = "twin") -> None:
+        self.shown, self.steps, self.what = shown, Steps(quiet), what
+        self.bar = shown.add_task(what, total=1.0, note="")
 
     def on_step(self, text: str) -> None:
+        """What begins."""
         self.shown.update(self.bar, note=text)
-        self.steps.say(f"twin: {text}", force=True)
+        self.steps.say(f"{self.what}: {text}", force=True)
 
     def on_event(self, event: FreeRunProgress) -> None:
+        """How far it is."""
         error = "" if event.validation is None else f", free-run error {event.validation:.3g} deviations"
         note = f"update {event.update}/{event.updates}, runs of {event.length_s:g} s{error}"
         self.shown.update(self.bar, completed=event.update / event.updates, note=note)
-        self.steps.say(f"twin: {note}, {duration(event.seconds_left)} left")
+        self.steps.say(f"{self.what}: {note}, {duration(event.seconds_left)} left")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ TRIES = 4
 
 
 @dataclass(eq=False)
-class _Round:
+class GreyRound:
     """Stretches of one round, in units of the grey box."""
 
     demands: Doubles
@@ -52,19 +52,49 @@ class GreyFit:
         seconds: processor time.
         information: of the coordinates in which it was fitted: inverse covariance by the data that the last rounds
             saw, without what was thought plausible before ``(number, number)``.
+        theta: where the fit ended in these coordinates, each in plausible deviations.
     """
 
     twin: GreyTwin
     history: list[dict[str, Any]]
     seconds: float
     information: Doubles
+    theta: Doubles
 
 
-class _Problem:
-    """Losses of free runs by the coordinates of the numbers."""
+class Tie(Protocol):
+    """Fewer coordinates, of which all numbers of a grey box follow; each in plausible deviations from zero.
 
-    def __init__(self, twin: GreyTwin, train: Sequence[Series], stroke_weight: float, delta: float) -> None:
-        self.twin, self.delta = twin, delta / FINEST
+    Attributes:
+        begin: where a fit begins ``(coordinate,)``.
+    """
+
+    @property
+    def begin(self) -> Doubles:
+        """Where a fit begins ``(coordinate,)``."""
+        ...
+
+    def numbers(self, theta: Doubles) -> Doubles:
+        """Numbers of the grey box, in its units ``(number,)``."""
+        ...
+
+    def slopes(self, theta: Doubles) -> Doubles:
+        """Their derivatives ``(number, coordinate)``."""
+        ...
+
+
+class GreyProblem:
+    """Losses of free runs by the coordinates of the numbers.
+
+    Args:
+        twin: the grey box.
+        train: training stretches.
+        tie: other coordinates than one of each number.
+    """
+
+    def __init__(self, twin: GreyTwin, train: Sequence[Series], tie: Tie | None = None) -> None:
+        stroke_weight, delta = twin.spec.fit.stroke_weight, twin.spec.fit.delta
+        self.twin, self.tie, self.delta = twin, tie, delta / FINEST
         # Coordinates begin at the start of the twin, which knows more than the nominal numbers.
         self.begin = twin.numbers.copy()
         channels = twin.channels
@@ -73,8 +103,9 @@ class _Problem:
         self.weight = each * twin.units / twin.scales.answer_width.astype(np.float64) / FINEST
         self.series = [part for part in train if part.samples > twin.prefix_ticks + 2]
         self.plausible = np.where(twin.table.positive, twin.table.width, 1.0)
+        self.first = np.zeros(len(self.begin)) if tie is None else tie.begin
 
-    def draw(self, ticks: int, lanes: int, rng: np.random.Generator) -> _Round:
+    def draw(self, ticks: int, lanes: int, rng: np.random.Generator) -> GreyRound:
         """Stretches with starts everywhere."""
         prefix = self.twin.prefix_ticks
         usable = [part for part in self.series if part.samples > prefix + ticks]
@@ -97,15 +128,21 @@ class _Problem:
         # Rows that count lie apart: neighbouring errors of a run say the same.
         counts = (prefix, prefix if self.twin.wiring.whole else 0, max(1, ticks // 10))
         truth = np.ascontiguousarray(values[:, 1:])
-        return _Round(self.twin.demands(np.stack(commands)), measured, truth, counts)
+        return GreyRound(self.twin.demands(np.stack(commands)), measured, truth, counts)
 
     def numbers(self, theta: Doubles) -> Doubles:
         """Numbers by coordinates in plausible deviations."""
+        if self.tie is not None:
+            return self.tie.numbers(theta)
         table = self.twin.table
         grown = self.begin * np.exp(np.clip(theta * self.plausible, -12.0, 12.0))
         return np.where(table.positive, grown, self.begin + table.width * theta)
 
-    def losses(self, theta: Doubles, drawn: _Round, full: bool) -> tuple[Doubles, Doubles, Doubles]:
+    def slope(self, numbers: Doubles) -> Doubles:
+        """Derivative of each number by its own coordinate."""
+        return np.where(self.twin.table.positive, numbers * self.plausible, self.twin.table.width)
+
+    def losses(self, theta: Doubles, drawn: GreyRound, full: bool) -> tuple[Doubles, Doubles, Doubles]:
         """Matrix and gradient by the coordinates, and the loss of each lane."""
         twin, numbers = self.twin, self.numbers(theta)
         size = len(numbers) if full else 0
@@ -115,9 +152,11 @@ class _Problem:
         judged = RunTarget(drawn.truth, self.weight, self.delta, drawn.counts, normal)
         twin.lanes(numbers, drawn.demands, drawn.measured, state, judge=judged, full=full)
         matrix, gradient, losses = normal
-        if full:
-            table = self.twin.table
-            slope = np.where(table.positive, numbers * self.plausible, table.width)
+        if full and self.tie is not None:
+            slopes = self.tie.slopes(theta)
+            matrix, gradient = slopes.T @ matrix @ slopes, slopes.T @ gradient
+        elif full:
+            slope = self.slope(numbers)
             matrix, gradient = matrix * slope * slope[:, None], gradient * slope
         return matrix, gradient, np.nan_to_num(losses, nan=1e12, posinf=1e12)
 
@@ -128,6 +167,7 @@ def fit_grey_box(
     validation: Sequence[Series],
     seed: int,
     on_event: Callable[[FreeRunProgress], None] | None = None,
+    tie: Tie | None = None,
 ) -> GreyFit:
     """Fit the numbers of a grey box to free runs; free runs of the validation part choose among the rounds.
 
@@ -137,12 +177,13 @@ def fit_grey_box(
         validation: stretches that choose.
         seed: of the stretches and of the further starts.
         on_event: called after each round.
+        tie: coordinates to fit in place of one of each number.
 
     Raises:
         DataError: stretches that are too short.
     """
     spec, began = twin.spec.fit, time.process_time()
-    problem = _Problem(twin, train, spec.stroke_weight, spec.delta)
+    problem = GreyProblem(twin, train, tie)
     judge = FreeRunValidation(twin, validation, round(spec.validation_s * twin.channels.rate_hz), spec.validation_runs)
     rounds = [length for length, count in zip(spec.lengths_s, spec.rounds, strict=True) for _ in range(count)]
     total = len(rounds) + (spec.starts - 1) * spec.rounds[0]
@@ -175,7 +216,7 @@ def fit_grey_box(
     chosen = min(paths, key=lambda path: path.least)
     advance(chosen, rounds[spec.rounds[0] :])
     final = twin.with_numbers(problem.numbers(chosen.best))
-    return GreyFit(final, history, time.process_time() - began, chosen.information)
+    return GreyFit(final, history, time.process_time() - began, chosen.information, chosen.best)
 
 
 class _Path:
@@ -187,12 +228,12 @@ class _Path:
         information: of the numbers at `best`, as `GreyFit` has it.
     """
 
-    def __init__(self, problem: _Problem, number: int, seed: int) -> None:
+    def __init__(self, problem: GreyProblem, number: int, seed: int) -> None:
         self.problem, self.number = problem, number
         # Each start has stretches of its own; the first one begins at the balance of forces.
         self.rng = np.random.default_rng([seed, number] if number else seed)
-        size = len(problem.begin)
-        self.theta = APART * self.rng.normal(size=size) if number else np.zeros(size)
+        size = len(problem.first)
+        self.theta = problem.first + (APART * self.rng.normal(size=size) if number else 0.0)
         self.best, self.least, self.error = self.theta, np.inf, np.inf
         self.damping, self.matrix = 1.0, np.zeros((size, size))
         self.memory, self.information = np.zeros((size, size)), np.zeros((size, size))
@@ -218,7 +259,7 @@ class _Path:
 
 
 def _improve(
-    problem: _Problem, theta: Doubles, drawn: _Round, damping: float, steps: int, memory: Doubles
+    problem: GreyProblem, theta: Doubles, drawn: GreyRound, damping: float, steps: int, memory: Doubles
 ) -> tuple[Doubles, float, Doubles]:
     """Damped Gauss-Newton steps on one round; the matrix of the last one comes back as well.
 

@@ -66,7 +66,7 @@ def test_a_run_holds_a_twin_its_settings_and_scores_beside_the_floors(edp, logs,
 
 
 def test_a_stopped_training_goes_on(edp, logs, trained, tmp_path, monkeypatch):
-    from edp.cli.twin import _Display
+    from edp.cli.twin import FitDisplay
 
     def stop(self, event):
         if event.update == 3:
@@ -74,7 +74,7 @@ def test_a_stopped_training_goes_on(edp, logs, trained, tmp_path, monkeypatch):
 
     run = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(_Display, "on_event", stop)
+        patch.setattr(FitDisplay, "on_event", stop)
         assert edp("twin", logs, "--out", run, *WORDS).code == 130
     assert not (run / "twin").exists()
     assert edp("twin", logs, "--out", run, *WORDS).code == 0

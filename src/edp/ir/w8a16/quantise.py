@@ -129,6 +129,11 @@ def quantise(graph: Graph, chosen: Formats, moments: Mapping[str, NDArray[np.flo
                 f"layer '{layer.name}' is a {kind.__name__}, which has no form in integer arithmetic; {REFUSED[kind]}"
             )
         if layer.name not in inside:
+            if isinstance(layer, layers.Dense):
+                raise ExportError(
+                    f"layer '{layer.name}' multiplies what a feedback edge hands on; 8-bit weights would move its "
+                    "poles, so it has no form in integer arithmetic: export in float32"
+                )
             work.out.append(replace(layer, inputs=tuple(work.as_float(name) for name in layer.inputs)))
             continue
         inputs = tuple(work.as_fixed(name) for name in layer.inputs)

@@ -227,14 +227,49 @@ class Plant:
         """Like `run`, with the operator's hand between targets and levers."""
         return self._advance(targets, 1.0 / self.rate_hz)
 
+    def drive(self, demands: Array) -> Array:
+        """Like `run`, by signed demands of the spools as logs have them, shape (samples, 6), as shares of full."""
+        every = np.concatenate([self._demands, demands])
+        # In place, since a snapshot restores arrays in place.
+        self._demands[:] = every[len(every) - self._past :]
+        return self._moved(every)
+
+    def rest_at(self, demands: Array) -> None:
+        """Let pilots and spools rest where these demands, shape (6,), have held them for long."""
+        self._demands[:] = demands
+        self.valves[:] = 0.0
+        for column in (at.PILOT, at.PLAY, at.SPOOL):
+            self.valves[:, column] = demands
+
+    def place(self, strokes: Array, velocities: Array, pressures: Array) -> None:
+        """Put cylinders and oil where they were measured; valves, displacements and friction go on as they were.
+
+        Args:
+            strokes: m, shape (3,); held within the stroke.
+            velocities: of the cylinders, m/s, shape (3,).
+            pressures: of heads, rods and pump lines, Pa, shape (8,); NaN leaves one as it is.
+        """
+        for i in range(at.AXES):
+            within = min(max(float(strokes[i]), 0.0), float(self.axes[i, at.STROKE]))
+            psi = linkage.angle_at_stroke(i, within, self.axes, self.plant)
+            self.state[at.PSI + i] = psi
+            self.state[at.RATE + i] = velocities[i] / linkage.cylinder(i, psi, self.plant)[1]
+        known = np.isfinite(pressures)
+        self.state[at.HEAD : at.BRISTLE][known] = np.maximum(pressures[known], at.LOWEST_PRESSURE)
+
     def _advance(self, levers: Array, hand_s: float) -> Array:
         """Run with levers that the hand smooths at steps of `hand_s`; 0 for levers as they are."""
         setup = (self.axes, self.plant, self.work, self._ground)
-        samples = len(levers)
-        demands = np.empty((samples + self._past, at.SPOOLS))
-        log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
+        demands = np.empty((len(levers) + self._past, at.SPOOLS))
         levers = np.ascontiguousarray(levers, dtype=float)
         shape_commands(levers, self.hand, hand_s, self._demands, setup, demands, self._held)
+        return self._moved(demands)
+
+    def _moved(self, demands: Array) -> Array:
+        """Run along demands, behind the past ones."""
+        setup = (self.axes, self.plant, self.work, self._ground)
+        samples = len(demands) - self._past
+        log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
         times = (self._delays, self._clocks)
         self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
         return log

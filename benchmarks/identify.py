@@ -1,0 +1,179 @@
+"""Does `edp identify` find a machine again whose numbers were drawn anew?
+
+Machines of the simulator's family: geometry and bores are told, as a tape measure tells them; every other guess is
+M22's, which for a machine of another size is far off. Of each number that the logs tell: the error against the truth.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import finish, parser, table, verdict
+from edp.config.twin import load_twin_experiment
+from edp.logs.source import DataSource
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_files import load_machine
+from edp.storage import write_bytes
+from edp.workflows.identify import Identified, identify
+from edp.workflows.identify.bodies import Poses, base_parameters, load_by_base
+from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
+from edp.workflows.identify.machine_text import machine_text
+
+NEAR = 0.1
+"""Of the truth: the goal."""
+GOALS = ("valve curves", "dead bands", "leakage", "friction")
+"""Groups of numbers that the goal names; inertia and gravity are judged by joint, over poses."""
+JOINTS = ("boom", "arm", "bucket")
+QUICK = (
+    *("twin.fit.lengths_s=[0.1, 0.3]", "twin.fit.rounds=[3, 2]", "twin.fit.starts=1", "twin.fit.ticks=1500"),
+    *("twin.fit.validation_runs=8", "judge.seconds=10", "judge.starts=2", "judge.at_s=[1, 10]"),
+)
+
+
+def main() -> None:
+    arguments_of = parser(__doc__ or "")
+    arguments_of.add_argument("--machines", type=int, default=5, help="how many of the family")
+    arguments_of.add_argument("--ticks", type=int, default=40_000, help="of a round of the fit")
+    arguments = arguments_of.parse_args()
+    quick, seed = arguments.quick, arguments.seed
+    minutes, recordings = (4.0, 8) if quick else (40.0, 16)
+    changes = QUICK if quick else (f"twin.fit.ticks={arguments.ticks}", "judge.at_s=[1, 10, 60]")
+    details: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        for index in range(1 if quick else arguments.machines):
+            name, folder = f"family-{seed}-{index}", Path(temporary)
+            source = (arguments.data or folder) / name
+            order = SimulationOrder(machine=name, minutes=minutes, recordings=recordings, seed=seed + 1)
+            simulate_data_set(source, order, workers=1)
+            truth = load_machine(name)
+            write_bytes(folder / "measured.toml", machine_text(measured(truth), [], {}).encode())
+            began = time.process_time()
+            result = identify(
+                DataSource.of(source),
+                folder / "found.toml",
+                str(folder / "measured.toml"),
+                load_twin_experiment(None, ["twin.kind=greybox", *changes]),
+                on_event=lambda e: print(f"round {e.update}/{e.updates}, validation {e.validation:.4f}", flush=True),
+            )
+            details[name] = compared(truth, measured(truth), result) | {"seconds": time.process_time() - began}
+            show(name, details[name])
+    finish("identify", verdicts(details, quick), seed, details)
+
+
+def measured(truth: Machine) -> Machine:
+    """M22 with the pins, lengths, bores, rods and strokes of a machine."""
+    base, own = load_machine("M22"), truth.cylinders
+    cylinders = replace(base.cylinders, count=own.count, bore=own.bore, rod=own.rod, stroke=own.stroke)
+    pins = {name: getattr(truth, name) for name in ("boom_cylinder", "arm_cylinder", "bucket_linkage")}
+    return replace(base, bodies=replace(base.bodies, length=truth.bodies.length), cylinders=cylinders, **pins)
+
+
+def compared(truth: Machine, guess: Machine, result: Identified) -> dict[str, Any]:
+    """Errors of each number as shares of the truth, of the joints' inertia and gravity, and the scores."""
+    true = {number.label: number.of(truth) for number in MACHINE_NUMBERS}
+    # No log tells pump flow and power from the volumetric efficiency, which is the guess's.
+    share = truth.pumps.volumetric_efficiency / guess.pumps.volumetric_efficiency
+    true |= {label: true[label] * share for label in ("pumps.max_flow", "pumps.power_limit")}
+    numbers = []
+    for row in result.rows:
+        if true.get(row.label, 0.0) > 0.0:
+            right = true[row.label]
+            errors = {"error": row.value / right - 1.0, "guess_error": row.base / right - 1.0}
+            inside = row.low <= right <= row.high
+            numbers.append({"label": row.label, "group": row.group, "told": row.told, "inside": inside, **errors})
+    joints = [
+        {"joint": joint, "inertia": inertia, "gravity": gravity, "guess_inertia": first, "guess_gravity": second}
+        for joint, (inertia, gravity), (first, second) in zip(
+            JOINTS, joint_errors(truth, result.machine), joint_errors(truth, guess), strict=True
+        )
+    ]
+    return {"numbers": numbers, "joints": joints, "models": result.scores}
+
+
+def joint_errors(truth: Machine, other: Machine) -> list[tuple[float, float]]:
+    """Error of inertia and of gravity torque of each joint, root mean square over poses as a share of the truth's."""
+    strokes = np.random.default_rng(0).uniform(0.1, 0.9, (200, 3)) * np.array(truth.cylinders.stroke)
+    poses = Poses.of(truth, strokes)
+    by_torque, by_inertia = load_by_base(poses, truth.bodies.length, truth.gravity)
+    values = []
+    for machine in (truth, other):
+        nine = base_parameters(machine.bodies)
+        values.append((np.diagonal(by_inertia @ nine, axis1=1, axis2=2), by_torque @ nine))
+    (mass, pull), (mass_2, pull_2) = values
+
+    def apart(a: Any, b: Any) -> Any:
+        return np.sqrt(np.square(a - b).mean(axis=0) / np.square(b).mean(axis=0))
+
+    return list(zip(apart(mass_2, mass).tolist(), apart(pull_2, pull).tolist(), strict=True))
+
+
+def groups_of(details: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Rows of all machines by group."""
+    groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for entry in details.values():
+        for row in entry["numbers"]:
+            groups[row["group"]].append(row)
+    return groups
+
+
+def verdicts(details: dict[str, Any], quick: bool) -> list[Any]:
+    """Of each group that the goal names, the share of told numbers within 10 % of the truth; errors of the joints."""
+    result = []
+    for group, rows in groups_of(details).items():
+        told = [row for row in rows if row["told"]]
+        if group in GOALS and told:
+            share = float(np.mean([abs(row["error"]) <= NEAR for row in told]))
+            result.append(verdict(f"{group}: told numbers within 10 %", share, 1.0, ">= 1", "share", quick))
+    for what in ("inertia", "gravity"):
+        worst = max(joint[what] for entry in details.values() for joint in entry["joints"])
+        result.append(verdict(f"{what} of a joint over poses: largest error", worst, NEAR, "<= 1", "share", quick))
+    for name, entry in details.items():
+        ours, rivals = (entry["models"][key]["velocity_mae"]["mean"] for key in ("identified machine", "machine M22"))
+        result.append(verdict(f"{name}: velocity MAE against the guess", ours, rivals, "<= 1", "mm/s", quick))
+    return result
+
+
+def show(name: str, entry: dict[str, Any]) -> None:
+    """Print the groups, the joints and the scores of one machine."""
+    print(f"\n{name}: {entry['seconds']:.0f} processor s")
+    rows = []
+    for group, numbers in groups_of({name: entry}).items():
+        told = [row for row in numbers if row["told"]]
+        errors = [abs(row["error"]) for row in told]
+        first = [abs(row["guess_error"]) for row in told]
+        cells = [float(np.median(errors)), max(errors), float(np.median(first))] if told else ["-", "-", "-"]
+        near = sum(error <= NEAR for error in errors)
+        rows.append([group, f"{len(told)} of {len(numbers)}", near, *cells, sum(row["inside"] for row in told)])
+    heads = ["group", "told", "within 10 %", "median error", "largest", "guess: median", "in the interval"]
+    table(heads, rows)
+    table(
+        ["joint", "inertia", "gravity", "guess: inertia", "guess: gravity"],
+        [
+            [j[key] for key in ("joint", "inertia", "gravity", "guess_inertia", "guess_gravity")]
+            for j in entry["joints"]
+        ],
+    )
+    heads = ["model", "velocity MAE, mm/s", "stroke error by time, mm", "pressure NRMSE", "diverged"]
+    rows = [
+        [
+            model,
+            scores["velocity_mae"]["mean"],
+            " / ".join(f"{row['mean']:.3g}" for row in scores["stroke_error"]),
+            scores["pressure_nrmse"]["mean"],
+            scores["diverged"],
+        ]
+        for model, scores in entry["models"].items()
+    ]
+    table(heads, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""``edp identify``: from logs to a machine file of the simulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from edp.cli.console import JsonFlag, emit, out, progress, table
+from edp.cli.train import MapOption, RepairOption, source_of
+from edp.cli.twin import FitDisplay, score_table
+
+if TYPE_CHECKING:
+    from edp.workflows.identify import Identified
+
+
+def identify(
+    data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
+    file: Annotated[Path, typer.Option("--out", help="Machine file (.toml) to write; numbers beside it as .json.")],
+    machine: Annotated[
+        str, typer.Option(help="M22, C14, or a machine file: pins, lengths and bores, and a guess of the rest.")
+    ] = "M22",
+    run: Annotated[
+        Path | None, typer.Option(help="Run folder of a grey box of these logs, in place of a new fit.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="Settings of the grey box and its fit (TOML).")] = None,
+    changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.fit.starts=1.")] = [],  # noqa: B006
+    signal_map: MapOption = None,
+    repair: RepairOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Make the simulator's excavator yours: a machine file from logs of boom, arm and bucket.
+
+    Valve curves, dead bands, leakage, friction, volumes, pumps, time constants, inertia and gravity are fitted to the
+    logs; pins, lengths and bores are those of --machine, and so is what the logs do not tell, which is said number by
+    number. Both machines are then driven by the commands of held-out recordings.
+
+    Example: `edp identify logs --out mine.toml --machine measured.toml`
+    """
+    from edp.config.twin import load_twin_experiment
+    from edp.workflows.identify import identify as run_identify
+
+    experiment = None
+    if config is not None or changes:
+        # A file says which kind it is of.
+        experiment = load_twin_experiment(config, changes if config else ["twin.kind=greybox", *changes])
+    with progress(as_json) as shown:
+        display = FitDisplay(shown, as_json, "identify")
+        result = run_identify(
+            source_of(data, signal_map, repair), file, machine, experiment, run, display.on_event, display.on_step
+        )
+    numbers = [row.plain() for row in result.rows]
+    facts = {"machine": str(file), "numbers": numbers, "models": result.scores, "notes": result.notes}
+
+    def show() -> None:
+        number_table(result)
+        score_table(result.scores)
+        for note in result.notes:
+            out.print(f"note: {note}")
+        out.print(f"machine in {file}, numbers and scores in {file.with_suffix('.json')}")
+        out.print(f"next: edp simulate data/mine --machine {file}")
+
+    emit(as_json, facts, show)
+
+
+def number_table(result: Identified) -> None:
+    """Print a row a number: the guess, what was identified and its interval, or that the logs do not tell it."""
+    rows = []
+    for row in result.rows:
+        interval = f"{row.low:.3g} to {row.high:.3g}" if row.told else "kept: not told by the logs"
+        rows.append([row.label, row.unit, f"{row.base:.4g}", f"{row.value:.4g}", interval])
+    told = sum(row.told for row in result.rows)
+    table(
+        f"{told} of {len(rows)} numbers are told by the logs", ["", "unit", "guess", "identified", "about 95 %"], rows
+    )

@@ -1,0 +1,315 @@
+"""From logs to a machine file of the simulator: a grey box is fitted, and its numbers are written back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.config.twin import TwinExperiment, load_twin_experiment
+from edp.data.prepared import Prepared
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError, DataError
+from edp.evaluation.free_run import free_run_scores
+from edp.logs.source import DataSource
+from edp.networks.twin import TWINS, TwinSpec, fit_scales
+from edp.networks.twin.grey.datasheet import BASIS, UNEXCITED
+from edp.networks.twin.grey.elements import Elements
+from edp.networks.twin.greybox import GreyBox, GreyTwin
+from edp.recording import Recording
+from edp.signals import Kind
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_files import load_machine, parse_machine
+from edp.storage import write_bytes, write_json
+from edp.training.free_run import FreeRunProgress
+from edp.training.grey_fit import GreyProblem, fit_grey_box
+from edp.training.twin_bundle import load_twin
+from edp.workflows.identify.bodies import Poses, realised
+from edp.workflows.identify.compare import FrontChannels, MeasuredRuns
+from edp.workflows.identify.elements import check_strokes, excavator_elements, full_commands, parts_of
+from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
+from edp.workflows.identify.machine_text import machine_text
+from edp.workflows.identify.mapping import GreyParts
+from edp.workflows.identify.rows import IdentifiedNumber, body_rows, line_comments, number_rows
+from edp.workflows.identify.tie import MachineTie, deviations, kept_back, nearest
+from edp.workflows.twin.prepare_twin import prepared_twin
+
+Doubles = NDArray[np.float64]
+Tell = Callable[[str], None]
+OIL = "OilTemperature"
+FREEZING = 273.15
+LAST_STAGES = 2
+"""Of the fit's stages, those that refine the machine itself: its free runs are long from the beginning."""
+ROUNDS_THAT_INFORM = 3
+"""Rounds from which the information of a grey box is taken that was fitted before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """What `identify` leaves.
+
+    Attributes:
+        machine: identified, as its file has it.
+        rows: of each number.
+        scores: of the identified machine, the guess, the grey box and the static map on held-out recordings.
+        notes: what a reader must know.
+    """
+
+    machine: Machine
+    rows: list[IdentifiedNumber]
+    scores: dict[str, Any]
+    notes: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A grey box of an excavator front, and what its numbers are worth."""
+
+    twin: GreyTwin
+    elements: Elements
+    information: Doubles
+
+
+def identify(
+    source: DataSource,
+    out: str | Path,
+    machine: str = "M22",
+    experiment: TwinExperiment | None = None,
+    run: str | Path | None = None,
+    on_event: Callable[[FreeRunProgress], None] | None = None,
+    on_step: Tell | None = None,
+) -> Identified:
+    """Find the machine of the simulator whose numbers are those of the logs, and write its file.
+
+    Beside it a file of the same name that ends in ``.json`` has every number and the scores.
+
+    Args:
+        source: the logs.
+        out: machine file (.toml) to write.
+        machine: name or file of the guess; its pins, lengths and bores hold, and what the logs do not tell.
+        experiment: settings of a grey box, its fit and the division of the logs; by default `GreyBox`'s.
+        run: run folder of a grey box of these logs, in place of a fit.
+        on_event: called with progress of the fit.
+        on_step: called with what begins.
+
+    Raises:
+        EdpError: logs, guess, settings or run that do not fit each other, or an identified machine that cannot be;
+            nothing is written then.
+    """
+    tell, target = on_step or (lambda text: None), Path(out)
+    if target.suffix.lower() != ".toml":
+        raise ConfigError(f"--out {out}: a machine file ends in .toml; edp simulate reads it")
+    if run is not None and experiment is not None:
+        raise ConfigError(
+            f"--run {run} comes with settings; a run keeps its own: leave --config and --set out, or --run to fit anew"
+        )
+    base = load_machine(machine)
+    tell("reading logs")
+    recordings = source.read()
+    loaded = None if run is None else _of_run(run)
+    settings = experiment or load_twin_experiment(None, ["twin.kind=greybox"])
+    settings = loaded[1] if loaded is not None else settings
+    if not isinstance(settings.twin, GreyBox):
+        raise ConfigError(
+            f"settings: a machine is identified by a grey box, twin.kind = '{TWINS.name_of(settings.twin)}' came; "
+            "leave it out, or set twin.kind = 'greybox'"
+        )
+    channels, data = prepared_twin(recordings, settings)
+    _check_strokes(channels, data, base)
+    if loaded is None:
+        fitted = _fitted(base, settings.twin, (channels, data, settings.training.seed), (on_event, tell))
+    else:
+        fitted = _informed(loaded[0], data, settings.training.seed)
+    celsius, notes = _celsius(recordings, base)
+    parts = parts_of(fitted.twin, fitted.elements, base, celsius)
+    notes += _notes(parts)
+    tell("fitting the machine itself to free runs")
+    tie, theta, information = _refined(base, parts, fitted, (data, settings), on_event)
+    found, rows = _machine(tie, theta, information, (fitted.twin, data))
+    found = replace(found, name=_name(target), description=_description(base))
+    text = machine_text(found, _head(base, rows, notes), line_comments(rows))
+    try:
+        # As a reader of the file will check it: what cannot be simulated is not written.
+        written = parse_machine(text, target.name)
+    except ConfigError as error:
+        raise ConfigError(
+            f"the identified machine cannot be ({error}); the logs do not fit machine {base.name}: check units, map, "
+            "and pins and bores of --machine"
+        ) from error
+    tell("driving both machines by the commands of held-out recordings")
+    scores = _scores(fitted, (base, written), parts, (data, settings))
+    write_bytes(target, text.encode())
+    facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
+    write_json(target.with_suffix(".json"), facts | {"numbers": [row.plain() for row in rows], "models": scores})
+    return Identified(written, rows, scores, notes)
+
+
+def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
+    bundle = load_twin(run)
+    if not isinstance(bundle.twin, GreyTwin):
+        raise ConfigError(
+            f"--run {run}: it holds a twin of kind '{TWINS.name_of(bundle.spec)}'; numbers of a machine are those of a "
+            "grey box: give a run of twin.kind = 'greybox', or leave --run out to have one fitted"
+        )
+    return bundle.twin, load_twin_experiment(Path(run) / "config.toml")
+
+
+def _fitted(base: Machine, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], report: Any) -> _Fitted:
+    """A grey box with the elements of an excavator front, fitted to the logs; `logs` ends with the seed."""
+    channels, data, seed = logs
+    on_event, tell = report
+    elements = excavator_elements(channels, base)
+    full = np.array(full_commands(channels, elements, base), np.float32)
+    spec = replace(spec, cylinders=elements.cylinders, valves=elements.valves, pumps=elements.pumps)
+    begun = spec.start(channels, fit_scales(channels, data.train), data.train, seed)
+    twin = GreyTwin(channels, begun.scales, spec, (begun.table, begun.wiring), begun.numbers, full)
+    tell("fitting a grey box to free runs")
+    fit = fit_grey_box(twin, data.train, data.validation, seed, on_event)
+    return _Fitted(fit.twin, elements, fit.information)
+
+
+def _informed(twin: GreyTwin, data: Prepared, seed: int) -> _Fitted:
+    """A grey box that was fitted before, with the information of free runs of its last stage."""
+    problem, spec = GreyProblem(twin, data.train), twin.spec.fit
+    rng, total = np.random.default_rng(seed), np.zeros((len(twin.numbers),) * 2)
+    ticks = max(1, round(spec.lengths_s[-1] * twin.channels.rate_hz))
+    for _ in range(ROUNDS_THAT_INFORM):
+        drawn = problem.draw(ticks, max(8, min(spec.lanes, spec.ticks // ticks)), rng)
+        total += problem.losses(np.zeros(len(twin.numbers)), drawn, True)[0]
+    return _Fitted(twin, twin.spec.elements(twin.channels), total / ROUNDS_THAT_INFORM)
+
+
+def _refined(
+    base: Machine,
+    parts: GreyParts,
+    fitted: _Fitted,
+    logs: tuple[Prepared, TwinExperiment],
+    on_event: Callable[[FreeRunProgress], None] | None,
+) -> tuple[MachineTie, Doubles, Doubles]:
+    """The machine fitted to free runs through its grey box: coordinates, where the fit ended, and their information."""
+    data, settings = logs
+    tie = MachineTie.of(base, parts, fitted.twin.numbers[parts.load])
+    tie = replace(tie, begin=nearest(tie, fitted.twin.numbers, fitted.information))
+    fit = fitted.twin.spec.fit
+    last = replace(fit, lengths_s=fit.lengths_s[-LAST_STAGES:], rounds=fit.rounds[-LAST_STAGES:], starts=1)
+    twin = fitted.twin
+    spec = replace(twin.spec, fit=last)
+    tied = GreyTwin(twin.channels, twin.scales, spec, (twin.table, twin.wiring), tie.numbers(tie.begin), twin.full)
+    result = fit_grey_box(tied, data.train, data.validation, settings.training.seed + 1, on_event, tie)
+    return tie, result.theta, result.information
+
+
+def _machine(
+    tie: MachineTie, theta: Doubles, information: Doubles, logs: tuple[GreyTwin, Prepared]
+) -> tuple[Machine, list[IdentifiedNumber]]:
+    """The machine of the coordinates, those that the logs do not tell set back to the guess; and a row of each."""
+    twin, data = logs
+    count, left = len(MACHINE_NUMBERS), deviations(information)
+    told = left[:count] < UNEXCITED
+    back = np.concatenate([~told, np.zeros(len(theta) - count, np.bool_)])
+    final = replace(tie, free=told)
+    settled = kept_back(theta, information, back)
+    machine, load = final.machine(settled), tie.load + tie.load_width * settled[count:]
+    valves = machine.valves
+    missing = np.array(tie.parts.conflux) < 0
+    shares: dict[str, Any] = {
+        key: tuple(0.0 if none else float(v) for v, none in zip(getattr(valves, key), missing, strict=True))
+        for key in ("conflux_extend", "conflux_retract")
+    }
+    machine = replace(machine, valves=replace(valves, **shares))
+    machine = replace(machine, oil=replace(machine.oil, temperature=tie.parts.celsius))
+    speeds = len(twin.channels.velocities)
+    strokes = np.concatenate([part.targets[:, speeds : 2 * speeds] for part in data.train]).astype(np.float64)
+    poses = Poses.of(machine, strokes)
+    spread = np.linalg.inv(information + np.eye(len(theta)))[count:, count:]
+    covariance = spread * tie.load_width * tie.load_width[:, None]
+    nine, body = body_rows(tie.base, tie.parts, load, covariance, twin.wiring.z_of, poses)
+    machine = replace(machine, bodies=realised(nine, tie.base))
+    return machine, number_rows(tie.base, machine, left[:count], told) + body
+
+
+def _check_strokes(channels: TwinChannels, data: Prepared, base: Machine) -> None:
+    count = len(channels.velocities)
+    if len(channels.strokes) != count:
+        # The elements say what is missing.
+        excavator_elements(channels, base)
+    rows = [part.targets[:, count : 2 * count] for part in (*data.train, *data.validation, *data.test)]
+    low, high = (getattr(np.concatenate(rows), end)(axis=0) for end in ("min", "max"))
+    if len(channels.strokes) == 3:
+        check_strokes(channels.strokes, low, high, base)
+
+
+def _celsius(recordings: Sequence[Recording], base: Machine) -> tuple[float, list[str]]:
+    """Temperature of the oil in the logs, and a note of it."""
+    logged = [
+        r.column(OIL)
+        for r in recordings
+        if OIL in r.channel_names and r.channels[r.index(OIL)].kind is Kind.TEMPERATURE
+    ]
+    if len(logged) < len(recordings):
+        celsius = base.oil.temperature
+        return celsius, [f"the logs have no {OIL}: {celsius:g} degC of machine {base.name} is taken"]
+    celsius = float(np.nanmean(np.concatenate(logged).astype(np.float64))) - FREEZING
+    if not np.isfinite(celsius):
+        raise DataError(f"'{OIL}' holds no number; correct the log, or leave the channel out")
+    return celsius, [f"leakage, viscous friction and bulk modulus are those at the logs' mean of {celsius:.1f} degC"]
+
+
+def _notes(parts: GreyParts) -> list[str]:
+    notes = []
+    if min(parts.conflux) < 0:
+        notes.append("commands of second spools are not logged: conflux_extend and conflux_retract are 0 there")
+    far = [share for share in parts.reach if share < 0.9]
+    if far:
+        notes.append(f"commands reach {min(far):.0%} of the full pilot only; curves beyond are extrapolated")
+    notes.append("masses are not told apart from where they sit: inertia and gravity of the joints are")
+    notes.append("pump flow and power are told times the volumetric efficiency, which is the guess's")
+    return notes
+
+
+def _scores(
+    fitted: _Fitted, machines: tuple[Machine, Machine], parts: GreyParts, logs: tuple[Prepared, TwinExperiment]
+) -> dict[str, Any]:
+    """Free runs along held-out recordings: the identified machine, the guess, the grey box and the static map."""
+    data, settings = logs
+    twin, judge = fitted.twin, settings.judge
+    runs = MeasuredRuns.of(twin, data.test, judge.seconds, judge.starts)
+    front = FrontChannels.of(
+        twin,
+        fitted.elements,
+        (*parts.primary, *parts.conflux),
+        full_commands(twin.channels, fitted.elements, machines[0]),
+    )
+    floor: TwinSpec = replace(TWINS["static"](), prefix_ticks=twin.prefix_ticks)
+    static = floor.start(twin.channels, twin.scales, data.train, settings.training.seed)
+    answers = {
+        "identified machine": runs.by_machine(machines[1], front),
+        f"machine {machines[0].name}": runs.by_machine(machines[0], front),
+        "grey box": runs.by_twin(twin),
+        "static map": runs.by_twin(static),
+    }
+    return {name: free_run_scores(runs.answered(twin, values), judge) for name, values in answers.items()}
+
+
+def _name(out: Path) -> str:
+    """A name that a machine file may have, from that of the file."""
+    name = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "-" for c in out.stem).strip("-_")
+    return name or "identified"
+
+
+def _description(base: Machine) -> str:
+    return f"identified from logs; geometry and what they do not tell are those of {base.name}"
+
+
+def _head(base: Machine, rows: Sequence[IdentifiedNumber], notes: Sequence[str]) -> list[str]:
+    told = sum(row.told for row in rows)
+    return [
+        f"Identified from logs by edp identify: {told} of {len(rows)} numbers are told by them.",
+        "Behind a number: an approximate 95 % interval (too narrow: errors of the structure are not in it), or that it",
+        f"is kept. Numbers without a comment are those of machine {base.name}, bodies but for their lengths excepted.",
+        *notes,
+    ]

@@ -1,0 +1,151 @@
+"""From a machine of the simulator to the numbers of its grey box, equation by equation.
+
+The grey box (`edp.networks.twin.grey`) has the simulator's equations but for its linkage, so most numbers are the same
+in other units. What differs:
+
+- opening curves have free knots; the simulator's are k r (0.25 + 0.75 r), taken at the knots;
+- a pilot is two equal lags; the simulator's has a damping of 0.9, and the same delay, 2 zeta / omega;
+- pumps ask for and deliver their flow behind the volumetric efficiency, which no log tells apart from it;
+- bulk modulus, leakage and viscous friction are those at the oil's temperature of the logs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.grey import layout as grey
+from edp.networks.twin.grey.numbers import KNOTS, NumberTable
+from edp.sim.machine import layout as sim
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics.valve import PILOT_DAMPING
+
+Doubles = NDArray[np.float64]
+DEMAND_START, DEMAND_SPAN = 0.1, 0.75
+"""Of the simulator's pumps (`edp.sim.physics.pump.demand`): the pilot at which they begin, and its way to full."""
+
+
+@dataclass(frozen=True, eq=False)
+class GreyParts:
+    """Which element of a grey box is which part of a machine.
+
+    Attributes:
+        table: of its numbers.
+        primary: valve of each cylinder ``(3,)``.
+        conflux: second valve of each cylinder, -1 where it has none.
+        reach: what a full command of each valve is, as a share of the machine's full pilot ``(valve,)``.
+        celsius: of the oil in the logs.
+    """
+
+    table: NumberTable
+    primary: tuple[int, int, int]
+    conflux: tuple[int, int, int]
+    reach: tuple[float, ...]
+    celsius: float
+
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        """Numbers that a machine has no place for, or that are constants of the simulator ``(number,)``."""
+        at, table = np.zeros(len(self.table.numbers), np.bool_), self.table
+        at[[table.circuit_at + k for k in (grey.SUPPLY, grey.DEMAND_START, grey.DEMAND_SPAN)]] = True
+        at[table.actuator_at + grey.ASYMMETRY] = True
+        return at
+
+    @property
+    def load(self) -> slice:
+        """Numbers of the load: polynomials, of which bodies are found apart."""
+        return slice(self.table.inertia_at, len(self.table.numbers))
+
+
+def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
+    """Numbers of the grey box of a machine, in its own units ``(number,)``.
+
+    Args:
+        machine: of the simulator.
+        parts: which element is which.
+        load: numbers of the load, in units of the grey box, which stay as they are.
+    """
+    machine = replace(machine, oil=replace(machine.oil, temperature=parts.celsius))
+    axes, plant = pack(machine)
+    table = parts.table
+    si = table.nominal * np.array([number.factor for number in table.numbers])
+    for i in range(sim.AXES):
+        _put_cylinder(si, table.actuator_at[i], axes[i], plant)
+        for second, j in enumerate((parts.primary[i], parts.conflux[i])):
+            if j >= 0:
+                _put_valve(si, table.valve_at[j], (machine, i, bool(second)), axes[i], parts.reach[j])
+    for a in table.pump_at:
+        si[a + grey.FLOW] = plant[sim.EFFICIENCY] * plant[sim.MAX_FLOW]
+        si[a + grey.LEAST], si[a + grey.LAG] = plant[sim.MIN_DISPLACEMENT], plant[sim.PUMP_TIME]
+        si[a + grey.LINE], si[a + grey.RELIEF] = plant[sim.LINE_VOLUME], plant[sim.PUMP_RELIEF]
+        si[a + grey.BYPASS], si[a + grey.BYPASS_CLOSED] = plant[sim.BYPASS], plant[sim.BYPASS_CLOSED]
+    _put_circuit(si, table.circuit_at, plant, float(np.mean([parts.reach[j] for j in parts.primary])))
+    numbers = si / np.array([number.factor for number in table.numbers])
+    numbers[parts.load] = load
+    return np.asarray(numbers)
+
+
+def _put_cylinder(si: Doubles, a: int, axis: Doubles, plant: Doubles) -> None:
+    """Numbers of one cylinder, from its row of the simulator's."""
+    same = {
+        grey.HEAD_AREA: sim.HEAD_AREA, grey.ROD_AREA: sim.ROD_AREA, grey.HEAD_DEAD: sim.HEAD_DEAD,
+        grey.ROD_DEAD: sim.ROD_DEAD, grey.HEAD_RELIEF: sim.RELIEF_HEAD, grey.ROD_RELIEF: sim.RELIEF_ROD,
+        grey.CUSHION_LENGTH: sim.CUSHION_LENGTH, grey.CUSHION_LEAST: sim.CUSHION_AREA, grey.COULOMB: sim.COULOMB,
+        grey.STRIBECK: sim.STRIBECK, grey.BRISTLE: sim.SIGMA0, grey.BRISTLE_DAMPING: sim.SIGMA1,
+        grey.STOP_HIGH: sim.STROKE, grey.STOP_STIFFNESS: sim.STOP_STIFFNESS,
+    }  # fmt: skip
+    for place, column in same.items():
+        si[a + place] = axis[column]
+    si[a + grey.PISTON_LEAK] = axis[sim.PISTON_LEAK] * plant[sim.THINNING]
+    si[a + grey.SPOOL_LEAK] = axis[sim.SPOOL_LEAK] * plant[sim.THINNING]
+    si[a + grey.STATIC] = axis[sim.STATIC] - axis[sim.COULOMB]
+    si[a + grey.VISCOUS] = axis[sim.VISCOUS] * plant[sim.VISCOUS_SHARE]
+    si[a + grey.STOP_LOW] = si[a + grey.ASYMMETRY] = 0.0
+
+
+def _put_valve(
+    si: Doubles, places: NDArray[np.int64], which: tuple[Machine, int, bool], axis: Doubles, reach: float
+) -> None:
+    """Numbers of one spool; `which`: machine, cylinder, and whether it is the second spool."""
+    machine, i, second = which
+    valves = machine.valves
+    si[places[grey.DELAY]] = valves.dead_time[i] + (valves.conflux_extra_dead_time if second else 0.0)
+    si[places[grey.PILOT_LAG]] = PILOT_DAMPING / (2.0 * np.pi * valves.pilot_frequency[i])
+    frequency = (valves.conflux_spool_frequency if second else valves.spool_frequency)[i]
+    si[places[grey.SPOOL_LAG]] = 1.0 / (2.0 * np.pi * frequency)
+    if second:
+        bands = (sim.CONFLUX_DEAD_BAND_EXTEND, sim.CONFLUX_DEAD_BAND_RETRACT)
+        into = (sim.CONFLUX_EXTEND, sim.CONFLUX_RETRACT)
+    else:
+        bands, into = (sim.DEAD_BAND_EXTEND, sim.DEAD_BAND_RETRACT), (sim.IN_EXTEND, sim.IN_RETRACT)
+    out, again = (sim.OUT_EXTEND, sim.OUT_RETRACT), (sim.REGEN_EXTEND, sim.REGEN_RETRACT)
+    demand = (sim.DEMAND_EXTEND, sim.DEMAND_RETRACT)
+    for d in range(2):
+        band = axis[bands[d]]
+        si[places[grey.BAND + d]] = band / reach
+        si[places[grey.GAIN + d]] = axis[demand[d]]
+        # Where the knots lie on the simulator's spool: those of the grey box count from its own full command.
+        spool = band + (reach - band) * KNOTS
+        r = np.clip((spool - band) / (1.0 - band), 0.0, 1.0)
+        curve = np.diff(r * (0.25 + 0.75 * r))
+        for first, column in ((grey.INTO, into[d]), (grey.OUT_OF, out[d])):
+            at = places[first + d]
+            if at >= 0:
+                si[at : at + len(curve)] = axis[column] * curve
+        if places[grey.REGENERATION + d] >= 0:
+            si[places[grey.REGENERATION + d]] = axis[again[d]] / axis[out[d]]
+
+
+def _put_circuit(si: Doubles, c: int, plant: Doubles, reach: float) -> None:
+    same = {
+        grey.BULK: sim.BULK_MODULUS, grey.AIR: sim.AIR, grey.TANK: sim.TANK, grey.MAKE_UP: sim.ANTI_CAVITATION,
+        grey.PORT_SLOPE: sim.PORT_SLOPE, grey.RELIEF_SLOPE: sim.RELIEF_SLOPE,
+    }  # fmt: skip
+    for place, column in same.items():
+        si[c + place] = plant[column]
+    si[c + grey.POWER] = plant[sim.EFFICIENCY] * plant[sim.POWER_LIMIT]
+    si[c + grey.PLAY] = plant[sim.HYSTERESIS] / reach
+    si[c + grey.DEMAND_START], si[c + grey.DEMAND_SPAN] = DEMAND_START / reach, DEMAND_SPAN / reach

@@ -1,0 +1,120 @@
+"""What an identification says of each number: value, interval, and whether the logs told it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.grey.datasheet import NORMAL, UNEXCITED
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_checks import CYLINDERS
+from edp.workflows.identify.bodies import NAMES, Poses, base_parameters, grey_load, solved_base
+from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS
+from edp.workflows.identify.mapping import GreyParts
+
+Doubles = NDArray[np.float64]
+BODIES = "inertia and gravity"
+"""Group of the nine numbers of the bodies."""
+
+
+@dataclass(frozen=True)
+class IdentifiedNumber:
+    """One number.
+
+    Attributes:
+        label: section, key and cylinder.
+        group: of numbers that are judged together.
+        unit: of the values.
+        base: in the machine that was guessed.
+        value: identified; that of the guess where the logs do not tell it.
+        low: lower end of an approximate 95 % interval; `high` the upper one.
+        high: upper end.
+        told: whether the logs tell it.
+    """
+
+    label: str
+    group: str
+    unit: str
+    base: float
+    value: float
+    low: float
+    high: float
+    told: bool
+
+    def plain(self) -> dict[str, Any]:
+        """For JSON."""
+        return dict(vars(self))
+
+
+def number_rows(base: Machine, machine: Machine, left: Doubles, told: NDArray[np.bool_]) -> list[IdentifiedNumber]:
+    """A row for each number of `MACHINE_NUMBERS`.
+
+    Args:
+        base: the guess.
+        machine: the identified one.
+        left: deviations that the data leave, as shares of the plausible ones ``(number,)``.
+        told: which numbers the logs tell.
+    """
+    rows = []
+    for number, share, known in zip(MACHINE_NUMBERS, left, told, strict=True):
+        value, reach = number.of(machine), np.exp(NORMAL * share * number.width)
+        ends = (value / reach, value * reach) if known else (value, value)
+        rows.append(
+            IdentifiedNumber(
+                number.label, number.group, number.unit, number.of(base), value, float(ends[0]), float(ends[1]),
+                bool(known),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def body_rows(
+    base: Machine, parts: GreyParts, load: Doubles, covariance: Doubles, z_of: tuple[Doubles, Doubles], poses: Poses
+) -> tuple[Doubles, list[IdentifiedNumber]]:
+    """The nine numbers of the bodies, and a row of each.
+
+    Args:
+        base: the guess.
+        parts: which element is which.
+        load: numbers of the load, in units of the grey box.
+        covariance: of them, in the same units.
+        z_of: middle and scale of the strokes.
+        poses: of the logs.
+    """
+
+    def solved(values: Doubles) -> Doubles:
+        return solved_base(*grey_load(parts.table, values, z_of, poses), poses, base)
+
+    nine, guess = solved(load), base_parameters(base.bodies)
+    width = parts.table.width[parts.load]
+    slopes = np.empty((len(nine), len(load)))
+    for k, step in enumerate(1e-4 * width):
+        moved = np.zeros(len(load))
+        moved[k] = step
+        slopes[:, k] = (solved(load + moved) - solved(load - moved)) / (2.0 * step)
+    left = np.sqrt(np.einsum("ik,kl,il->i", slopes, covariance, slopes))
+    before = np.sqrt(np.square(slopes * width).sum(axis=1))
+    rows = []
+    for i, name in enumerate(NAMES):
+        reach, unit = NORMAL * float(left[i]), "kg m" if i < 6 else "kg m^2"
+        ends = (float(nine[i]) - reach, float(nine[i]) + reach)
+        told = bool(left[i] < UNEXCITED * before[i])
+        label = f"bodies.{name}"
+        rows.append(IdentifiedNumber(label, BODIES, unit, float(guess[i]), float(nine[i]), *ends, told))
+    return nine, rows
+
+
+def line_comments(rows: Sequence[IdentifiedNumber]) -> dict[tuple[str, str], str]:
+    """What stands behind each line of the machine's file."""
+    comments: dict[tuple[str, str], list[str]] = {}
+    for number, row in zip(MACHINE_NUMBERS, rows, strict=False):
+        name = "" if number.place is None else f"{CYLINDERS[number.place]} "
+        text = f"{row.low:.3g} to {row.high:.3g}" if row.told else "kept, not told by the logs"
+        comments.setdefault((number.section, number.key), []).append(f"{name}{text}")
+    static = ("friction", "static_fraction")
+    comments[static] = [f"less Coulomb: {text}" for text in comments[static]]
+    return {key: "; ".join(texts) for key, texts in comments.items()}

@@ -1,0 +1,160 @@
+"""Machine and grey box tied together: a fit of the numbers of a machine file through those of its grey box.
+
+The first machine is the one whose grey box is nearest to a fitted one, in the metric of what the data told of that:
+
+    min (x(theta) - x)' I (x(theta) - x) + theta' theta
+
+x are the coordinates of the fitted grey box, I their information, theta the numbers of the machine in plausible
+deviations from a guess. Free runs then refine theta itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.networks.twin.grey.numbers import NumberTable
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_checks import BOUNDS
+from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS, guesses, with_values
+from edp.workflows.identify.mapping import GreyParts, grey_numbers
+
+Doubles = NDArray[np.float64]
+STEP = 1e-4
+"""Of the differences that give the slopes of the map, in plausible deviations."""
+FARTHEST = 12.0
+"""Deviations beyond which no number is moved."""
+MOST_ITERATIONS, ENOUGH = 60, 1e-12
+LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class MachineTie:
+    """Coordinates of a fit: numbers of a machine, then those of the load, which stay polynomials.
+
+    Attributes:
+        base: the machine that is guessed.
+        parts: which element of the grey box is which part of it.
+        load: numbers of the load from which a fit begins, in units of the grey box.
+        free: coordinates that move; the others stay at the guess ``(number of the machine,)``.
+        begin: where a fit begins ``(coordinate,)``.
+    """
+
+    base: Machine
+    parts: GreyParts
+    load: Doubles
+    free: NDArray[np.bool_]
+    begin: Doubles
+
+    @staticmethod
+    def of(base: Machine, parts: GreyParts, load: Doubles) -> MachineTie:
+        """From the guess itself."""
+        count = len(MACHINE_NUMBERS)
+        return MachineTie(base, parts, load, np.ones(count, np.bool_), np.zeros(count + len(load)))
+
+    @property
+    def load_width(self) -> Doubles:
+        """Plausible deviations of the load."""
+        return self.parts.table.width[self.parts.load]
+
+    def machine(self, theta: Doubles) -> Machine:
+        """The machine of these coordinates; numbers that are not free are those of the guess, zeros included."""
+        return with_values(self.base, self._values(theta))
+
+    def _values(self, theta: Doubles) -> Doubles:
+        own = np.clip(theta[: len(MACHINE_NUMBERS)], -FARTHEST, FARTHEST)
+        grown = guesses(self.base) * np.exp(WIDTHS * own)
+        stated = np.array([number.of(self.base) for number in MACHINE_NUMBERS])
+        return np.where(self.free, np.minimum(grown, MOST), stated)
+
+    def numbers(self, theta: Doubles) -> Doubles:
+        """Numbers of the grey box, in its units ``(number,)``."""
+        load = self.load + self.load_width * theta[len(MACHINE_NUMBERS) :]
+        numbers = grey_numbers(self.machine(theta), self.parts, load)
+        # A logarithm has no zero: a regeneration that is not there is a very small one.
+        return np.where(self.parts.table.positive, np.maximum(numbers, TINY * self.parts.table.nominal), numbers)
+
+    def slopes(self, theta: Doubles) -> Doubles:
+        """Derivatives of the numbers by the coordinates ``(number, coordinate)``."""
+        count = len(MACHINE_NUMBERS)
+        result = np.zeros((len(self.parts.table.numbers), len(theta)))
+        for k in np.flatnonzero(self.free):
+            step = np.zeros(len(theta))
+            step[k] = STEP
+            result[:, k] = (self.numbers(theta + step) - self.numbers(theta - step)) / (2.0 * STEP)
+        result[self.parts.load, count:] = np.diag(self.load_width)
+        return result
+
+
+TINY = 1e-6
+"""Of the plausible value: what is as good as zero."""
+MOST: Doubles = np.array([BOUNDS[number.path].high if number.path in BOUNDS else np.inf for number in MACHINE_NUMBERS])
+"""Largest values that a machine file may have."""
+WIDTHS: Doubles = np.array([number.width for number in MACHINE_NUMBERS])
+
+
+def coordinates(table: NumberTable, numbers: Doubles, origin: Doubles) -> Doubles:
+    """Coordinates of numbers: plausible deviations from `origin`, of the logarithm where they are positive."""
+    safe = np.where(table.positive, numbers / np.where(table.positive, origin, 1.0), 1.0)
+    return np.asarray(np.where(table.positive, np.log(safe), numbers - origin) / table.width)
+
+
+def nearest(tie: MachineTie, numbers: Doubles, information: Doubles, prior: float = 1.0) -> Doubles:
+    """Coordinates of the machine whose grey box is nearest to these numbers, by damped Gauss-Newton steps.
+
+    Args:
+        tie: the coordinates.
+        numbers: of the fitted grey box, in its units.
+        information: of its coordinates at these numbers, in plausible deviations ``(number, number)``.
+        prior: weight of the guess.
+    """
+    table, theta, damping = tie.parts.table, tie.begin.copy(), 1.0
+    slope = np.where(table.positive, numbers * table.width, table.width)
+
+    def residual(at: Doubles) -> Doubles:
+        return coordinates(table, tie.numbers(at), numbers)
+
+    def cost(at: Doubles) -> float:
+        apart = residual(at)
+        return float(apart @ information @ apart + prior * at @ at)
+
+    least = cost(theta)
+    for _ in range(MOST_ITERATIONS):
+        # Slopes of the coordinates at where the machine is now, not at where the fitted numbers are.
+        now = np.where(table.positive, tie.numbers(theta) * table.width, slope)
+        jacobian = tie.slopes(theta) / now[:, None]
+        pull = jacobian.T @ information @ residual(theta) + prior * theta
+        system = jacobian.T @ information @ jacobian + prior * np.eye(len(theta))
+        before = least
+        while damping < MOST_DAMPING:
+            scale = np.diag(damping * np.maximum(np.diag(system), ENOUGH))
+            tried = theta - np.linalg.solve(system + scale, pull)
+            if (new := cost(tried)) < least:
+                theta, least, damping = tried, new, max(damping / 5.0, LEAST_DAMPING)
+                break
+            damping *= 4.0
+        if before - least <= ENOUGH * max(least, ENOUGH):
+            break
+    return theta
+
+
+def deviations(information: Doubles) -> Doubles:
+    """Deviations that the data leave of coordinates whose plausible ones are 1."""
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(information))))))
+
+
+def kept_back(theta: Doubles, information: Doubles, back: NDArray[np.bool_]) -> Doubles:
+    """Where the other coordinates go once some are set back to the guess: the conditional optimum of the quadratic.
+
+    Args:
+        theta: optimum of all.
+        information: there.
+        back: coordinates that are set back to zero.
+    """
+    system, rest = information + np.eye(len(theta)), ~back
+    moved = theta.copy()
+    moved[back] = 0.0
+    moved[rest] += np.linalg.solve(system[np.ix_(rest, rest)], system[np.ix_(rest, back)] @ theta[back])
+    return moved

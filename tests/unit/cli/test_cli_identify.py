@@ -1,0 +1,98 @@
+"""``edp identify``: from logs to a machine file that ``edp simulate`` takes, and what it refuses."""
+
+import numpy as np
+import pytest
+
+from edp.config.twin import load_twin_experiment
+from edp.logs import read_recording, write_recording
+from edp.logs.source import DataSource
+from edp.sim.data_set import SimulationOrder, simulate_data_set
+from edp.sim.machine.machine_files import load_machine
+from edp.storage import read_json
+from edp.workflows.twin import train_twin
+
+SMALL = (
+    *("twin.fit.lengths_s=[0.1]", "twin.fit.rounds=[2]", "twin.fit.starts=1", "twin.fit.ticks=400"),
+    *("twin.fit.validation_s=1", "twin.fit.validation_runs=2", "twin.inertia_degree=1", "twin.potential_degree=3"),
+    *(
+        "judge.seconds=2",
+        "judge.starts=1",
+        "judge.at_s=[1, 2]",
+        "judge.calibration_starts=2",
+        'judge.floors=["static"]',
+    ),
+)
+WORDS = [word for change in SMALL for word in ("--set", change)]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fronts")
+    simulate_data_set(folder, SimulationOrder(minutes=2.0, recordings=5, seed=1), workers=1)
+    return folder
+
+
+def test_a_machine_file_is_written_that_simulates_and_says_what_is_told(edp, logs, tmp_path):
+    file = tmp_path / "mine.toml"
+    ended = edp("identify", logs, "--out", file, *WORDS, "--json")
+    assert ended.code == 0, ended.err
+    machine = load_machine(str(file))
+    assert machine.name == "mine"
+    base = load_machine("M22")
+    assert (machine.cylinders.bore, machine.boom_cylinder) == (base.cylinders.bore, base.boom_cylinder)
+    facts = read_json(tmp_path / "mine.json")
+    assert set(facts["models"]) == {"identified machine", "machine M22", "grey box", "static map"}
+    rows = {row["label"]: row for row in facts["numbers"]}
+    assert len(rows) == len(ended.json["numbers"])
+    kept = [row for row in rows.values() if not row["told"] and not row["label"].startswith("bodies")]
+    # Port reliefs open in no free move of 24 s.
+    assert not rows["valves.port_relief_head[bucket]"]["told"]
+    assert all(row["value"] == pytest.approx(row["base"], rel=1e-6) for row in kept)
+    text = file.read_text()
+    assert "kept, not told by the logs" in text
+    assert "valves.meter_in_extend" not in text
+    # The simulator itself, driven by the commands from measured starts, follows its own recordings.
+    own = facts["models"]["machine M22"]
+    assert own["velocity_mae"]["mean"] < 1.0
+    assert own["stroke_error"][-1]["mean"] < 1.0
+    assert edp("simulate", tmp_path / "data", "--machine", file, "--minutes", 0.05, "--recordings", 1).code == 0
+
+
+def test_a_run_of_a_grey_box_is_taken_and_one_of_another_kind_refused(edp, logs, tmp_path):
+    for kind, file in (("greybox", "grey"), ("static", "map")):
+        settings = [f"twin.kind={kind}", *(word for word in SMALL if kind == "greybox" or "twin." not in word)]
+        train_twin(DataSource.of(logs), load_twin_experiment(None, settings), tmp_path / file)
+    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", "--run", tmp_path / "grey")
+    assert ended.code == 0, ended.err
+    assert "of 114 numbers are told by the logs" in ended.out
+    assert "next: edp simulate" in ended.out
+    ended = edp("identify", logs, "--out", tmp_path / "other.toml", "--run", tmp_path / "map")
+    assert ended.code == 1
+    assert "holds a twin of kind 'static'" in ended.err
+    assert not (tmp_path / "other.toml").exists()
+    ended = edp("identify", logs, "--out", tmp_path / "other.toml", "--run", tmp_path / "grey", *WORDS)
+    assert "a run keeps its own" in " ".join(ended.err.split())
+
+
+def test_logs_and_machines_that_do_not_fit_are_refused_and_nothing_is_written(edp, logs, tmp_path):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for path in sorted(logs.glob("*.parquet"))[:4]:
+        recording = read_recording(path)
+        names = [name for name in recording.channel_names if not name.startswith(("CylPressures", "PumpPressure"))]
+        columns = tuple(recording.channels[recording.index(name)] for name in names)
+        values = np.ascontiguousarray(recording.select(names))
+        write_recording(
+            type(recording)(recording.name, columns, values, recording.rate_hz, recording.source), bare / path.name
+        )
+    cases = [
+        ((bare, "--out", tmp_path / "a.toml"), "0 pressures of the boom cylinder"),
+        ((logs, "--out", tmp_path / "a.toml", "--machine", "C14"), "goes from"),
+        ((logs, "--out", tmp_path / "a.txt"), "a machine file ends in .toml"),
+        ((logs, "--out", tmp_path / "a.toml", "--machine", "M23"), "unknown machine 'M23'"),
+    ]
+    for words, message in cases:
+        ended = edp("identify", *words, *WORDS)
+        assert ended.code == 1
+        assert message in " ".join(ended.err.split())
+    assert not [path for path in tmp_path.iterdir() if path.suffix]

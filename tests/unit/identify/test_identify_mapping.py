@@ -1,0 +1,210 @@
+"""From machine to grey box and back: every number to rounding, bodies by inertia and gravity, files as read."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError, DataError
+from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.numbers import KNOTS, Travel, number_table
+from edp.signals import VOCABULARY, Channel, Kind
+from edp.sim.machine.machine_files import load_machine, parse_machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import dynamics
+from edp.sim.physics.valve import opening
+from edp.workflows.identify.bodies import (
+    Poses,
+    base_parameters,
+    grey_load,
+    load_by_base,
+    realised,
+    solved_base,
+)
+from edp.workflows.identify.elements import check_strokes, excavator_elements, full_commands
+from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS, guesses, with_values
+from edp.workflows.identify.machine_text import machine_text
+from edp.workflows.identify.mapping import GreyParts, grey_numbers
+from edp.workflows.identify.tie import MachineTie, coordinates, deviations, kept_back, nearest
+
+M22 = load_machine("M22")
+PILOTS = ("BmUp", "BmDwn", "AmIn", "AmOut", "BktIn", "BktOut")
+PRESSURES = tuple(f"CylPressures_{i}" for i in (1, 2, 3, 5, 6, 7))
+
+
+def channels(commands=(*PILOTS, *(f"{name}Conf" for name in PILOTS)), pressures=(*PRESSURES, "PumpPressure_1")):
+    named = [tuple(VOCABULARY[name] for name in names) for names in (commands, pressures)]
+    speeds, strokes = (tuple(VOCABULARY[f"{name}_{i}"] for i in (1, 2, 3)) for name in ("CylVels", "CylStroke"))
+    return TwinChannels(named[0], speeds, strokes, named[1], 100.0)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    elements = excavator_elements(channels(), M22)
+    travels = [Travel(0.0, stroke, 0.3, (30.0, 30.0)) for stroke in M22.cylinders.stroke]
+    table = number_table(elements, travels, [30.0, 30.0], (2, 4))
+    return GreyParts(table, (0, 2, 4), (1, 3, 5), (1.0,) * 6, 52.0)
+
+
+def other_machine(seed=0):
+    """M22 with every identified number changed by up to some ten percent; no regeneration of its own is zero."""
+    shift = np.minimum([number.width for number in MACHINE_NUMBERS], 0.5) * np.random.default_rng(seed).normal(
+        size=len(MACHINE_NUMBERS)
+    )
+    # A pump that is asked for more than all gives no more.
+    shift = [-abs(s) if "pump_demand" in n.key else s for n, s in zip(MACHINE_NUMBERS, shift, strict=True)]
+    return with_values(M22, guesses(M22) * np.exp(0.3 * np.array(shift)))
+
+
+def test_numbers_of_a_grey_box_made_from_a_machine_map_back_to_it(parts):
+    machine = other_machine()
+    tie = MachineTie.of(M22, parts, parts.table.nominal[parts.load])
+    numbers = grey_numbers(machine, parts, tie.load)
+    theta = nearest(tie, numbers, 1e4 * np.eye(len(numbers)), prior=0.0)
+    again, truth = (np.array([n.of(m) for n in MACHINE_NUMBERS]) for m in (tie.machine(theta), machine))
+    assert np.abs(again / truth - 1.0).max() < 1e-9
+
+
+def test_what_the_data_do_not_tell_stays_at_the_guess(parts):
+    machine, tie = other_machine(1), MachineTie.of(M22, parts, parts.table.nominal[parts.load])
+    numbers = grey_numbers(machine, parts, tie.load)
+    # Only dead bands and openings of the boom are told.
+    told = np.zeros(len(numbers))
+    told[parts.table.valve_at[0, at.BAND] : parts.table.valve_at[0, at.BAND] + 12] = 1e6
+    theta = nearest(tie, numbers, np.diag(told))
+    found = {n.label: n.of(tie.machine(theta)) for n in MACHINE_NUMBERS}
+    truth = {n.label: n.of(machine) for n in MACHINE_NUMBERS}
+    base = {n.label: n.of(M22) for n in MACHINE_NUMBERS}
+    for label in ("valves.dead_band_extend[boom]", "valves.meter_in_extend[boom]", "valves.meter_out_extend[boom]"):
+        assert found[label] == pytest.approx(truth[label], rel=1e-3)
+    for label in ("valves.meter_in_extend[arm]", "friction.viscous[boom]", "pumps.max_flow"):
+        assert found[label] == pytest.approx(base[label])
+
+
+def test_a_number_set_back_moves_those_that_make_up_for_it():
+    information = np.array([[50.0, 49.0], [49.0, 50.0]])
+    theta = np.array([0.5, -0.5])
+    moved = kept_back(theta, information, np.array([False, True]))
+    # What matters is the sum, which the first one now gives alone, but for what was thought before.
+    assert moved == pytest.approx([0.5 + 49.0 / 51.0 * -0.5, 0.0])
+    assert deviations(np.diag([0.0, 99.0])) == pytest.approx([1.0, 0.1])
+
+
+def test_opening_curves_and_areas_are_those_of_the_simulator(parts):
+    table, numbers = parts.table, grey_numbers(M22, parts, parts.table.nominal[parts.load])
+    axes, _ = pack(M22)
+    assert numbers[table.actuator_at + at.HEAD_AREA] == pytest.approx(axes[:, 5])
+    first = table.valve_at[2, at.INTO]
+    curve = np.concatenate([[0.0], np.cumsum(numbers[first : first + len(KNOTS) - 1])])
+    band = M22.valves.dead_band_extend[1]
+    areas = [opening(band + (1.0 - band) * r, band) for r in KNOTS]
+    flow, bar = M22.valves.meter_in_extend[1]
+    # L/min at bar to m^3/s/MPa^0.5
+    assert curve == pytest.approx(np.array(areas) * flow / 6e4 / np.sqrt(bar * 1e5) * 1e3)
+
+
+def test_commands_that_reach_half_of_the_full_pilot_see_half_of_the_curve(parts):
+    half = replace(parts, reach=(0.5,) * 6)
+    load = parts.table.nominal[parts.load]
+    whole, part = (grey_numbers(M22, which, load) for which in (parts, half))
+    table = parts.table
+    band, first = table.valve_at[0, at.BAND], table.valve_at[0, at.INTO]
+    assert part[band] == pytest.approx(2.0 * whole[band])
+    total, share = (values[first : first + len(KNOTS) - 1].sum() for values in (whole, part))
+    assert share / total == pytest.approx(opening(0.5, M22.valves.dead_band_extend[0]))
+
+
+@pytest.fixture(scope="module")
+def poses():
+    strokes = np.random.default_rng(3).uniform(0.05, 0.95, (60, 3)) * np.array(M22.cylinders.stroke)
+    return Poses.of(M22, strokes)
+
+
+def test_inertia_and_gravity_are_linear_in_the_nine_numbers(poses):
+    by_torque, by_inertia = load_by_base(poses, M22.bodies.length, M22.gravity)
+    nine, (axes, _) = base_parameters(M22.bodies), pack(M22)
+    mass, torque = np.empty((3, 3)), np.empty(3)
+    for i, psi in enumerate(poses.angles):
+        dynamics.mass_matrix(psi, axes, mass)
+        dynamics.gravity_torque(psi, axes, M22.gravity, torque)
+        assert by_torque[i] @ nine == pytest.approx(torque, rel=1e-12, abs=1e-8)
+        assert by_inertia[i] @ nine == pytest.approx(mass, rel=1e-12, abs=1e-8)
+
+
+def test_bodies_come_back_from_inertia_and_gravity(poses):
+    by_torque, by_inertia = load_by_base(poses, M22.bodies.length, M22.gravity)
+    nine = base_parameters(M22.bodies)
+    assert solved_base(by_torque @ nine, by_inertia @ nine, poses, M22) == pytest.approx(nine, rel=1e-9)
+    bodies = realised(nine, M22)
+    assert np.array(bodies.inertia) == pytest.approx(M22.bodies.inertia, rel=1e-6)
+    heavy = replace(M22, bodies=replace(M22.bodies, mass=(2500.0, 700.0, 1200.0), com_y=(0.4, 0.2, 0.2)))
+    # Other masses, the same motion; a guess that is far off changes what the poses tell by little.
+    assert base_parameters(realised(nine, heavy)) == pytest.approx(nine)
+    assert solved_base(by_torque @ nine, by_inertia @ nine, poses, heavy)[[0, 2, 4]] == pytest.approx(
+        nine[[0, 2, 4]], rel=1e-3
+    )
+    with pytest.raises(ConfigError, match="no rigid bodies have the joint inertia and gravity torques of the logs"):
+        realised(nine * np.array([1, 1, 1, 1, 1, 1, 1, 1, 0.05]), M22)
+
+
+def test_the_load_of_a_grey_box_is_read_as_forces_and_masses(parts, poses):
+    """One potential and one inertia whose values are known: U = 0.01 z_1, L = 0.1 on the diagonal."""
+    table, middle = parts.table, np.array(M22.cylinders.stroke) / 2
+    load = np.zeros(len(table.numbers) - table.inertia_at)
+    for entry in (0, 2, 5):
+        load[entry * table.inertia_terms] = 0.1
+    load[table.potential_at - table.inertia_at] = 0.01
+    torque, inertia = grey_load(table, load, (middle, 1.0 / middle), poses)
+    assert torque[:, 0] == pytest.approx(1e4 / middle[0] * poses.levers[:, 0])
+    assert np.abs(torque[:, 1:]).max() == 0.0
+    assert np.diagonal(inertia, axis1=1, axis2=2) == pytest.approx(1e4 * poses.levers**2)
+
+
+def test_the_text_of_a_machine_is_read_back_as_the_machine():
+    machine = replace(other_machine(2), description='a "quoted" text')
+    text = machine_text(machine, ["from logs\nname = 'x'"], {("pumps", "relief"): "1 to 2\n[valves]"})
+    again = parse_machine(text, "text")
+    values, truth = (np.array([n.of(m) for n in MACHINE_NUMBERS]) for m in (again, machine))
+    assert values == pytest.approx(truth, rel=1e-5)
+    assert again.description == machine.description
+    assert "  # 1 to 2 [valves]\n" in text
+
+
+def test_coordinates_are_plausible_deviations(parts):
+    table = parts.table
+    moved = table.values(np.full(len(table.numbers), 0.5))
+    expected = np.where(table.positive, 0.5 / table.width, 0.5)
+    assert coordinates(table, moved, table.nominal) == pytest.approx(expected)
+
+
+def test_logs_without_second_spools_have_none():
+    elements = excavator_elements(channels(PILOTS, PRESSURES), M22)
+    assert [valve.name for valve in elements.valves] == ["boom", "arm", "bucket"]
+    assert [pump.pressure for pump in elements.pumps] == ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("logged", "message"),
+    [
+        (channels(pressures=PRESSURES[:5]), "1 pressures of the bucket cylinder; those of head and rod must be"),
+        (channels(commands=PILOTS[:4]), "0 commands of the bucket cylinder"),
+        (replace(channels(), strokes=()), "3 cylinders and no strokes"),
+    ],
+)
+def test_logs_that_lack_a_channel_are_refused(logged, message):
+    with pytest.raises(DataError, match=message):
+        excavator_elements(logged, M22)
+
+
+def test_commands_that_are_no_pilots_are_refused():
+    logged = channels()
+    logged = replace(logged, commands=(Channel("BmUp", Kind.CURRENT), *logged.commands[1:]))
+    with pytest.raises(DataError, match="command 'BmUp' is of kind current"):
+        full_commands(logged, excavator_elements(channels(), M22), M22)
+
+
+def test_strokes_beyond_those_of_the_machine_are_refused():
+    high = np.array([1.2, 1.6, 1.0])
+    with pytest.raises(ConfigError, match=r"goes from 0 to 1\.6 m in the logs, but the arm cylinder of machine M22"):
+        check_strokes(channels().strokes, np.zeros(3), high, M22)
