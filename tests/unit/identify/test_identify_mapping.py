@@ -9,11 +9,12 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.numbers import KNOTS, Travel, number_table
+from edp.networks.twin.grey.steps import GAMMA
 from edp.signals import VOCABULARY, Channel, Kind
 from edp.sim.machine.machine_files import load_machine, parse_machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import dynamics
-from edp.sim.physics.valve import opening
+from edp.sim.physics.valve import opening, pilot_half_step, spool_filters, spool_half_step
 from edp.workflows.identify.bodies import (
     Poses,
     base_parameters,
@@ -101,7 +102,10 @@ def test_opening_curves_and_areas_are_those_of_the_simulator(parts):
     areas = [opening(band + (1.0 - band) * r, band) for r in KNOTS]
     flow, bar = M22.valves.meter_in_extend[1]
     # L/min at bar to m^3/s/MPa^0.5
-    assert curve == pytest.approx(np.array(areas) * flow / 6e4 / np.sqrt(bar * 1e5) * 1e3)
+    full = flow / 6e4 / np.sqrt(bar * 1e5) * 1e3
+    # The nearest polygon has corners below a convex curve, since its chords lie above.
+    assert np.abs(curve / full - areas).max() < 0.02
+    assert (curve[1:] / full < areas[1:]).all()
 
 
 def test_commands_that_reach_half_of_the_full_pilot_see_half_of_the_curve(parts):
@@ -112,7 +116,7 @@ def test_commands_that_reach_half_of_the_full_pilot_see_half_of_the_curve(parts)
     band, first = table.valve_at[0, at.BAND], table.valve_at[0, at.INTO]
     assert part[band] == pytest.approx(2.0 * whole[band])
     total, share = (values[first : first + len(KNOTS) - 1].sum() for values in (whole, part))
-    assert share / total == pytest.approx(opening(0.5, M22.valves.dead_band_extend[0]))
+    assert share / total == pytest.approx(opening(0.5, M22.valves.dead_band_extend[0]), rel=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -208,3 +212,29 @@ def test_strokes_beyond_those_of_the_machine_are_refused():
     high = np.array([1.2, 1.6, 1.0])
     with pytest.raises(ConfigError, match=r"goes from 0 to 1\.6 m in the logs, but the arm cylinder of machine M22"):
         check_strokes(channels().strokes, np.zeros(3), high, M22)
+
+
+def test_the_chain_of_lags_moves_as_the_spools_of_the_simulator(parts):
+    """Steps of both, written out: the grey box's as its compiled code moves valves, the simulator's at 1 ms."""
+    numbers, places = grey_numbers(M22, parts, parts.table.nominal[parts.load]), parts.table.valve_at[2]
+    delay, first, second = (numbers[places[k]] for k in (at.DELAY, at.PILOT_LAG, at.SPOOL_LAG))
+    ticks, whole = 40, int(delay / 0.01)
+    state, grey = np.zeros(4), []
+    for t in range(ticks):
+        goal = float(t > whole) + (t == whole) * (1.0 - (delay / 0.01 - whole))
+        for h in (GAMMA * 0.01, (1.0 - GAMMA) * 0.01):
+            for k, lag in enumerate((first, first, second, second)):
+                ahead = goal if k == 0 else state[k - 1]
+                state[k] = ahead + (state[k] - ahead) * np.exp(-h / lag)
+        grey.append(state[3])
+    filters, valves, sim = spool_filters(M22, 5e-4), np.zeros((6, 5)), []
+    for n in range(10 * ticks):
+        demand = np.full(6, float(n + 0.5 >= 1e3 * M22.valves.dead_time[1]))
+        for _ in range(2):
+            pilot_half_step(demand, filters, 0.0, valves)
+            spool_half_step(filters, valves)
+        sim.append(valves[1, 3])
+    apart = np.array(grey) - np.array(sim[9::10])
+    assert np.abs(apart).max() < 0.02
+    # The same delay: what lies between the two curves adds up to nothing.
+    assert abs(apart.sum() * 0.01) < 5e-4

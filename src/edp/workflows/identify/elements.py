@@ -135,7 +135,8 @@ def parts_of(twin: GreyTwin, elements: Elements, machine: Machine, celsius: floa
             f"commands of valve '{elements.valves[far[0]].name}' reach {reach[far[0]]:.3g} of the full pilot of "
             f"machine {machine.name} ({full[far[0]]:.4g} in SI units); correct valves.pilot_pressure of --machine"
         )
-    return GreyParts(twin.table, places[0], places[1], reach, celsius)
+    tick_s, steps = twin.time
+    return GreyParts(twin.table, places[0], places[1], reach, celsius, tick_s / steps)
 
 
 def check_strokes(channels: Sequence[Channel], low: np.ndarray, high: np.ndarray, machine: Machine) -> None:

@@ -3,8 +3,11 @@
 The grey box (`edp.networks.twin.grey`) has the simulator's equations but for its linkage, so most numbers are the same
 in other units. What differs:
 
-- opening curves have free knots; the simulator's are k r (0.25 + 0.75 r), taken at the knots;
-- a pilot is two equal lags; the simulator's has a damping of 0.9, and the same delay, 2 zeta / omega;
+- opening curves are polygons with free corners; of the simulator's, k r (0.25 + 0.75 r), the nearest polygon is taken
+  (the chords of a convex curve all lie above it);
+- a pilot is two equal lags, the simulator's has a damping of 0.9; and each lag behind another one reads where that is
+  at the end of a step, so the chain leads by half a step three times. Shares of the lags are those with which spool
+  positions of logs agree best; the dead time makes the delay the same;
 - pumps ask for and deliver their flow behind the volumetric efficiency, which no log tells apart from it;
 - bulk modulus, leakage and viscous friction are those at the oil's temperature of the logs.
 """
@@ -18,12 +21,17 @@ from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as grey
 from edp.networks.twin.grey.numbers import KNOTS, NumberTable
+from edp.networks.twin.grey.steps import GAMMA
 from edp.sim.machine import layout as sim
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics.valve import PILOT_DAMPING
 
 Doubles = NDArray[np.float64]
+PILOT_SHARE, SPOOL_SHARE = 0.86, 0.95
+"""Lags of the grey box by 1 / omega of the simulator's filters: least squares on the spools of a family member."""
+FINE = 201
+"""Points of a spool's travel on which polygons are fitted."""
 DEMAND_START, DEMAND_SPAN = 0.1, 0.75
 """Of the simulator's pumps (`edp.sim.physics.pump.demand`): the pilot at which they begin, and its way to full."""
 
@@ -38,6 +46,7 @@ class GreyParts:
         conflux: second valve of each cylinder, -1 where it has none.
         reach: what a full command of each valve is, as a share of the machine's full pilot ``(valve,)``.
         celsius: of the oil in the logs.
+        step_s: of the grey box's solver.
     """
 
     table: NumberTable
@@ -45,6 +54,7 @@ class GreyParts:
     conflux: tuple[int, int, int]
     reach: tuple[float, ...]
     celsius: float
+    step_s: float = 0.01
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
@@ -76,7 +86,7 @@ def grey_numbers(machine: Machine, parts: GreyParts, load: Doubles) -> Doubles:
         _put_cylinder(si, table.actuator_at[i], axes[i], plant)
         for second, j in enumerate((parts.primary[i], parts.conflux[i])):
             if j >= 0:
-                _put_valve(si, table.valve_at[j], (machine, i, bool(second)), axes[i], parts.reach[j])
+                _put_valve(si, table.valve_at[j], (machine, i, bool(second)), axes[i], (parts.reach[j], parts.step_s))
     for a in table.pump_at:
         si[a + grey.FLOW] = plant[sim.EFFICIENCY] * plant[sim.MAX_FLOW]
         si[a + grey.LEAST], si[a + grey.LAG] = plant[sim.MIN_DISPLACEMENT], plant[sim.PUMP_TIME]
@@ -107,15 +117,19 @@ def _put_cylinder(si: Doubles, a: int, axis: Doubles, plant: Doubles) -> None:
 
 
 def _put_valve(
-    si: Doubles, places: NDArray[np.int64], which: tuple[Machine, int, bool], axis: Doubles, reach: float
+    si: Doubles, places: NDArray[np.int64], which: tuple[Machine, int, bool], axis: Doubles, clock: tuple[float, float]
 ) -> None:
-    """Numbers of one spool; `which`: machine, cylinder, and whether it is the second spool."""
+    """Numbers of one spool; `which`: machine, cylinder, and whether it is the second spool; `clock`: reach and step."""
     machine, i, second = which
+    reach, step_s = clock
     valves = machine.valves
-    si[places[grey.DELAY]] = valves.dead_time[i] + (valves.conflux_extra_dead_time if second else 0.0)
-    si[places[grey.PILOT_LAG]] = PILOT_DAMPING / (2.0 * np.pi * valves.pilot_frequency[i])
     frequency = (valves.conflux_spool_frequency if second else valves.spool_frequency)[i]
-    si[places[grey.SPOOL_LAG]] = 1.0 / (2.0 * np.pi * frequency)
+    pilot, spool = (1.0 / (2.0 * np.pi * hertz) for hertz in (valves.pilot_frequency[i], frequency))
+    lags = PILOT_SHARE * pilot, SPOOL_SHARE * spool
+    dead_time = valves.dead_time[i] + (valves.conflux_extra_dead_time if second else 0.0)
+    left = 2.0 * (PILOT_DAMPING * pilot + spool - sum(lags))
+    si[places[grey.DELAY]] = dead_time + left + _lead(lags, step_s)
+    si[places[grey.PILOT_LAG]], si[places[grey.SPOOL_LAG]] = lags
     if second:
         bands = (sim.CONFLUX_DEAD_BAND_EXTEND, sim.CONFLUX_DEAD_BAND_RETRACT)
         into = (sim.CONFLUX_EXTEND, sim.CONFLUX_RETRACT)
@@ -127,16 +141,35 @@ def _put_valve(
         band = axis[bands[d]]
         si[places[grey.BAND + d]] = band / reach
         si[places[grey.GAIN + d]] = axis[demand[d]]
-        # Where the knots lie on the simulator's spool: those of the grey box count from its own full command.
-        spool = band + (reach - band) * KNOTS
+        # Where the simulator's spool is: the curve of the grey box counts from its own full command.
+        spool = band + (reach - band) * np.linspace(0.0, 1.0, FINE)
         r = np.clip((spool - band) / (1.0 - band), 0.0, 1.0)
-        curve = np.diff(r * (0.25 + 0.75 * r))
+        curve = POLYGON @ (r * (0.25 + 0.75 * r))
         for first, column in ((grey.INTO, into[d]), (grey.OUT_OF, out[d])):
             at = places[first + d]
             if at >= 0:
                 si[at : at + len(curve)] = axis[column] * curve
         if places[grey.REGENERATION + d] >= 0:
             si[places[grey.REGENERATION + d]] = axis[again[d]] / axis[out[d]]
+
+
+def _polygon() -> Doubles:
+    """Increments between the knots of the polygon through zero that is nearest to values on a fine grid."""
+    grid = np.linspace(0.0, 1.0, FINE)
+    rising = np.clip((grid[:, None] - KNOTS[:-1]) / np.diff(KNOTS), 0.0, 1.0)
+    return np.asarray(np.linalg.pinv(rising))
+
+
+POLYGON = _polygon()
+
+
+def _lead(lags: tuple[float, float], step_s: float) -> float:
+    """Time by which the grey box's chain of lags leads: the second lag of the pilot and both of the spool."""
+    first, second = lags
+    # Means over the two parts of a step; see the delay of a lag that reads the end of each: h / (exp(h / lag) - 1).
+    parts = np.array([GAMMA, 1.0 - GAMMA]) * step_s
+    half, third = (parts**2).sum() / step_s / 2.0, (parts**3).sum() / step_s / 12.0
+    return float(3.0 * half - third * (1.0 / first + 2.0 / second))
 
 
 def _put_circuit(si: Doubles, c: int, plant: Doubles, reach: float) -> None:
