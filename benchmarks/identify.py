@@ -88,7 +88,7 @@ def compared(truth: Machine, guess: Machine, result: Identified) -> dict[str, An
             right = true[row.label]
             errors = {"error": row.value / right - 1.0, "guess_error": row.base / right - 1.0}
             inside = row.low <= right <= row.high
-            numbers.append({"label": row.label, "group": row.group, "told": row.told, "inside": inside, **errors})
+            numbers.append({"label": row.label, "group": row.group, "excited": row.excited, "inside": inside, **errors})
     joints = [
         {"joint": joint, "inertia": inertia, "gravity": gravity, "guess_inertia": first, "guess_gravity": second}
         for joint, (inertia, gravity), (first, second) in zip(
@@ -128,9 +128,9 @@ def verdicts(details: dict[str, Any], quick: bool) -> list[Any]:
     """Of each group that the goal names, the share of told numbers within 10 % of the truth; errors of the joints."""
     result = []
     for group, rows in groups_of(details).items():
-        told = [row for row in rows if row["told"]]
-        if group in GOALS and told:
-            share = float(np.mean([abs(row["error"]) <= NEAR for row in told]))
+        excited = [row for row in rows if row["excited"]]
+        if group in GOALS and excited:
+            share = float(np.mean([abs(row["error"]) <= NEAR for row in excited]))
             result.append(verdict(f"{group}: told numbers within 10 %", share, 1.0, ">= 1", "share", quick))
     for what in ("inertia", "gravity"):
         worst = max(joint[what] for entry in details.values() for joint in entry["joints"])
@@ -146,12 +146,12 @@ def show(name: str, entry: dict[str, Any]) -> None:
     print(f"\n{name}: {entry['seconds']:.0f} processor s")
     rows = []
     for group, numbers in groups_of({name: entry}).items():
-        told = [row for row in numbers if row["told"]]
-        errors = [abs(row["error"]) for row in told]
-        first = [abs(row["guess_error"]) for row in told]
-        cells = [float(np.median(errors)), max(errors), float(np.median(first))] if told else ["-", "-", "-"]
+        excited = [row for row in numbers if row["excited"]]
+        errors = [abs(row["error"]) for row in excited]
+        first = [abs(row["guess_error"]) for row in excited]
+        cells = [float(np.median(errors)), max(errors), float(np.median(first))] if excited else ["-", "-", "-"]
         near = sum(error <= NEAR for error in errors)
-        rows.append([group, f"{len(told)} of {len(numbers)}", near, *cells, sum(row["inside"] for row in told)])
+        rows.append([group, f"{len(excited)} of {len(numbers)}", near, *cells, sum(row["inside"] for row in excited)])
     heads = ["group", "told", "within 10 %", "median error", "largest", "guess: median", "in the interval"]
     table(heads, rows)
     table(

@@ -68,9 +68,11 @@ def number_table(result: Identified) -> None:
     """Print a row a number: the guess, what was identified and its interval, or that the logs do not tell it."""
     rows = []
     for row in result.rows:
-        interval = f"{row.low:.3g} to {row.high:.3g}" if row.told else "kept: not told by the logs"
+        interval = f"{row.low:.3g} to {row.high:.3g}" if row.excited else "kept: not told by the logs"
         rows.append([row.label, row.unit, f"{row.base:.4g}", f"{row.value:.4g}", interval])
-    told = sum(row.told for row in result.rows)
+    excited = sum(row.excited for row in result.rows)
     table(
-        f"{told} of {len(rows)} numbers are told by the logs", ["", "unit", "guess", "identified", "about 95 %"], rows
+        f"{excited} of {len(rows)} numbers are told by the logs",
+        ["", "unit", "guess", "identified", "about 95 %"],
+        rows,
     )

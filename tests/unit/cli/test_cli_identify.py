@@ -44,10 +44,10 @@ def test_a_machine_file_is_written_that_simulates_and_says_what_is_told(edp, log
     assert set(facts["models"]) == {"identified machine", "machine M22", "grey box", "static map"}
     rows = {row["label"]: row for row in facts["numbers"]}
     assert len(rows) == len(ended.json["numbers"])
-    kept = [row for row in rows.values() if not row["told"] and not row["label"].startswith("bodies")]
+    unexcited = [row for row in rows.values() if not row["excited"] and not row["label"].startswith("bodies")]
     # Port reliefs open in no free move of 24 s.
-    assert not rows["valves.port_relief_head[bucket]"]["told"]
-    assert all(row["value"] == pytest.approx(row["base"], rel=1e-6) for row in kept)
+    assert not rows["valves.port_relief_head[bucket]"]["excited"]
+    assert all(row["value"] == pytest.approx(row["base"], rel=1e-6) for row in unexcited)
     text = file.read_text()
     assert "kept, not told by the logs" in text
     assert "valves.meter_in_extend" not in text

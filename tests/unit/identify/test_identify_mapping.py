@@ -71,16 +71,16 @@ def test_what_the_data_do_not_tell_stays_at_the_guess(parts):
     machine, tie = other_machine(1), MachineTie.of(M22, parts, parts.table.nominal[parts.load])
     numbers = grey_numbers(machine, parts, tie.load)
     # Only dead bands and openings of the boom are told.
-    told = np.zeros(len(numbers))
-    told[parts.table.valve_at[0, at.BAND] : parts.table.valve_at[0, at.BAND] + 12] = 1e6
-    theta = nearest(tie, numbers, np.diag(told))
-    found = {n.label: n.of(tie.machine(theta)) for n in MACHINE_NUMBERS}
+    excited = np.zeros(len(numbers))
+    excited[parts.table.valve_at[0, at.BAND] : parts.table.valve_at[0, at.BAND] + 12] = 1e6
+    theta = nearest(tie, numbers, np.diag(excited))
+    machine_found = {n.label: n.of(tie.machine(theta)) for n in MACHINE_NUMBERS}
     truth = {n.label: n.of(machine) for n in MACHINE_NUMBERS}
     base = {n.label: n.of(M22) for n in MACHINE_NUMBERS}
     for label in ("valves.dead_band_extend[boom]", "valves.meter_in_extend[boom]", "valves.meter_out_extend[boom]"):
-        assert found[label] == pytest.approx(truth[label], rel=1e-3)
+        assert machine_found[label] == pytest.approx(truth[label], rel=1e-3)
     for label in ("valves.meter_in_extend[arm]", "friction.viscous[boom]", "pumps.max_flow"):
-        assert found[label] == pytest.approx(base[label])
+        assert machine_found[label] == pytest.approx(base[label])
 
 
 def test_a_number_set_back_moves_those_that_make_up_for_it():

@@ -254,8 +254,8 @@ class Plant:
             psi = linkage.angle_at_stroke(i, within, self.axes, self.plant)
             self.state[at.PSI + i] = psi
             self.state[at.RATE + i] = velocities[i] / linkage.cylinder(i, psi, self.plant)[1]
-        known = np.isfinite(pressures)
-        self.state[at.HEAD : at.BRISTLE][known] = np.maximum(pressures[known], at.LOWEST_PRESSURE)
+        finite = np.isfinite(pressures)
+        self.state[at.HEAD : at.BRISTLE][finite] = np.maximum(pressures[finite], at.LOWEST_PRESSURE)
 
     def _advance(self, levers: Array, hand_s: float) -> Array:
         """Run with levers that the hand smooths at steps of `hand_s`; 0 for levers as they are."""

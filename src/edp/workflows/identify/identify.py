@@ -129,9 +129,9 @@ def identify(
     notes += _notes(parts)
     tell("fitting the machine itself to free runs")
     tie, theta, information = _refined(base, parts, fitted, (data, settings), on_event)
-    found, rows = _machine(tie, theta, information, (fitted.twin, data))
-    found = replace(found, name=_name(target), description=_description(base))
-    text = machine_text(found, _head(base, rows, notes), line_comments(rows))
+    machine_found, rows = _machine(tie, theta, information, (fitted.twin, data))
+    machine_found = replace(machine_found, name=_name(target), description=_description(base))
+    text = machine_text(machine_found, _head(base, rows, notes), line_comments(rows))
     try:
         # As a reader of the file will check it: what cannot be simulated is not written.
         written = parse_machine(text, target.name)
@@ -209,9 +209,9 @@ def _machine(
     """The machine of the coordinates, those that the logs do not tell set back to the guess; and a row of each."""
     twin, data = logs
     count, left = len(MACHINE_NUMBERS), deviations(information)
-    told = left[:count] < UNEXCITED
-    back = np.concatenate([~told, np.zeros(len(theta) - count, np.bool_)])
-    final = replace(tie, free=told)
+    excited = left[:count] < UNEXCITED
+    back = np.concatenate([~excited, np.zeros(len(theta) - count, np.bool_)])
+    final = replace(tie, free=excited)
     settled = kept_back(theta, information, back)
     machine, load = final.machine(settled), tie.load + tie.load_width * settled[count:]
     valves = machine.valves
@@ -229,7 +229,7 @@ def _machine(
     covariance = spread * tie.load_width * tie.load_width[:, None]
     nine, body = body_rows(tie.base, tie.parts, load, covariance, twin.wiring.z_of, poses)
     machine = replace(machine, bodies=realised(nine, tie.base))
-    return machine, number_rows(tie.base, machine, left[:count], told) + body
+    return machine, number_rows(tie.base, machine, left[:count], excited) + body
 
 
 def _check_strokes(channels: TwinChannels, data: Prepared, base: Machine) -> None:
@@ -306,9 +306,9 @@ def _description(base: Machine) -> str:
 
 
 def _head(base: Machine, rows: Sequence[IdentifiedNumber], notes: Sequence[str]) -> list[str]:
-    told = sum(row.told for row in rows)
+    excited = sum(row.excited for row in rows)
     return [
-        f"Identified from logs by edp identify: {told} of {len(rows)} numbers are told by them.",
+        f"Identified from logs by edp identify: {excited} of {len(rows)} numbers are told by them.",
         "Behind a number: an approximate 95 % interval (too narrow: errors of the structure are not in it), or that it",
         f"is kept. Numbers without a comment are those of machine {base.name}, bodies but for their lengths excepted.",
         *notes,

@@ -26,7 +26,7 @@ class MachineNumber:
     Attributes:
         section: table of the file.
         key: in it.
-        place: which cylinder; None for a number of the whole machine.
+        cylinder: which one; None for a number of the whole machine.
         group: of numbers that are judged together.
         width: plausible deviation of its logarithm from the guess.
         unit: of the value.
@@ -34,7 +34,7 @@ class MachineNumber:
 
     section: str
     key: str
-    place: int | None
+    cylinder: int | None
     group: str
     width: float
     unit: str
@@ -47,12 +47,12 @@ class MachineNumber:
     @property
     def label(self) -> str:
         """As messages and comments call it."""
-        return self.path + ("" if self.place is None else f"[{CYLINDERS[self.place]}]")
+        return self.path + ("" if self.cylinder is None else f"[{CYLINDERS[self.cylinder]}]")
 
     def of(self, machine: Machine) -> float:
         """Its value; of a rating the flow, of static friction what it exceeds the Coulomb friction by."""
         value = getattr(getattr(machine, self.section), self.key)
-        value = value if self.place is None else value[self.place]
+        value = value if self.cylinder is None else value[self.cylinder]
         value = value[0] if isinstance(value, tuple) else value
         excess = machine.friction.coulomb_fraction if (self.section, self.key) == STATIC else 0.0
         return float(value) - excess
@@ -133,7 +133,7 @@ def guesses(machine: Machine) -> Doubles:
 def _regeneration(machine: Machine, number: MachineNumber) -> float:
     """Flow of a small regeneration, L/min at the pressure difference that the file rates it at."""
     out = number.key.replace("regeneration", "meter_out")
-    (flow, bar), (_, own_bar) = (getattr(machine.valves, key)[number.place] for key in (out, number.key))
+    (flow, bar), (_, own_bar) = (getattr(machine.valves, key)[number.cylinder] for key in (out, number.key))
     return float(LEAST_REGENERATION * flow * np.sqrt(own_bar / bar))
 
 
@@ -148,11 +148,11 @@ def with_values(machine: Machine, values: Sequence[float] | Doubles) -> Machine:
     for number, value in zip(MACHINE_NUMBERS, values, strict=True):
         changed = sections.setdefault(number.section, {})
         old = changed.get(number.key, getattr(getattr(machine, number.section), number.key))
-        if number.place is None:
+        if number.cylinder is None:
             changed[number.key] = _rated(old, float(value))
         else:
             each = list(old)
-            each[number.place] = _rated(each[number.place], float(value))
+            each[number.cylinder] = _rated(each[number.cylinder], float(value))
             changed[number.key] = tuple(each)
     friction = sections["friction"]
     friction["static_fraction"] += friction["coulomb_fraction"]

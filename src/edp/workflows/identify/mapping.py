@@ -107,8 +107,8 @@ def _put_cylinder(si: Doubles, a: int, axis: Doubles, plant: Doubles) -> None:
         grey.STRIBECK: sim.STRIBECK, grey.BRISTLE: sim.SIGMA0, grey.BRISTLE_DAMPING: sim.SIGMA1,
         grey.STOP_HIGH: sim.STROKE, grey.STOP_STIFFNESS: sim.STOP_STIFFNESS,
     }  # fmt: skip
-    for place, column in same.items():
-        si[a + place] = axis[column]
+    for index, column in same.items():
+        si[a + index] = axis[column]
     si[a + grey.PISTON_LEAK] = axis[sim.PISTON_LEAK] * plant[sim.THINNING]
     si[a + grey.SPOOL_LEAK] = axis[sim.SPOOL_LEAK] * plant[sim.THINNING]
     si[a + grey.STATIC] = axis[sim.STATIC] - axis[sim.COULOMB]
@@ -177,8 +177,8 @@ def _put_circuit(si: Doubles, c: int, plant: Doubles, reach: float) -> None:
         grey.BULK: sim.BULK_MODULUS, grey.AIR: sim.AIR, grey.TANK: sim.TANK, grey.MAKE_UP: sim.ANTI_CAVITATION,
         grey.PORT_SLOPE: sim.PORT_SLOPE, grey.RELIEF_SLOPE: sim.RELIEF_SLOPE,
     }  # fmt: skip
-    for place, column in same.items():
-        si[c + place] = plant[column]
+    for index, column in same.items():
+        si[c + index] = plant[column]
     si[c + grey.POWER] = plant[sim.EFFICIENCY] * plant[sim.POWER_LIMIT]
     si[c + grey.PLAY] = plant[sim.HYSTERESIS] / reach
     si[c + grey.DEMAND_START], si[c + grey.DEMAND_SPAN] = DEMAND_START / reach, DEMAND_SPAN / reach

@@ -33,7 +33,7 @@ class IdentifiedNumber:
         value: identified; that of the guess where the logs do not tell it.
         low: lower end of an approximate 95 % interval; `high` the upper one.
         high: upper end.
-        told: whether the logs tell it.
+        excited: whether the logs tell it.
     """
 
     label: str
@@ -43,30 +43,30 @@ class IdentifiedNumber:
     value: float
     low: float
     high: float
-    told: bool
+    excited: bool
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
         return dict(vars(self))
 
 
-def number_rows(base: Machine, machine: Machine, left: Doubles, told: NDArray[np.bool_]) -> list[IdentifiedNumber]:
+def number_rows(base: Machine, machine: Machine, left: Doubles, excited: NDArray[np.bool_]) -> list[IdentifiedNumber]:
     """A row for each number of `MACHINE_NUMBERS`.
 
     Args:
         base: the guess.
         machine: the identified one.
         left: deviations that the data leave, as shares of the plausible ones ``(number,)``.
-        told: which numbers the logs tell.
+        excited: which numbers the logs tell.
     """
     rows = []
-    for number, share, known in zip(MACHINE_NUMBERS, left, told, strict=True):
+    for number, share, is_known in zip(MACHINE_NUMBERS, left, excited, strict=True):
         value, reach = number.of(machine), np.exp(NORMAL * share * number.width)
-        ends = (value / reach, value * reach) if known else (value, value)
+        ends = (value / reach, value * reach) if is_known else (value, value)
         rows.append(
             IdentifiedNumber(
                 number.label, number.group, number.unit, number.of(base), value, float(ends[0]), float(ends[1]),
-                bool(known),
+                bool(is_known),
             )
         )  # fmt: skip
     return rows
@@ -102,9 +102,9 @@ def body_rows(
     for i, name in enumerate(NAMES):
         reach, unit = NORMAL * float(left[i]), "kg m" if i < 6 else "kg m^2"
         ends = (float(nine[i]) - reach, float(nine[i]) + reach)
-        told = bool(left[i] < UNEXCITED * before[i])
+        excited = bool(left[i] < UNEXCITED * before[i])
         label = f"bodies.{name}"
-        rows.append(IdentifiedNumber(label, BODIES, unit, float(guess[i]), float(nine[i]), *ends, told))
+        rows.append(IdentifiedNumber(label, BODIES, unit, float(guess[i]), float(nine[i]), *ends, excited))
     return nine, rows
 
 
@@ -112,8 +112,8 @@ def line_comments(rows: Sequence[IdentifiedNumber]) -> dict[tuple[str, str], str
     """What stands behind each line of the machine's file."""
     comments: dict[tuple[str, str], list[str]] = {}
     for number, row in zip(MACHINE_NUMBERS, rows, strict=False):
-        name = "" if number.place is None else f"{CYLINDERS[number.place]} "
-        text = f"{row.low:.3g} to {row.high:.3g}" if row.told else "kept, not told by the logs"
+        name = "" if number.cylinder is None else f"{CYLINDERS[number.cylinder]} "
+        text = f"{row.low:.3g} to {row.high:.3g}" if row.excited else "kept, not told by the logs"
         comments.setdefault((number.section, number.key), []).append(f"{name}{text}")
     static = ("friction", "static_fraction")
     comments[static] = [f"less Coulomb: {text}" for text in comments[static]]
