@@ -92,6 +92,7 @@ def baseline_names(text: str) -> list[str]:
 def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | None, as_json: bool) -> None:
     """Judge a twin with a progress display, and print its scores."""
     from edp.cli.twin import ahead_table, coverage_table, score_table, situation_table
+    from edp.evaluation.guard import twin_beaten_by
     from edp.storage import read_object
     from edp.workflows.twin import evaluate_twin
     from edp.workflows.twin.judge_twin import SCORES
@@ -106,15 +107,20 @@ def evaluate_twin_run(run: Path, source: DataSource | None, predictor: Path | No
 
         folder = evaluate_twin(run, source, predictor, on_step)
     scores = read_object(folder / SCORES)
+    beaten = twin_beaten_by(scores["models"])
 
     def show() -> None:
+        if beaten is not None:
+            out.print(beaten.sentence(), style="bold red")
         score_table(scores["models"])
         for print_table in (coverage_table, situation_table, ahead_table):
             print_table(scores["models"]["twin"])
         out.print(f"scores in {folder / SCORES}")
         out.print(f"next: edp report {folder}")
 
-    emit(as_json, {"folder": str(folder), **scores}, show)
+    emit(as_json, {"folder": str(folder), "beaten_by": None if beaten is None else beaten.label, **scores}, show)
+    if beaten is not None:
+        raise typer.Exit(BEATEN)
 
 
 def run_evaluation(

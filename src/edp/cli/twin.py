@@ -32,6 +32,7 @@ def twin(
     Example: `edp twin data/m22 --out runs/twin`
     """
     from edp.config.twin import load_twin_experiment
+    from edp.evaluation.guard import twin_beaten_by
     from edp.workflows.twin import train_twin
 
     experiment = load_twin_experiment(config, changes)
@@ -39,9 +40,13 @@ def twin(
         display = FitDisplay(shown, as_json)
         trained = train_twin(source_of(data, signal_map, repair), experiment, folder, display.on_event, display.on_step)
     seconds = trained.bundle.provenance["seconds"]
+    beaten = twin_beaten_by(trained.scores)
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
+    facts["beaten_by"] = None if beaten is None else beaten.label
 
     def show() -> None:
+        if beaten is not None:
+            out.print(beaten.sentence(), style="bold red")
         score_table(trained.scores)
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
         if (folder / "datasheet.txt").is_file():

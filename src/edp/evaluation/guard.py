@@ -1,4 +1,4 @@
-"""Whether a simple baseline does better than the network after all, by the scores of held-out recordings."""
+"""Whether a simple baseline does better than a network or a twin after all, by the scores of held-out recordings."""
 
 from __future__ import annotations
 
@@ -8,30 +8,36 @@ from dataclasses import dataclass
 from typing import Any
 
 NETWORK = "network"
+TWIN = "twin"
+TWIN_ADVICE = "take that floor by twin.kind, another formulation, or more recordings with more motion"
 LEAST = 1e-3
 """Share of error below which two models count as equal: rounding and threads make as much."""
 
 
 @dataclass(frozen=True)
 class Beaten:
-    """A baseline with less error than the network.
+    """A baseline with less error than the network, or a floor with less than the twin.
 
     Attributes:
         label: how tables call it.
         less: by which share its error is less, over all outputs and horizons.
         outputs: targets on which it has less error, over all horizons.
+        judged: what it beats.
+        advice: what to do instead.
     """
 
     label: str
     less: float
     outputs: tuple[str, ...]
+    judged: str = "network"
+    advice: str = "train with the preset auto, or on more recordings"
 
     def sentence(self) -> str:
         """For the first line of what a person reads."""
         where = f" (on {', '.join(self.outputs)})" if self.outputs else ""
         return (
-            f"On the held-out recordings {self.label} has {100 * self.less:.1f} % less error than the network{where}: "
-            "do not use this network; train with the preset auto, or on more recordings."
+            f"On the held-out recordings {self.label} has {100 * self.less:.1f} % less error than the "
+            f"{self.judged}{where}: do not use this {self.judged}; {self.advice}."
         )
 
 
@@ -63,6 +69,39 @@ def beaten_by(scores: Mapping[str, Any]) -> Beaten | None:
     # Logarithms: halving one target's error and doubling another's cancel out.
     mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
     return worst if mean > LEAST else None
+
+
+def twin_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
+    """The floor that beats the twin by most on free runs; None where none does.
+
+    Compared is the geometric mean, over actuators, of the ratios of the velocities' errors and of the strokes' at each
+    time: a network that only follows for a second, or drifts for a minute, is seen by both.
+
+    Args:
+        models: scores by name, as ``free_run.json`` has them; the twin's is ``twin``.
+    """
+    own, better = _free_run_errors(models[TWIN]), []
+    for name, scores in models.items():
+        theirs = _free_run_errors(scores)
+        by_actuator = {
+            actuator: [math.log(a / b) for a, b in zip(errors, theirs[actuator], strict=True) if a > 0 and b > 0]
+            for actuator, errors in own.items()
+            if name != TWIN
+        }
+        ratios = [ratio for actuator in by_actuator.values() for ratio in actuator]
+        if ratios:
+            lost = tuple(name for name, logs in by_actuator.items() if sum(logs) > LEAST * len(logs))
+            mean = sum(ratios) / len(ratios)
+            better.append((mean, Beaten(name, 1.0 - math.exp(-mean), lost, TWIN, TWIN_ADVICE)))
+    mean, worst = max(better, key=lambda entry: entry[0], default=(0.0, None))
+    return worst if mean > LEAST else None
+
+
+def _free_run_errors(scores: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Of each actuator the error of its velocity, then of its stroke at each time."""
+    rows = [scores["velocity_mae"], *scores["stroke_error"]]
+    columns = zip(*(row["by_channel"].values() for row in rows), strict=True)
+    return dict(zip(scores["velocity_mae"]["by_channel"], map(list, columns), strict=True))
 
 
 def _logarithm(network: Mapping[str, Any], model: Mapping[str, Any], target: str, horizons: list[int]) -> float:

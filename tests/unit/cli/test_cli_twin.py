@@ -249,5 +249,7 @@ def test_a_log_of_positions_alone_of_two_kinds_has_a_table_an_actuator(edp, tmp_
     assert "deg/s" in result.out
     log = tmp_path / "logs" / "log_0.parquet"
     judged = edp("evaluate", run, "--data", log)
+    assert judged.code == 6  # a twin of six updates
+    assert "less error than the twin" in judged.out
     assert f"{names[0]}_velocity: its MAE" in judged.out
     assert edp("rollout", run, log, "--seconds", 2).code == 0

@@ -9,6 +9,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import DataError
 from edp.evaluation.ahead import ahead_scores, look_ahead, predictor_scores
 from edp.evaluation.free_run import FreeRunJudgeSpec, FreeRuns, free_run_scores, free_runs
+from edp.evaluation.guard import twin_beaten_by
 from edp.networks.twin.static_map import StaticMap
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators, sample_twin
@@ -176,3 +177,26 @@ def test_a_look_ahead_is_measured_up_to_its_moment_and_told_the_commands_after_i
     assert beside["velocities"]["twin"]["mean"] == pytest.approx(1e3 * errors[1], rel=1e-4)
     with pytest.raises(DataError, match="no recording has 508 ticks"):
         look_ahead(twin, [replace(part, inputs=part.inputs[:50], targets=part.targets[:50])], 7, first=500)
+
+
+def _scores(velocity, *strokes):
+    rows = [{"by_channel": {"boom": value}} for value in strokes]
+    return {"velocity_mae": {"by_channel": {"v": velocity}}, "stroke_error": rows}
+
+
+def test_a_twin_that_a_floor_beats_is_told_by_how_much():
+    beaten = twin_beaten_by(
+        {"twin": _scores(2.0, 1.0, 4.0), "static": _scores(2.0, 1.0, 0.5), "arx": _scores(1.9, 1, 4)}
+    )
+    assert beaten is not None
+    assert beaten.label == "static"
+    assert beaten.less == pytest.approx(0.5)  # a cube root of 1 * 1 * 8
+    assert beaten.outputs == ("v",)
+    assert (
+        "static has 50.0 % less error than the twin (on v): do not use this twin; take that floor" in beaten.sentence()
+    )
+
+
+def test_a_twin_ahead_of_its_floors_is_not_beaten():
+    assert twin_beaten_by({"twin": _scores(1.0, 1.0), "static": _scores(2.0, 1.0), "arx": _scores(0.0, 0.0)}) is None
+    assert twin_beaten_by({"twin": _scores(1.0, 1.0)}) is None
