@@ -1,5 +1,7 @@
 """Grey boxes: exact tangents, physics that must hold, elements that must connect, numbers that a fit finds again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -141,6 +143,44 @@ def test_a_fit_finds_a_machine_again(bench):
     # Nothing ran into a cushion of a stop, and no port relief opened.
     assert not rows["ram.head_relief"]["excited"]
     assert "(" in datasheet_text(list(rows.values()))
+
+
+def test_what_is_left_out_does_nothing_and_is_not_fitted(bench):
+    machine, runs = bench
+    parts = ("power_limit", "cushions", "play")
+    spec = replace(BENCH, without=parts)
+    scales = machine.scales
+    bare = spec.build(machine.channels, scales, {"numbers": machine.numbers.astype(np.float32), "full": machine.full})
+    names = [number.name for number in bare.table.numbers]
+    numbers = np.where(bare.table.width == 0.0, bare.table.nominal, machine.numbers)
+    bare = bare.with_numbers(numbers)
+    # As little as the equations with the parts in them do when those are out of reach.
+    far = machine.numbers.copy()
+    for name, value in (("power_limit", 1e4), ("cushion_least", 1.0), ("play", 1e-12)):
+        far[names.index(name)] = value
+    commands = np.stack([series.inputs for series in runs])[:, :-1]
+    start = np.stack([series.targets[0] for series in runs])
+    answers, other, whole = (
+        twin.rollout(commands, twin.initial_state(commands[:, 0], start))[0]
+        for twin in (bare, machine.with_numbers(far), machine)
+    )
+    width = scales.answer_width
+    np.testing.assert_allclose(answers / width, other / width, atol=1e-4)
+    assert np.abs((answers - whole) / width).max() > 1e-2
+    fit = replace(BENCH.fit, lengths_s=(0.1,), rounds=(1,), starts=2)
+    fresh = replace(spec, fit=fit).start(machine.channels, scales, runs[:2], 0)
+    result = fit_grey_box(fresh, runs[:2], runs[2:3], seed=0)
+    fixed = bare.table.width == 0.0
+    assert fixed.sum() == 4
+    np.testing.assert_array_equal(result.twin.numbers[fixed], bare.numbers[fixed])
+    assert not np.array_equal(result.twin.numbers, fresh.numbers)
+    rows = datasheet(bare.table, result.twin.numbers, result.information)
+    assert not {row["name"] for row in rows} & {"power_limit", "cushion_length", "cushion_least", "play"}
+
+
+def test_a_part_that_cannot_be_left_out_is_refused_by_name():
+    with pytest.raises(ConfigError, match=r"without names 'cushion'.*cushions.*power_limit, cushions, play must hold"):
+        GreyBox(without=("cushion",))
 
 
 def test_monomials_are_sorted_by_degree():

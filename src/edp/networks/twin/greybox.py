@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError, closest
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.elements import (
@@ -21,7 +22,7 @@ from edp.networks.twin.grey.elements import (
     default_elements,
 )
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
-from edp.networks.twin.grey.numbers import KNOTS, NumberTable, Travel, number_table
+from edp.networks.twin.grey.numbers import KNOTS, LEFT_OUT, NumberTable, Travel, number_table
 from edp.networks.twin.grey.run import run_lanes
 from edp.networks.twin.grey.start import load_start
 from edp.networks.twin.scales import FASTEST, HIGHEST, Array, TwinScales
@@ -47,11 +48,13 @@ class GreyBox:
         pumps: with their lines; none: valves are fed at constant pressure.
         inertia_degree: of the polynomials of the strokes that stand for the root of the inertia.
         potential_degree: of the polynomial that stands for gravity.
+        without: what its equations leave out: `power_limit` of the pumps, `cushions` at the end stops, `play` of the
+            spools.
         prefix_ticks: measured ticks before a free run.
         fit: how its numbers are fitted.
 
     Raises:
-        ConfigError: a value out of range.
+        ConfigError: a value out of range, or no such part of the equations.
     """
 
     cylinders: tuple[CylinderElement, ...] = ()
@@ -59,6 +62,7 @@ class GreyBox:
     pumps: tuple[PumpElement, ...] = ()
     inertia_degree: int = 2
     potential_degree: int = 4
+    without: tuple[str, ...] = ()
     prefix_ticks: int = 30
     fit: GreyFitSpec = field(default_factory=GreyFitSpec)
 
@@ -67,6 +71,13 @@ class GreyBox:
         check_bounds("grey box", self, inertia_degree=degree, potential_degree=integer(1, 6), prefix_ticks=PREFIX)
         for name in ("cylinders", "valves", "pumps"):
             check_count("grey box", name, getattr(self, name), MOST_NAMES)
+        check_count("grey box", "without", self.without, len(LEFT_OUT))
+        for part in self.without:
+            if part not in LEFT_OUT:
+                raise ConfigError(
+                    f"grey box: without names '{part}'{closest(part, tuple(LEFT_OUT))}; any of {', '.join(LEFT_OUT)} "
+                    "must hold"
+                )
 
     def elements(self, channels: TwinChannels) -> Elements:
         """Connected elements.
@@ -97,7 +108,7 @@ class GreyBox:
         """All numbers, and the full command of each valve."""
         elements = self.elements(channels)
         travels = [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * len(elements.cylinders)
-        table = number_table(elements, travels, [1.0] * len(elements.pumps), self._degrees)
+        table = number_table(elements, travels, [1.0] * len(elements.pumps), self._degrees, self.without)
         return {"numbers": (len(table.numbers),), "full": (len(elements.valves),)}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> GreyTwin:
@@ -128,7 +139,7 @@ class GreyBox:
             fastest = float(scales.high[i]) / FASTEST
             travels.append(Travel(float(low), float(high), fastest, (highest(cylinder.head), highest(cylinder.rod))))
         pumps = [highest(pump.pressure) * HIGHEST for pump in elements.pumps]
-        return number_table(elements, travels, pumps, self._degrees)
+        return number_table(elements, travels, pumps, self._degrees, self.without)
 
 
 def _sides(valve: ValveElement, channels: TwinChannels) -> list[int]:

@@ -22,7 +22,7 @@ BASIS = (
 
 
 def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list[dict[str, Any]]:
-    """A row for each number, SI units.
+    """A row for each number that is fitted, SI units.
 
     Args:
         table: of the grey box.
@@ -36,6 +36,8 @@ def datasheet(table: NumberTable, values: Doubles, information: Doubles) -> list
     left = np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(values)))))
     rows = []
     for number, value, deviation in zip(table.numbers, values, left, strict=True):
+        if number.width == 0.0:
+            continue
         reach = NORMAL * deviation * number.width
         ends = value * np.exp([-reach, reach]) if number.positive else value + np.array([-reach, reach])
         low, high = (float(end * number.factor) for end in ends)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -17,6 +17,12 @@ IntArray = NDArray[np.int64]
 KNOTS = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """Of the opening curves, as shares of the spool's travel behind the dead band: denser where levers are finer."""
 MEGA, LITRE = 1e6, 1e3
+LEFT_OUT = {
+    "power_limit": {"power_limit": 1e6},
+    "cushions": {"cushion_length": 1.0, "cushion_least": 1.0},
+    "play": {"play": 0.0},
+}
+"""What can be left out of the equations: its numbers, and where they do nothing (1 TW, whole outflow, no width)."""
 START_CURVE = (0.25, 0.75)
 """Linear and quadratic share of the opening that a curve starts from: fine control near closed, as spools are cut."""
 
@@ -31,7 +37,7 @@ class GreyNumber:
         unit: SI; of the value times `factor`.
         factor: from the units of the grey box to SI.
         nominal: where a fit starts, in units of the grey box.
-        width: plausible deviation: of the logarithm where `positive`, else in units of the grey box.
+        width: plausible deviation: of the logarithm where `positive`, else in units of the grey box; 0: not fitted.
         positive: whether it is fitted by its logarithm.
     """
 
@@ -110,7 +116,11 @@ def monomials(variables: int, degree: int) -> IntArray:
 
 
 def number_table(
-    elements: Elements, travels: Sequence[Travel], highest_pump: Sequence[float], degrees: tuple[int, int]
+    elements: Elements,
+    travels: Sequence[Travel],
+    highest_pump: Sequence[float],
+    degrees: tuple[int, int],
+    left_out: Sequence[str] = (),
 ) -> NumberTable:
     """Numbers of connected elements, with starting values from what the data show.
 
@@ -119,6 +129,7 @@ def number_table(
         travels: of each cylinder.
         highest_pump: highest pressure of each pump's line, MPa.
         degrees: of the polynomials of L and of U.
+        left_out: keys of `LEFT_OUT`.
     """
     numbers: list[GreyNumber] = []
     actuator_at, areas = [], []
@@ -154,10 +165,17 @@ def number_table(
     potential_at = len(numbers)
     for b in range(1, len(exponents)):
         numbers.append(GreyNumber("load", f"potential_{_power(exponents[b])}", "J", MEGA, 0.0, 0.03, False))
+    neutral = {name: value for part in left_out for name, value in LEFT_OUT[part].items()}
+    every = tuple(_fixed(number, neutral[number.name]) if number.name in neutral else number for number in numbers)
     return NumberTable(
-        tuple(numbers), valve_at, np.array(actuator_at), np.array(pump_at, dtype=np.int64), circuit_at, inertia_at,
+        every, valve_at, np.array(actuator_at), np.array(pump_at, dtype=np.int64), circuit_at, inertia_at,
         inertia_terms, potential_at, exponents,
     )  # fmt: skip
+
+
+def _fixed(number: GreyNumber, value: float) -> GreyNumber:
+    """The number at a value that a fit leaves alone."""
+    return replace(number, nominal=value, width=0.0, positive=False)
 
 
 def _power(exponent: IntArray) -> str:
