@@ -155,19 +155,17 @@ class SettingsTree:
         if not isinstance(table, Mapping):
             problems.append(f"{path}: expected a table, got {shown(table)}")
             return None
-        hints = _hints(cls)
-        field_names = [entry.name for entry in fields(cls)]
+        settings_of_class = _settings_of(cls)
         before = len(problems)
         for key in table:
-            if key not in field_names:
-                problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), field_names)}")
-        for entry in fields(cls):
-            required = entry.default is MISSING and entry.default_factory is MISSING
-            if required and entry.name not in table:
-                problems.append(f"'{_join(path, entry.name)}' is missing; it must be given")
+            if key not in settings_of_class:
+                problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), list(settings_of_class))}")
+        for name, entry in settings_of_class.items():
+            if entry.required and name not in table:
+                problems.append(f"'{_join(path, name)}' is missing; it must be given")
         values = {
-            name: self._value(name, hints[name], table[name], _join(path, name), problems)
-            for name in field_names
+            name: self._value(name, entry.hint, table[name], _join(path, name), problems)
+            for name, entry in settings_of_class.items()
             if name in table
         }
         # Built only from sound values: the class's own checks would report what follows from these problems.
@@ -184,25 +182,21 @@ class SettingsTree:
     def _value(self, name: str, hint: Any, value: Any, path: str, problems: list[str]) -> Any:
         if value is None and type(None) in _leaves(hint):
             return None  # JSON has a word for it; TOML leaves the key out
+        form = _form(hint)
         if name in self.parts:
-            if typing.get_origin(hint) is tuple:
+            if form.sequence:
                 items = value if isinstance(value, list) else [value]
                 return tuple(self._part(name, item, f"{path}[{i}]", problems) for i, item in enumerate(items))
             return self._part(name, value, path, problems)
-        choices = typing.get_args(hint) if typing.get_origin(hint) is not tuple else ()
-        table_type = hint if is_dataclass(hint) else next((c for c in choices if is_dataclass(c)), None)
-        if table_type is not None and (isinstance(value, Mapping) or table_type is hint):
-            return self._build(typing.cast(type, table_type), value, path, problems)
-        item_type = next(iter(typing.get_args(hint)), None) if typing.get_origin(hint) is tuple else None
-        if is_dataclass(item_type) and isinstance(value, list):
-            cls = typing.cast(type, item_type)
-            return tuple(self._build(cls, item, f"{path}[{i}]", problems) for i, item in enumerate(value))
-        inner = typing.get_args(hint)
-        if typing.get_origin(hint) is tuple and Ellipsis not in inner and isinstance(value, list | tuple):
+        if form.table is not None and (form.table is hint or isinstance(value, Mapping)):
+            return self._build(form.table, value, path, problems)
+        if form.item is not None and isinstance(value, list):
+            return tuple(self._build(form.item, item, f"{path}[{i}]", problems) for i, item in enumerate(value))
+        if form.sequence and not form.endless and isinstance(value, list | tuple):
             return self._row(hint, value, path, problems)
-        if typing.get_origin(hint) is Mapping and isinstance(value, Mapping):
+        if form.values is not None and isinstance(value, Mapping):
             entries = {key: _join(path, _key(key)) for key in value}
-            return {key: self._value("", inner[1], value[key], where, problems) for key, where in entries.items()}
+            return {key: self._value("", form.values, value[key], where, problems) for key, where in entries.items()}
         return _scalar(hint, value, path, problems)
 
     def _row(self, hint: Any, values: list[Any] | tuple[Any, ...], path: str, problems: list[str]) -> Any:
@@ -236,8 +230,49 @@ class SettingsTree:
         return self._build(cls, {key: value for key, value in table.items() if key != "kind"}, path, problems)
 
 
-# A search builds thousands of experiments, and making these took nine tenths of the time.
-_hints = cache(typing.get_type_hints)
+class _Setting(typing.NamedTuple):
+    """A field of a spec: its type, and whether it has no default."""
+
+    hint: Any
+    required: bool
+
+
+# A search builds thousands of experiments, and reading their types each time took nine tenths of the time.
+@cache
+def _settings_of(cls: type) -> Mapping[str, _Setting]:
+    """The fields of a spec by name, in their order."""
+    hints = typing.get_type_hints(cls)
+    return {
+        entry.name: _Setting(hints[entry.name], entry.default is MISSING and entry.default_factory is MISSING)
+        for entry in fields(cls)
+    }
+
+
+class _Form(typing.NamedTuple):
+    """What a type allows beside plain values.
+
+    Attributes:
+        sequence: it is a tuple; `endless`: of any length.
+        table: the spec that it is, or the first one that it may be.
+        item: the spec of each entry of a tuple.
+        values: the type of a mapping's values.
+    """
+
+    sequence: bool
+    endless: bool
+    table: type | None
+    item: type | None
+    values: Any
+
+
+@cache
+def _form(hint: Any) -> _Form:
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    sequence = origin is tuple
+    table: Any = hint if is_dataclass(hint) else next((c for c in (() if sequence else inner) if is_dataclass(c)), None)
+    item: Any = inner[0] if sequence and inner and is_dataclass(inner[0]) else None
+    values = inner[1] if origin is Mapping and inner else None
+    return _Form(sequence, Ellipsis in inner, table, item, values)
 
 
 @cache

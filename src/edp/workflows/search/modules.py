@@ -223,6 +223,8 @@ class _Option:
 
 def _options(settings: Table, name: str, shape: Shape | None = None) -> dict[str, _Option]:
     module, options = part_of(name), {}
+    if not module.options:
+        return {}  # a search asks for those of every module thousands of times
     plain = plain_tree(build(Experiment, _added(settings, {name}), f"with {name}"))
     if shape is not None:
         plain = shape(plain)
