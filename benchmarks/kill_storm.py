@@ -20,8 +20,7 @@ from typing import Any
 
 from common import finish, parser, table, verdict
 from edp.storage.ledger import Ledger, TrainingIdentity, known, read_records
-from edp.workflows.search.dispatch import complete
-from edp.workflows.search.executor import Job
+from edp.workflows.search.executor import Job, complete
 from edp.workflows.search.local import LocalPool
 
 STUDY = "study"

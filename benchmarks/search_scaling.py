@@ -19,8 +19,7 @@ from common import finish, parser, table, verdict
 from edp.config.experiment import load_experiment
 from edp.storage.ledger import Ledger, Record, TrainingIdentity, TrainingStatus, digest_of
 from edp.storage.runs import environment
-from edp.workflows.search.dispatch import complete
-from edp.workflows.search.executor import Job
+from edp.workflows.search.executor import Job, complete
 from edp.workflows.search.jobs import job_of
 from edp.workflows.search.local import LocalPool
 from edp.workflows.search.trainings import TrainingRequest, settings_of

@@ -21,8 +21,7 @@ import edp.workflows.search.cluster
 from edp.errors import ConfigError
 from edp.storage.ledger import Ledger, TrainingStatus, read_state
 from edp.workflows.search.cluster import RayPool
-from edp.workflows.search.dispatch import complete
-from edp.workflows.search.executor import START
+from edp.workflows.search.executor import START, complete
 from edp.workflows.search.local import LocalPool
 from edp.workflows.search.plan import load_plan
 from edp.workflows.search.runner import Resources, SearchCallbacks, run_search

@@ -13,8 +13,7 @@ from edp.storage.ledger import Ledger, read_records
 STUDY = """
 import sys
 from edp.storage.ledger import Ledger, TrainingIdentity
-from edp.workflows.search.dispatch import complete
-from edp.workflows.search.executor import Job
+from edp.workflows.search.executor import Job, complete
 from edp.workflows.search.local import LocalPool
 
 def identity(seed):

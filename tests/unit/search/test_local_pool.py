@@ -10,7 +10,7 @@ import pytest
 from edp.errors import ConfigError, StorageError
 from edp.storage.ledger import Ledger, TrainingStatus, claim, leave_arrival
 from edp.workflows.search import worker
-from edp.workflows.search.dispatch import complete
+from edp.workflows.search.executor import complete
 from edp.workflows.search.local import LocalPool
 
 
