@@ -2,6 +2,8 @@
 PYTHON ?= python3
 WORKERS ?= 2
 BIN := .venv/bin
+# A worker takes whole files, so that what the tests of a file share (a training, a study) is made once.
+SIDE_BY_SIDE = -n $(WORKERS) --dist loadfile
 # Python keeps the bytecode of what it imports, also where the caller's environment forbids it: without it each worker and
 # each of the tests' hundreds of child processes compiles some thousand sources anew, which takes as long as they run.
 export PYTHONDONTWRITEBYTECODE :=
@@ -42,10 +44,10 @@ demo: $(READY) ## the main job, small: simulate, train, judge, write a report pa
 	$(BIN)/edp demo --out demo
 
 check: lint ## lint, contracts and unit tests that start no process and train for no seconds
-	$(BIN)/python -m pytest -n $(WORKERS) --no-processes tests/contracts tests/unit
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) --no-processes tests/contracts tests/unit
 
 test: $(READY) ## the fast tests
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 test-slow: $(READY) ## the tests that take minutes
 	$(BIN)/python -m pytest -m slow --timeout 3600

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import gc
 from collections.abc import Callable, Generator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import beforehand as beforehand  # the first of all, see there
 import compiled
 import numpy as np
 import process_guard
@@ -179,6 +181,12 @@ def pytest_configure(config: pytest.Config) -> None:
     compiled.install(cache)
     if not hasattr(config, "workerinput"):
         compiled.warm_numba(cache)
+
+
+def pytest_collection_finish() -> None:
+    """Take what was imported and collected, some half a million objects, out of every later collection of garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
@@ -106,7 +107,12 @@ def _in_folders(place: str) -> bool:
 
 
 def _place(item: pytest.Item) -> str:
-    return item.path.relative_to(HERE).as_posix() if item.path.is_relative_to(HERE) else ""
+    return _place_of(item.path)
+
+
+@cache  # a file has thousands of tests
+def _place_of(path: Path) -> str:
+    return path.relative_to(HERE).as_posix() if path.is_relative_to(HERE) else ""
 
 
 def _in_unit(place: str, names: frozenset[str]) -> bool:

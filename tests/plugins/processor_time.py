@@ -51,6 +51,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         output[NAME] = sum(now())
 
 
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist, which `-p no:xdist` leaves out
 def pytest_testnodedown(node: Any) -> None:
     _starts.append(float(getattr(node, "workeroutput", {}).get(NAME, 0.0)))
 
