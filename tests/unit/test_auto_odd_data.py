@@ -18,7 +18,7 @@ from edp.config.experiment import build
 from edp.logs.repair import Repair
 from edp.report import build_report
 from edp.storage import read_json
-from edp.workflows.auto import load_auto, train_auto
+from edp.workflows.auto import candidates, load_auto, train_auto
 from edp.workflows.train_evaluate import DataSource, evaluate
 
 ROOT = Path(__file__).parents[2]
@@ -191,8 +191,17 @@ def check(source: DataSource, settings: Sequence[str], factor: float, folder: Pa
     assert "Why this model" in page
 
 
+SMALLER = {"UNITS": 16, "LEAST_STEPS": 100, "CENTRES": 100}
+"""Sizes of a committee that trains in a fraction of the time; `make test-slow` takes the preset's own."""
+
+
+@pytest.mark.parametrize(
+    "sizes", [pytest.param(SMALLER, id="smaller"), pytest.param({}, id="", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("name", ODDITIES)
-def test_it_keeps_up_with_simple_rivals_on(name, tmp_path):
+def test_it_keeps_up_with_simple_rivals_on(name, sizes, tmp_path, monkeypatch):
+    for constant, size in sizes.items():
+        monkeypatch.setattr(candidates, constant, size)
     oddity = ODDITIES[name]
     check(write(tmp_path, oddity), oddity.settings, oddity.factor, tmp_path / "run")
 
