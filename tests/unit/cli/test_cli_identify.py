@@ -12,11 +12,11 @@ from edp.storage import read_json
 from edp.workflows.twin import train_twin
 
 SMALL = (
-    *("twin.fit.lengths_s=[0.1]", "twin.fit.rounds=[2]", "twin.fit.starts=1", "twin.fit.ticks=400"),
-    *("twin.fit.validation_s=1", "twin.fit.validation_runs=2", "twin.inertia_degree=1", "twin.potential_degree=3"),
+    *("twin.fit.lengths_s=[0.1, 0.3]", "twin.fit.rounds=[3, 1]", "twin.fit.starts=1", "twin.fit.ticks=1500"),
+    *("twin.fit.validation_s=1", "twin.fit.validation_runs=2", "twin.inertia_degree=1"),
     *(
         "judge.seconds=2",
-        "judge.starts=1",
+        "judge.starts=3",
         "judge.at_s=[1, 2]",
         "judge.calibration_starts=2",
         'judge.floors=["static"]',
@@ -28,7 +28,7 @@ WORDS = [word for change in SMALL for word in ("--set", change)]
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fronts")
-    simulate_data_set(folder, SimulationOrder(minutes=2.0, recordings=5, seed=1), workers=1)
+    simulate_data_set(folder, SimulationOrder(minutes=5.0, recordings=10, seed=1), workers=1)
     return folder
 
 
