@@ -51,6 +51,9 @@ def twin(
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
         if (folder / "datasheet.txt").is_file():
             out.print(f"numbers of the machine with units and intervals in {folder / 'datasheet.txt'}")
+        network = trained.bundle.provenance.get("residual")
+        if network and not network["helps"]:
+            out.print("the network does not help on the validation part: this twin is its grey box alone")
         out.print(f"next: edp report {folder}, or edp rollout {folder} LOG --seconds 60")
 
     emit(as_json, facts, show)

@@ -22,7 +22,8 @@ from edp.data.series import Series
 from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.networks.losses.huber import huber
 from edp.networks.twin import Twin, even_starts
-from edp.networks.twin.recurrent import RecurrentTwin, TwinNetwork
+from edp.networks.twin.recurrent import CellWeights, RecurrentTwin
+from edp.networks.twin.residual import ResidualTwin
 from edp.settings.bounds import (
     MOST_BATCH,
     MOST_NAMES,
@@ -161,7 +162,7 @@ class FreeRunSampler:
         DataError: no stretch is long enough.
     """
 
-    def __init__(self, twin: RecurrentTwin, series: Sequence[Series], longest: int) -> None:
+    def __init__(self, twin: Twin, series: Sequence[Series], longest: int) -> None:
         usable = [part for part in series if part.samples > twin.prefix_ticks + longest]
         if not usable:
             rate = twin.channels.rate_hz
@@ -199,7 +200,7 @@ def measured_ports(spec: FreeRunSpec, shape: tuple[int, int, int], prefix: int, 
 
 
 def fit_free_runs(
-    twin: RecurrentTwin,
+    twin: RecurrentTwin | ResidualTwin,
     train: Sequence[Series],
     validation: Sequence[Series],
     spec: FreeRunSpec,
@@ -263,7 +264,7 @@ def fit_free_runs(
 
 
 def _resumed(
-    run: KeyedRun | None, network: TwinNetwork, optimizer: torch.optim.Optimizer
+    run: KeyedRun | None, network: CellWeights, optimizer: torch.optim.Optimizer
 ) -> tuple[Progress, dict[str, Tensor]]:
     """Where the run stands and its best weights; network and optimiser are set to where it stopped."""
     checkpoint = None if run is None else load_checkpoint(run.folder.file(FILE), run.key)
@@ -285,7 +286,7 @@ def _waited_out(progress: Progress, spec: FreeRunSpec, total: int) -> bool:
     return bool(spec.patience) and since >= spec.patience and judged > total - spec.updates[-1]
 
 
-def answer_weights(twin: RecurrentTwin, spec: FreeRunSpec) -> Array:
+def answer_weights(twin: Twin, spec: FreeRunSpec) -> Array:
     """Weight of each answer's error in deviations ``(answer,)``."""
     channels = twin.channels
     counts = (len(channels.velocities), len(channels.strokes), len(channels.pressures))
@@ -293,7 +294,7 @@ def answer_weights(twin: RecurrentTwin, spec: FreeRunSpec) -> Array:
 
 
 def _update(
-    twin: RecurrentTwin,
+    twin: RecurrentTwin | ResidualTwin,
     sampler: FreeRunSampler,
     spec: FreeRunSpec,
     now: tuple[int, int],
@@ -307,8 +308,7 @@ def _update(
     truth = sampler.answers[rows]
     ports = measured_ports(spec, truth[1:].shape, twin.prefix_ticks, rng)
     commands, measured, port = (torch.from_numpy(a) for a in (sampler.commands[rows[:-1]], truth[:-1], ports))
-    start = (measured[0], torch.zeros(spec.lanes, twin.network.units))
-    answers, _ = twin.network(commands, measured, port, start, twin.bounds)
+    answers = twin.free_run(commands, measured, port)
     loss = huber((answers - torch.from_numpy(truth[1:])) * weight, spec.delta).mean()
     optimizer.zero_grad()
     loss.backward()

@@ -1,6 +1,14 @@
 """TwinPlant models that run free: commands in, velocities, strokes and pressures out, measured or fed back."""
 
-from edp.networks.twin import arx, elements, greybox, n4sid, recurrent, static_map  # noqa: F401  registers the formulations
+from edp.networks.twin import (  # noqa: F401  registers the formulations
+    arx,
+    elements,
+    greybox,
+    n4sid,
+    recurrent,
+    residual,
+    static_map,
+)
 from edp.networks.twin.base import TWINS, Twin, TwinSpec, TwinState, even_starts
 from edp.networks.twin.intervals import FreeRunIntervals, calibrate
 from edp.networks.twin.plant import IntegerTwinPlant, TwinPlant

@@ -150,6 +150,14 @@ class Twin(ABC):
             return np.empty(shape, np.float32), state
         return self._run(commands, np.where(np.isfinite(measured), measured, np.float32(np.nan)), state)
 
+    def scaled(self, answers: Array) -> Array:
+        """Answers in SI units as a network reads them."""
+        return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)
+
+    def scaled_commands(self, commands: Array) -> Array:
+        """Commands in SI units as a network reads them."""
+        return np.asarray((commands - self.scales.command_offset) / self.scales.command_width, dtype=np.float32)
+
     def bounded(self, feedback: Array, velocity: Array, pressure: Array) -> Array:
         """Answers ``(batch, answer)`` within the bounds, SI units.
 

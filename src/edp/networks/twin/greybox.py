@@ -13,6 +13,7 @@ from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, closest
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
 from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.correction import Cell, Trace
 from edp.networks.twin.grey.elements import (
     CylinderElement,
     Elements,
@@ -99,7 +100,7 @@ class GreyBox:
         commands = np.concatenate([series.inputs for series in train])
         full = [_full(commands[:, _sides(valve, channels)]) for valve in elements.valves]
         arrays = {"numbers": table.nominal.astype(np.float32), "full": np.array(full, np.float32)}
-        twin = self.build(channels, scales, arrays)
+        twin = self.build(channels, scales, arrays | self._network(channels, seed))
         declared = [cylinder.areas is not None for cylinder in elements.cylinders]
         values = load_start(table, train, twin.wiring.columns, twin.wiring.z_of, channels.rate_hz, declared)
         return twin.with_numbers(values)
@@ -120,6 +121,10 @@ class GreyBox:
             raise ValueError("one of its numbers is not positive")
         wiring = Wiring.of(elements, channels, scales)
         return GreyTwin(channels, scales, self, (table, wiring), numbers, arrays["full"])
+
+    def _network(self, channels: TwinChannels, seed: int) -> dict[str, Array]:
+        """Arrays of a network on top, untrained; here none."""
+        return {}
 
     @property
     def _degrees(self) -> tuple[int, int]:
@@ -239,6 +244,14 @@ class RunTarget:
 EMPTY = (np.zeros((0, 0)), np.zeros(0), np.zeros(0))
 
 
+def _singles(*dimensions: int) -> tuple[Array, ...]:
+    return tuple(np.zeros((0,) * count, np.float32) for count in dimensions)
+
+
+NO_CELL: Cell = (*_singles(3, 2, 2, 2, 1, 2, 1), *EMPTY[1:], np.zeros(0), np.zeros(0, np.int64))  # type: ignore[assignment]
+NO_TRACE: Trace = _singles(3, 3, 3, 3, 3, 4, 2)  # type: ignore[assignment]
+
+
 class GreyTwin(Twin):
     """State: ``answer`` in SI units, and in units of `edp.networks.twin.grey.layout` what the elements remember."""
 
@@ -276,6 +289,12 @@ class GreyTwin(Twin):
         """Length of a tick in seconds, and implicit steps in it."""
         tick = 1.0 / self.channels.rate_hz
         return tick, max(1, int(np.ceil(tick / LONGEST_STEP_S - 1e-9)))
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Numbers of pressures and velocities, strokes, bristles and pumps: the state on which a tick acts."""
+        actuators = len(self.wiring.columns)
+        return self.wiring.nodes + actuators, actuators, actuators, len(self.table.pump_at)
 
     def demands(self, commands: Array) -> Doubles:
         """Signed commands of the valves as shares of full ``(batch, tick, valve)``, extension positive."""
@@ -317,10 +336,17 @@ class GreyTwin(Twin):
         return {"answer": measured.astype(np.float32)} | named
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
+        return self.answered(commands, measured, state)
+
+    def answered(
+        self, commands: Array, measured: Array, state: TwinState, cell: Cell = NO_CELL, trace: Trace = NO_TRACE
+    ) -> tuple[Array, TwinState]:
+        """`rollout` of checked arrays, with a cell on top; see `edp.networks.twin.grey.run.run_lanes`."""
         now = tuple(np.array(state[name], np.float64, order="C") for name in ("answer", *STATES))
         now[0][:] /= self.units
         answers = np.empty(measured.shape)
-        self.lanes(self.numbers, self.demands(commands), measured / self.units, now, answers=answers)
+        network = (cell, trace)
+        self.lanes(self.numbers, self.demands(commands), measured / self.units, now, answers=answers, network=network)
         after = {name: values.astype(np.float32) for name, values in zip(STATES, now[1:], strict=True)}
         rounded = answers.astype(np.float32)
         return rounded, {"answer": rounded[:, -1].copy()} | after
@@ -334,6 +360,7 @@ class GreyTwin(Twin):
         answers: Doubles | None = None,
         judge: RunTarget | None = None,
         full: bool = False,
+        network: tuple[Cell, Trace] = (NO_CELL, NO_TRACE),
     ) -> None:
         """`edp.networks.twin.grey.run.run_lanes` with these elements: a free run, or the errors of one."""
         nothing = np.zeros((0, 0, 0))
@@ -342,7 +369,7 @@ class GreyTwin(Twin):
         run_lanes(
             demands, measured, judged.truth, state, judged.counts, (judged.weight, judged.delta), limits,
             (numbers, KNOTS, *self.wiring.z_of), self.form, self.wiring.ports, self.table.places, self.table.exponents,
-            self.time, full, nothing if answers is None else answers, judged.normal,
+            self.time, full, nothing if answers is None else answers, judged.normal, *network,
         )  # fmt: skip
 
     def arrays(self) -> dict[str, Array]:

@@ -47,15 +47,9 @@ class Recurrent:
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> RecurrentTwin:
         """An untrained one; its weights follow from the seed."""
-        generator = torch.Generator().manual_seed(seed)
-        # The uniform bound is PyTorch's; answers that start at no change at all make the first free runs stand still.
-        bound = 1.0 / math.sqrt(self.units)
         network = TwinNetwork(len(channels.commands), len(channels.answers), self.units)
-        with torch.no_grad():
-            for name, weight in network.named_parameters():
-                weight.uniform_(-bound, bound, generator=generator)
-                if name.startswith("out"):
-                    weight.mul_(0.1)
+        # Answers that start at no change at all make the first free runs stand still.
+        network.draw(seed, 0.1)
         return RecurrentTwin(channels, scales, self.prefix_ticks, network)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
@@ -71,20 +65,41 @@ class Recurrent:
         return RecurrentTwin(channels, scales, self.prefix_ticks, network)
 
 
-class TwinNetwork(nn.Module):
-    """Weights of the cell; it runs over scaled numbers, time first."""
+class CellWeights(nn.Module):
+    """Weights of a cell that reads commands and `read` further numbers, and answers `answers` of them; zero."""
 
-    def __init__(self, commands: int, answers: int, units: int) -> None:
+    def __init__(self, commands: int, read: int, answers: int, units: int) -> None:
         super().__init__()
         self.units = units
         self.command_weight = nn.Parameter(torch.zeros(3 * units, commands))
         self.bias = nn.Parameter(torch.zeros(3 * units))
         # Inputs first: the compiled loop multiplies rows of a batch with them.
-        self.feedback_weight = nn.Parameter(torch.zeros(answers, 3 * units))
+        self.feedback_weight = nn.Parameter(torch.zeros(read, 3 * units))
         self.h_weight = nn.Parameter(torch.zeros(units, 3 * units))
         self.inner_bias = nn.Parameter(torch.zeros(units))
         self.out_weight = nn.Parameter(torch.zeros(units, answers))
         self.out_bias = nn.Parameter(torch.zeros(answers))
+
+    def draw(self, seed: int, answers: float) -> None:
+        """Draw weights with PyTorch's uniform bound, those of the answers times `answers`."""
+        generator, bound = torch.Generator().manual_seed(seed), 1.0 / math.sqrt(self.units)
+        with torch.no_grad():
+            for name, weight in self.named_parameters():
+                weight.uniform_(-bound, bound, generator=generator)
+                if name.startswith("out"):
+                    weight.mul_(answers)
+
+    @property
+    def looped(self) -> tuple[nn.Parameter, ...]:
+        """What the compiled loop reads: all but the commands' part and the bias of the gates."""
+        return self.feedback_weight, self.h_weight, self.inner_bias, self.out_weight, self.out_bias
+
+
+class TwinNetwork(CellWeights):
+    """The cell over scaled numbers, time first."""
+
+    def __init__(self, commands: int, answers: int, units: int) -> None:
+        super().__init__(commands, answers, answers, units)
 
     def forward(
         self, commands: Tensor, measured: Tensor, port: Tensor, start: tuple[Tensor, Tensor], bounds: Bounds
@@ -99,8 +114,7 @@ class TwinNetwork(nn.Module):
             bounds: of the answers.
         """
         projected = nn.functional.linear(commands, self.command_weight, self.bias)
-        weights = (self.feedback_weight, self.h_weight, self.inner_bias, self.out_weight, self.out_bias)
-        result = _Steps.apply(projected, measured, port, *start, *weights, bounds)  # type: ignore[no-untyped-call]
+        result = _Steps.apply(projected, measured, port, *start, *self.looped, bounds)  # type: ignore[no-untyped-call]
         return result[0], result[1]
 
 
@@ -161,21 +175,7 @@ class _Steps(torch.autograd.Function):
         grads = (by_gates, by_inner, by_out, by_answer, by_h)
         incoming = np.ascontiguousarray(grad_answers.numpy())
         run_backward(incoming, ctx.port, ctx.weights, ctx.bounds.arrays, ctx.bounds.velocities, ctx.saved, grads)
-        units = inner.shape[2]
-
-        # Gradients of the weights need all ticks at once: one large product replaces one small product a tick.
-        def rows(values: Array) -> Tensor:
-            return torch.from_numpy(values).flatten(0, 1)
-
-        gate_rows, inner_rows, out_rows, before = rows(by_gates), rows(by_inner), rows(by_out), rows(hs[:-1])
-        by_h_weight = torch.cat([before.t() @ gate_rows[:, : 2 * units], before.t() @ inner_rows], dim=1)
-        by_weights = (
-            rows(fed).t() @ gate_rows,
-            by_h_weight,
-            inner_rows.sum(0),
-            rows(hs[1:]).t() @ out_rows,
-            out_rows.sum(0),
-        )
+        by_weights = weight_gradients(fed, hs, by_gates, by_inner, by_out)
         return (
             torch.from_numpy(by_gates),
             None,
@@ -185,6 +185,24 @@ class _Steps(torch.autograd.Function):
             *by_weights,
             None,
         )
+
+
+def weight_gradients(read: Array, hs: Array, by_gates: Array, by_inner: Array, by_out: Array) -> tuple[Tensor, ...]:
+    """Gradients of `CellWeights.looped`, from what a cell read, its h, and the adjoint's gradients; tick first."""
+    units = by_inner.shape[2]
+
+    # Gradients of the weights need all ticks at once: one large product replaces one small product a tick.
+    def rows(values: Array) -> Tensor:
+        return torch.from_numpy(values).flatten(0, 1)
+
+    gate_rows, inner_rows, out_rows, before = rows(by_gates), rows(by_inner), rows(by_out), rows(hs[:-1])
+    return (
+        rows(read).t() @ gate_rows,
+        torch.cat([before.t() @ gate_rows[:, : 2 * units], before.t() @ inner_rows], dim=1),
+        inner_rows.sum(0),
+        rows(hs[1:]).t() @ out_rows,
+        out_rows.sum(0),
+    )
 
 
 class RecurrentTwin(Twin):
@@ -197,18 +215,21 @@ class RecurrentTwin(Twin):
     def initial_state(self, command: Array, measured: Array) -> TwinState:
         return {"answer": self.scaled(measured), "h": np.zeros((len(measured), self.network.units), np.float32)}
 
-    def scaled(self, answers: Array) -> Array:
-        """Answers in SI units as the network reads them."""
-        return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)
+    def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
+        """Scaled answers ``(time, batch, answer)`` with gradients by the weights, from measured starts.
 
-    def scaled_commands(self, commands: Array) -> Array:
-        """Commands in SI units as the network reads them."""
-        return np.asarray((commands - self.scales.command_offset) / self.scales.command_width, dtype=np.float32)
+        Args:
+            commands: scaled ``(time, batch, command)``.
+            measured: scaled ``(time, batch, answer)``, any finite number where `port` is 0.
+            port: 1 where a port reads what was measured; all of the first tick.
+        """
+        start = (measured[0], torch.zeros(measured.shape[1], self.network.units))
+        answers, _ = self.network(commands, measured, port, start, self.bounds)
+        return torch.as_tensor(answers)
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         network, batch = self.network, len(commands)
-        weights = (network.feedback_weight, network.h_weight, network.inner_bias, network.out_weight, network.out_bias)
-        arrays = tuple(weight.detach().numpy() for weight in weights)
+        arrays = tuple(weight.detach().numpy() for weight in network.looped)
         command_weight, bias = network.command_weight.detach().numpy(), network.bias.detach().numpy()
         pieces, answer, h = [], state["answer"], state["h"]
         for at in range(0, commands.shape[1], PIECE):

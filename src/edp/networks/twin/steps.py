@@ -47,7 +47,7 @@ def _tanh(x: np.float32) -> np.float32:
 
 
 @compiler.compiled
-def _gates(into: Array, up: Array, bias: Array, h: Array, gates: Array, inner: Array, new_h: Array) -> None:
+def gates_of(into: Array, up: Array, bias: Array, h: Array, gates: Array, inner: Array, new_h: Array) -> None:
     """Gates r, k, n ``(batch, 3 units)``, ``inner = U h + b`` of n, and the next h."""
     batch, units = h.shape
     half = np.float32(0.5)
@@ -132,12 +132,45 @@ def run_forward(
         for row in range(batch):
             for i in range(into.shape[1]):
                 into[row, i] += projected[t, row, i]
-        _gates(into, up, inner_bias, hs[t], gates[t], inner[t], hs[t + 1])
+        gates_of(into, up, inner_bias, hs[t], gates[t], inner[t], hs[t + 1])
         np.dot(hs[t + 1], out_weight, change)
         for row in range(batch):
             for j in range(width):
                 change[row, j] = scale[j] * (change[row, j] + out_bias[j])
         _answer(fed[t], change, low, high, trapezoid, velocities, answers[t], free[t])
+
+
+@compiler.compiled
+def gates_back(
+    by_h: Array, from_out: Array, gates: Array, inner: Array, h: Array, grads: tuple[Array, Array, Array]
+) -> None:
+    """The adjoint of `gates_of`.
+
+    Args:
+        by_h: gradient by the next h ``(batch, units)``; written: by h, but for its part in the products.
+        from_out: gradient by the next h that its answers add.
+        gates: of the forward run; `inner` and `h` likewise.
+        inner: sums of n.
+        h: before.
+        grads: written: by the pre-activations ``(batch, 3 units)``, by `inner`, and both as the products with h see
+            them ``(batch, 3 units)``.
+    """
+    by_gates, by_inner, by_up = grads
+    batch, units = by_h.shape
+    for row in range(batch):
+        for i in range(units):
+            total = by_h[row, i] + from_out[row, i]
+            reset, keep, new = gates[row, i], gates[row, units + i], gates[row, 2 * units + i]
+            by_new = total * (1 - keep) * (1 - new * new)
+            by_gates[row, i] = by_new * inner[row, i] * reset * (1 - reset)
+            by_gates[row, units + i] = total * (h[row, i] - new) * keep * (1 - keep)
+            by_gates[row, 2 * units + i] = by_new
+            by_inner[row, i] = by_new * reset
+            by_h[row, i] = total * keep
+        for i in range(2 * units):
+            by_up[row, i] = by_gates[row, i]
+        for i in range(units):
+            by_up[row, 2 * units + i] = by_inner[row, i]
 
 
 @compiler.compiled
@@ -190,20 +223,7 @@ def run_backward(
                 by_out[t, row, velocities + j] = 0.0
                 by_fed[row, j] += by_fed[row, velocities + j] * trapezoid[j]
         np.dot(by_out[t], out_up, from_out)
-        for row in range(batch):
-            for i in range(units):
-                total = by_h[row, i] + from_out[row, i]
-                reset, keep, new = gates[t, row, i], gates[t, row, units + i], gates[t, row, 2 * units + i]
-                by_new = total * (1 - keep) * (1 - new * new)
-                by_gates[t, row, i] = by_new * inner[t, row, i] * reset * (1 - reset)
-                by_gates[t, row, units + i] = total * (hs[t, row, i] - new) * keep * (1 - keep)
-                by_gates[t, row, 2 * units + i] = by_new
-                by_inner[t, row, i] = by_new * reset
-                by_h[row, i] = total * keep
-            for i in range(2 * units):
-                by_up[row, i] = by_gates[t, row, i]
-            for i in range(units):
-                by_up[row, 2 * units + i] = by_inner[t, row, i]
+        gates_back(by_h, from_out, gates[t], inner[t], hs[t], (by_gates[t], by_inner[t], by_up))
         np.dot(by_up, h_up, from_h)
         np.dot(by_gates[t], feedback_up, through)
         for row in range(batch):

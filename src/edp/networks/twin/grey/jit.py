@@ -11,7 +11,12 @@ _FOLDER = Path(__file__).parent
 _FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 compiler = Compiler(
     "grey",
-    lambda: (_FOLDER / "layout.py", *files_with(_FOLDER, "from edp.networks.twin.grey.jit import")),
+    # The cell on top of a grey box is that of the recurrent twin.
+    lambda: (
+        _FOLDER / "layout.py",
+        _FOLDER.parent / "steps.py",
+        *files_with(_FOLDER, "from edp.networks.twin.grey.jit import"),
+    ),
     {"nogil": True, "error_model": "numpy", "fastmath": _FASTMATH},
 )
 compiled, inlined, inner = compiler.compiled, compiler.inlined, compiler.inner

@@ -38,6 +38,10 @@ VALVE_STATES = 5
 BY_DELAY, BY_PILOT_LAG, BY_SPOOL_LAG, BY_PLAY = range(4)
 OWN = 4
 
+# tangents that a tick carries along: none, by all numbers, or by the state before:
+# pressures and velocities, strokes, bristles, displacements; valves depend on the commands alone
+NONE, BY_NUMBERS, BY_STATE = range(3)
+
 ATMOSPHERE = 0.1013
 """MPa; pressures are gauge."""
 LEAST_ABSOLUTE = 1e-3

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.correction import Cell, Trace, correct, fed_ports, note_bounds, note_slopes, seed
 from edp.networks.twin.grey.jit import compiled, inner
 from edp.networks.twin.grey.steps import GAMMA, bristles, tick
 from edp.networks.twin.grey.valve import advance_valves, displace
@@ -16,7 +17,7 @@ IntArray = NDArray[np.int64]
 
 @inner
 def _work(
-    n: int, nodes: int, pumps: int, valves: int, numbers: int, terms: int, degree: int
+    n: int, nodes: int, pumps: int, valves: int, numbers: int, columns: int, terms: int, degree: int
 ) -> tuple[tuple[Array, ...], ...]:
     """Arrays that a tick writes: network sums, rows, load, monomials, vectors, matrices; and tangents."""
     unknown = nodes + n
@@ -38,11 +39,11 @@ def _work(
         np.zeros(unknown),
     )  # fmt: skip
     matrices = (
-        np.zeros((n, numbers)), np.zeros((unknown, numbers)), np.zeros((n, numbers)), np.zeros((unknown, numbers)),
-        np.zeros((n, numbers)), np.zeros((unknown, numbers)),
+        np.zeros((n, columns)), np.zeros((unknown, columns)), np.zeros((n, columns)), np.zeros((unknown, columns)),
+        np.zeros((n, columns)), np.zeros((unknown, columns)),
     )  # fmt: skip
     tangents = (
-        np.zeros((unknown, numbers)), np.zeros((n, numbers)), np.zeros((n, numbers)), np.zeros((pumps, numbers)),
+        np.zeros((unknown, columns)), np.zeros((n, columns)), np.zeros((n, columns)), np.zeros((pumps, columns)),
     )  # fmt: skip
     return sums, out, loads, monomials, vectors, matrices, tangents
 
@@ -67,16 +68,16 @@ def _follow(
     form: tuple[IntArray, ...],
     circuit: int,
     tick_s: float,
-    full: bool,
+    columns_by: int,
 ) -> None:
     """A tick in which the whole load is measured: only valves, displacements and bristles move."""
     y, s, z, d, valves = lane
     t_y, _, t_z, t_d, t_valves = tangents
     n, nodes = len(s), len(y) - len(s)
     advance_valves(valves, t_valves, history, GAMMA * tick_s, tick_s, q, form[0], circuit + at.PLAY)
-    displace(d, t_d, valves, t_valves, (y[2 * n : nodes], t_y[2 * n : nodes]), tick_s, q, form, circuit, full)
+    displace(d, t_d, valves, t_valves, (y[2 * n : nodes], t_y[2 * n : nodes]), tick_s, q, form, circuit, columns_by)
     advance_valves(valves, t_valves, history, (1.0 - GAMMA) * tick_s, tick_s, q, form[0], circuit + at.PLAY)
-    bristles(y, z.copy(), tick_s, q, form[3], z, (t_z, t_z.copy(), t_y), full)
+    bristles(y, z.copy(), tick_s, q, form[3], z, (t_z, t_z.copy(), t_y), columns_by)
 
 
 @inner
@@ -173,6 +174,8 @@ def run_lanes(
     full: bool,
     answers: Array,
     normal: tuple[Array, Array, Array],
+    cell: Cell,
+    trace: Trace,
 ) -> None:
     """Run lanes, each port measured or fed back; on request with losses, their gradient and Gauss-Newton matrix.
 
@@ -195,46 +198,57 @@ def run_lanes(
         full: whether gradient and matrix are wanted.
         answers: written ``(lane, tick, answer)``.
         normal: matrix ``(number, number)`` and gradient ``(number,)``, added to, and losses ``(lane,)``, written.
+        cell: a network's part in what is answered; without units there is none. The commands' part of its gates
+            ``(tick, lane, 3 units)``; h ``(lane, units)``, moved; weights of what it reads ``(read, 3 units)``, of h
+            ``(units, 3 units)``, bias of n's inner sum ``(units,)``, weights ``(units, solved)`` and bias of what it
+            answers; offset and inverse width of what it reads ``(answer,)`` and width of changes ``(solved,)``, in
+            units of the grey box; and which answers it corrects ``(solved,)``.
+        trace: written for `run_back`, unless empty: what the cell read, where no bound acted, gates, inner sums, h
+            ``(tick + 1, lane, units)``, Jacobians of the grey box's ticks ``(tick, lane, state, state)``, and where
+            these count ``(tick, lane)``; all tick first.
     """
     q = model[0]
     prefix, followed, stride = counts
     n, unknown, ticks = state[2].shape[1], state[1].shape[1], demands.shape[1]
-    nodes, numbers, judged = unknown - n, (len(q) if full else 0), len(truth) > 0
-    work = _work(n, nodes, state[4].shape[1], state[5].shape[1], numbers, len(exponents), exponents.max())
+    nodes, judged, traced = unknown - n, len(truth) > 0, len(trace[0]) > 0
+    numbers = len(q) if full or traced else 0
+    columns = trace[5].shape[2] if traced else numbers
+    work = _work(n, nodes, state[4].shape[1], state[5].shape[1], numbers, columns, len(exponents), exponents.max())
     scratch = (work[0], work[1], work[2], work[3], work[4], work[5])
     own = np.zeros((state[5].shape[1], at.VALVE_STATES, at.OWN))
     t_y, t_s = work[6][0], work[6][1]
     tangents = (t_y, t_s, work[6][2], work[6][3], own)
     rows = ((ticks - prefix) // stride + 2) * len(ports) if full else 0
-    slopes, errors = np.zeros((rows, numbers)), np.zeros(rows)
-    s_before, v_before = np.zeros(n), np.zeros(n)
+    slopes, errors = np.zeros((rows, columns)), np.zeros(rows)
+    before = (np.zeros(n), np.zeros(n), np.zeros(len(ports)), np.zeros(len(ports)))
+    wiring = (ports, limits, time[0])
     for row in range(len(demands)):
         y, s, history = state[1][row], state[2][row], state[6][row]
         lane = (y, s, state[3][row], state[4][row], state[5][row])
         for values in work[6]:
             values[:] = 0.0
         own[:] = 0.0
-        loss, used = 0.0, 0
+        loss, used, by_weights = 0.0, 0, False
         for t in range(ticks):
             _feed(measured[row, t], state[0][row], not judged, ports, (y, s), (t_y, t_s), full)
             for k in range(len(history) - 1, 0, -1):
                 history[k] = history[k - 1]
             history[0] = demands[row, t]
             if t < followed:
-                _follow(lane, tangents, history, q, form, places[3], time[0], full)
+                _follow(lane, tangents, history, q, form, places[3], time[0], at.BY_NUMBERS if full else at.NONE)
                 continue
-            s_before[:], v_before[:] = s, y[nodes:]
-            tick(lane, tangents, history, model, form, places, exponents, time, scratch, full)
+            before[0][:], before[1][:] = s, y[nodes:]
+            columns_by = at.BY_NUMBERS if full else at.NONE
+            if traced:
+                by_weights = by_weights or not np.isfinite(measured[row, t]).all()
+                columns_by = at.BY_STATE if by_weights else at.NONE
+                seed((t_y, t_s, work[6][2], work[6][3]))
+            fed_ports(ports, y, s, before[2])
+            tick(lane, tangents, history, model, form, places, exponents, time, scratch, columns_by)
+            if by_weights:
+                note_slopes((t, row), (t_y, t_s, work[6][2], work[6][3]), trace)
             if not judged:
-                _bound(y, s, (s_before, v_before), ports, limits, time[0])
-                _rounded(lane, history)
-                for c in range(len(ports)):
-                    kind, which = ports[c, 0], ports[c, 1]
-                    value = s[which] if kind == 1 else y[which + (nodes if kind == 0 else 0)]
-                    # Answers are kept as they go out: single precision, SI units.
-                    answer = np.float32(value * limits[2][c])
-                    answers[row, t, c] = answer
-                    state[0][row, c] = answer / limits[2][c]
+                _answer((t, row), lane, history, before, wiring, (answers[row, t], state[0][row]), cell, trace)
                 continue
             done = t + 1 - prefix
             if done <= 0 or (done % stride and t + 1 != ticks):
@@ -248,6 +262,46 @@ def run_lanes(
             counted = slopes[:used]
             normal[0][:] += np.dot(counted.T, counted)
             normal[1][:] += np.dot(counted.T, errors[:used])
+
+
+@inner
+def _answer(
+    now: tuple[int, int],
+    lane: tuple[Array, ...],
+    history: Array,
+    before: tuple[Array, Array, Array, Array],
+    wiring: tuple[IntArray, tuple[Array, Array, Array], float],
+    out: tuple[Array, Array],
+    cell: Cell,
+    trace: Trace,
+) -> None:
+    """What a twin answers after a tick: corrected, within its bounds, rounded as it goes out; and what ports read next.
+
+    Args:
+        now: tick and lane.
+        lane: state after the tick; moved.
+        history: of the demands.
+        before: strokes, velocities and ports before the tick; the last one is written.
+        wiring: ports, limits, and length of a tick (s).
+        out: written: answers in SI units, and in units of the grey box.
+        cell: of `run_lanes`.
+        trace: of `run_lanes`.
+    """
+    ports, limits, tick_s = wiring
+    y, s, nodes = lane[0], lane[1], len(lane[0]) - len(lane[1])
+    if cell[1].shape[1] > 0:
+        correct(now, y, s, before[2], ports, cell, trace, before[3])
+    _bound(y, s, (before[0], before[1]), ports, limits, tick_s)
+    if len(trace[0]) > 0:
+        note_bounds(now, y, s, ports, limits, trace, before[3])
+    _rounded(lane, history)
+    for c in range(len(ports)):
+        kind, which = ports[c, 0], ports[c, 1]
+        value = s[which] if kind == 1 else y[which + (nodes if kind == 0 else 0)]
+        # Answers are kept as they go out: single precision, SI units.
+        answer = np.float32(value * limits[2][c])
+        out[0][c] = answer
+        out[1][c] = answer / limits[2][c]
 
 
 @inner

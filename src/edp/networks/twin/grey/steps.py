@@ -1,4 +1,4 @@
-"""A grey box over time: one tick of one lane, with the exact tangents of its state by all numbers where wanted."""
+"""A grey box over time: one tick of one lane, with exact tangents by all numbers, or by the state before it."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ def _tangents_of_stage(
     out: tuple[Array, ...],
     circuit: int,
     frozen: Array,
+    columns_by: int,
 ) -> None:
-    """Tangents of y after a stage: ``R_y y' = -(R_q + R_x x' + ...)``, by one factorisation for all numbers.
+    """Tangents of y after a stage: ``R_y y' = -(R_q + R_x x' + ...)``, by one factorisation for all columns.
 
     Args:
-        solved: written ``(unknown, number)``.
+        solved: written ``(unknown, column)``: a column is a number, or a state before the tick.
         base: tangents of the base of y.
         bristle: deflections of its base, and their tangents.
         tangents: of the state at the start of the step.
@@ -51,6 +52,7 @@ def _tangents_of_stage(
         out: derivatives of the stage.
         circuit: place of the circuit's numbers.
         frozen: tangents of the frozen strokes.
+        columns_by: by what, see `layout.BY_NUMBERS`.
     """
     y, _, step = now
     _, by_y, by_x, by_s, by_d, by_q = out
@@ -58,15 +60,16 @@ def _tangents_of_stage(
     n = len(frozen)
     nodes = len(y) - n
     own = np.empty(at.OWN, np.int64)
+    columns, numbered = solved.shape[1], columns_by == at.BY_NUMBERS
     for row in range(len(y)):
-        for k in range(len(q)):
-            solved[row, k] = -by_q[row, k]
+        for k in range(columns):
+            solved[row, k] = -by_q[row, k] if numbered else 0.0
         for i in range(n):
             slope = by_s[row, i] + (step * load[3][row - nodes, i] if row >= nodes else 0.0)
             if slope != 0.0:
-                for k in range(len(q)):
+                for k in range(columns):
                     solved[row, k] -= slope * frozen[i, k]
-        for j in range(by_x.shape[1]):
+        for j in range(by_x.shape[1] if numbered else 0):
             slope = by_x[row, j]
             if slope != 0.0:
                 own_places(j, form[0], circuit + at.PLAY, own)
@@ -75,9 +78,9 @@ def _tangents_of_stage(
         if row < nodes:
             for m in range(by_d.shape[1]):
                 if by_d[row, m] != 0.0:
-                    for k in range(len(q)):
+                    for k in range(columns):
                         solved[row, k] -= by_d[row, m] * t_d[m, k]
-            for k in range(len(q)):
+            for k in range(columns):
                 solved[row, k] += base[row, k]
             continue
         i = row - nodes
@@ -86,15 +89,15 @@ def _tangents_of_stage(
         reached = stroke[0][i] + stroke[2] * (stroke[1][i] + y[row])
         inside = q[a + at.STOP_LOW] <= reached <= q[a + at.STOP_HIGH]
         touched = 0.0 if inside else step * q[a + at.STOP_STIFFNESS]
-        for k in range(len(q)):
-            solved[row, k] -= step * load[5][i, k] + by_before * bristle[1][i, k]
+        for k in range(columns):
+            solved[row, k] -= (step * load[5][i, k] if numbered else 0.0) + by_before * bristle[1][i, k]
             solved[row, k] -= touched * (t_s[i, k] + stroke[2] * t_y[row, k])
         for m in range(n):
             mass = 0.0
             for c in range(min(i, m) + 1):
                 mass += load[1][i, c] * load[1][m, c]
             slope = step * load[4][i, m]
-            for k in range(len(q)):
+            for k in range(columns):
                 solved[row, k] += mass * base[nodes + m, k] - slope * t_y[nodes + m, k]
     factorise(by_y)
     solve(by_y, solved)
@@ -109,7 +112,7 @@ def bristles(
     actuator_at: IntArray,
     z: Array,
     tangents: tuple[Array, Array, Array],
-    full: bool,
+    columns_by: int,
 ) -> None:
     """Deflections after a stage into `z`, and their tangents; `tangents`: theirs, of their base, and of y."""
     n = len(z)
@@ -118,10 +121,11 @@ def bristles(
     for i in range(n):
         a = actuator_at[i]
         z[i], _, _, _, under, _ = friction(y[nodes + i], base[i], step, a, q)
-        if full:
+        if columns_by:
             by_v, own = bristle_slopes(y[nodes + i], base[i], step, a, q)
-            for k in range(len(q)):
+            for k in range(t_z.shape[1]):
                 t_z[i, k] = under * t_base[i, k] + by_v * t_y[nodes + i, k]
+        if columns_by == at.BY_NUMBERS:
             t_z[i, a + at.COULOMB] += own[0]
             t_z[i, a + at.STATIC] += own[1]
             t_z[i, a + at.STRIBECK] += own[2]
@@ -130,17 +134,18 @@ def bristles(
 
 @inner
 def _contents(
-    y: Array, t_y: Array, nodes: int, q: Array, circuit: int, contents: Array, t_contents: Array, full: bool
+    y: Array, t_y: Array, nodes: int, q: Array, circuit: int, contents: Array, t_contents: Array, columns_by: int
 ) -> None:
     """What pressures and velocities hold: oil and the velocities themselves; with their tangents."""
     contents[nodes:] = y[nodes:]
-    if full:
+    if columns_by:
         t_contents[nodes:] = t_y[nodes:]
     for k in range(nodes):
         contents[k], by_p, by_bulk, by_air = content(y[k], q[circuit + at.BULK], q[circuit + at.AIR])
-        if full:
-            for m in range(len(q)):
+        if columns_by:
+            for m in range(t_y.shape[1]):
                 t_contents[k, m] = by_p * t_y[k, m]
+        if columns_by == at.BY_NUMBERS:
             t_contents[k, circuit + at.BULK] += by_bulk
             t_contents[k, circuit + at.AIR] += by_air
 
@@ -156,13 +161,13 @@ def tick(
     exponents: IntArray,
     time: tuple[float, int],
     work: tuple[tuple[Array, ...], ...],
-    full: bool,
+    columns_by: int,
 ) -> int:
     """One tick of one lane.
 
     Args:
         lane: y, strokes, bristles, displacements and valves; moved.
-        tangents: of these, by number ``(..., number)``; of valves by their own numbers; moved, if `full`.
+        tangents: of these ``(..., column)``; of valves by their own numbers; moved, if `columns_by`.
         history: demands ``(tick, valve)``, newest first.
         model: numbers, knots, middle of the strokes and scale from stroke to z.
         form: places of valves and elements.
@@ -170,7 +175,7 @@ def tick(
         exponents: of the load's monomials.
         time: length of the tick (s), and steps in it.
         work: arrays that are written.
-        full: whether tangents are wanted.
+        columns_by: by what tangents are carried along: `layout.NONE`, `BY_NUMBERS` or `BY_STATE`.
 
     Returns:
         Iterations of all stages together.
@@ -188,12 +193,12 @@ def tick(
     t_speed, t_stroke = t_y[nodes:].copy(), t_s.copy()
     for _ in range(time[1]):
         before_v[:] = y[nodes:]
-        _freeze(s, (t_y, t_s), model, places, exponents, step, work, full)
+        _freeze(s, (t_y, t_s), model, places, exponents, step, work, columns_by)
         load = (loads[0], loads[1], loads[2], loads[3], loads[4], loads[5])
         small = (loads[0], loads[1], loads[2], loads[3])
         start[:], zs[:], base_z[:] = y, z, z
-        _contents(y, t_y, nodes, q, circuit, base, t_base, full)
-        if full:
+        _contents(y, t_y, nodes, q, circuit, base, t_base, columns_by)
+        if columns_by:
             t_first[:], t_start_z[:], t_base_z[:] = t_y, t_z, t_z
         h = GAMMA * step
         for which in range(2):
@@ -202,28 +207,28 @@ def tick(
             )
             if which == 0:
                 lines = (start[2 * n : nodes], t_first[2 * n : nodes])
-                displace(d, t_d, valves, t_valves, lines, step, q, form, circuit, full)
+                displace(d, t_d, valves, t_valves, lines, step, q, form, circuit, columns_by)
             stroke = (s, before_v, 0.5 * (h if which == 0 else step))
             now = (y, base, h)
             x = valves[:, at.SPOOL].copy()
             spent += newton(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out, terms[0])
-            if full:
+            if columns_by:
                 assemble(now, x, d, frozen_s, stroke, base_z, q, form, small, places, knots, sums, out, True, terms[0])
-                state = (t_first, t_s, t_z, t_d, t_valves)
+                state, bases = (t_first, t_s, t_z, t_d, t_valves), (base_z, t_base_z)
                 _tangents_of_stage(
-                    t_y, t_base, (base_z, t_base_z), state, now, stroke, q, form, load, out, circuit, t_frozen
+                    t_y, t_base, bases, state, now, stroke, q, form, load, out, circuit, t_frozen, columns_by
                 )
-            bristles(y, base_z, h, q, form[3], z, (t_z, t_base_z, t_y), full)
+            bristles(y, base_z, h, q, form[3], z, (t_z, t_base_z, t_y), columns_by)
             if which == 0:
-                _contents(y, t_y, nodes, q, circuit, reached, t_reached, full)
+                _contents(y, t_y, nodes, q, circuit, reached, t_reached, columns_by)
                 base[:] += AHEAD * (reached - base)
                 base_z[:] = zs + AHEAD * (z - zs)
-                if full:
+                if columns_by:
                     t_base[:] += AHEAD * (t_reached - t_base)
                     t_base_z[:] = t_start_z + AHEAD * (t_z - t_start_z)
-        _move(s, t_s, s, t_s, (before_v, t_first[nodes:]), (y[nodes:], t_y[nodes:]), 0.5 * step, scale, full)
+        _move(s, t_s, s, t_s, (before_v, t_first[nodes:]), (y[nodes:], t_y[nodes:]), 0.5 * step, scale, columns_by)
     # What a twin promises: a stroke is the trapezoidal integral of the velocities that it answers, one a tick.
-    _move(s, t_s, s_start, t_stroke, (at_start, t_speed), (y[nodes:], t_y[nodes:]), 0.5 * time[0], scale, full)
+    _move(s, t_s, s_start, t_stroke, (at_start, t_speed), (y[nodes:], t_y[nodes:]), 0.5 * time[0], scale, columns_by)
     return spent
 
 
@@ -237,14 +242,14 @@ def _move(
     after: tuple[Array, Array],
     half: float,
     scale: Array,
-    full: bool,
+    columns_by: int,
 ) -> None:
     """Strokes and their tangents by the trapezoidal rule, from velocities and their tangents before and after."""
     for i in range(len(s)):
         # A stroke that is not measured has no scale, and nothing depends on it: it stays where it is.
         weight = half if scale[i] > 0.0 else 0.0
         s[i] = start[i] + weight * (before[0][i] + after[0][i])
-        if full:
+        if columns_by:
             for k in range(t_s.shape[1]):
                 t_s[i, k] = t_start[i, k] + weight * (before[1][i, k] + after[1][i, k])
 
@@ -258,7 +263,7 @@ def _freeze(
     exponents: IntArray,
     step: float,
     work: tuple[tuple[Array, ...], ...],
-    full: bool,
+    columns_by: int,
 ) -> None:
     """Strokes in the middle of the step, and the load there; `tangents`: those of y and of the strokes."""
     q, _, middle, scale = model
@@ -270,10 +275,10 @@ def _freeze(
         half = 0.5 * step if scale[i] > 0.0 else 0.0
         frozen_s[i] = s[i] + half * before_v[i]
         z[i] = (frozen_s[i] - middle[i]) * scale[i]
-        if full:
-            for k in range(len(q)):
+        if columns_by:
+            for k in range(t_s.shape[1]):
                 matrices[0][i, k] = t_s[i, k] + half * t_y[nodes + i, k]
     every = (terms[0], terms[1], loads[7])
     basis(z, exponents, scale, loads[6], every)
     force = (loads[0], loads[3], loads[4], loads[5])
-    freeze_load(q, (places[0], places[1], places[2]), before_v, every, loads[1], loads[2], force, full)
+    freeze_load(q, (places[0], places[1], places[2]), before_v, every, loads[1], loads[2], force, columns_by != at.NONE)

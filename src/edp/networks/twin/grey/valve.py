@@ -97,26 +97,26 @@ def displace(
     q: Array,
     form: tuple[IntArray, ...],
     circuit: int,
-    full: bool,
+    columns_by: int,
 ) -> None:
     """Move the displacements of all pumps towards what the pilots ask for, under the common power limit.
 
     Args:
-        displacement: shares of full ``(pump,)``, moved; `tangents` theirs ``(pump, number)``.
-        tangents: moved as well, if `full`.
+        displacement: shares of full ``(pump,)``, moved; `tangents` theirs ``(pump, column)``.
+        tangents: moved as well, if `columns_by`.
         valves: state of the valves; `slopes` their tangents.
         slopes: of the valves.
         pressures: of the pump lines (MPa) and their tangents.
         step: s.
         q: numbers.
         form: of the model.
-        circuit: gain_at of the circuit's numbers.
-        full: whether tangents are wanted.
+        circuit: place of the circuit's numbers.
+        columns_by: by what tangents are carried along, see `layout.BY_NUMBERS`.
     """
     valve_at, _, valve_pump, _, pump_at = form
-    pumps, numbers = len(displacement), len(q)
+    pumps, columns, numbered = len(displacement), tangents.shape[1], columns_by == at.BY_NUMBERS
     start, span = q[circuit + at.DEMAND_START], q[circuit + at.DEMAND_SPAN]
-    asked, by_asked = np.empty(pumps), np.zeros((pumps, numbers))
+    asked, by_asked = np.empty(pumps), np.zeros((pumps, columns))
     own = np.empty(at.OWN, np.int64)
     power = 0.0
     for m in range(pumps):
@@ -130,7 +130,7 @@ def displace(
                 if min(gain * r, 1.0) > asked[m]:
                     asked[m], best, best_r, inside = min(gain * r, 1.0), j, r, gain * r < 1.0
         power += q[pump_at[m] + at.FLOW] * asked[m] * max(pressures[0][m], 0.0)
-        if not full:
+        if not numbered:
             continue
         if best < 0:
             by_asked[m, pump_at[m] + at.LEAST] = 1.0
@@ -146,14 +146,16 @@ def displace(
                 for k in range(at.OWN):
                     by_asked[m, own[k]] += along * slopes[best, at.PILOT_2, k] * (1.0 if pilot >= 0.0 else -1.0)
     limit = min(1.0, q[circuit + at.POWER] / max(power, IDLE))
-    by_limit = np.zeros(numbers)
-    if full and limit < 1.0:
+    by_limit = np.zeros(columns)
+    if numbered and limit < 1.0:
         by_limit[circuit + at.POWER] = limit / q[circuit + at.POWER]
+    if columns_by and limit < 1.0:
         for m in range(pumps):
             p = max(pressures[0][m], 0.0)
             flow = q[pump_at[m] + at.FLOW]
-            by_limit[pump_at[m] + at.FLOW] -= limit / power * asked[m] * p
-            for k in range(numbers):
+            if numbered:
+                by_limit[pump_at[m] + at.FLOW] -= limit / power * asked[m] * p
+            for k in range(columns):
                 by_limit[k] -= (
                     limit / power * flow * (by_asked[m, k] * p + (asked[m] * pressures[1][m, k] if p > 0.0 else 0.0))
                 )
@@ -162,8 +164,9 @@ def displace(
         keep, goal = math.exp(-step / lag), asked[m] * limit
         behind = displacement[m] - goal
         displacement[m] = goal + behind * keep
-        if full:
-            for k in range(numbers):
+        if columns_by:
+            for k in range(columns):
                 by_goal = by_asked[m, k] * limit + asked[m] * by_limit[k]
                 tangents[m, k] = keep * tangents[m, k] + (1.0 - keep) * by_goal
+        if numbered:
             tangents[m, pump_at[m] + at.LAG] += behind * keep * step / (lag * lag)

@@ -1,0 +1,191 @@
+"""A network on top of a grey box: what the equations leave, as a correction of their changes from tick to tick."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError
+from edp.networks.twin.base import TWINS, TwinState, solved_columns
+from edp.networks.twin.grey.correction import Cell, Trace, run_back
+from edp.networks.twin.greybox import Doubles, GreyBox, GreyTwin
+from edp.networks.twin.recurrent import CellWeights, weight_gradients
+from edp.networks.twin.scales import Array, TwinScales
+from edp.settings.bounds import (
+    MOST_BATCH,
+    MOST_NAMES,
+    MOST_UNITS,
+    MOST_UPDATES,
+    above,
+    check_bounds,
+    check_count,
+    integer,
+)
+
+
+@TWINS.register("residual")
+@dataclass(frozen=True, kw_only=True)
+class Residual(GreyBox):
+    """A grey box, fitted first, and a GRU that reads commands, ports and the grey box's change, and adds to it.
+
+    Attributes:
+        units: width of the network's memory.
+        lanes: free runs side by side in an update of the network.
+        lengths_s: lengths of the free runs, stage after stage.
+        updates: updates of each stage.
+        validate_every: updates from one validation to the next.
+
+    Raises:
+        ConfigError: a value out of range, or stages that do not fit one another.
+    """
+
+    units: int = 64
+    lanes: int = 32
+    lengths_s: tuple[float, ...] = (0.3, 1.0, 3.0)
+    updates: tuple[int, ...] = (300, 700, 150)
+    validate_every: int = 50
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        count = integer(1, MOST_UPDATES)
+        bounds = {"units": integer(1, MOST_UNITS), "lanes": integer(1, MOST_BATCH), "lengths_s": above(0.0, 600.0)}
+        check_bounds("residual twin", self, updates=count, validate_every=count, **bounds)
+        check_count("residual twin", "lengths_s", self.lengths_s, MOST_NAMES, least=1)
+        if len(self.lengths_s) != len(self.updates):
+            raise ConfigError(
+                f"residual twin: {len(self.lengths_s)} lengths_s and {len(self.updates)} updates; one number of "
+                "updates for each length must hold"
+            )
+
+    def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
+        """Those of the grey box and of the network."""
+        with torch.device("meta"):  # a header says how wide it is: no memory before that is checked
+            network = _network(channels, self.units)
+        return super().shapes(channels) | {name: tuple(weight.shape) for name, weight in network.named_parameters()}
+
+    def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> ResidualTwin:
+        """The twin with these numbers and weights."""
+        network = _network(channels, self.units)
+        network.load_state_dict({name: torch.from_numpy(np.array(arrays[name])) for name in network.state_dict()})
+        return ResidualTwin(super().build(channels, scales, arrays), network)
+
+    def _network(self, channels: TwinChannels, seed: int) -> dict[str, Array]:
+        network = _network(channels, self.units)
+        # Answers of zero: an untrained network leaves its grey box alone, and training begins there.
+        network.draw(seed, 0.0)
+        return {name: weight.detach().numpy() for name, weight in network.named_parameters()}
+
+
+def _network(channels: TwinChannels, units: int) -> CellWeights:
+    """It reads ports, and changes of all but the strokes, which are integrals."""
+    solved = len(solved_columns(channels))
+    return CellWeights(len(channels.commands), len(channels.answers) + solved, solved, units)
+
+
+class ResidualTwin(GreyTwin):
+    """State: that of the grey box, and ``h`` of the network ``(batch, units)``."""
+
+    def __init__(self, grey: GreyTwin, network: CellWeights) -> None:
+        parts = (grey.table, grey.wiring)
+        super().__init__(grey.channels, grey.scales, grey.spec, parts, grey.numbers, grey.full)
+        self.network = network
+
+    def with_numbers(self, numbers: Doubles) -> ResidualTwin:
+        """The same elements and network with other numbers of the grey box, rounded as they are kept."""
+        return ResidualTwin(super().with_numbers(numbers), self.network)
+
+    def without_network(self) -> ResidualTwin:
+        """The grey box alone: a network that answers zero."""
+        network = _network(self.channels, self.network.units)
+        network.load_state_dict(self.network.state_dict())
+        with torch.no_grad():
+            network.out_weight.zero_()
+            network.out_bias.zero_()
+        return ResidualTwin(self, network)
+
+    def initial_state(self, command: Array, measured: Array) -> TwinState:
+        h = np.zeros((len(measured), self.network.units), np.float32)
+        return super().initial_state(command, measured) | {"h": h}
+
+    def cell(self, projected: Array, h: Array) -> Cell:
+        """The network as compiled code reads it, in units of the grey box; see `edp.networks.twin.grey.run.run_lanes`.
+
+        Args:
+            projected: the commands' part of the gates ``(tick, lane, 3 units)``.
+            h: ``(lane, units)``; a run moves it.
+        """
+        solved = np.array(solved_columns(self.channels), dtype=np.int64)
+        weights = tuple(weight.detach().numpy() for weight in self.network.looped)
+        scales, units = self.scales, self.units
+        offset, per_width = scales.answer_offset / units, units / scales.answer_width
+        change = (scales.change_width / units)[solved]
+        return (projected, h, *weights, offset, per_width, change, solved)  # type: ignore[return-value]
+
+    def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
+        command_weight, bias = (w.detach().numpy() for w in (self.network.command_weight, self.network.bias))
+        # A product a tick, so that a chunk and its single ticks round alike.
+        projected = np.stack([row @ command_weight.T for row in self.scaled_commands(commands).swapaxes(0, 1)]) + bias
+        h = state["h"].copy()
+        answers, after = self.answered(commands, measured, state, self.cell(projected, h))
+        return answers, after | {"h": h}
+
+    def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
+        """Scaled answers ``(time, batch, answer)`` with gradients by the weights of the network, from measured starts.
+
+        Args:
+            commands: scaled ``(time, batch, command)``.
+            measured: scaled ``(time, batch, answer)``, any finite number where `port` is 0.
+            port: 1 where a port reads what was measured; all of the first tick.
+        """
+        network, scales = self.network, self.scales
+        projected = nn.functional.linear(commands, network.command_weight, network.bias)
+        inputs = (commands.numpy() * scales.command_width + scales.command_offset).swapaxes(0, 1)
+        fed = measured.numpy() * scales.answer_width + scales.answer_offset
+        fed = np.where(port.numpy() > 0, fed, np.float32(np.nan)).swapaxes(0, 1)
+        result = _Corrected.apply(projected, *network.looped, self, inputs, fed, port.numpy())  # type: ignore[no-untyped-call]
+        return torch.as_tensor(result)
+
+    def arrays(self) -> dict[str, Array]:
+        weights = {name: weight.detach().numpy().copy() for name, weight in self.network.named_parameters()}
+        return super().arrays() | weights
+
+
+class _Corrected(torch.autograd.Function):
+    """A free run of grey box and network, with the exact adjoint through both (`run_back`)."""
+
+    @staticmethod
+    def forward(ctx: Any, projected: Tensor, *rest: Any) -> Tensor:
+        twin, commands, fed, port = rest[5:]
+        lanes, ticks, answers = fed.shape
+        units, sizes = twin.network.units, twin.sizes
+        h = np.zeros((lanes, units), np.float32)
+        solved = len(solved_columns(twin.channels))
+        shapes = [(ticks, answers + solved), (ticks, answers), (ticks, 3 * units), (ticks, units), (ticks + 1, units)]
+        rows = [np.zeros((time, lanes, width), np.float32) for time, width in shapes]
+        jacobians = np.zeros((ticks, lanes, sum(sizes), sum(sizes)), np.float32)
+        trace: Trace = (*rows, jacobians, np.zeros((ticks, lanes), np.float32))  # type: ignore[assignment]
+        ctx.cell = twin.cell(np.ascontiguousarray(projected.detach().numpy()), h)
+        state = twin.initial_state(np.ascontiguousarray(commands[:, 0]), np.ascontiguousarray(fed[:, 0]))
+        values, _ = twin.answered(np.ascontiguousarray(commands), np.ascontiguousarray(fed), state, ctx.cell, trace)
+        ctx.trace, ctx.port, ctx.twin = trace, np.ascontiguousarray(port), twin
+        return torch.from_numpy(np.ascontiguousarray(twin.scaled(values).swapaxes(0, 1)))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_answers: Tensor) -> tuple[Tensor | None, ...]:
+        twin, trace, cell = ctx.twin, ctx.trace, ctx.cell
+        by_gates, by_inner = np.empty_like(trace[2]), np.empty_like(trace[3])
+        by_out = np.empty((*trace[2].shape[:2], len(cell[-1])), np.float32)
+        incoming = np.ascontiguousarray(grad_answers.numpy())
+        actuators, nodes = len(twin.wiring.columns), twin.wiring.nodes
+        sizes = (actuators, nodes, 0.5 / twin.channels.rate_hz)
+        run_back(incoming, ctx.port, cell, twin.wiring.ports, sizes, trace, (by_gates, by_inner, by_out))
+        by_weights = weight_gradients(trace[0], trace[4], by_gates, by_inner, by_out)
+        return (torch.from_numpy(by_gates), *by_weights, None, None, None, None)

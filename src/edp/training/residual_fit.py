@@ -1,0 +1,85 @@
+"""Training the network of a residual twin on free runs of it and its grey box, fitted before; kept where it helps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from edp.data.series import Series
+from edp.networks.twin.residual import Residual, ResidualTwin
+from edp.storage.runs import KeyedRun
+from edp.training.free_run import FreeRunProgress, FreeRunSpec, FreeRunValidation, fit_free_runs
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualFit:
+    """A trained residual twin.
+
+    Attributes:
+        twin: with the weights of the best validation; the grey box alone where these do not help.
+        history: a row per validation.
+        seconds: processor time of the network's training.
+        grey_error: mean error of the velocities over the free runs of the validation part, in deviations, of the grey
+            box alone.
+        error: the same with the network.
+    """
+
+    twin: ResidualTwin
+    history: list[dict[str, Any]]
+    seconds: float
+    grey_error: float
+    error: float
+
+    @property
+    def helps(self) -> bool:
+        """Whether the network has less error than the grey box alone; else it answers zero."""
+        return self.error < self.grey_error
+
+    def facts(self) -> dict[str, Any]:
+        """For provenance."""
+        return {"helps": self.helps, "validation": self.error, "validation_grey_box": self.grey_error}
+
+
+def residual_spec(form: Residual, training: FreeRunSpec) -> FreeRunSpec:
+    """Settings of the network's training: those of every twin, but for what its own formulation settles."""
+    return replace(
+        training,
+        lanes=form.lanes,
+        lengths_s=form.lengths_s,
+        updates=form.updates,
+        validate_every=form.validate_every,
+    )
+
+
+def fit_residual(
+    twin: ResidualTwin,
+    form: Residual,
+    train: Sequence[Series],
+    validation: Sequence[Series],
+    training: FreeRunSpec,
+    on_event: Callable[[FreeRunProgress], None] | None = None,
+    run: KeyedRun | None = None,
+) -> ResidualFit:
+    """Train the network on top of a grey box whose numbers are fitted and stay.
+
+    Args:
+        twin: its network untrained; it is changed.
+        form: formulation, which says how long is trained on what.
+        train: training stretches.
+        validation: stretches that choose among the weights on the way, and between network and none.
+        training: settings that all twins share.
+        on_event: called with progress, after each validation.
+        run: folder and key of the run; where given, a stopped training goes on.
+
+    Raises:
+        DataError: stretches that are too short.
+        FreeRunDiverged: a gradient is not finite any more.
+    """
+    spec = residual_spec(form, training)
+    ticks = round(spec.validation_s * twin.channels.rate_hz)
+    grey_error = FreeRunValidation(twin.without_network(), validation, ticks, spec.lanes).error()
+    fitted = fit_free_runs(twin, train, validation, spec, on_event, run)
+    error = min(row["validation"] for row in fitted.history)
+    chosen = twin if error < grey_error else twin.without_network()
+    return ResidualFit(chosen, fitted.history, fitted.seconds, grey_error, error)
