@@ -27,7 +27,7 @@ from edp.workflows.identify.elements import check_strokes, excavator_elements, f
 from edp.workflows.identify.machine_numbers import MACHINE_NUMBERS, guesses, with_values
 from edp.workflows.identify.machine_text import machine_text
 from edp.workflows.identify.mapping import GreyParts, grey_numbers
-from edp.workflows.identify.tie import MachineTie, coordinates, deviations, kept_back, nearest
+from edp.workflows.identify.tie import CUSHIONS, MachineTie, coordinates, deviations, kept_back, nearest
 
 M22 = load_machine("M22")
 PILOTS = ("BmUp", "BmDwn", "AmIn", "AmOut", "BktIn", "BktOut")
@@ -238,3 +238,13 @@ def test_the_chain_of_lags_moves_as_the_spools_of_the_simulator(parts):
     assert np.abs(apart).max() < 0.02
     # The same delay: what lies between the two curves adds up to nothing.
     assert abs(apart.sum() * 0.01) < 5e-4
+
+
+def test_no_cushion_of_an_identified_machine_reaches_the_middle_of_its_stroke(parts):
+    """Logs that never meet an end stop may ask for any length; a machine file takes half of the stroke at most."""
+    tie = MachineTie.of(M22, parts, parts.table.nominal[parts.load])
+    theta = np.zeros(len(tie.begin))
+    theta[CUSHIONS] = 8.0
+    machine = tie.machine(theta)
+    for length, stroke in zip(machine.cylinders.cushion_length, machine.cylinders.stroke, strict=True):
+        assert 0.49 * stroke < length < 0.5 * stroke

@@ -67,7 +67,10 @@ class MachineTie:
         own = np.clip(theta[: len(MACHINE_NUMBERS)], -FARTHEST, FARTHEST)
         grown = guesses(self.base) * np.exp(WIDTHS * own)
         stated = np.array([number.of(self.base) for number in MACHINE_NUMBERS])
-        return np.where(self.free, np.minimum(grown, MOST), stated)
+        values = np.where(self.free, np.minimum(grown, MOST), stated)
+        # Cushions that meet in the middle are refused by a machine file.
+        values[CUSHIONS] = np.minimum(values[CUSHIONS], LONGEST_CUSHION * values[STROKES])
+        return values
 
     def numbers(self, theta: Doubles) -> Doubles:
         """Numbers of the grey box, in its units ``(number,)``."""
@@ -92,6 +95,13 @@ TINY = 1e-6
 """Of the plausible value: what is as good as zero."""
 MOST: Doubles = np.array([BOUNDS[number.path].high if number.path in BOUNDS else np.inf for number in MACHINE_NUMBERS])
 """Largest values that a machine file may have."""
+CUSHIONS, STROKES = (
+    np.array([k for k, number in enumerate(MACHINE_NUMBERS) if number.path == f"cylinders.{key}"])
+    for key in ("cushion_length", "stroke")
+)
+"""Places of both among the numbers, a cylinder each."""
+LONGEST_CUSHION = 0.499
+"""Of the stroke: half of it is the limit of a machine file, less what its digits round away."""
 WIDTHS: Doubles = np.array([number.width for number in MACHINE_NUMBERS])
 
 
