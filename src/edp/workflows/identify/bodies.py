@@ -165,8 +165,8 @@ def realised(base: Doubles, guess: Machine) -> Bodies:
         mass = np.array(own.mass) * np.exp(logarithms)
         x, y, inertia = _given_masses(base, mass, length)
         share = inertia / (mass * length**2) / spin
-        # A line below a tenth, so that what is negative is far away, but finite.
-        bent = np.where(share > 0.1, np.log(np.maximum(share, 0.1)), np.log(0.1) - 10.0 * (0.1 - share))
+        # A steep line below a tenth: what is negative is further away than any proportion, but finite.
+        bent = np.where(share > 0.1, np.log(np.maximum(share, 0.1)), np.log(0.1) - 100.0 * (0.1 - share))
         moved = (np.concatenate([x / length, y / length]) - shape) / np.repeat(NEAR[1:3], 3)
         return np.concatenate([logarithms / NEAR[0], moved, bent / NEAR[3]])
 
