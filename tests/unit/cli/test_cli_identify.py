@@ -98,3 +98,18 @@ def test_logs_and_machines_that_do_not_fit_are_refused_and_nothing_is_written(ed
         assert ended.code == 1
         assert message in " ".join(ended.err.split())
     assert not [path for path in tmp_path.iterdir() if path.suffix]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("twin.kind=residual", "twin.kind = 'residual' came"),
+        ('twin.without=["play"]', "twin.without = ['play'] leaves out numbers that a machine file has"),
+    ],
+)
+def test_what_is_no_whole_grey_box_is_refused_before_any_fit(edp, logs, tmp_path, change, message):
+    kind = () if "kind" in change else ("--set", "twin.kind=greybox")
+    ended = edp("identify", logs, "--out", tmp_path / "mine.toml", *kind, "--set", change)
+    assert ended.code == 1
+    assert message in " ".join(ended.err.split())
+    assert not list(tmp_path.glob("mine*"))

@@ -20,6 +20,7 @@ from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, UNEXCITED
 from edp.networks.twin.grey.elements import Elements
 from edp.networks.twin.greybox import GreyBox, GreyTwin
+from edp.networks.twin.residual import Residual
 from edp.recording import Recording
 from edp.signals import Kind
 from edp.sim.machine.machine import Machine
@@ -113,15 +114,11 @@ def identify(
     loaded = None if run is None else _of_run(run)
     settings = experiment or load_twin_experiment(None, ["twin.kind=greybox"])
     settings = loaded[1] if loaded is not None else settings
-    if not isinstance(settings.twin, GreyBox):
-        raise ConfigError(
-            f"settings: a machine is identified by a grey box, twin.kind = '{TWINS.name_of(settings.twin)}' came; "
-            "leave it out, or set twin.kind = 'greybox'"
-        )
+    grey = _whole_grey_box(settings.twin)
     channels, data = prepared_twin(recordings, settings)
     _check_strokes(channels, data, base)
     if loaded is None:
-        fitted = _fitted(base, settings.twin, (channels, data, settings.training.seed), (on_event, tell))
+        fitted = _fitted(base, grey, (channels, data, settings.training.seed), (on_event, tell))
     else:
         fitted = _informed(loaded[0], data, settings.training.seed)
     celsius, notes = _celsius(recordings, base)
@@ -146,6 +143,21 @@ def identify(
     facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
     write_json(target.with_suffix(".json"), facts | {"numbers": [row.plain() for row in rows], "models": scores})
     return Identified(written, rows, scores, notes)
+
+
+def _whole_grey_box(spec: TwinSpec) -> GreyBox:
+    """The spec itself; refused is what is no whole grey box: a network on top would take part of what its numbers are to explain."""
+    if not isinstance(spec, GreyBox) or isinstance(spec, Residual):
+        raise ConfigError(
+            f"settings: a machine is identified by a grey box, twin.kind = '{TWINS.name_of(spec)}' came; leave it out, "
+            "or set twin.kind = 'greybox'"
+        )
+    if spec.without:
+        raise ConfigError(
+            f"settings: twin.without = {list(spec.without)} leaves out numbers that a machine file has; identify with "
+            "a grey box that has all of them"
+        )
+    return spec
 
 
 def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
