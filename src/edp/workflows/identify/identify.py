@@ -146,7 +146,12 @@ def identify(
 
 
 def _whole_grey_box(spec: TwinSpec) -> GreyBox:
-    """The spec itself; refused is what is no whole grey box: a network on top would take part of what its numbers are to explain."""
+    """The spec itself.
+
+    Raises:
+        ConfigError: another kind, a network on top, which takes part of what the numbers are to explain, or parts that
+            are left out.
+    """
     if not isinstance(spec, GreyBox) or isinstance(spec, Residual):
         raise ConfigError(
             f"settings: a machine is identified by a grey box, twin.kind = '{TWINS.name_of(spec)}' came; leave it out, "
