@@ -252,6 +252,16 @@ def test_spans_grow_with_the_horizon_as_far_as_the_data_allow():
     assert steps[0] < steps[-1]
 
 
+def test_the_budget_of_long_recordings_goes_to_the_recurrent_network():
+    short = Amount(rows=100_000, shortest=1_000, features=12, outputs=3, horizon=10, minutes=5.0)
+    long = replace(short, rows=100_001)
+    kinds = ("perceptrons", "trees", "recurrent")
+    for amount, most in ((short, "trees"), (long, "recurrent")):
+        seconds = {kind: amount.seconds(kind) for kind in kinds}
+        assert sum(seconds.values()) == pytest.approx(300.0)
+        assert seconds[most] >= max(seconds.values())
+
+
 def test_trees_of_many_outputs_keep_most_of_the_rows():
     """A budget goes into rows first, then into left-out parts, then into trees; more minutes never mean less."""
     amount = Amount(rows=31_000, shortest=1_000, features=12, outputs=24, horizon=10, minutes=5.0)

@@ -113,3 +113,13 @@ def test_what_is_no_whole_grey_box_is_refused_before_any_fit(edp, logs, tmp_path
     assert ended.code == 1
     assert message in " ".join(ended.err.split())
     assert not list(tmp_path.glob("mine*"))
+
+
+@pytest.mark.parametrize("there", ["mine.toml", "mine.json"])
+def test_no_file_is_written_over(edp, logs, tmp_path, there):
+    """Nor the machine file that the guess comes from; said before any fit."""
+    (tmp_path / there).write_text("what a tape measure told")
+    ended = edp("identify", logs, "--out", tmp_path / "mine.toml")
+    assert ended.code == 1
+    assert "is there already and is not written over" in " ".join(ended.err.split())
+    assert (tmp_path / there).read_text() == "what a tape measure told"

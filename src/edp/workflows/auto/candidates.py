@@ -35,8 +35,8 @@ TREES, LEAST_TREES, TREE_DEPTH = 200, 80, 6
 TREE_ROWS = (30_000, 15_000, 8_000, 4_000)
 """Rows that a tree is grown on: the most that leave time for `LEAST_TREES` trees."""
 TREE_FOLDS = (5, 3, 2)
-"""Parts that trees leave out in turn: as many as leave time for all trees, else the fewest. On 26 min of a small
-excavator (24 outputs) two left-out folds of five weighed the trees as well as five did, in half of the time."""
+"""Parts that trees leave out in turn: as many as leave time for all trees, else the fewest, for each costs a growth of
+them. What two parts lose against five on the same rows was not measured; the rows and trees they pay for were."""
 TREE_RATE, MOST_TREE_RATE = 10.0, 0.2
 """The rate of boosting is the first over the rounds, at least scikit-learn's 0.1: fewer trees must each do more."""
 TREE_SECONDS, TREE_CELLS_PER_S = 1.7e-3, 1.2e8
@@ -44,13 +44,15 @@ TREE_SECONDS, TREE_CELLS_PER_S = 1.7e-3, 1.2e8
 BATCH = 256
 FOLDS = 5
 SHARE = {"perceptrons": 0.2, "trees": 0.4, "recurrent": 0.4}
-"""Of the budget; linear models and kernel machines take seconds."""
+LONG_SHARE = {"perceptrons": 0.25, "trees": 0.15, "recurrent": 0.6}
+"""Of the budget, up to `LONG_ROWS` and above; linear models and kernel machines take seconds."""
 LEAST_STEPS, USUAL_STEPS, MOST_STEPS = 300, 2500, 5000
 """Updates of a member: fewer learn nothing, more than `USUAL_STEPS` pay where rows are many."""
 ROW_PASSES = 20
 """How often a row may be seen before further updates only fit its noise."""
 LONG_ROWS = 100_000
-"""Training ticks above which the budget goes to the recurrent network, which has a memory of its own."""
+"""Training ticks above which most of the budget goes to the recurrent network, which has a memory of its own; below,
+its useful updates cost less than its share, and trees were the rival to beat (26 min of a small excavator)."""
 RECURRENT_ROWS = 20_000
 """Training ticks below which a recurrent network lost to the committee on every measured set that was tried."""
 RECURRENT_LANES, RECURRENT_CHUNK, RECURRENT_BURN_IN = 8, 128, 50
@@ -91,6 +93,10 @@ class Amount:
             span *= 2
         return span
 
+    def seconds(self, kind: str) -> float:
+        """Processor time for a kind of learner."""
+        return 60 * self.minutes * (LONG_SHARE if self.rows > LONG_ROWS else SHARE)[kind]
+
     @property
     def window(self) -> int:
         """W of every candidate, so that all of them are cut from the recordings in the same way."""
@@ -128,7 +134,7 @@ def _columns(amount: Amount) -> int:
 def _steps(amount: Amount, groups: int) -> int:
     """Updates of each perceptron that the budget allows and the rows are worth."""
     weights = MEMBERS * groups * (_columns(amount) * UNITS + UNITS * UNITS + UNITS * amount.outputs)
-    affordable = 60 * amount.minutes * SHARE["perceptrons"] * OPERATIONS_PER_S / (PASSES * BATCH * weights)
+    affordable = amount.seconds("perceptrons") * OPERATIONS_PER_S / (PASSES * BATCH * weights)
     useful = max(USUAL_STEPS, ROW_PASSES * amount.rows // BATCH)
     return int(min(max(affordable, LEAST_STEPS), useful, MOST_STEPS))
 
@@ -159,7 +165,7 @@ def tree_plan(amount: Amount) -> TreePlan:
         seconds = TREE_SECONDS + min(rows, amount.rows) * _columns(amount) / TREE_CELLS_PER_S
         for folds in TREE_FOLDS:
             # Each part is left out by trees on the other rows; the network's trees are grown on all rows.
-            trees = int(60 * amount.minutes * SHARE["trees"] / (folds * amount.outputs * seconds))
+            trees = int(amount.seconds("trees") / (folds * amount.outputs * seconds))
             if trees >= (TREES if folds > TREE_FOLDS[-1] else LEAST_TREES):
                 return TreePlan(min(trees, TREES), rows, folds)
     return TreePlan(0, TREE_ROWS[-1], TREE_FOLDS[-1])
@@ -213,7 +219,7 @@ def _recurrent(amount: Amount) -> Table | None:
         return None
     epochs = 12
     tick = PASSES * RECURRENT_TICK * RECURRENT_LANES * RECURRENT_CHUNK
-    affordable = 60 * amount.minutes * SHARE["recurrent"] * OPERATIONS_PER_S / (tick * epochs)
+    affordable = amount.seconds("recurrent") * OPERATIONS_PER_S / (tick * epochs)
     useful = ROW_PASSES * amount.rows // (RECURRENT_LANES * RECURRENT_CHUNK * epochs)
     return {
         "model": {

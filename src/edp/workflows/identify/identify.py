@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
-from edp.errors import ConfigError, DataError
+from edp.errors import ConfigError, DataError, StorageError
 from edp.evaluation.free_run import free_run_scores
 from edp.logs.source import DataSource
 from edp.networks.twin import TWINS, TwinSpec, fit_scales
@@ -25,7 +25,7 @@ from edp.recording import Recording
 from edp.signals import Kind
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import load_machine, parse_machine
-from edp.storage import write_bytes, write_json
+from edp.storage import check_writable, write_bytes, write_json
 from edp.training.free_run import FreeRunProgress
 from edp.training.grey_fit import GreyProblem, fit_grey_box
 from edp.training.twin_bundle import load_twin
@@ -101,9 +101,7 @@ def identify(
         EdpError: logs, guess, settings or run that do not fit each other, or an identified machine that cannot be;
             nothing is written then.
     """
-    tell, target = on_step or (lambda text: None), Path(out)
-    if target.suffix.lower() != ".toml":
-        raise ConfigError(f"--out {out}: a machine file ends in .toml; edp simulate reads it")
+    tell, target = on_step or (lambda text: None), _new_file(out)
     if run is not None and experiment is not None:
         raise ConfigError(
             f"--run {run} comes with settings; a run keeps its own: leave --config and --set out, or --run to fit anew"
@@ -143,6 +141,24 @@ def identify(
     facts = {"schema": 1, "machine": str(target), "base": base.name, "basis": BASIS, "notes": notes}
     write_json(target.with_suffix(".json"), facts | {"numbers": [row.plain() for row in rows], "models": scores})
     return Identified(written, rows, scores, notes)
+
+
+def _new_file(out: str | Path) -> Path:
+    """Where the machine is written, before a fit of minutes: a file that is not there yet, nor the one beside it.
+
+    Raises:
+        ConfigError: another ending.
+        StorageError: one of the two files is there, or the folder cannot be written.
+    """
+    target = Path(out)
+    if target.suffix.lower() != ".toml":
+        raise ConfigError(f"--out {out}: a machine file ends in .toml; edp simulate reads it")
+    for file in (target, target.with_suffix(".json")):
+        # It may be what a tape measure told, and the very file of --machine.
+        if file.exists():
+            raise StorageError(f"--out {out}: '{file}' is there already and is not written over; choose another name")
+    check_writable(target.parent)
+    return target
 
 
 def _whole_grey_box(spec: TwinSpec) -> GreyBox:
