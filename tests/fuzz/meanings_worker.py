@@ -9,7 +9,6 @@ import faulthandler
 import json
 import logging
 import os
-import resource
 import shutil
 import sys
 import warnings
@@ -18,6 +17,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 import meanings
+from worker import peak_mb
 
 from edp.config.experiment import load_experiment
 from edp.errors import EdpError
@@ -113,8 +113,7 @@ def main() -> None:
             one(kind, number, folder, results[kind])
         print(kind, file=sys.stderr)
     end()
-    users = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    results["peak_mb"] = max(resource.getrusage(user).ru_maxrss for user in users) / 1024
+    results["peak_mb"] = peak_mb()
     results["marker"] = any(folder.rglob("marker"))
     print(json.dumps(results))
 

@@ -67,7 +67,7 @@ PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
         *("budget", "config", "data", "features", "further", "limit", "map", "out", "page", "scenario", "start"),
-        *("plots", "predictor", "study", "teacher", "w8a16"),
+        *("plots", "predictor", "run", "study", "teacher", "w8a16"),
     )
 )
 """Options of all commands that name a file or folder."""
