@@ -7,6 +7,7 @@ import pytest
 
 import edp.networks.twin
 from edp.networks.twin import TWINS
+from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.static_map import StaticMap, StaticTwin
 from edp.testing import ContractError, check_spec, check_twin
 
@@ -16,13 +17,18 @@ def test_a_formulation_keeps_the_contract(name):
     check_twin(name)
 
 
+@pytest.mark.parametrize("members", [1, 3])
+def test_a_recurrent_twin_on_a_static_map_keeps_the_contract(members):
+    check_twin("recurrent", Recurrent(units=6, members=members, valve_map=True))
+
+
 @pytest.mark.parametrize("name", list(TWINS))
 def test_options_of_a_formulation_are_frozen_and_survive_json(name):
     check_spec(TWINS, name)
 
 
 def test_every_file_of_a_formulation_registers_it():
-    shared = {"__init__", "base", "intervals", "lowering", "plant", "scales", "steps"}
+    shared = {"__init__", "base", "intervals", "lowering", "plant", "recurrent_cell", "scales", "steps"}
     files = {path.stem for path in Path(edp.networks.twin.__path__[0]).glob("*.py")} - shared
     assert files == {TWINS[name].__module__.rpartition(".")[2] for name in TWINS}
 
@@ -38,7 +44,7 @@ class Forgetful(StaticTwin):
 class Unbounded(StaticTwin):
     def bounded(self, feedback, velocity, pressure):
         answers = super().bounded(feedback, velocity, pressure)
-        answers[:, : velocity.shape[1]] = velocity
+        answers[:, : velocity.shape[1]] = 100.0 * velocity
         return answers
 
 

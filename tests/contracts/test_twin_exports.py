@@ -21,7 +21,8 @@ from edp.training.twin_bundle import TwinBundle, plant_bundle, save_twin
 from edp.workflows.deployment import export_bundle, unheld_adaptation
 
 QUICK = {"fmu": {"binaries": "none"}}
-SPECS = {"recurrent": Recurrent(units=5)}
+ON_A_MAP = "recurrent on a map"
+SPECS = {"recurrent": Recurrent(units=5), ON_A_MAP: Recurrent(units=6, members=3, valve_map=True)}
 SENSORS = {
     "all": {},
     "no pressures": {"pressures": False},
@@ -34,7 +35,7 @@ def in_layers(name: str) -> bool:
     return type(sample_twin(SPECS.get(name) or TWINS[name]())[0]).lower is not Twin.lower
 
 
-LOWERED = [name for name in TWINS if in_layers(name)]
+LOWERED = [ON_A_MAP, *(name for name in TWINS if in_layers(name))]
 
 
 def plant_of(name: str, sensors: str = "all") -> TwinPlant:

@@ -27,12 +27,14 @@ def twin(
 ) -> None:
     """Train a plant model that runs on commands alone: velocities, strokes and pressures over a minute.
 
+    Without settings, several formulations are fitted and free runs of the validation part choose; twin.kind names one.
     Judged on held-out recordings beside a static valve map and ARX. Ends with exit code 4 where the training diverged.
 
     Example: `edp twin data/m22 --out runs/twin`
     """
     from edp.config.twin import load_twin_experiment
     from edp.evaluation.guard import twin_beaten_by
+    from edp.report.twin.candidates import choice_sentence, read_candidates
     from edp.workflows.twin import train_twin
 
     experiment = load_twin_experiment(config, changes)
@@ -43,10 +45,14 @@ def twin(
     beaten = twin_beaten_by(trained.scores)
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}
     facts["beaten_by"] = None if beaten is None else beaten.label
+    facts["candidates"] = candidates = read_candidates(folder)
 
     def show() -> None:
         if beaten is not None:
             out.print(beaten.sentence(), style="bold red")
+        if candidates:
+            candidate_table(candidates)
+            out.print(f"chosen: {choice_sentence(candidates)}")
         score_table(trained.scores)
         out.print(f"trained in {duration(seconds)} of processor time; twin in {folder / 'twin'}")
         if (folder / "datasheet.txt").is_file():
@@ -102,6 +108,22 @@ def rollout(
             out.print(f"page: {page.resolve()}")
 
     emit(as_json, facts, show)
+
+
+def candidate_table(candidates: list[dict[str, Any]]) -> None:
+    """Print a row a formulation that was tried: its error over the static map's, and why one could not be fitted."""
+    rows = [
+        [
+            ("* " if row["chosen"] else "  ") + row["label"],
+            "-" if row["error"] is None else f"{row['error']:.3f}",
+            duration(row["seconds"]),
+        ]
+        for row in candidates
+    ]
+    table("error of free runs in the validation part, over the static map's", ["", "error", "processor time"], rows)
+    for row in candidates:
+        if row["why"]:
+            out.print(f"{row['label']} was left out: {row['why']}")
 
 
 def score_table(models: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
@@ -143,8 +144,9 @@ def free_runs(twin: Twin, series: Sequence[Series], seconds: float, starts: int)
         lanes = runs[first : first + LANES]
         commands = np.stack([part.inputs[at : at + length - 1] for part, at in lanes])
         truth = np.stack([part.targets[at : at + length] for part, at in lanes])
-        state = twin.reset(commands[:, :prefix], truth[:, :prefix])
-        answers.append(twin.rollout(commands[:, prefix:], state)[0])
+        with threadpool_limits(limits=1, user_api="blas"):  # see `fit_free_runs`
+            state = twin.reset(commands[:, :prefix], truth[:, :prefix])
+            answers.append(twin.rollout(commands[:, prefix:], state)[0])
         truths.append(truth[:, prefix:])
     whole_truth = np.concatenate(truths)
     names = tuple(part.name for part, _ in runs)

@@ -97,6 +97,21 @@ def twin_beaten_by(models: Mapping[str, Any]) -> Beaten | None:
     return worst if mean > LEAST else None
 
 
+def free_run_error(scores: Mapping[str, Any], reference: Mapping[str, Any]) -> float:
+    """Error of free runs over that of a reference on the same runs: what `twin_beaten_by` compares, as one number.
+
+    Args:
+        scores: see `edp.evaluation.free_run.free_run_scores`.
+        reference: of another twin.
+
+    Returns:
+        The geometric mean, over actuators, of the ratios of velocity errors and of stroke errors at each time.
+    """
+    pairs = zip(_free_run_errors(scores).values(), _free_run_errors(reference).values(), strict=True)
+    ratios = [math.log(a / b) for ours, theirs in pairs for a, b in zip(ours, theirs, strict=True) if a > 0 and b > 0]
+    return math.exp(sum(ratios) / len(ratios)) if ratios else 1.0
+
+
 def _free_run_errors(scores: Mapping[str, Any]) -> dict[str, list[float]]:
     """Of each actuator the error of its velocity, then of its stroke at each time."""
     rows = [scores["velocity_mae"], *scores["stroke_error"]]

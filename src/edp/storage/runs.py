@@ -7,7 +7,8 @@ import json
 import platform
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -22,6 +23,8 @@ from edp.storage.writing import make_folder, remove_unfinished, write_bytes, wri
 
 RECORDED = ("torch", "numpy", "scipy", "numba", "scikit-learn", "safetensors")
 """Libraries whose versions can change a result."""
+PARTS = "parts"
+"""Folder of a run in which its single trainings stand, where it has several."""
 
 
 def environment(threads: int) -> dict[str, str]:
@@ -127,6 +130,18 @@ class KeyedRun:
 
     folder: RunFolder
     key: str
+
+
+@contextmanager
+def part_of(run: KeyedRun | None, name: str) -> Iterator[KeyedRun | None]:
+    """A folder in that of a run, for one of several trainings of it, locked while it is open; the run itself where
+    `name` is empty, None without one.
+    """
+    if run is None or not name:
+        yield run
+        return
+    with RunFolder(run.folder.path / PARTS / name) as folder:
+        yield KeyedRun(folder, run.key)
 
 
 def read_provenance(folder: str | Path) -> dict[str, Any]:

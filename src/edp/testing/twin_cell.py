@@ -5,11 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from edp.networks.twin.recurrent import Bounds, TwinNetwork
+from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork
 
 
 def plain_steps(
-    network: TwinNetwork, commands: Tensor, measured: Tensor, port: Tensor, start: tuple[Tensor, Tensor], bounds: Bounds
+    network: TwinNetwork,
+    commands: Tensor,
+    measured: Tensor,
+    port: Tensor,
+    start: tuple[Tensor, Tensor],
+    bounds: Bounds,
+    mapped: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """What `TwinNetwork.forward` computes, with the same arguments; autograd keeps a graph of every tick."""
     change, low, high, trapezoid = (torch.from_numpy(values) for values in bounds.arrays)
@@ -25,6 +31,8 @@ def plain_steps(
         new = torch.tanh(into[:, 2 * units :] + reset * (up[:, 2 * units :] + network.inner_bias))
         h = new + keep * (h - new)
         value = fed + change * (h @ network.out_weight + network.out_bias)
+        if mapped is not None:
+            value = value + network.pulls(bounds) * (mapped[t] - fed)
         velocity = value[:, :n].clamp(low[:n], high[:n])
         rest = value[:, n + strokes :].clamp(low[n + strokes :], high[n + strokes :])
         parts = [velocity, rest]

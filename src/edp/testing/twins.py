@@ -69,14 +69,18 @@ def sample_twin(spec: TwinSpec, recording: Recording | None = None) -> tuple[Twi
     return twin, commands, measured
 
 
-def check_twin(name: str) -> None:
+def check_twin(name: str, options: TwinSpec | None = None) -> None:
     """Hold a registered formulation to its contract, for two actuators and for one with the least of sensors.
+
+    Args:
+        name: under which it is registered.
+        options: of the formulation; its defaults where left out.
 
     Raises:
         ContractError: what does not hold, and for which channels.
     """
     for recording in (sample_actuators(), sample_actuators(axes=1, strokes=False, pressures=False)):
-        spec: TwinSpec = TWINS[name]()
+        spec: TwinSpec = options or TWINS[name]()
         twin, commands, measured = sample_twin(spec, recording)
         where = f"twin '{name}', {', '.join(channel.name for channel in twin.channels.answers)}"
         prefix = twin.prefix_ticks

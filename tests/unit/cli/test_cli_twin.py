@@ -22,8 +22,8 @@ from edp.training.bundle import make_bundle, save_bundle
 from edp.training.twin_bundle import load_twin
 
 SMALL = (
-    *("twin.units=6", "twin.prefix_ticks=20", "training.lanes=4", "training.lengths_s=[0.2]", "training.updates=[6]"),
-    *("training.validate_every=3", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]"),
+    *("twin.kind=recurrent", "twin.units=6", "twin.prefix_ticks=20", "training.lanes=4", "training.lengths_s=[0.2]"),
+    *("training.updates=[6]", "training.validate_every=3", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]"),
 )
 WORDS = [word for change in SMALL for word in ("--set", change)]
 
@@ -82,8 +82,33 @@ def test_a_stopped_training_goes_on(edp, logs, trained, tmp_path, monkeypatch):
     assert all(np.array_equal(resumed[name], whole[name]) for name in whole)
 
 
+def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs, tmp_path):
+    run, page = tmp_path / "run", tmp_path / "page.html"
+    words = ["--set", "twin.candidates=['static','n4sid','recurrent']", *WORDS[4:]]
+    shown = " ".join(edp("twin", logs, "--out", run, *words).out.split())
+    assert "chosen: " in shown
+    ended = edp("twin", logs, "--out", run, *words, "--json").json
+    rows = ended["candidates"]
+    assert [row["label"] for row in rows[:2]] == ["static", "n4sid"]
+    assert all("updates" in row["label"] for row in rows[2:])
+    (kept,) = (row for row in rows if row["chosen"])
+    assert f"chosen: {kept['label']}: on free runs of the validation part" in shown
+    bundle = load_twin(run)
+    assert bundle.provenance["chosen"] in kept["label"] + "recurrent"
+    assert kept["label"].startswith(type(bundle.spec).__name__.lower()[:5])
+    assert edp("report", run, "--out", page).code == 0
+    text = page.read_text()
+    for part in ("It is ", 'id="candidates"', "n4sid", "as good as the best"):
+        assert part in text
+    before = (run / "candidates.json").read_text()
+    assert edp("evaluate", run).code == 0
+    assert (run / "candidates.json").read_text() == before
+    (run / "candidates.json").write_text(before.replace('"chosen": true', '"chosen": "yes"'))
+    assert "chosen is 'yes'; true or false must hold" in " ".join(edp("report", run).err.split())
+
+
 def test_floors_are_formulations_of_their_own(edp, logs, tmp_path):
-    ended = edp("twin", logs, "--out", tmp_path / "run", "--set", "twin.kind=arx", *WORDS[4:], "--json")
+    ended = edp("twin", logs, "--out", tmp_path / "run", "--set", "twin.kind=arx", *WORDS[6:], "--json")
     models = ended.json["models"]
     assert models["twin"]["stroke_error"] == models["arx"]["stroke_error"]
     assert load_twin(tmp_path / "run").spec.lags == 25

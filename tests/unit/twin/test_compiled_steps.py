@@ -4,20 +4,23 @@ import numpy as np
 import pytest
 import torch
 
-from edp.networks.twin.recurrent import Bounds, TwinNetwork
+from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork
 from edp.networks.twin.steps import _tanh
 from edp.testing.twin_cell import plain_steps
 
 TICKS, BATCH, COMMANDS, VELOCITIES, PRESSURES, UNITS = 40, 5, 3, 2, 3, 8
 
 
-def case(strokes, tight):
+def case(strokes, tight, pulled):
     """A network with random weights, and inputs with every mixture of free and measured ports."""
     generator = torch.Generator().manual_seed(3)
     answers = VELOCITIES + strokes + PRESSURES
-    network = TwinNetwork(COMMANDS, answers, UNITS)
-    for weight in network.parameters():
-        weight.data.normal_(0, 0.4, generator=generator)
+    network = TwinNetwork(COMMANDS, answers, UNITS, VELOCITIES + PRESSURES if pulled else 0)
+    for name, weight in network.named_parameters():
+        if name != "pull":
+            weight.data.normal_(0, 0.4, generator=generator)
+    if pulled:
+        network.pull.data.copy_(torch.tensor([0.3, 0.9, 0.0, 1.0, 0.5]))
 
     def draw(*shape):
         return torch.randn(*shape, generator=generator)
@@ -30,17 +33,22 @@ def case(strokes, tight):
     inputs = [draw(TICKS, BATCH, COMMANDS), 0.3 * draw(TICKS, BATCH, answers), port]
     start = (0.3 * draw(BATCH, answers), 0.3 * draw(BATCH, UNITS))
     target = draw(TICKS, BATCH, answers)
-    return network, inputs, start, bounds, target
+    mapped = None
+    if pulled:
+        mapped = draw(TICKS, BATCH, answers)
+        mapped[..., VELOCITIES : VELOCITIES + strokes] = 0.0
+    return network, inputs, start, bounds, mapped, target
 
 
+@pytest.mark.parametrize("pulled", [False, True], ids=["alone", "map"])
 @pytest.mark.parametrize("strokes", [VELOCITIES, 0], ids=["strokes", "no_strokes"])
 @pytest.mark.parametrize("tight", [True, False], ids=["bounds_act", "bounds_far"])
-def test_values_and_gradients_are_those_of_autograd(strokes, tight):
-    network, (commands, measured, port), start, bounds, target = case(strokes, tight)
+def test_values_and_gradients_are_those_of_autograd(strokes, tight, pulled):
+    network, (commands, measured, port), start, bounds, mapped, target = case(strokes, tight, pulled)
     results = []
     for run in (network, lambda *a: plain_steps(network, *a)):
         leaves = [commands.clone().requires_grad_(), *(values.clone().requires_grad_() for values in start)]
-        answers, h = run(leaves[0], measured, port, (leaves[1], leaves[2]), bounds)
+        answers, h = run(leaves[0], measured, port, (leaves[1], leaves[2]), bounds, mapped)
         loss = (answers - target).square().sum() + 3 * answers[-1].sum() + h.square().sum()
         grads = torch.autograd.grad(loss, [*leaves, *network.parameters()])
         results.append((answers.detach(), h.detach(), *grads))
@@ -50,7 +58,7 @@ def test_values_and_gradients_are_those_of_autograd(strokes, tight):
 
 
 def test_bounds_act_in_the_case_that_claims_it():
-    network, (commands, measured, port), start, bounds, _ = case(VELOCITIES, True)
+    network, (commands, measured, port), start, bounds, _, _ = case(VELOCITIES, True, False)
     answers, _ = network(commands, measured, port, start, bounds)
     strokes, velocities = answers[..., VELOCITIES : 2 * VELOCITIES], answers[..., :VELOCITIES]
     at_stop = strokes.abs() == 0.6

@@ -158,6 +158,10 @@ class Twin(ABC):
         """Commands in SI units as a network reads them."""
         return np.asarray((commands - self.scales.command_offset) / self.scales.command_width, dtype=np.float32)
 
+    def drive(self, commands: Array) -> Array:
+        """What a training on free runs reads of commands ``(tick, command)`` in SI units, a row a tick."""
+        return self.scaled_commands(commands)
+
     def bounded(self, feedback: Array, velocity: Array, pressure: Array) -> Array:
         """Answers ``(batch, answer)`` within the bounds, SI units.
 
@@ -270,15 +274,15 @@ def even_starts(twin: Twin, series: Sequence[Series], length: int, each: int) ->
     return usable
 
 
-def check_length(channels: TwinChannels, spec: TwinSpec, train: Sequence[Series]) -> None:
+def check_length(channels: TwinChannels, prefix_ticks: int, train: Sequence[Series]) -> None:
     """Refuse recordings in which no prefix and free run have room.
 
     Raises:
         ConfigError: says how long the longest one is.
     """
     longest = max((series.samples for series in train), default=0)
-    if longest < spec.prefix_ticks + 2:
+    if longest < prefix_ticks + 2:
         raise ConfigError(
-            f"twin: the longest training recording has {longest} ticks; more than prefix_ticks = {spec.prefix_ticks} "
+            f"twin: the longest training recording has {longest} ticks; more than prefix_ticks = {prefix_ticks} "
             "must hold: give longer recordings, or set a shorter prefix"
         )

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
+from torch import Tensor
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.errors import ConfigError
 from edp.ir import Builder
-from edp.ir.layers import BinaryOperation, Dense
+from edp.ir.layers import BinaryOperation, Dense, ScaleShift
 from edp.ir.memory import Gru
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_columns
+from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork, buffers
 from edp.networks.twin.scales import Array, TwinScales
-from edp.networks.twin.steps import run_backward, run_forward
+from edp.networks.twin.static_map import StaticMap, StaticTwin
+from edp.networks.twin.steps import run_forward
 from edp.settings.bounds import MOST_UNITS, check_bounds, integer
 
 PIECE = 256
 """Ticks that a run without gradients keeps at once: the loop writes what only a backward run would read."""
+MAP = "map_"
+"""Before the names of a static map's numbers, among those of the twin that it is part of."""
+MOST_MEMBERS = 32
+MEMBER_SEED = 1000
+"""Between the seeds of members, so that few runs share one."""
 
 
 @TWINS.register("recurrent")
@@ -31,222 +36,164 @@ PIECE = 256
 class Recurrent:
     """A GRU with feedback ports, trained on its own free runs (`edp.training.free_run`).
 
+    Several members are networks that are trained apart; the twin answers with the mean of their changes. As they read
+    the same ports, they are one network, whose weights between members are zero.
+
     Attributes:
-        units: width of its memory.
+        units: width of its memory, that of all members together.
+        members: networks whose changes are averaged.
+        valve_map: whether velocities and pressures are also pulled to what a static map (`StaticMap`) says of the
+            commands; how strongly is learned. A twin that has learned nothing else is that map.
         prefix_ticks: measured ticks before a free run, in which its memory forms.
 
     Raises:
-        ConfigError: a value out of range.
+        ConfigError: a value out of range, or units that members cannot share.
     """
 
     units: int = 96
+    members: int = 1
+    valve_map: bool = False
     prefix_ticks: int = 30
 
     def __post_init__(self) -> None:
-        check_bounds("recurrent twin", self, units=integer(1, MOST_UNITS), prefix_ticks=PREFIX)
+        bounds = {"units": integer(1, MOST_UNITS), "members": integer(1, MOST_MEMBERS), "prefix_ticks": PREFIX}
+        check_bounds("recurrent twin", self, **bounds)
+        if self.units % self.members:
+            raise ConfigError(
+                f"recurrent twin: {self.units} units and {self.members} members; a whole number of units for each "
+                "member must hold"
+            )
 
     def start(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series], seed: int) -> RecurrentTwin:
         """An untrained one; its weights follow from the seed."""
-        network = TwinNetwork(len(channels.commands), len(channels.answers), self.units)
+        static = self.static_map(channels, scales, train)
+        seeds = [member_seed(seed, i) for i in range(self.members)]
+        return averaged([self.member(channels, scales, static, one) for one in seeds])
+
+    def static_map(self, channels: TwinChannels, scales: TwinScales, train: Sequence[Series]) -> StaticTwin | None:
+        """The map that it is pulled to, fitted to the training stretches; None where it has none."""
+        return self._map_spec.start(channels, scales, train, 0) if self.valve_map else None
+
+    def member(self, channels: TwinChannels, scales: TwinScales, static: StaticTwin | None, seed: int) -> RecurrentTwin:
+        """One of its members, untrained, on a fitted map."""
+        network = self.alone()._network(channels)
         # Answers that start at no change at all make the first free runs stand still.
         network.draw(seed, 0.1)
-        return RecurrentTwin(channels, scales, self.prefix_ticks, network)
+        return RecurrentTwin(channels, scales, self.prefix_ticks, network, static)
+
+    def alone(self) -> Recurrent:
+        """Options of one of its members."""
+        return replace(self, units=self.units // self.members, members=1)
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
-        """Those of the network."""
+        """Those of the network, and of the map."""
         with torch.device("meta"):  # a header says how wide it is: no memory before that is checked
-            network = TwinNetwork(len(channels.commands), len(channels.answers), self.units)
-        return {name: tuple(weight.shape) for name, weight in network.named_parameters()}
+            network = self._network(channels)
+        shapes = {name: tuple(weight.shape) for name, weight in network.named_parameters()}
+        return shapes | {MAP + name: shape for name, shape in self._map_shapes(channels).items()}
 
     def build(self, channels: TwinChannels, scales: TwinScales, arrays: Mapping[str, Array]) -> RecurrentTwin:
         """The twin with these weights."""
-        network = TwinNetwork(len(channels.commands), len(channels.answers), self.units)
-        network.load_state_dict({name: torch.from_numpy(np.array(arrays[name])) for name in self.shapes(channels)})
-        return RecurrentTwin(channels, scales, self.prefix_ticks, network)
+        network = self._network(channels)
+        network.load_state_dict({name: torch.from_numpy(np.array(arrays[name])) for name in network.state_dict()})
+        numbers = {name: arrays[MAP + name] for name in self._map_shapes(channels)}
+        static = self._map_spec.build(channels, scales, numbers) if numbers else None
+        return RecurrentTwin(channels, scales, self.prefix_ticks, network, static)
 
-
-class CellWeights(nn.Module):
-    """Weights of a cell that reads commands and `read` further numbers, and answers `answers` of them; zero."""
-
-    def __init__(self, commands: int, read: int, answers: int, units: int) -> None:
-        super().__init__()
-        self.units = units
-        self.command_weight = nn.Parameter(torch.zeros(3 * units, commands))
-        self.bias = nn.Parameter(torch.zeros(3 * units))
-        # Inputs first: the compiled loop multiplies rows of a batch with them.
-        self.feedback_weight = nn.Parameter(torch.zeros(read, 3 * units))
-        self.h_weight = nn.Parameter(torch.zeros(units, 3 * units))
-        self.inner_bias = nn.Parameter(torch.zeros(units))
-        self.out_weight = nn.Parameter(torch.zeros(units, answers))
-        self.out_bias = nn.Parameter(torch.zeros(answers))
-
-    def draw(self, seed: int, answers: float) -> None:
-        """Draw weights with PyTorch's uniform bound, those of the answers times `answers`."""
-        generator, bound = torch.Generator().manual_seed(seed), 1.0 / math.sqrt(self.units)
-        with torch.no_grad():
-            for name, weight in self.named_parameters():
-                weight.uniform_(-bound, bound, generator=generator)
-                if name.startswith("out"):
-                    weight.mul_(answers)
+    def _network(self, channels: TwinChannels) -> TwinNetwork:
+        pulled = len(solved_columns(channels)) if self.valve_map else 0
+        return TwinNetwork(len(channels.commands), len(channels.answers), self.units, pulled)
 
     @property
-    def looped(self) -> tuple[nn.Parameter, ...]:
-        """What the compiled loop reads: all but the commands' part and the bias of the gates."""
-        return self.feedback_weight, self.h_weight, self.inner_bias, self.out_weight, self.out_bias
+    def _map_spec(self) -> StaticMap:
+        return StaticMap(prefix_ticks=self.prefix_ticks)
 
-
-class TwinNetwork(CellWeights):
-    """The cell over scaled numbers, time first."""
-
-    def __init__(self, commands: int, answers: int, units: int) -> None:
-        super().__init__(commands, answers, answers, units)
-
-    def forward(
-        self, commands: Tensor, measured: Tensor, port: Tensor, start: tuple[Tensor, Tensor], bounds: Bounds
-    ) -> tuple[Tensor, Tensor]:
-        """Answers ``(time, batch, answer)`` and the h after them ``(batch, units)``.
-
-        Args:
-            commands: ``(time, batch, command)``.
-            measured: ``(time, batch, answer)``, any finite number where `port` is 0.
-            port: 1 where a port reads what was measured, 0 where it reads the last answer.
-            start: last answer ``(batch, answer)`` and h ``(batch, units)``.
-            bounds: of the answers.
-        """
-        projected = nn.functional.linear(commands, self.command_weight, self.bias)
-        result = _Steps.apply(projected, measured, port, *start, *self.looped, bounds)  # type: ignore[no-untyped-call]
-        return result[0], result[1]
-
-
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """Of scaled answers: change by unit of output, low, high ``(answer,)``, trapezoid ``(stroke,)``; velocities."""
-
-    change: Array
-    low: Array
-    high: Array
-    trapezoid: Array
-    velocities: int
-
-    @staticmethod
-    def of(channels: TwinChannels, scales: TwinScales) -> Bounds:
-        """The bounds of a twin in its own numbers."""
-        offset, width = scales.answer_offset, scales.answer_width
-        low, high = (np.ascontiguousarray((end - offset) / width) for end in (scales.low, scales.high))
-        change = np.ascontiguousarray(scales.change_width / width)
-        return Bounds(change, low, high, scales.trapezoid(channels), len(channels.velocities))
-
-    @property
-    def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """As the compiled loop reads them."""
-        return self.change, self.low, self.high, self.trapezoid
-
-
-def _buffers(ticks: int, batch: int, answers: int, units: int) -> tuple[Array, ...]:
-    """What `run_forward` writes: answers, fed values, where no bound acts, gates, inner sums, and h."""
-    shapes = [(ticks, answers)] * 3 + [(ticks, 3 * units), (ticks, units), (ticks + 1, units)]
-    return tuple(np.empty((time, batch, width), np.float32) for time, width in shapes)
-
-
-class _Steps(torch.autograd.Function):
-    """`run_forward` with `run_backward` as its adjoint."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, projected: Tensor, measured: Tensor, port: Tensor, answer: Tensor, h: Tensor, *rest: Any
-    ) -> tuple[Tensor, Tensor]:
-        weights = tuple(weight.detach().numpy() for weight in rest[:5])
-        bounds: Bounds = rest[5]
-        ticks, batch, width = measured.shape
-        saved = _buffers(ticks, batch, width, h.shape[1])
-        into, values, ports, last, memory = (
-            np.ascontiguousarray(tensor.detach().numpy()) for tensor in (projected, measured, port, answer, h)
-        )
-        run_forward(into, values, ports, weights, bounds.arrays, bounds.velocities, (last, memory), saved)
-        ctx.saved, ctx.port, ctx.weights, ctx.bounds = saved, ports, weights, bounds
-        return torch.from_numpy(saved[0]), torch.from_numpy(saved[5][-1])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_answers: Tensor, grad_h: Tensor) -> tuple[Tensor | None, ...]:
-        _, fed, _, gates, inner, hs = ctx.saved
-        by_gates, by_inner, by_out = np.empty_like(gates), np.empty_like(inner), np.empty_like(fed)
-        by_answer, by_h = np.zeros_like(fed[0]), np.array(grad_h.numpy(), order="C")
-        grads = (by_gates, by_inner, by_out, by_answer, by_h)
-        incoming = np.ascontiguousarray(grad_answers.numpy())
-        run_backward(incoming, ctx.port, ctx.weights, ctx.bounds.arrays, ctx.bounds.velocities, ctx.saved, grads)
-        by_weights = weight_gradients(fed, hs, by_gates, by_inner, by_out)
-        return (
-            torch.from_numpy(by_gates),
-            None,
-            None,
-            torch.from_numpy(by_answer),
-            torch.from_numpy(by_h),
-            *by_weights,
-            None,
-        )
-
-
-def weight_gradients(read: Array, hs: Array, by_gates: Array, by_inner: Array, by_out: Array) -> tuple[Tensor, ...]:
-    """Gradients of `CellWeights.looped`, from what a cell read, its h, and the adjoint's gradients; tick first."""
-    units = by_inner.shape[2]
-
-    # Gradients of the weights need all ticks at once: one large product replaces one small product a tick.
-    def rows(values: Array) -> Tensor:
-        return torch.from_numpy(values).flatten(0, 1)
-
-    gate_rows, inner_rows, out_rows, before = rows(by_gates), rows(by_inner), rows(by_out), rows(hs[:-1])
-    return (
-        rows(read).t() @ gate_rows,
-        torch.cat([before.t() @ gate_rows[:, : 2 * units], before.t() @ inner_rows], dim=1),
-        inner_rows.sum(0),
-        rows(hs[1:]).t() @ out_rows,
-        out_rows.sum(0),
-    )
+    def _map_shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
+        return self._map_spec.shapes(channels) if self.valve_map else {}
 
 
 class RecurrentTwin(Twin):
-    """The network in SI units, without gradients. State: ``answer`` scaled, and ``h`` ``(batch, units)``."""
+    """The network in SI units, without gradients.
 
-    def __init__(self, channels: TwinChannels, scales: TwinScales, prefix_ticks: int, network: TwinNetwork) -> None:
+    State: ``answer`` scaled, ``h`` ``(batch, units)``, and with a static map the ``commands`` of its delay.
+
+    Args:
+        channels: what commands it and what it answers.
+        scales: of its numbers, and the bounds of its answers.
+        prefix_ticks: least number of measured ticks before a free run.
+        network: the cell.
+        static: the map to which its answers are pulled; None where the network has no pull.
+    """
+
+    def __init__(
+        self,
+        channels: TwinChannels,
+        scales: TwinScales,
+        prefix_ticks: int,
+        network: TwinNetwork,
+        static: StaticTwin | None = None,
+    ) -> None:
         super().__init__(channels, scales, prefix_ticks)
-        self.network, self.bounds = network, Bounds.of(channels, scales)
+        self.network, self.static, self.bounds = network, static, Bounds.of(channels, scales)
 
     def initial_state(self, command: Array, measured: Array) -> TwinState:
-        return {"answer": self.scaled(measured), "h": np.zeros((len(measured), self.network.units), np.float32)}
+        state = {"answer": self.scaled(measured), "h": np.zeros((len(measured), self.network.units), np.float32)}
+        if self.static is not None:
+            state["commands"] = self.static.initial_state(command, measured)["commands"]
+        return state
+
+    def drive(self, commands: Array) -> Array:
+        """The scaled commands, and behind them with a static map what it says of them, as its answers are scaled."""
+        if self.static is None:
+            return self.scaled_commands(commands)
+        return np.concatenate([self.scaled_commands(commands), self._scaled_map(self.static.along(commands))], axis=1)
 
     def free_run(self, commands: Tensor, measured: Tensor, port: Tensor) -> Tensor:
         """Scaled answers ``(time, batch, answer)`` with gradients by the weights, from measured starts.
 
         Args:
-            commands: scaled ``(time, batch, command)``.
+            commands: what `drive` made of them ``(time, batch, number)``.
             measured: scaled ``(time, batch, answer)``, any finite number where `port` is 0.
             port: 1 where a port reads what was measured; all of the first tick.
         """
+        count = len(self.channels.commands)
+        mapped = None if self.static is None else commands[..., count:]
         start = (measured[0], torch.zeros(measured.shape[1], self.network.units))
-        answers, _ = self.network(commands, measured, port, start, self.bounds)
+        answers, _ = self.network(commands[..., :count], measured, port, start, self.bounds, mapped)
         return torch.as_tensor(answers)
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
-        network, batch = self.network, len(commands)
+        network, batch, bounds = self.network, len(commands), self.bounds
         arrays = tuple(weight.detach().numpy() for weight in network.looped)
         command_weight, bias = network.command_weight.detach().numpy(), network.bias.detach().numpy()
-        pieces, answer, h = [], state["answer"], state["h"]
+        pull = network.pulls(bounds).detach().numpy()
+        pieces, after = [], dict(state)
         for at in range(0, commands.shape[1], PIECE):
+            piece = commands[:, at : at + PIECE]
             read = np.ascontiguousarray(self.scaled(measured[:, at : at + PIECE]).swapaxes(0, 1))
             port = np.isfinite(read).astype(np.float32)
-            saved = _buffers(len(read), batch, read.shape[2], network.units)
-            command_rows = self.scaled_commands(commands[:, at : at + PIECE]).swapaxes(0, 1)
+            saved = buffers(len(read), batch, read.shape[2], network.units)
             # A product a tick, so that a chunk and its single ticks round alike.
-            projected = np.stack([row @ command_weight.T for row in command_rows]) + bias
-            bounds = self.bounds
-            run_forward(
-                projected, np.nan_to_num(read), port, arrays, bounds.arrays, bounds.velocities, (answer, h), saved
-            )
+            rows = self.scaled_commands(piece).swapaxes(0, 1)
+            projected = np.stack([row @ command_weight.T for row in rows]) + bias
+            mapped = np.zeros((0, 0, 0), np.float32)
+            if self.static is not None:
+                solved, after["commands"] = self.static.mapped(piece, after["commands"])
+                mapped = np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1))
+            start = (after["answer"], after["h"])
+            shape = (bounds.arrays, bounds.velocities)
+            run_forward(projected, np.nan_to_num(read), port, arrays, (mapped, pull), *shape, start, saved)
             pieces.append(saved[0].swapaxes(0, 1))
-            answer, h = saved[0][-1].copy(), saved[5][-1].copy()
+            after["answer"], after["h"] = saved[0][-1].copy(), saved[5][-1].copy()
         answers = np.concatenate(pieces, axis=1) * self.scales.answer_width + self.scales.answer_offset
-        return np.asarray(answers, dtype=np.float32), {"answer": answer, "h": h}
+        return np.asarray(answers, dtype=np.float32), after
+
+    def _scaled_map(self, solved: Array) -> Array:
+        """Scaled answers ``(..., answer)`` of what the map says ``(..., all but strokes)``, zero for strokes."""
+        columns, scales = solved_columns(self.channels), self.scales
+        answers = np.zeros((*solved.shape[:-1], len(self.channels.answers)), np.float32)
+        answers[..., columns] = (solved - scales.answer_offset[columns]) / scales.answer_width[columns]
+        return answers
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:
         network, solved = self.network, solved_columns(self.channels)
@@ -265,8 +212,57 @@ class RecurrentTwin(Twin):
         unit = self.bounds.change[solved]
         weight, bias = unit[:, None] * arrays["out_weight"].T[solved], unit * arrays["out_bias"][solved]
         change = build.add(Dense, "change", h, weight=weight, bias=bias)
-        return build.combine("proposed", BinaryOperation.ADD, build.pick("before", fed, solved), change)
+        before = build.pick("before", fed, solved)
+        if self.static is not None:
+            with build.inside("map"):
+                mapped = self.static.lower(build, commands, fed)
+            pull, zero = network.pulls(self.bounds).detach().numpy()[solved], np.zeros(len(solved))
+            # Two products and no difference: a number that is far from both has no digits to lose.
+            near = build.add(ScaleShift, "pulled", mapped, gain=pull, shift=zero)
+            kept = build.add(ScaleShift, "kept", before, gain=1.0 - pull, shift=zero)
+            before = build.combine("pulled_before", BinaryOperation.ADD, kept, near)
+        return build.combine("proposed", BinaryOperation.ADD, before, change)
 
     def arrays(self) -> dict[str, Array]:
         weights = {name: weight.detach().numpy().copy() for name, weight in self.network.named_parameters()}
-        return self.scales.arrays() | weights
+        numbers = {} if self.static is None else self.static.numbers
+        return self.scales.arrays() | weights | {MAP + name: values for name, values in numbers.items()}
+
+
+def member_seed(seed: int, which: int) -> int:
+    """Seed of a member of a twin with this seed; the first one has the twin's own."""
+    return seed + MEMBER_SEED * which
+
+
+def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
+    """One twin that answers with the mean of the changes of twins of equal width, over the same channels.
+
+    All of them read the same ports, and what an answer adds up from h is linear: so their mean is one network, whose
+    gates are theirs side by side and whose answers have their weights over the number of twins.
+
+    Args:
+        twins: at least one; with one static map for all of them, or none.
+    """
+    first, count = twins[0], len(twins)
+    if count == 1:
+        return first
+    network = TwinNetwork(len(first.channels.commands), len(first.channels.answers), count * first.network.units,
+                          0 if first.network.pull is None else len(first.network.pull))  # fmt: skip
+    units, total = first.network.units, network.units
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.zero_()
+        for i, member in enumerate(twin.network for twin in twins):
+            own = slice(i * units, (i + 1) * units)
+            for gate in range(3):
+                at = slice(gate * total + own.start, gate * total + own.stop)
+                theirs = slice(gate * units, (gate + 1) * units)
+                network.command_weight[at], network.bias[at] = member.command_weight[theirs], member.bias[theirs]
+                network.feedback_weight[:, at] = member.feedback_weight[:, theirs]
+                network.h_weight[own, at] = member.h_weight[:, theirs]
+            network.inner_bias[own] = member.inner_bias
+            network.out_weight[own] = member.out_weight / count
+            network.out_bias.add_(member.out_bias / count)
+            if network.pull is not None and member.pull is not None:
+                network.pull.add_(member.pull.clamp(0.0, 1.0) / count)
+    return RecurrentTwin(first.channels, first.scales, first.prefix_ticks, network, first.static)

@@ -16,7 +16,7 @@ from edp.errors import ConfigError
 from edp.networks.twin.base import TWINS, TwinState, solved_columns
 from edp.networks.twin.grey.correction import Cell, Trace, run_back
 from edp.networks.twin.greybox import Doubles, GreyBox, GreyTwin
-from edp.networks.twin.recurrent import CellWeights, weight_gradients
+from edp.networks.twin.recurrent_cell import CellWeights, weight_gradients
 from edp.networks.twin.scales import Array, TwinScales
 from edp.settings.bounds import (
     MOST_BATCH,

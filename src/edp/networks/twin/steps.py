@@ -7,8 +7,11 @@ The cell is PyTorch's GRU with feedback ports: at each tick it reads f, measured
 with f plus its change::
 
     r, k = sigmoid(a + W f + U h),  n = tanh(a + W f + r (U h + b)),  h' = n + k (h - n)
-    velocity = clip(f + c o),  pressure = clip(f + c o),  o = V h' + d
+    velocity = clip(f + c o + p (m - f)),  pressure likewise,  o = V h' + d
     stroke = clip(f + trapezoid (velocity before + velocity)), and no velocity into an end stop
+
+Where a twin has a static map, m is what it says of the commands, and p the share of the way to it that an answer is
+pulled in a tick; else p is zero.
 
 All compiled code of a twin is in this file, whose content is the fingerprint of the code that is kept on disk.
 """
@@ -96,6 +99,7 @@ def run_forward(
     measured: Array,
     port: Array,
     weights: tuple[Array, ...],
+    map_of: tuple[Array, Array],
     bounds: tuple[Array, ...],
     velocities: int,
     start: tuple[Array, Array],
@@ -109,6 +113,8 @@ def run_forward(
         port: 1 where a port reads `measured`, 0 where it reads the last answer; the shape of `measured`.
         weights: of feedback ``(answer, 3 units)``, of h ``(units, 3 units)``, bias of n's inner sum ``(units,)``, of
             the answers ``(units, answer)`` and their bias ``(answer,)``.
+        map_of: what the static map says ``(time, batch, answer)``, and p ``(answer,)``, zero for strokes; without a
+            map p is empty.
         bounds: scale of changes, low, high ``(answer,)``, and the trapezoid ``(stroke,)``.
         velocities: number of velocities, the first answers.
         start: last answer ``(batch, answer)`` and h ``(batch, units)``.
@@ -117,6 +123,7 @@ def run_forward(
     """
     feedback_weight, h_weight, inner_bias, out_weight, out_bias = weights
     scale, low, high, trapezoid = bounds
+    mapped, pull = map_of
     answers, fed, free, gates, inner, hs = saved
     ticks, batch, width = measured.shape
     into, up = np.empty_like(gates[0]), np.empty_like(gates[0])
@@ -137,6 +144,8 @@ def run_forward(
         for row in range(batch):
             for j in range(width):
                 change[row, j] = scale[j] * (change[row, j] + out_bias[j])
+            for j in range(len(pull)):
+                change[row, j] += pull[j] * (mapped[t, row, j] - fed[t, row, j])
         _answer(fed[t], change, low, high, trapezoid, velocities, answers[t], free[t])
 
 
@@ -178,6 +187,7 @@ def run_backward(
     grad_answers: Array,
     port: Array,
     weights: tuple[Array, ...],
+    pull: Array,
     bounds: tuple[Array, ...],
     velocities: int,
     saved: tuple[Array, ...],
@@ -189,6 +199,7 @@ def run_backward(
         grad_answers: gradient by the answers ``(time, batch, answer)``.
         port: as in the forward run; `weights`, `bounds`, `velocities` and `saved` likewise.
         weights: of the cell.
+        pull: to the static map, see `run_forward`.
         bounds: of the answers.
         velocities: number of them.
         saved: what the forward run wrote.
@@ -219,6 +230,8 @@ def run_backward(
                 by_fed[row, j] = (by_answer[row, j] + along) * free[t, row, j]
             for j in range(width):
                 by_out[t, row, j] = by_fed[row, j] * scale[j]
+            for j in range(len(pull)):
+                by_fed[row, j] *= 1 - pull[j]
             for j in range(strokes):
                 by_out[t, row, velocities + j] = 0.0
                 by_fed[row, j] += by_fed[row, velocities + j] * trapezoid[j]

@@ -28,6 +28,7 @@ from edp.evaluation.scores_file import (
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import number, percent
+from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.storage import read_object
 
 CONTENT, RUNS, SCHEMA = "free_run.json", "free_runs.safetensors", 2
@@ -120,12 +121,14 @@ class FreeRunFacts:
         content: plain values.
         shown: ``seconds``, ``half_width`` where known, and ``NAME/answers``, ``NAME/truth`` ``(tick, answer)``, SI.
         provenance: of the twin; empty where it is not at hand.
+        candidates: formulations that it was chosen among, see `read_candidates`; empty where it was not chosen.
     """
 
     title: str
     content: Mapping[str, Any]
     shown: Mapping[str, NDArray[np.float32]]
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    candidates: Sequence[Mapping[str, Any]] = ()
 
     @property
     def models(self) -> Mapping[str, Mapping[str, Any]]:
@@ -178,7 +181,8 @@ def read_free_runs(folder: str | Path) -> FreeRunFacts:
         raise StorageError(f"cannot read '{path / RUNS}' ({error}); run edp evaluate {folder}") from error
     header = path / "twin" / "twin.json"
     provenance = read_object(header).get("provenance") if header.is_file() else {}
-    facts = FreeRunFacts(path.resolve().name, content, shown, provenance if isinstance(provenance, dict) else {})
+    known = provenance if isinstance(provenance, dict) else {}
+    facts = FreeRunFacts(path.resolve().name, content, shown, known, read_candidates(path))
     _check_arrays(facts, path / RUNS)
     return facts
 
@@ -211,6 +215,7 @@ def verdict(facts: FreeRunFacts) -> list[str]:
         if facts.provenance
         else f"{twin['runs']} free runs of {twin['seconds']:g} s."
     ]
+    lines += [f"It is {sentence}" for sentence in (choice_sentence(facts.candidates),) if sentence]
     for name, scores in facts.models.items():
         if name != TWIN and scores["stroke_error"] and scores["stroke_error"][-1]["mean"] is not None:
             last = scores["stroke_error"][-1]
@@ -245,6 +250,7 @@ def sheets_of(facts: FreeRunFacts) -> dict[str, Sheet]:
         _summary_sheet("recordings", "By recording, the worst first", "Recording", _worst(twin["by_recording"])),
         _summary_sheet("driving", "By way of driving", "Way of driving", twin["by_driving"]),
         _situation_sheet(twin),
+        *([candidate_sheet(facts.candidates)] if facts.candidates else []),
         *([_coverage_sheet(twin["intervals"])] if "intervals" in twin else []),
         *([_ahead_sheet(facts)] if "ahead" in twin else []),
         *([_beside_sheet(twin["beside"])] if "beside" in twin else []),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config.twin import TwinExperiment, load_twin_experiment
+from edp.config.twin import KINDS, AutoTwin, TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
@@ -161,7 +161,7 @@ def _new_file(out: str | Path) -> Path:
     return target
 
 
-def _whole_grey_box(spec: TwinSpec) -> GreyBox:
+def _whole_grey_box(spec: TwinSpec | AutoTwin) -> GreyBox:
     """The spec itself.
 
     Raises:
@@ -170,7 +170,7 @@ def _whole_grey_box(spec: TwinSpec) -> GreyBox:
     """
     if not isinstance(spec, GreyBox) or isinstance(spec, Residual):
         raise ConfigError(
-            f"settings: a machine is identified by a grey box, twin.kind = '{TWINS.name_of(spec)}' came; leave it out, "
+            f"settings: a machine is identified by a grey box, twin.kind = '{KINDS.name_of(spec)}' came; leave it out, "
             "or set twin.kind = 'greybox'"
         )
     if spec.without:
@@ -188,7 +188,8 @@ def _of_run(run: str | Path) -> tuple[GreyTwin, TwinExperiment]:
             f"--run {run}: it holds a twin of kind '{TWINS.name_of(bundle.spec)}'; numbers of a machine are those of a "
             "grey box: give a run of twin.kind = 'greybox', or leave --run out to have one fitted"
         )
-    return bundle.twin, load_twin_experiment(Path(run) / "config.toml")
+    # A run that chose among formulations keeps the one that it chose in its bundle.
+    return bundle.twin, replace(load_twin_experiment(Path(run) / "config.toml"), twin=bundle.spec)
 
 
 def _fitted(base: Machine, spec: GreyBox, logs: tuple[TwinChannels, Prepared, int], report: Any) -> _Fitted:

@@ -34,7 +34,7 @@ def prepared_twin(recordings: Sequence[Recording], experiment: TwinExperiment) -
     for recording in recordings[1:]:
         same_channels(channels, recording)
     data = prepare(recordings, channels.task(), experiment.split, experiment.twin.prefix_ticks)
-    check_length(channels, experiment.twin, data.train)
+    check_length(channels, experiment.twin.prefix_ticks, data.train)
     return channels, data
 
 

@@ -9,23 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from edp import __version__
-from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
+from edp.config.twin import TWIN_SETTINGS, AutoTwin, TwinExperiment, twin_toml
 from edp.data.prepared import Prepared
 from edp.evaluation.free_run import calibrated
 from edp.logs.source import DataSource
-from edp.networks.twin import Twin, fit_scales
-from edp.networks.twin.elements import ElementsTwin
-from edp.networks.twin.grey.datasheet import BASIS, datasheet, datasheet_text
-from edp.networks.twin.greybox import GreyTwin
-from edp.networks.twin.recurrent import RecurrentTwin
-from edp.networks.twin.residual import Residual, ResidualTwin
+from edp.networks.twin import fit_scales
+from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
+from edp.report.twin.candidates import CANDIDATES
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
-from edp.training.elements_fit import fit_elements
-from edp.training.free_run import FittedTwin, FreeRunProgress, fit_free_runs
-from edp.training.grey_fit import fit_grey_box
-from edp.training.residual_fit import fit_residual
+from edp.training.free_run import FittedTwin, FreeRunProgress
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
+from edp.workflows.twin.choose_twin import TwinChoice
+from edp.workflows.twin.fit_twin import MadeTwin, TwinFit
 from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
@@ -56,7 +52,8 @@ def train_twin(
     on_event: Callable[[FreeRunProgress], None] | None = None,
     on_step: Callable[[str], None] | None = None,
 ) -> TrainedTwin:
-    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``. A finished one is read,
+    """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``, and where the
+    formulation was left open ``candidates.json``. A finished one is read,
     a stopped one goes on.
 
     Args:
@@ -80,16 +77,17 @@ def train_twin(
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
         run.write_status("running")
-        scales = fit_scales(channels, data.train)
-        started = time.process_time()
-        twin = experiment.twin.start(channels, scales, data.train, experiment.training.seed)
-        fitted, facts = _fitted(twin, experiment, data, KeyedRun(run, key), on_event, tell)
-        fitted = replace(fitted, seconds=fitted.seconds or time.process_time() - started)
+        fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell)
+        made = _made(fit, KeyedRun(run, key))
+        fitted = made.fitted
         run.write_history(fitted.history)
+        if made.datasheet:
+            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": made.datasheet})
+            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(made.datasheet).encode())
         tell("calibrating intervals")
         intervals = calibrated(fitted.twin, data.validation, experiment.judge)
-        provenance = _provenance(source, experiment, data, fitted) | facts
-        bundle = TwinBundle(experiment.twin, fitted.twin, provenance, {}, intervals)
+        provenance = _provenance(source, experiment, data, fitted) | made.facts
+        bundle = TwinBundle(made.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
         write_scores(run.path, scores, runs, intervals)
         bundle = replace(bundle, scores=scores)
@@ -98,42 +96,14 @@ def train_twin(
     return TrainedTwin(bundle, scores, False)
 
 
-def _fitted(
-    twin: Twin,
-    experiment: TwinExperiment,
-    data: Prepared,
-    keyed: KeyedRun,
-    on_event: Callable[[FreeRunProgress], None] | None,
-    tell: Callable[[str], None],
-) -> tuple[FittedTwin, dict[str, Any]]:
-    """The twin after what its formulation needs beyond its start, and what its provenance says of that."""
-    seed, parts = experiment.training.seed, (data.train, data.validation)
-    if isinstance(twin, RecurrentTwin):
-        tell("training on free runs")
-        return fit_free_runs(twin, *parts, experiment.training, on_event, keyed), {}
-    if isinstance(twin, ElementsTwin):
-        tell("fitting the elements to free runs")
-        elements_fit = fit_elements(twin, *parts, seed, on_event)
-        _write_datasheet(keyed.folder, elements_fit.rows)
-        return FittedTwin(elements_fit.twin, elements_fit.history, elements_fit.seconds), {}
-    if not isinstance(twin, GreyTwin):
-        return FittedTwin(twin, [], 0.0), {}
-    tell("fitting the grey box to free runs")
-    fit = fit_grey_box(twin, *parts, seed, on_event)
-    _write_datasheet(keyed.folder, datasheet(twin.table, fit.twin.numbers, fit.information))
-    if not (isinstance(fit.twin, ResidualTwin) and isinstance(experiment.twin, Residual)):
-        return FittedTwin(fit.twin, fit.history, fit.seconds), {}
-    tell("training the network on top of the grey box")
-    network = fit_residual(fit.twin, experiment.twin, *parts, experiment.training, on_event, keyed)
-    if not network.helps:
-        tell("the network does not help on the validation part: the grey box stays alone")
-    fitted = FittedTwin(network.twin, fit.history + network.history, fit.seconds + network.seconds)
-    return fitted, {"residual": network.facts()}
-
-
-def _write_datasheet(run: RunFolder, rows: list[dict[str, Any]]) -> None:
-    write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": rows})
-    write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(rows).encode())
+def _made(fit: TwinFit, run: KeyedRun) -> MadeTwin:
+    """The twin that the settings ask for; where they leave the formulation open, ``candidates.json`` has the choice."""
+    spec = fit.experiment.twin
+    if not isinstance(spec, AutoTwin):
+        return fit.made(spec, run)
+    made, tried = TwinChoice(fit, spec, run).best()
+    write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
+    return made
 
 
 def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, fitted: FittedTwin) -> dict[str, Any]:

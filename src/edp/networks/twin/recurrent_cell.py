@@ -1,0 +1,190 @@
+"""The cell of a twin with feedback ports, with the gradients of its weights: a GRU whose answers are changes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from edp.data.twin_channels import TwinChannels
+from edp.networks.twin.scales import Array, TwinScales
+from edp.networks.twin.steps import run_backward, run_forward
+
+
+class CellWeights(nn.Module):
+    """Weights of a cell that reads commands and `read` further numbers, and answers `answers` of them; zero."""
+
+    def __init__(self, commands: int, read: int, answers: int, units: int) -> None:
+        super().__init__()
+        self.units = units
+        self.command_weight = nn.Parameter(torch.zeros(3 * units, commands))
+        self.bias = nn.Parameter(torch.zeros(3 * units))
+        # Inputs first: the compiled loop multiplies rows of a batch with them.
+        self.feedback_weight = nn.Parameter(torch.zeros(read, 3 * units))
+        self.h_weight = nn.Parameter(torch.zeros(units, 3 * units))
+        self.inner_bias = nn.Parameter(torch.zeros(units))
+        self.out_weight = nn.Parameter(torch.zeros(units, answers))
+        self.out_bias = nn.Parameter(torch.zeros(answers))
+
+    def draw(self, seed: int, answers: float) -> None:
+        """Draw weights with PyTorch's uniform bound, those of the answers times `answers`."""
+        generator, bound = torch.Generator().manual_seed(seed), 1.0 / math.sqrt(self.units)
+        with torch.no_grad():
+            for name, weight in self.named_parameters():
+                if name == "pull":  # it starts where it is
+                    continue
+                weight.uniform_(-bound, bound, generator=generator)
+                if name.startswith("out"):
+                    weight.mul_(answers)
+
+    @property
+    def looped(self) -> tuple[nn.Parameter, ...]:
+        """What the compiled loop reads: all but the commands' part and the bias of the gates."""
+        return self.feedback_weight, self.h_weight, self.inner_bias, self.out_weight, self.out_bias
+
+
+class TwinNetwork(CellWeights):
+    """The cell over scaled numbers, time first.
+
+    Args:
+        commands: number of them.
+        answers: number of them.
+        units: width of the memory.
+        pulled: answers that a static map pulls, all but the strokes; 0 without a map.
+    """
+
+    def __init__(self, commands: int, answers: int, units: int, pulled: int = 0) -> None:
+        super().__init__(commands, answers, answers, units)
+        # All the way in each tick: an untrained network leaves the map as it is.
+        self.pull = nn.Parameter(torch.ones(pulled)) if pulled else None
+
+    def forward(
+        self,
+        commands: Tensor,
+        measured: Tensor,
+        port: Tensor,
+        start: tuple[Tensor, Tensor],
+        bounds: Bounds,
+        mapped: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Answers ``(time, batch, answer)`` and the h after them ``(batch, units)``.
+
+        Args:
+            commands: ``(time, batch, command)``.
+            measured: ``(time, batch, answer)``, any finite number where `port` is 0.
+            port: 1 where a port reads what was measured, 0 where it reads the last answer.
+            start: last answer ``(batch, answer)`` and h ``(batch, units)``.
+            bounds: of the answers.
+            mapped: what a static map says ``(time, batch, answer)``, strokes zero; None without one.
+        """
+        projected = nn.functional.linear(commands, self.command_weight, self.bias)
+        mapped = torch.zeros(0, 0, 0) if mapped is None else mapped
+        parts = (mapped, self.pulls(bounds))
+        result = _Steps.apply(projected, measured, port, *start, *self.looped, *parts, bounds)  # type: ignore[no-untyped-call]
+        return result[0], result[1]
+
+    def pulls(self, bounds: Bounds) -> Tensor:
+        """Share of the way to the map by which each answer is pulled in a tick, 0 for strokes; empty without a map."""
+        if self.pull is None:
+            return torch.zeros(0)
+        strokes = torch.zeros(len(bounds.trapezoid))
+        share, velocities = self.pull.clamp(0.0, 1.0), bounds.velocities
+        return torch.cat([share[:velocities], strokes, share[velocities:]])
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Of scaled answers: change by unit of output, low, high ``(answer,)``, trapezoid ``(stroke,)``; velocities."""
+
+    change: Array
+    low: Array
+    high: Array
+    trapezoid: Array
+    velocities: int
+
+    @staticmethod
+    def of(channels: TwinChannels, scales: TwinScales) -> Bounds:
+        """The bounds of a twin in its own numbers."""
+        offset, width = scales.answer_offset, scales.answer_width
+        low, high = (np.ascontiguousarray((end - offset) / width) for end in (scales.low, scales.high))
+        change = np.ascontiguousarray(scales.change_width / width)
+        return Bounds(change, low, high, scales.trapezoid(channels), len(channels.velocities))
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """As the compiled loop reads them."""
+        return self.change, self.low, self.high, self.trapezoid
+
+
+def buffers(ticks: int, batch: int, answers: int, units: int) -> tuple[Array, ...]:
+    """What `run_forward` writes: answers, fed values, where no bound acts, gates, inner sums, and h."""
+    shapes = [(ticks, answers)] * 3 + [(ticks, 3 * units), (ticks, units), (ticks + 1, units)]
+    return tuple(np.empty((time, batch, width), np.float32) for time, width in shapes)
+
+
+class _Steps(torch.autograd.Function):
+    """`run_forward` with `run_backward` as its adjoint."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, projected: Tensor, measured: Tensor, port: Tensor, answer: Tensor, h: Tensor, *rest: Any
+    ) -> tuple[Tensor, Tensor]:
+        weights = tuple(weight.detach().numpy() for weight in rest[:5])
+        mapped, pull = (np.ascontiguousarray(part.detach().numpy()) for part in rest[5:7])
+        bounds: Bounds = rest[7]
+        ticks, batch, width = measured.shape
+        saved = buffers(ticks, batch, width, h.shape[1])
+        into, values, ports, last, memory = (
+            np.ascontiguousarray(tensor.detach().numpy()) for tensor in (projected, measured, port, answer, h)
+        )
+        shape = (bounds.arrays, bounds.velocities)
+        run_forward(into, values, ports, weights, (mapped, pull), *shape, (last, memory), saved)
+        ctx.saved, ctx.port, ctx.weights, ctx.map, ctx.bounds = saved, ports, weights, (mapped, pull), bounds
+        return torch.from_numpy(saved[0]), torch.from_numpy(saved[5][-1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_answers: Tensor, grad_h: Tensor) -> tuple[Tensor | None, ...]:
+        _, fed, _, gates, inner, hs = ctx.saved
+        by_gates, by_inner, by_out = np.empty_like(gates), np.empty_like(inner), np.empty_like(fed)
+        by_answer, by_h = np.zeros_like(fed[0]), np.array(grad_h.numpy(), order="C")
+        grads = (by_gates, by_inner, by_out, by_answer, by_h)
+        incoming = np.ascontiguousarray(grad_answers.numpy())
+        (mapped, pull), bounds = ctx.map, ctx.bounds
+        run_backward(incoming, ctx.port, ctx.weights, pull, bounds.arrays, bounds.velocities, ctx.saved, grads)
+        by_pull = ((mapped - fed) * (by_out / bounds.change)).sum((0, 1)) if len(pull) else np.zeros(0, np.float32)
+        by_weights = weight_gradients(fed, hs, by_gates, by_inner, by_out)
+        return (
+            torch.from_numpy(by_gates),
+            None,
+            None,
+            torch.from_numpy(by_answer),
+            torch.from_numpy(by_h),
+            *by_weights,
+            None,
+            torch.from_numpy(by_pull),
+            None,
+        )
+
+
+def weight_gradients(read: Array, hs: Array, by_gates: Array, by_inner: Array, by_out: Array) -> tuple[Tensor, ...]:
+    """Gradients of `CellWeights.looped`, from what a cell read, its h, and the adjoint's gradients; tick first."""
+    units = by_inner.shape[2]
+
+    # Gradients of the weights need all ticks at once: one large product replaces one small product a tick.
+    def rows(values: Array) -> Tensor:
+        return torch.from_numpy(values).flatten(0, 1)
+
+    gate_rows, inner_rows, out_rows, before = rows(by_gates), rows(by_inner), rows(by_out), rows(hs[:-1])
+    return (
+        rows(read).t() @ gate_rows,
+        torch.cat([before.t() @ gate_rows[:, : 2 * units], before.t() @ inner_rows], dim=1),
+        inner_rows.sum(0),
+        rows(hs[1:]).t() @ out_rows,
+        out_rows.sum(0),
+    )

@@ -1,0 +1,53 @@
+"""Training the members of a recurrent twin apart, each from a seed of its own, and averaging them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from edp.data.series import Series
+from edp.data.twin_channels import TwinChannels
+from edp.networks.twin import TwinScales
+from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, member_seed
+from edp.networks.twin.static_map import StaticTwin
+from edp.storage.runs import KeyedRun, part_of
+from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
+
+
+def fit_members(
+    form: Recurrent,
+    parts: tuple[TwinChannels, TwinScales, StaticTwin | None],
+    train: Sequence[Series],
+    validation: Sequence[Series],
+    training: FreeRunSpec,
+    on_event: Callable[[FreeRunProgress], None] | None = None,
+    run: KeyedRun | None = None,
+    trained: Sequence[FittedTwin] = (),
+) -> FittedTwin:
+    """Train each member of a recurrent twin on free runs of its own, and average them.
+
+    Args:
+        form: its options.
+        parts: channels, scales, and the fitted static map that all members share, where there is one.
+        train: training stretches.
+        validation: stretches that choose among the weights of each member.
+        training: how; the first member has its seed, the others one of their own.
+        on_event: called with progress of each member in turn.
+        run: folder and key of the run; where given, each member's training is resumable.
+        trained: members that are trained already, the first ones.
+
+    Returns:
+        The average, the rows of all trainings one behind the other (each with its ``member`` where there are
+        several), and the processor time of all.
+    """
+    fits = list(trained)
+    for which in range(len(fits), form.members):
+        seed = member_seed(training.seed, which)
+        twin = form.member(*parts, seed)
+        with part_of(run, f"member_{which}" if form.members > 1 else "") as own:
+            fits.append(fit_free_runs(twin, train, validation, replace(training, seed=seed), on_event, own))
+    if len(fits) == 1:
+        return fits[0]
+    rows = [row | {"member": which} for which, fit in enumerate(fits) for row in fit.history]
+    twins = [fit.twin for fit in fits if isinstance(fit.twin, RecurrentTwin)]
+    return FittedTwin(averaged(twins), rows, sum(fit.seconds for fit in fits))

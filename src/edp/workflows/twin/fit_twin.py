@@ -1,0 +1,94 @@
+"""From prepared recordings to a fitted twin of one formulation, as its settings say."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from edp.config.twin import TwinExperiment
+from edp.data.prepared import Prepared
+from edp.data.twin_channels import TwinChannels
+from edp.networks.twin import TwinScales, TwinSpec
+from edp.networks.twin.elements import ElementsTwin
+from edp.networks.twin.grey.datasheet import datasheet
+from edp.networks.twin.greybox import GreyTwin
+from edp.networks.twin.recurrent import Recurrent
+from edp.networks.twin.residual import Residual, ResidualTwin
+from edp.storage.runs import KeyedRun
+from edp.training.elements_fit import fit_elements
+from edp.training.free_run import FittedTwin, FreeRunProgress
+from edp.training.free_run_members import fit_members
+from edp.training.grey_fit import fit_grey_box
+from edp.training.residual_fit import fit_residual
+
+
+@dataclass(frozen=True, eq=False)
+class MadeTwin:
+    """A fitted twin.
+
+    Attributes:
+        spec: the formulation with the options that were settled.
+        fitted: twin, history, processor time.
+        datasheet: numbers of the machine with units and intervals; empty where the formulation has none.
+        facts: what provenance says of it.
+    """
+
+    spec: TwinSpec
+    fitted: FittedTwin
+    datasheet: list[dict[str, Any]] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class TwinFit:
+    """What every fit of a run needs.
+
+    Attributes:
+        channels: of the twin.
+        scales: fitted to the training part.
+        data: prepared series.
+        experiment: the settings.
+        on_event: called with progress of a training on free runs.
+        tell: called with what begins.
+    """
+
+    channels: TwinChannels
+    scales: TwinScales
+    data: Prepared
+    experiment: TwinExperiment
+    on_event: Callable[[FreeRunProgress], None] | None
+    tell: Callable[[str], None]
+
+    def made(self, spec: TwinSpec, run: KeyedRun | None) -> MadeTwin:
+        """One formulation, fitted.
+
+        Raises:
+            EdpError: it does not suit the channels, or its fit ends in no numbers.
+        """
+        seed, parts = self.experiment.training.seed, (self.data.train, self.data.validation)
+        if isinstance(spec, Recurrent):
+            self.tell("training on free runs")
+            static = spec.static_map(self.channels, self.scales, self.data.train)
+            shared = (self.channels, self.scales, static)
+            return MadeTwin(spec, fit_members(spec, shared, *parts, self.experiment.training, self.on_event, run))
+        started = time.process_time()
+        twin = spec.start(self.channels, self.scales, self.data.train, seed)
+        if isinstance(twin, ElementsTwin):
+            self.tell("fitting the elements to free runs")
+            lumped = fit_elements(twin, *parts, seed, self.on_event)
+            return MadeTwin(spec, FittedTwin(lumped.twin, lumped.history, lumped.seconds), lumped.rows)
+        if not isinstance(twin, GreyTwin):
+            return MadeTwin(spec, FittedTwin(twin, [], time.process_time() - started))
+        self.tell("fitting the grey box to free runs")
+        grey = fit_grey_box(twin, *parts, seed, self.on_event)
+        numbers = datasheet(twin.table, grey.twin.numbers, grey.information)
+        if not (isinstance(grey.twin, ResidualTwin) and isinstance(spec, Residual)):
+            return MadeTwin(spec, FittedTwin(grey.twin, grey.history, grey.seconds), numbers)
+        self.tell("training the network on top of the grey box")
+        network = fit_residual(grey.twin, spec, *parts, self.experiment.training, self.on_event, run)
+        if not network.helps:
+            self.tell("the network does not help on the validation part: the grey box stays alone")
+        fitted = FittedTwin(network.twin, grey.history + network.history, grey.seconds + network.seconds)
+        return MadeTwin(spec, fitted, numbers, {"residual": network.facts()})
