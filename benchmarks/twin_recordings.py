@@ -1,10 +1,10 @@
 """Is the default twin at least as good as simple plant models, on free runs along measured recordings?
 
 Each set is a machine with one or two actuators: commands, and positions whose change from tick to tick is the
-velocity. The first 55 % of every recording train, then 20 % choose and calibrate, the last 25 % are judged: free runs of
-30 s, or as long as the recordings allow. The twin is what `edp twin` gives without settings (`twin.kind = "auto"`); the
-rivals are the static map, ARX and a subspace model, fitted in the same run. The error is the geometric mean over
-actuators, of velocities and of strokes at each time, over that of the static map.
+velocity. The first 55 % of every recording train, then 20 % choose and calibrate, the last 25 % are judged: free runs
+of 30 s, or as long as the recordings allow. The twin is what `edp twin` gives without settings; the rivals are the
+static map, ARX and a subspace model, fitted in the same run. The error is the geometric mean over actuators, of
+velocities and of strokes at each time, over that of the static map.
 
     python benchmarks/twin_recordings.py --logs LOGS --map MAP.toml --repair gaps=cut --repair nan=hold
 
@@ -101,8 +101,8 @@ def measure(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) 
     judge = replace(experiment.judge, seconds=30.0, starts=8, at_s=(1.0, 5.0, 10.0, 30.0))
     with tempfile.TemporaryDirectory() as folder, RunFolder(folder) as run:
         fit = TwinFit(channels, scales, data, experiment, None, lambda text: None)
-        made, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
-    twins = {"twin": made.fitted.twin}
+        result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
+    twins = {"twin": result.fitted.twin}
     for name in RIVALS:
         spec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
         twins[name] = spec.start(channels, scales, data.train, seed)

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edp.config.twin import AutoTwin, TwinExperiment, load_twin_experiment
+from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import prepare
 from edp.data.splits import ByRecording
 from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError, DataError
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.arx import Arx
+from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, averaged, member_seed
 from edp.storage.runs import KeyedRun, RunFolder
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
@@ -45,11 +46,11 @@ def run(tmp_path):
 def test_the_simplest_candidate_that_is_as_good_as_the_best_is_kept(run, monkeypatch, least_gain, kept):
     errors = {"StaticTwin": 1.0, "ArxTwin": 0.7, "N4sidTwin": 0.6}
     monkeypatch.setattr(TwinChoice, "_error", lambda self, twin, reference: errors[type(twin).__name__])
-    made, tried = choice(run, candidates=("static", "arx", "n4sid"), least_gain=least_gain).best()
+    result, tried = choice(run, candidates=("static", "arx", "n4sid"), least_gain=least_gain).best()
     assert [one.error for one in tried] == [1.0, 0.7, 0.6]
     assert [one.label for one in tried if one.chosen] == [kept]
-    assert TWINS.name_of(made.spec) == kept
-    assert made.facts == {"chosen": kept}
+    assert TWINS.name_of(result.spec) == kept
+    assert result.facts == {"chosen": kept}
 
 
 def test_errors_are_those_of_the_static_map_and_of_free_runs(run):
@@ -92,13 +93,13 @@ def test_trainings_get_longer_as_long_as_that_helps_and_the_last_word_has_the_av
     monkeypatch.setattr(choose_twin, "fit_free_runs", fitted)
     monkeypatch.setattr(TwinChoice, "_error", error)
     monkeypatch.setattr(choose_twin, "LENGTHS", (0.05, 0.15, 0.45, 1.0))
-    made, tried = choice(run, replace(TINY, updates=(20,)), candidates=("recurrent",)).best()
+    result, tried = choice(run, replace(TINY, updates=(20,)), candidates=("recurrent",)).best()
     # 0.595 is less than 1 % better than 0.6: neither the full length is tried, nor the third one kept.
     assert trained == [1, 1, 3, 3, 9]
     assert [one.error for one in tried] == [0.9, 0.8, 0.85, 0.5, 0.595]
-    assert made.spec == Recurrent(units=96, members=3, prefix_ticks=20)
+    assert result.spec == Recurrent(units=96, members=3, prefix_ticks=20)
     assert [one.label for one in tried if one.chosen] == ["recurrent (3 members, 96 units), 3 updates"]
-    assert {row["member"] for row in made.fitted.history} == {0, 1, 2}
+    assert {row["member"] for row in result.fitted.history} == {0, 1, 2}
 
 
 class Stop(Exception):

@@ -219,8 +219,8 @@ class RecurrentTwin(Twin):
             pull, zero = network.pulls(self.bounds).detach().numpy()[solved], np.zeros(len(solved))
             # Two products and no difference: a number that is far from both has no digits to lose.
             near = build.add(ScaleShift, "pulled", mapped, gain=pull, shift=zero)
-            kept = build.add(ScaleShift, "kept", before, gain=1.0 - pull, shift=zero)
-            before = build.combine("pulled_before", BinaryOperation.ADD, kept, near)
+            rest = build.add(ScaleShift, "kept", before, gain=1.0 - pull, shift=zero)
+            before = build.combine("pulled_before", BinaryOperation.ADD, rest, near)
         return build.combine("proposed", BinaryOperation.ADD, before, change)
 
     def arrays(self) -> dict[str, Array]:

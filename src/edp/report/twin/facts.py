@@ -181,8 +181,8 @@ def read_free_runs(folder: str | Path) -> FreeRunFacts:
         raise StorageError(f"cannot read '{path / RUNS}' ({error}); run edp evaluate {folder}") from error
     header = path / "twin" / "twin.json"
     provenance = read_object(header).get("provenance") if header.is_file() else {}
-    known = provenance if isinstance(provenance, dict) else {}
-    facts = FreeRunFacts(path.resolve().name, content, shown, known, read_candidates(path))
+    origin = provenance if isinstance(provenance, dict) else {}
+    facts = FreeRunFacts(path.resolve().name, content, shown, origin, read_candidates(path))
     _check_arrays(facts, path / RUNS)
     return facts
 

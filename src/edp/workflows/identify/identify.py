@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.config.twin import KINDS, AutoTwin, TwinExperiment, load_twin_experiment
+from edp.config.twin import TwinExperiment, load_twin_experiment
 from edp.data.prepared import Prepared
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, DataError, StorageError
@@ -20,6 +20,7 @@ from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, UNEXCITED
 from edp.networks.twin.grey.elements import Elements
 from edp.networks.twin.greybox import GreyBox, GreyTwin
+from edp.networks.twin.kinds import KINDS, AutoTwin
 from edp.networks.twin.residual import Residual
 from edp.recording import Recording
 from edp.signals import Kind

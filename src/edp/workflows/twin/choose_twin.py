@@ -8,17 +8,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from edp.config.twin import AutoTwin
 from edp.errors import ConfigError, DataError, NotFiniteError
 from edp.evaluation.free_run import free_run_scores, free_runs
 from edp.evaluation.guard import free_run_error
 from edp.networks.twin import TWINS, Twin, TwinSpec
+from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.static_map import StaticTwin
 from edp.storage.runs import KeyedRun, part_of
 from edp.training.free_run import FittedTwin, FreeRunSpec, fit_free_runs
 from edp.training.free_run_members import fit_members
-from edp.workflows.twin.fit_twin import MadeTwin, TwinFit
+from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
 """Shares of the updates of `[training]` that are tried in turn, each with a whole schedule of its learning rate.
@@ -39,13 +39,13 @@ AT = (0.1, 0.5, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class TwinCandidate:
     """A formulation that was tried.
 
     Attributes:
         label: how sentences and tables call it.
         seconds: processor time.
-        made: None where it could not be fitted.
+        result: None where it could not be fitted.
         error: of its free runs in the validation part, over that of the static map; None where it could not be fitted.
         why: why it could not be fitted.
         chosen: whether it is kept.
@@ -53,7 +53,7 @@ class Candidate:
 
     label: str
     seconds: float
-    made: MadeTwin | None = None
+    result: FittedFormulation | None = None
     error: float | None = None
     why: str = ""
     chosen: bool = False
@@ -74,8 +74,8 @@ class _Trained:
     fitted: FittedTwin
 
     @property
-    def made(self) -> MadeTwin:
-        return MadeTwin(self.form.alone(), self.fitted)
+    def result(self) -> FittedFormulation:
+        return FittedFormulation(self.form.alone(), self.fitted)
 
     @property
     def label(self) -> str:
@@ -96,7 +96,7 @@ class TwinChoice:
     auto: AutoTwin
     run: KeyedRun
 
-    def best(self) -> tuple[MadeTwin, list[Candidate]]:
+    def best(self) -> tuple[FittedFormulation, list[TwinCandidate]]:
         """The simplest of the candidates that are as good as the best, and all of them.
 
         Raises:
@@ -104,18 +104,18 @@ class TwinChoice:
         """
         reference = self._scores(self._floor("static").start(*self._shared, self.fit.experiment.training.seed))
         tried = [one for name in self.auto.candidates for one in self._tried(name, reference)]
-        fits = [(i, one.made, one.error) for i, one in enumerate(tried) if one.made and one.error is not None]
+        fits = [(i, one.result, one.error) for i, one in enumerate(tried) if one.result and one.error is not None]
         if not fits:
             reasons = "; ".join(f"{one.label}: {one.why}" for one in tried)
             raise ConfigError(f"twin.candidates: none of them can be fitted to these recordings: {reasons}")
         enough = self._enough([error for _, _, error in fits])
-        which, made, _ = next(entry for entry in fits if entry[2] <= enough)
+        which, result, _ = next(entry for entry in fits if entry[2] <= enough)
         tried[which] = replace(tried[which], chosen=True)
         seconds = sum(one.seconds for one in tried)
-        facts = made.facts | {"chosen": tried[which].label}
-        return replace(made, fitted=replace(made.fitted, seconds=seconds), facts=facts), tried
+        facts = result.facts | {"chosen": tried[which].label}
+        return replace(result, fitted=replace(result.fitted, seconds=seconds), facts=facts), tried
 
-    def _tried(self, name: str, reference: dict[str, Any]) -> list[Candidate]:
+    def _tried(self, name: str, reference: dict[str, Any]) -> list[TwinCandidate]:
         """A formulation with the default options; the recurrent one in several forms, the simplest first."""
         began = time.process_time()
         try:
@@ -123,14 +123,18 @@ class TwinChoice:
                 return self._recurrent(reference)
             self.fit.tell(f"fitting {name}")
             with part_of(self.run, name) as own:
-                made = self.fit.made(self._floor(name), own)
-            error = self._error(made.fitted.twin, reference)
+                result = self.fit.fitted(self._floor(name), own)
+            error = self._error(result.fitted.twin, reference)
         except (ConfigError, DataError, NotFiniteError) as problem:
             # What does not suit these channels is no reason to give up on what does.
-            return [Candidate(name, time.process_time() - began, why=str(problem))]
-        return [Candidate(described(made.spec), max(made.fitted.seconds, time.process_time() - began), made, error)]
+            return [TwinCandidate(name, time.process_time() - began, why=str(problem))]
+        return [
+            TwinCandidate(
+                described(result.spec), max(result.fitted.seconds, time.process_time() - began), result, error
+            )
+        ]
 
-    def _recurrent(self, reference: dict[str, Any]) -> list[Candidate]:
+    def _recurrent(self, reference: dict[str, Any]) -> list[TwinCandidate]:
         """The recurrent twin on a static map or not, as long as longer training helps; last the average of members."""
         parts = (self.fit.data.train, self.fit.data.validation)
         wide = sum(part.samples for part in parts[0]) >= LONG_TICKS
@@ -146,7 +150,7 @@ class TwinChoice:
             if min(one.error for one in trained) > before * (1.0 - LENGTHENED):
                 break
         first, form = self._simplest(trained), self._simplest(trained).form
-        tried = [Candidate(one.label, one.fitted.seconds, one.made, one.error) for one in trained]
+        tried = [TwinCandidate(one.label, one.fitted.seconds, one.result, one.error) for one in trained]
         if form.members == 1:
             return tried
         self.fit.tell(f"training {form.members - 1} further members")
@@ -156,7 +160,7 @@ class TwinChoice:
         error = self._error(fitted.twin, reference)
         if error < first.error:  # an average takes the place of its first member, however little better it is
             label = labelled(form, first.training)
-            tried[trained.index(first)] = Candidate(label, fitted.seconds, MadeTwin(form, fitted), error)
+            tried[trained.index(first)] = TwinCandidate(label, fitted.seconds, FittedFormulation(form, fitted), error)
         return tried
 
     def _simplest(self, trained: Sequence[_Trained]) -> _Trained:
@@ -188,8 +192,10 @@ class TwinChoice:
         return spec
 
     def _scores(self, twin: Twin) -> dict[str, Any]:
-        """Of free runs as long as those that choose among weights: more of them fit into the validation part, and
-        differ more from one another, than long ones."""
+        """Of free runs as long as those that choose among weights.
+
+        More of them fit into the validation part, and differ more from one another, than long ones.
+        """
         experiment = self.fit.experiment
         seconds = experiment.training.validation_s
         at_s = tuple(sorted({share * seconds for share in AT}))

@@ -25,7 +25,7 @@ from edp.training.residual_fit import fit_residual
 
 
 @dataclass(frozen=True, eq=False)
-class MadeTwin:
+class FittedFormulation:
     """A fitted twin.
 
     Attributes:
@@ -61,7 +61,7 @@ class TwinFit:
     on_event: Callable[[FreeRunProgress], None] | None
     tell: Callable[[str], None]
 
-    def made(self, spec: TwinSpec, run: KeyedRun | None) -> MadeTwin:
+    def fitted(self, spec: TwinSpec, run: KeyedRun | None) -> FittedFormulation:
         """One formulation, fitted.
 
         Raises:
@@ -72,23 +72,25 @@ class TwinFit:
             self.tell("training on free runs")
             static = spec.static_map(self.channels, self.scales, self.data.train)
             shared = (self.channels, self.scales, static)
-            return MadeTwin(spec, fit_members(spec, shared, *parts, self.experiment.training, self.on_event, run))
+            return FittedFormulation(
+                spec, fit_members(spec, shared, *parts, self.experiment.training, self.on_event, run)
+            )
         started = time.process_time()
         twin = spec.start(self.channels, self.scales, self.data.train, seed)
         if isinstance(twin, ElementsTwin):
             self.tell("fitting the elements to free runs")
             lumped = fit_elements(twin, *parts, seed, self.on_event)
-            return MadeTwin(spec, FittedTwin(lumped.twin, lumped.history, lumped.seconds), lumped.rows)
+            return FittedFormulation(spec, FittedTwin(lumped.twin, lumped.history, lumped.seconds), lumped.rows)
         if not isinstance(twin, GreyTwin):
-            return MadeTwin(spec, FittedTwin(twin, [], time.process_time() - started))
+            return FittedFormulation(spec, FittedTwin(twin, [], time.process_time() - started))
         self.tell("fitting the grey box to free runs")
         grey = fit_grey_box(twin, *parts, seed, self.on_event)
         numbers = datasheet(twin.table, grey.twin.numbers, grey.information)
         if not (isinstance(grey.twin, ResidualTwin) and isinstance(spec, Residual)):
-            return MadeTwin(spec, FittedTwin(grey.twin, grey.history, grey.seconds), numbers)
+            return FittedFormulation(spec, FittedTwin(grey.twin, grey.history, grey.seconds), numbers)
         self.tell("training the network on top of the grey box")
         network = fit_residual(grey.twin, spec, *parts, self.experiment.training, self.on_event, run)
         if not network.helps:
             self.tell("the network does not help on the validation part: the grey box stays alone")
         fitted = FittedTwin(network.twin, grey.history + network.history, grey.seconds + network.seconds)
-        return MadeTwin(spec, fitted, numbers, {"residual": network.facts()})
+        return FittedFormulation(spec, fitted, numbers, {"residual": network.facts()})

@@ -9,19 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from edp import __version__
-from edp.config.twin import TWIN_SETTINGS, AutoTwin, TwinExperiment, twin_toml
+from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.data.prepared import Prepared
 from edp.evaluation.free_run import calibrated
 from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
+from edp.networks.twin.kinds import AutoTwin
 from edp.report.twin.candidates import CANDIDATES
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.free_run import FittedTwin, FreeRunProgress
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
-from edp.workflows.twin.fit_twin import MadeTwin, TwinFit
+from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
@@ -78,16 +79,16 @@ def train_twin(
             return TrainedTwin(bundle, dict(bundle.scores), True)
         run.write_status("running")
         fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell)
-        made = _made(fit, KeyedRun(run, key))
-        fitted = made.fitted
+        result = _chosen(fit, KeyedRun(run, key))
+        fitted = result.fitted
         run.write_history(fitted.history)
-        if made.datasheet:
-            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": made.datasheet})
-            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(made.datasheet).encode())
+        if result.datasheet:
+            write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": result.datasheet})
+            write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         tell("calibrating intervals")
         intervals = calibrated(fitted.twin, data.validation, experiment.judge)
-        provenance = _provenance(source, experiment, data, fitted) | made.facts
-        bundle = TwinBundle(made.spec, fitted.twin, provenance, {}, intervals)
+        provenance = _provenance(source, experiment, data, fitted) | result.facts
+        bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
         write_scores(run.path, scores, runs, intervals)
         bundle = replace(bundle, scores=scores)
@@ -96,14 +97,14 @@ def train_twin(
     return TrainedTwin(bundle, scores, False)
 
 
-def _made(fit: TwinFit, run: KeyedRun) -> MadeTwin:
+def _chosen(fit: TwinFit, run: KeyedRun) -> FittedFormulation:
     """The twin that the settings ask for; where they leave the formulation open, ``candidates.json`` has the choice."""
     spec = fit.experiment.twin
     if not isinstance(spec, AutoTwin):
-        return fit.made(spec, run)
-    made, tried = TwinChoice(fit, spec, run).best()
+        return fit.fitted(spec, run)
+    result, tried = TwinChoice(fit, spec, run).best()
     write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
-    return made
+    return result
 
 
 def _provenance(source: DataSource, experiment: TwinExperiment, data: Prepared, fitted: FittedTwin) -> dict[str, Any]:

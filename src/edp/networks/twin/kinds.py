@@ -1,0 +1,46 @@
+"""What settings may ask for: a formulation, or the choice among several of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.errors import ConfigError
+from edp.networks.twin import TWINS
+from edp.networks.twin.base import PREFIX
+from edp.registry import Registry
+from edp.settings.bounds import MOST_NAMES, SHARE, check_bounds, check_count
+
+KINDS: Registry[type] = Registry("twin")
+"""Every formulation, and the choice among several of them."""
+for _name, _formulation in TWINS.items():
+    KINDS.register(_name)(_formulation)
+
+
+@KINDS.register("auto")
+@dataclass(frozen=True, kw_only=True)
+class AutoTwin:
+    """Several formulations are fitted to the training part, and free runs of the validation part choose.
+
+    Attributes:
+        candidates: formulations, the simplest first.
+        least_gain: share of error by which a candidate must be better than a simpler one.
+        prefix_ticks: measured ticks before a free run.
+
+    Raises:
+        ConfigError: a value out of range, no candidate, or an unknown one.
+    """
+
+    candidates: tuple[str, ...] = ("static", "arx", "n4sid", "recurrent")
+    least_gain: float = 0.02
+    prefix_ticks: int = 30
+
+    def __post_init__(self) -> None:
+        check_bounds("automatic twin", self, least_gain=SHARE, prefix_ticks=PREFIX)
+        check_count("automatic twin", "candidates", self.candidates, MOST_NAMES, least=1)
+        for name in self.candidates:
+            try:
+                _ = TWINS[name]
+            except ConfigError as error:
+                raise ConfigError(f"twin.candidates: {error}") from None
+        if len(set(self.candidates)) < len(self.candidates):
+            raise ConfigError(f"twin.candidates: {', '.join(self.candidates)}; each once must hold")
