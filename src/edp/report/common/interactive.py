@@ -45,6 +45,8 @@ LEGENDS = {
     "right": {"orientation": "v", "x": 1.01, "y": 1, "yref": "paper", "xanchor": "left"},
     "none": {},
 }
+Trace = dict[str, Any]
+"""A trace in plotly's words."""
 _FIELD = re.compile(r"\{(x|y|z|label)(?::([^{}]*?)(g?))?\}")
 
 
@@ -69,70 +71,96 @@ def plots(charts: Iterable[Chart]) -> dict[str, Plot]:
 
 def plot(chart: Chart, title: str = "") -> Plot:
     """A chart as a figure of a page; the first option of each choice is shown. `title` is for where no heading is."""
-    figure = _panels(chart)
+    grid = _grid(chart)
+    # A figure is made of plain tables at once: each later change costs plotly as much as making it.
+    layout = grid.to_plotly_json()["layout"]
+    _put(layout, _frame(chart))
     if title:
-        figure.update_layout(title={"text": _text(title), "font": {"size": 14}}, margin_t=90)
+        _put(layout, {"title": {"text": _text(title), "font": {"size": 14}}, "margin": {"t": 90}})
+    for note in layout.get("annotations", ()):
+        _put(note, {"font": {"size": 13, "color": INK}} | ({"x": 0, "xanchor": "left"} if chart.columns == 1 else {}))
     chosen = {control.key: control.options[0][0] for control in chart.choices}
     named: set[tuple[str, str]] = set()
+    traces: list[Trace] = []
     for index, panel in enumerate(chart.panels):
         row, col = divmod(index, chart.columns)
-        cell = {"row": row + 1, "col": col + 1}
+        sides = [
+            grid.get_subplot(row + 1, col + 1, secondary_y=second) for second in (False, True)[: 1 + bool(panel.second)]
+        ]
         for mark in panel.marks:
+            place = _refs(sides[-1 if mark.second else 0])
             if isinstance(mark, GuideLine):
-                _rule(figure, mark, cell)
+                layout.setdefault("shapes", []).append(_rule(mark, *_refs(sides[0])))
                 continue
             for trace in _traces(mark):
                 # Plotly shows an entry for each trace; marks of one name are one thing to a reader.
                 entry = (mark.name, json.dumps(dict(mark.when), sort_keys=True))
-                trace.update(
-                    name=_text(mark.name), legendgroup=_text(mark.group or mark.name),
-                    showlegend=bool(mark.name) and trace.showlegend is not False and entry not in named,
-                    visible=fits(mark, chosen), meta=dict(mark.when) or None,
-                )  # fmt: skip
-                named |= {entry} if trace.showlegend else set()
-                figure.add_trace(trace, **cell, secondary_y=mark.second if panel.second else None)
+                trace |= {
+                    "name": _text(mark.name), "legendgroup": _text(mark.group or mark.name),
+                    "showlegend": bool(mark.name) and trace.get("showlegend") is not False and entry not in named,
+                    "visible": fits(mark, chosen), "meta": dict(mark.when) or None,
+                    "xaxis": place[0], "yaxis": place[1],
+                }  # fmt: skip
+                named |= {entry} if trace["showlegend"] else set()
+                traces.append(trace)
         last = not chart.together or row == chart.rows - 1
-        figure.update_xaxes(_axis(panel.x if last else replace(panel.x, title=""), upright=False), **cell)
-        figure.update_yaxes(_axis(panel.y, upright=True), **cell, secondary_y=False if panel.second else None)
-        if panel.second is not None:
-            figure.update_yaxes(_axis(panel.second, upright=True), **cell, secondary_y=True)
-    figure.update_annotations(font={"size": 13, "color": INK})
+        _put(layout[sides[0].xaxis.plotly_name], _axis(panel.x if last else replace(panel.x, title=""), upright=False))
+        for side, axis in zip(sides, (panel.y, panel.second)):
+            if axis is not None:
+                _put(layout[side.yaxis.plotly_name], _axis(axis, upright=True))
+    figure = go.Figure(data=traces, layout=layout)
     return Plot(chart.name, figure, tuple(c for c in chart.choices if len(c.options) > 1 or c.alone))
 
 
-def _panels(chart: Chart) -> go.Figure:
+def _put(table: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    """Changes into a table, key by key; a table in it keeps what is not changed."""
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(table.get(key), dict):
+            _put(table[key], value)
+        else:
+            table[key] = value
+
+
+def _refs(side: Any) -> tuple[str, str]:
+    """How traces name the axes of a panel."""
+    return tuple(axis.plotly_name.replace("axis", "") for axis in (side.xaxis, side.yaxis))  # type: ignore[return-value]
+
+
+def _grid(chart: Chart) -> go.Figure:
+    """The axes of all panels, where they lie."""
     rows, columns = chart.rows, chart.columns
     across = len(chart.shares) == columns > 1
     shares = {"column_widths" if across else "row_heights": list(chart.shares)} if chart.shares else {}
     titles = [_text(panel.title) for panel in chart.panels]
     apart = 0.26 if any(panel.y.title for index, panel in enumerate(chart.panels) if index % columns) else 0.18
-    top = (46 if any(titles) else 26) + (0 if chart.legend == "none" else 20)
     specs: list[dict[str, bool] | None] = [{"secondary_y": panel.second is not None} for panel in chart.panels]
     specs += [None] * (rows * columns - len(specs))
-    figure = make_subplots(
+    return make_subplots(
         rows=rows, cols=columns, shared_xaxes=chart.together, shared_yaxes=across,
         # A gap takes the title and the tick texts of a row: the more rows, the smaller its share.
         vertical_spacing=(0.18 if chart.together else 0.3) / max(rows, 2),
         horizontal_spacing=0.02 if across else apart / columns, subplot_titles=titles if any(titles) else None,
         specs=[specs[row * columns : (row + 1) * columns] for row in range(rows)], **shares,
     )  # fmt: skip
-    figure.update_layout(
-        template=go.layout.Template(),
-        height=chart.height,
-        font={"family": FONT, "size": 13, "color": INK},
-        paper_bgcolor="#ffffff",
-        plot_bgcolor="#ffffff",
-        margin={"l": 64, "r": 190 if chart.legend == "right" else 14, "t": top, "b": 52},
-        legend=LEGENDS[chart.legend] | {"tracegroupgap": 0},
-        showlegend=chart.legend != "none",
-        hoverlabel={"bgcolor": "#ffffff", "bordercolor": RULE, "font": {"family": FONT, "size": 12, "color": INK}},
-        modebar={"bgcolor": "rgba(0,0,0,0)", "color": "#b4bcc5", "activecolor": BLUE, "orientation": "h"},
-        hovermode="x unified" if chart.together else "closest",
-        bargap=0.34,
-    )
-    if columns == 1:
-        figure.update_annotations(x=0, xanchor="left")
-    return figure
+
+
+def _frame(chart: Chart) -> dict[str, Any]:
+    """What all panels share."""
+    top = (46 if any(panel.title for panel in chart.panels) else 26) + (0 if chart.legend == "none" else 20)
+    return {
+        "template": go.layout.Template(),
+        "height": chart.height,
+        "font": {"family": FONT, "size": 13, "color": INK},
+        "paper_bgcolor": "#ffffff",
+        "plot_bgcolor": "#ffffff",
+        "margin": {"l": 64, "r": 190 if chart.legend == "right" else 14, "t": top, "b": 52},
+        "legend": LEGENDS[chart.legend] | {"tracegroupgap": 0},
+        "showlegend": chart.legend != "none",
+        "hoverlabel": {"bgcolor": "#ffffff", "bordercolor": RULE, "font": {"family": FONT, "size": 12, "color": INK}},
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#b4bcc5", "activecolor": BLUE, "orientation": "h"},
+        "hovermode": "x unified" if chart.together else "closest",
+        "bargap": 0.34,
+    }
 
 
 def _axis(axis: ChartAxis, upright: bool) -> dict[str, Any]:
@@ -163,68 +191,71 @@ def _axis(axis: ChartAxis, upright: bool) -> dict[str, Any]:
     return options | ({"tickangle": -axis.slant} if axis.slant else {})
 
 
-def _rule(figure: go.Figure, rule: GuideLine, cell: Mapping[str, int]) -> None:
-    way = "x" if rule.x is not None else "y"
+def _rule(rule: GuideLine, across: str, upwards: str) -> dict[str, Any]:
+    """A line or a stripe through a panel, from edge to edge, as a shape."""
+    way, other = ("x", "y") if rule.x is not None else ("y", "x")
     at = rule.x if rule.x is not None else rule.y
-    line = {"color": rule.colour, "width": rule.width, "dash": rule.dash}
+    refs = {"x": across, "y": upwards}
+    shape: dict[str, Any] = {
+        f"{way}0": at, f"{way}1": at if rule.to is None else rule.to, f"{way}ref": refs[way],
+        f"{other}0": 0, f"{other}1": 1, f"{other}ref": f"{refs[other]} domain",
+    }  # fmt: skip
     if rule.to is None:
-        add = figure.add_vline if way == "x" else figure.add_hline
-        add(**{way: at}, line=line, layer="between", exclude_empty_subplots=False, **cell)
-    else:
-        add = figure.add_vrect if way == "x" else figure.add_hrect
-        add(**{f"{way}0": at, f"{way}1": rule.to}, fillcolor=rule.colour, line_width=0, layer="below",
-            exclude_empty_subplots=False, **cell)  # fmt: skip
+        line = {"color": rule.colour, "width": rule.width, "dash": rule.dash}
+        return shape | {"type": "line", "line": line, "layer": "between"}
+    return shape | {"type": "rect", "fillcolor": rule.colour, "line": {"width": 0}, "layer": "below"}
 
 
 @singledispatch
-def _traces(mark: Mark) -> list[Any]:
+def _traces(mark: Mark) -> list[Trace]:
     raise TypeError(f"no drawing for {type(mark).__name__}")
 
 
 @_traces.register(DataSeries)
-def _(mark: DataSeries) -> list[Any]:
+def _(mark: DataSeries) -> list[Trace]:
     mode = "+".join(["lines"] * (mark.width > 0) + ["markers"] * bool(mark.symbol)) or "none"
-    trace = go.Scatter(
-        **_along(mark.x), y=_escaped(mark.y), mode=mode,
-        opacity=mark.opacity, legendrank=mark.rank, cliponaxis=mark.clipped, **_hover(mark),
-    )  # fmt: skip
-    trace.line = {"color": mark.colour}
+    trace: Trace = {
+        "type": "scatter", **_along(mark.x), "y": _escaped(mark.y), "mode": mode, "line": {"color": mark.colour},
+        "opacity": mark.opacity, "legendrank": mark.rank, "cliponaxis": mark.clipped, **_hover(mark),
+    }  # fmt: skip
     if mark.width:
-        trace.line = {"color": mark.colour, "width": mark.width, "dash": mark.dash, "shape": STEPS[mark.step]}
+        trace["line"] = {"color": mark.colour, "width": mark.width, "dash": mark.dash, "shape": STEPS[mark.step]}
     if mark.symbol:
         edge = {"color": mark.edge, "width": 2} if mark.edge else {}
         symbol = SYMBOLS.get(mark.symbol, mark.symbol)
-        trace.marker = {"symbol": symbol, "size": mark.size, "color": mark.colour, "line": edge}
+        trace["marker"] = {"symbol": symbol, "size": mark.size, "color": mark.colour, "line": edge}
     if mark.filled:
-        trace.update(fill="tozeroy", fillcolor=_tint(mark.colour))
+        trace |= {"fill": "tozeroy", "fillcolor": _tint(mark.colour)}
     if len(mark.low):
-        trace.error_x = _interval(mark.x, mark.low, mark.high, mark.colour)
+        trace["error_x"] = _interval(mark.x, mark.low, mark.high, mark.colour)
     return [trace]
 
 
 @_traces.register(Range)
-def _(mark: Range) -> list[Any]:
-    shared: dict[str, Any] = _along(mark.x) | {"mode": "lines", "line": {"color": _tint(mark.colour), "width": 0.5}}
-    lower = go.Scatter(y=mark.low, showlegend=False, **shared, **_hover(mark))
-    return [lower, go.Scatter(y=mark.high, fill="tonexty", fillcolor=_tint(mark.colour), **shared, **_hover(mark))]
+def _(mark: Range) -> list[Trace]:
+    line = {"color": _tint(mark.colour), "width": 0.5}
+    shared: Trace = {"type": "scatter", **_along(mark.x), "mode": "lines", "line": line, **_hover(mark)}
+    lower = shared | {"y": mark.low, "showlegend": False}
+    return [lower, shared | {"y": mark.high, "fill": "tonexty", "fillcolor": _tint(mark.colour)}]
 
 
 @_traces.register(Bars)
-def _(mark: Bars) -> list[Any]:
+def _(mark: Bars) -> list[Trace]:
     along, reach = ("y", "x") if mark.horizontal else ("x", "y")
-    trace = go.Bar(
-        {along: _escaped(mark.positions), reach: mark.values}, orientation="h" if mark.horizontal else "v",
-        marker={"color": mark.colours[0] if len(set(mark.colours)) == 1 else list(mark.colours)}, **_hover(mark),
-    )  # fmt: skip
+    trace: Trace = {
+        "type": "bar", along: _escaped(mark.positions), reach: mark.values,
+        "orientation": "h" if mark.horizontal else "v",
+        "marker": {"color": mark.colours[0] if len(set(mark.colours)) == 1 else list(mark.colours)}, **_hover(mark),
+    }  # fmt: skip
     if len(mark.low):
-        trace.update({f"error_{reach}": _interval(mark.values, mark.low, mark.high, INK)})
+        trace[f"error_{reach}"] = _interval(mark.values, mark.low, mark.high, INK)
     if mark.valued:
-        trace.update(texttemplate=f"%{{{reach}:.3~g}}", textposition="outside", cliponaxis=False)
+        trace |= {"texttemplate": f"%{{{reach}:.3~g}}", "textposition": "outside", "cliponaxis": False}
     return [trace]
 
 
 @_traces.register(Cells)
-def _(mark: Cells) -> list[Any]:
+def _(mark: Cells) -> list[Trace]:
     rounded = [[finite_or_none(value) for value in row] for row in np.asarray(mark.values, dtype=float).tolist()]
     steps = np.linspace(0.0, 1.0, len(mark.scale)).tolist()
     bar: dict[str, Any] = {
@@ -237,24 +268,26 @@ def _(mark: Cells) -> list[Any]:
     if mark.ticks:
         bar |= {"tickvals": [at for at, _ in mark.ticks], "ticktext": [text for _, text in mark.ticks]}
     gap = 1 if mark.gap else 0
-    trace = go.Heatmap(
-        x=_escaped(mark.x), y=_escaped(mark.y), z=rounded, colorscale=[[*pair] for pair in zip(steps, mark.scale)],
-        zmin=mark.ends[0], zmax=mark.ends[1], xgap=gap, ygap=gap, colorbar=bar, showscale=mark.barred, **_hover(mark),
-    )  # fmt: skip
+    trace: Trace = {
+        "type": "heatmap", "x": _escaped(mark.x), "y": _escaped(mark.y), "z": rounded,
+        "colorscale": [[*pair] for pair in zip(steps, mark.scale)], "zmin": mark.ends[0], "zmax": mark.ends[1],
+        "xgap": gap, "ygap": gap, "colorbar": bar, "showscale": mark.barred, **_hover(mark),
+    }  # fmt: skip
     if mark.written:
-        trace.update(texttemplate="%{z:.2f}", textfont={"size": 9})
+        trace |= {"texttemplate": "%{z:.2f}", "textfont": {"size": 9}}
     if mark.shown is not None:
-        trace.customdata = mark.shown
+        trace["customdata"] = mark.shown
     return [trace]
 
 
 @_traces.register(Texts)
-def _(mark: Texts) -> list[Any]:
-    return [go.Scatter(
-        x=_escaped(mark.x), y=_escaped(mark.y), mode="text", text=[f"\u00a0{_text(text)}" for text in mark.texts],
-        textposition="top right" if mark.raised else "middle right", textfont={"size": 12, "color": mark.colour},
-        cliponaxis=False, hoverinfo="skip",
-    )]  # fmt: skip
+def _(mark: Texts) -> list[Trace]:
+    return [{
+        "type": "scatter", "x": _escaped(mark.x), "y": _escaped(mark.y), "mode": "text",
+        "text": [f"\u00a0{_text(text)}" for text in mark.texts], "cliponaxis": False, "hoverinfo": "skip",
+        "textposition": "top right" if mark.raised else "middle right",
+        "textfont": {"size": 12, "color": mark.colour},
+    }]  # fmt: skip
 
 
 def _hover(mark: Mark) -> dict[str, Any]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from edp.data.screening import ScreeningResult
 from edp.report.common.chart import (
     BLUE,
     DASHES,
@@ -43,6 +42,9 @@ from edp.report.screening.views import (
     stability_views,
     value_views,
 )
+
+if TYPE_CHECKING:
+    from edp.data.screening import ScreeningResult
 
 FIGURES_IN_CELLS = 32
 """Channels up to which a cell is large enough for its value."""

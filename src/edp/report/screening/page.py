@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from edp.data.screening import FlagKind, ScreeningResult
 from edp.logs import DataQuality
 from edp.report.common.picture import write_pictures
 from edp.report.common.templates import template
@@ -17,6 +16,9 @@ from edp.report.screening import tables as tables
 from edp.report.screening.charts import screening_charts
 from edp.report.screening.views import best_groups, joined
 from edp.storage import write_bytes
+
+if TYPE_CHECKING:
+    from edp.data.screening import ScreeningResult
 
 
 def build_screening_page(
@@ -111,6 +113,9 @@ def headline(screening: ScreeningResult) -> str:
 
 def verdict(screening: ScreeningResult, quality: DataQuality | None) -> list[str]:
     """What to know before the proposal is used."""
+    # Late: the screening brings a compiler, and every command that may write a page imports this module.
+    from edp.data.screening import FlagKind
+
     lines = []
     leaks = sorted({flag.channel for flag in screening.flags if flag.kind is FlagKind.LEAK})
     if leaks:
@@ -134,6 +139,8 @@ def sentence(text: str) -> str:
 
 def tiles(screening: ScreeningResult) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what."""
+    from edp.data.screening import FlagKind  # late: see `verdict`
+
     tiles = [
         (count_text(len(screening.proposal.kept)), "", f"of {len(screening.channels)} channels proposed"),
         (count_text(screening.proposal.window), "samples", "suggested memory W"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from edp.data.screening import ChannelVerdict, Flag, LagCurve, ScreeningResult
 from edp.report.common.tables import TextTable
 from edp.report.common.wording import MISSING, count_text, duration, number, percent
 from edp.report.screening.views import lag_ranges
+
+if TYPE_CHECKING:
+    from edp.data.screening import ChannelVerdict, Flag, LagCurve, ScreeningResult
 
 FLAG_WORDS = {
     "leak of the future": "leak of the future",

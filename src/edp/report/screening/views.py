@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.data.screening import GroupImportance, LagCurve, ScreeningResult, Stability, Value
 from edp.report.common.wording import short_label, short_labels
+
+if TYPE_CHECKING:
+    from edp.data.screening import GroupImportance, LagCurve, ScreeningResult, Stability, Value
 
 Array = NDArray[np.float64]
 MEASURES = {
