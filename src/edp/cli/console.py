@@ -9,6 +9,7 @@ import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Annotated, Any
 
 import typer
@@ -190,7 +191,7 @@ def run_app(app: typer.Typer) -> int:
     try:
         refuse_empty(sys.argv[1:])
         # Click would end the process itself; errors are to be told here.
-        code = app(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
+        code = _command(app)(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:
@@ -211,6 +212,13 @@ def run_app(app: typer.Typer) -> int:
         _say_usage(error)
         return int(getattr(error, "exit_code", 2))
     return code if isinstance(code, int) else 0
+
+
+@cache
+def _command(app: typer.Typer) -> Callable[..., Any]:
+    """The commands with their options, read from the functions' signatures once a process."""
+    command: Callable[..., Any] = typer.main.get_command(app)
+    return command
 
 
 def refuse_empty(words: Sequence[str]) -> None:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.io
 
 from edp import __version__
 from edp.errors import ExportError
@@ -119,6 +118,8 @@ def as_json(content: Mapping[str, Any]) -> bytes:
 
 def as_mat(variables: Mapping[str, Any]) -> bytes:
     """Variables as a MAT file (version 5), the same bytes at any time of day; lists become rows of numbers or cells."""
+    import scipy.io  # late: training and search import this module
+
     buffer = io.BytesIO()
     scipy.io.savemat(buffer, {name: _for_matlab(value) for name, value in variables.items()}, long_field_names=True)
     text = f"MATLAB 5.0 MAT-file, written by EDP {__version__}".ljust(116).encode()  # without the time of day

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 import torch
@@ -17,7 +18,9 @@ from edp.networks.input_range import usual_range
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import Predictor
 from edp.networks.trees import Trees
-from edp.networks.twin import TwinPlant
+
+if TYPE_CHECKING:
+    from edp.networks.twin import TwinPlant
 
 GOLDEN_TICKS = 200
 SHARE = 1e-5
@@ -42,7 +45,7 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     """
     if isinstance(predictor, IntegerPredictor):
         return np.zeros(outputs.shape[1], dtype=np.float32)
-    if isinstance(predictor, TwinPlant):
+    if _is_plant(predictor):
         grown: Rows = grown_tolerance(predictor, inputs, outputs).max(axis=0)
         return grown
     exact = stream(copy.deepcopy(predictor).double(), inputs)
@@ -52,6 +55,13 @@ def tolerance(predictor: Predictor, inputs: Rows, outputs: Rows) -> Rows:
     own = np.where(at_thresholds(predictor, inputs) > 0.0, 0.0, np.abs(outputs - exact)).max(axis=0)
     result: Rows = np.maximum(SHARE * (widths + np.abs(outputs).max(axis=0)), 2.0 * own).astype(np.float32)
     return result
+
+
+def _is_plant(predictor: Predictor) -> TypeGuard[TwinPlant]:
+    # Imported here: training and search import this module, and a plant brings the compiler of grey boxes.
+    from edp.networks.twin import TwinPlant
+
+    return isinstance(predictor, TwinPlant)
 
 
 def grown_tolerance(plant: TwinPlant, inputs: Rows, outputs: Rows) -> Rows:
@@ -146,7 +156,7 @@ def random_inputs(predictor: Predictor, ticks: int, seed: int, mixed: bool = Tru
     of the rest on.
     """
     rows = _smooth(predictor, ticks, seed)
-    if isinstance(predictor, TwinPlant):
+    if _is_plant(predictor):
         _set_ports(predictor, rows, seed, mixed)
     return rows
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -36,7 +36,6 @@ from edp.networks.predictor import check_combination, describe
 from edp.recording import Recording
 from edp.report import build_report
 from edp.report.run.choice import note_test_result
-from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
@@ -44,6 +43,9 @@ from edp.training.bundle import weights_digest
 from edp.training.fit import fit
 from edp.training.spec import check_fitted_parts, check_training, thread_count
 from edp.training.strategy import DirectFit, TrainingStrategy
+
+if TYPE_CHECKING:
+    from edp.sim.data_set import SimulationOrder, simulate_data_set
 
 SHOWN_RECORDINGS = 6
 # 60,000 ticks are ten minutes at 100 Hz: more than a picture can show.
@@ -369,6 +371,15 @@ def _shown(evaluation: Evaluation) -> dict[str, np.ndarray]:
 def judge_bundle(bundle: Bundle, data: Prepared, spec: JudgeSpec | None = None) -> Evaluation:
     """Judge a bundle on ``data.test`` without touching the disk."""
     return judge(bundle.predictor, data, spec or JudgeSpec(), describe(bundle.predictor.spec))
+
+
+def __getattr__(name: str) -> Any:
+    """The simulator's functions: with it comes a compiler, which every process that trains would load."""
+    if name in ("SimulationOrder", "simulate_data_set"):
+        from edp.sim import data_set
+
+        return getattr(data_set, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 __all__ = [
