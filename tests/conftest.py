@@ -15,6 +15,7 @@ import numpy as np
 import process_guard
 import processor_time
 import pytest
+import recordings
 import torch
 
 from edp.data.task import TargetMode, Task
@@ -210,6 +211,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     if not item.config.getoption("--no-processes"):
+        recordings.begin(process_guard.place_of(item))
         return (yield)
     with process_guard.watching():
         return (yield)

@@ -83,7 +83,7 @@ class ProcessStartedError(BaseException):
 
 def starts_processes(item: pytest.Item) -> bool:
     """Whether a test's folder or one of its fixtures starts processes."""
-    place = _place(item)
+    place = place_of(item)
     of_folder = _in_folders(place) or _in_unit(place, FILES)
     of_name = any(name in item.name for name in NAMES)
     return of_folder or of_name or bool(FIXTURES & set(getattr(item, "fixturenames", ())))
@@ -91,7 +91,7 @@ def starts_processes(item: pytest.Item) -> bool:
 
 def takes_long(item: pytest.Item) -> bool:
     """Whether a test trains networks for seconds: none of the quick check either."""
-    return _in_unit(_place(item), TRAINING)
+    return _in_unit(place_of(item), TRAINING)
 
 
 def leaves_out(path: Path) -> bool:
@@ -106,7 +106,8 @@ def _in_folders(place: str) -> bool:
     )
 
 
-def _place(item: pytest.Item) -> str:
+def place_of(item: pytest.Item) -> str:
+    """Of a test's file below `tests`; empty where it lies elsewhere."""
     return _place_of(item.path)
 
 

@@ -11,6 +11,8 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -96,21 +98,41 @@ def descendants(pid):
     return [one for child in children_of(pid) for one in (child, *descendants(child))]
 
 
+_hearing = []
+
+
+@cache  # a hook cannot be removed, and each one costs every later test of this process
+def _install_hook():
+    sys.addaudithook(
+        lambda event, arguments, hearing=_hearing: [hear(event, arguments) for hear in hearing] if hearing else None
+    )
+
+
+@contextmanager
+def heard(note):
+    """Every event of Python goes to `note`."""
+    _install_hook()
+    _hearing.append(note)
+    try:
+        yield
+    finally:
+        _hearing.clear()
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_this_process_opens_no_log_but_for_its_first_bytes(tmp_path, suffix, monkeypatch):
     path = write_recording(recording(), tmp_path / f"a{suffix}")
     opened = []
 
     def note(event, arguments):
-        if event in ("open", "sqlite3.connect") and opened is not None and str(arguments[0]).endswith(path.name):
+        if event in ("open", "sqlite3.connect") and str(arguments[0]).endswith(path.name):
             opened.append(event)
 
     for part in set(map(type, FORMATS.values())):
         monkeypatch.setattr(part, "read", lambda *_: pytest.fail("read in this process"))
-    sys.addaudithook(lambda event, arguments: note(event, arguments))
-    read = read_recording(path)
+    with heard(note):
+        read = read_recording(path)
     assert opened == ["open"] * 2 or opened == ["open"]  # os.open, and the stream made of it
-    opened = None
     names = ["BmUp", "CylVels_1"] if suffix == ".csv" else ["BmUp", "CylVels_1", "Extra"]
     assert sorted(read.channel_names) == names
     np.testing.assert_array_equal(read.select(names), recording().select(names))
