@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -102,13 +102,14 @@ def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Foo
     column = sum(cost.per_column for cost in costs)
     once = sum(cost.per_prediction for cost in costs)
     folded = sum(cost.parameters - cost.foldable for cost in costs)
+    parameters, macs_tick = parameters_and_macs(costs)
     sizes, refused = _sizes(predictor, adaptation)
     return Footprint(
-        parameters=sum(cost.parameters for cost in costs),
+        parameters=parameters,
         parameters_folded=folded,
         macs_window=column * window + once,
+        macs_tick=macs_tick,
         # Four bytes a number: activations are counted in float32 in both formats.
-        macs_tick=column + once + sum(cost.pooling for cost in costs),
         peak_activation_bytes=4 * max(cost.width_in + cost.width_out for cost in costs),
         peak_activation_bytes_window=4 * max(_window_width(cost, window) for cost in costs),
         state_bytes=4 * state,
@@ -117,6 +118,12 @@ def footprint(predictor: Predictor, adaptation: Adaptation | None = None) -> Foo
         estimates=tuple(estimate(costs, state, name, size) for name, size in sizes.items()),
         refused=refused,
     )
+
+
+def parameters_and_macs(costs: Sequence[Cost]) -> tuple[int, int]:
+    """Trainable numbers as stored, and multiply-accumulates of one tick of the stream, of the parts alone."""
+    macs = sum(cost.per_column + cost.per_prediction + cost.pooling for cost in costs)
+    return sum(cost.parameters for cost in costs), macs
 
 
 def _sizes(predictor: Predictor, adaptation: Adaptation | None) -> tuple[dict[str, Sizes], dict[str, str]]:

@@ -14,7 +14,7 @@ from edp.config.experiment import Experiment, Table, build, plain_tree
 from edp.data.prepared import Prepared, prepare
 from edp.data.splits import ByRecording, Split, Stretch
 from edp.errors import ConfigError, DataError
-from edp.evaluation.footprint import footprint
+from edp.evaluation.footprint import parameters_and_macs
 from edp.evaluation.judge import JudgeSpec, judge, score_predictions
 from edp.evaluation.mac_check import check_counted
 from edp.logs.source import DataSource
@@ -180,12 +180,12 @@ def train_part(plain: Mapping[str, Any], start: bytes | None = None) -> tuple[di
         name: {k: {score: horizon_scores["mean"][score] for score in SCORES} for k, horizon_scores in horizons.items()}
         for name, horizons in by_recording.items()
     }
-    counted = footprint(fitted.predictor)
+    parameters, macs_tick = parameters_and_macs(fitted.predictor.costs())
     result = {
         "sessions": sessions,
         "scores": mean_scores(sessions),
-        "parameters": counted.parameters,
-        "macs_tick": counted.macs_tick,
+        "parameters": parameters,
+        "macs_tick": macs_tick,
         "train_loss": fitted.history[-1]["train_loss"],
         "seconds": round(time.perf_counter() - began, 3),
     }
@@ -282,13 +282,19 @@ def costs_of(settings: Table, channels: Sequence[str] = ()) -> dict[str, float]:
     Raises:
         ConfigError: settings that cannot be, or a part that counts other work than it does.
     """
-    experiment = build(Experiment, settings, "of a search")
+    return dict(_costs(_frozen(settings), tuple(channels)))
+
+
+# A study that goes on asks for the costs of all its networks again, and phases ask for those of the same network.
+@lru_cache(maxsize=1024)
+def _costs(settings: str, channels: tuple[str, ...]) -> Mapping[str, float]:
+    experiment = build(Experiment, json.loads(settings), "of a search")
     task = experiment.task.resolve(100.0, channels, experiment.model.physics)
     # Weights do not matter to counts; building takes milliseconds, training minutes.
     network = build_model(task, experiment.model, blank_scaler(task), seed=0)
     check_counted(network)
-    counted = footprint(network)
-    return {"parameters": float(counted.parameters), "macs_tick": float(counted.macs_tick)}
+    parameters, macs_tick = parameters_and_macs(network.costs())
+    return {"parameters": float(parameters), "macs_tick": float(macs_tick)}
 
 
 def settings_of(experiment: Experiment) -> Table:
