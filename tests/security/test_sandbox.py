@@ -442,7 +442,14 @@ def test_a_watcher_hears_of_slow_logs_only(hostile, impatient, monkeypatch):
     assert heard[0][2] == path.stat().st_size
 
 
-def test_a_worker_that_ends_for_want_of_work_loses_no_order(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "pauses",
+    [
+        pytest.param(np.linspace(0.01, 0.03, 9), id="nine"),
+        pytest.param(np.linspace(0.0, 0.06, 25), id="many", marks=pytest.mark.slow),
+    ],
+)
+def test_a_worker_that_ends_for_want_of_work_loses_no_order(pauses, tmp_path, monkeypatch):
     """Orders that arrive while an idle worker ends are obeyed, or refused so that another worker starts."""
     module = tmp_path / "hasty_worker.py"
     module.write_text(
@@ -456,6 +463,6 @@ def test_a_worker_that_ends_for_want_of_work_loses_no_order(tmp_path, monkeypatc
     monkeypatch.setattr("edp.logs.sandboxed.WORKER", "hasty_worker")
     log = tmp_path / "log.csv"
     log.write_text("time,CylVels_1\n" + "\n".join(f"{tick / 100},{tick % 7}" for tick in range(50)) + "\n")
-    for pause in np.linspace(0.0, 0.06, 25):  # around the time after which the worker ends
+    for pause in pauses:  # around the time after which the worker ends
         time.sleep(pause)
         assert read_recording(log).samples == 50
