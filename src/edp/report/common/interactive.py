@@ -88,7 +88,7 @@ def plot(chart: Chart, title: str = "") -> Plot:
             grid.get_subplot(row + 1, col + 1, secondary_y=second) for second in (False, True)[: 1 + bool(panel.second)]
         ]
         for mark in panel.marks:
-            place = _refs(sides[-1 if mark.second else 0])
+            across, upwards = _refs(sides[-1 if mark.second else 0])
             if isinstance(mark, GuideLine):
                 layout.setdefault("shapes", []).append(_rule(mark, *_refs(sides[0])))
                 continue
@@ -99,7 +99,7 @@ def plot(chart: Chart, title: str = "") -> Plot:
                     "name": _text(mark.name), "legendgroup": _text(mark.group or mark.name),
                     "showlegend": bool(mark.name) and trace.get("showlegend") is not False and entry not in named,
                     "visible": fits(mark, chosen), "meta": dict(mark.when) or None,
-                    "xaxis": place[0], "yaxis": place[1],
+                    "xaxis": across, "yaxis": upwards,
                 }  # fmt: skip
                 named |= {entry} if trace["showlegend"] else set()
                 traces.append(trace)
@@ -123,7 +123,7 @@ def _put(table: dict[str, Any], changes: Mapping[str, Any]) -> None:
 
 def _refs(side: Any) -> tuple[str, str]:
     """How traces name the axes of a panel."""
-    return tuple(axis.plotly_name.replace("axis", "") for axis in (side.xaxis, side.yaxis))  # type: ignore[return-value]
+    return side.xaxis.plotly_name.replace("axis", ""), side.yaxis.plotly_name.replace("axis", "")
 
 
 def _grid(chart: Chart) -> go.Figure:
