@@ -186,12 +186,13 @@ def duration(seconds: float) -> str:
     return f"{whole // 60} min {whole % 60:02d} s" if whole >= 60 else f"{whole} s"
 
 
-def run_app(app: typer.Typer) -> int:
+def run_app(app: typer.Typer | Callable[..., Any]) -> int:
     """Run the command line; a user's mistake ends in one message and that error's exit code, Ctrl-C in 130."""
     try:
         refuse_empty(sys.argv[1:])
         # Click would end the process itself; errors are to be told here.
-        code = _command(app)(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
+        command = _command(app) if isinstance(app, typer.Typer) else app
+        code = command(standalone_mode=False)  # of a command that raised typer.Exit; 130 after Ctrl-C; else None
         if code == INTERRUPTED:
             raise KeyboardInterrupt
     except EdpError as error:
