@@ -20,7 +20,7 @@ def twin(
     data: Annotated[Path, typer.Argument(help="A log, a folder of logs, or a data-set file (.toml).")],
     folder: Annotated[Path, typer.Option("--out", help="Run folder; an unfinished run continues.")],
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
-    changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.units=64.")] = [],  # noqa: B006
+    changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.kind=recurrent.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
     as_json: JsonFlag = False,

@@ -151,7 +151,10 @@ class SettingsTree:
             raise ConfigError(f"{self.what} {where}: {count}\n  - {listed}")
         return typing.cast(T, spec)
 
-    def _build(self, cls: type, table: Any, path: str, problems: list[str]) -> Any:
+    def _build(
+        self, cls: type, table: Any, path: str, problems: list[str], beside: Mapping[str, type] | None = None
+    ) -> Any:
+        """A spec of a class; `beside` are the parts that a ``kind`` could have named in its place."""
         if not isinstance(table, Mapping):
             problems.append(f"{path}: expected a table, got {shown(table)}")
             return None
@@ -159,7 +162,8 @@ class SettingsTree:
         before = len(problems)
         for key in table:
             if key not in settings_of_class:
-                problems.append(f"unknown key '{_join(path, _key(key))}'{closest(_key(key), list(settings_of_class))}")
+                hint = _kinds_with(key, beside or {}) or closest(_key(key), list(settings_of_class))
+                problems.append(f"unknown key '{_join(path, _key(key))}'{hint}")
         for name, entry in settings_of_class.items():
             if entry.required and name not in table:
                 problems.append(f"'{_join(path, name)}' is missing; it must be given")
@@ -227,7 +231,13 @@ class SettingsTree:
         except ConfigError as error:
             problems.append(f"{path}.kind: {error}")
             return None
-        return self._build(cls, {key: value for key, value in table.items() if key != "kind"}, path, problems)
+        return self._build(cls, {key: value for key, value in table.items() if key != "kind"}, path, problems, registry)
+
+
+def _kinds_with(key: Any, parts: Mapping[str, type]) -> str:
+    """For the message on a key that is unknown, which kinds of the part have it; empty where none has."""
+    kinds = [f"'{name}'" for name, part in parts.items() if key in _settings_of(part)]
+    return f"; it belongs to kind = {' or '.join(kinds)}" if kinds else ""
 
 
 class _Setting(typing.NamedTuple):

@@ -195,6 +195,7 @@ def test_a_share_of_a_training_keeps_its_stages():
         ("twin.candidates=['static','rekurrent']", "unknown twin 'rekurrent'; did you mean 'recurrent'"),
         ("twin.candidates=['arx','arx']", "each once must hold"),
         ("twin.candidates=['auto']", "unknown twin 'auto'"),
+        ("twin.units=64", "unknown key 'twin.units'; it belongs to kind = 'recurrent' or 'residual'"),
         ("twin.least_gain=1.5", "least_gain = 1.5"),
         ("twin={kind='recurrent',units=10,members=3}", "10 units and 3 members; a whole number"),
         ("twin={kind='recurrent',units=66,members=33}", "members = 33"),
