@@ -34,7 +34,8 @@ def scripts():
     folder = str(ROOT / "benchmarks")
     sys.path.insert(0, folder)
     try:
-        yield {name: script(name) for name in ("real_recordings", "published_leagues", "twin_leagues")}
+        names = ("real_recordings", "published_leagues", "twin_leagues", "twin_recordings")
+        yield {name: script(name) for name in names}
     finally:
         sys.path.remove(folder)
 
@@ -86,7 +87,7 @@ def test_an_unset_variable_is_named(monkeypatch):
         DataSource.of(REAL / "faster.toml").read()
 
 
-@pytest.mark.parametrize("name", ["real_recordings", "published_leagues", "twin_leagues"])
+@pytest.mark.parametrize("name", ["real_recordings", "published_leagues", "twin_leagues", "twin_recordings"])
 def test_without_recordings_it_says_so_and_succeeds(name, scripts, tmp_path, capsys):
     scripts[name].main(["--shared", str(tmp_path / "nowhere")])
     lines = capsys.readouterr().out.strip().splitlines()
@@ -118,6 +119,21 @@ def test_a_set_becomes_a_machine_with_one_actuator(scripts):
     answers = twin.rollout(part.inputs[None, 10:-1], state)[0][0, :, 1]
     expected = np.sqrt(np.mean((answers - part.targets[11:, 1]) ** 2))
     assert twins.free_run_rmse(twin, part, "stroke") == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_default_twin_is_held_against_the_best_of_its_rivals(scripts):
+    twins = scripts["twin_recordings"]
+    assert set(twins.SETS) <= {path.stem for path in REAL.glob("*.toml")}
+    values = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
+    recording = Recording("log", (Channel("a", Kind.GENERIC), Channel("b", Kind.GENERIC)), values, 2.0, "here")
+    turned = twins.machine(recording, twins.MachineSet(("a",), ("b",), turning=True))
+    assert [(c.name, c.kind) for c in turned.channels] == [("a", Kind.RATIO), ("b", Kind.ANGLE)]
+    errors = {"twin": 0.4, "static": 1.0, "arx": 0.5, "n4sid": 2.0}
+    row = {"errors": errors, "diverged": dict.fromkeys(errors, 0.0), "chosen": "x", "promise": 0.5, "processor_s": 1.0}
+    first, second, mean = twins.show({"one": row, "two": row | {"errors": errors | {"twin": 0.6}}}, quick=True)
+    assert (first.met, second.met) == (True, False)
+    assert (first.ratio, second.ratio) == (pytest.approx(0.8), pytest.approx(1.2))
+    assert mean.ratio == pytest.approx(np.sqrt(0.8 * 1.2))
 
 
 def model(error: float) -> dict:
