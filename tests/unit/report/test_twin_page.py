@@ -22,12 +22,14 @@ HOSTILE = "</script><img src=x onerror=alert(1)>"
 SPEC = FreeRunJudgeSpec(at_s=(0.2, 1.0), covered_at_s=(0.2, 1.0))
 
 
-def judged(strokes=True, name="boom"):
-    """Scores and runs of a twin of one cylinder with noise for errors, in two recordings."""
+def judged(strokes=True, name="boom", swing=False):
+    """Scores and runs of a twin of one cylinder with noise for errors, in two recordings; with a swing of two axes."""
     stroke = (Channel(f"{name} stroke", Kind.POSITION),) if strokes else ()
-    channels = TwinChannels(
-        (Channel("u", Kind.RATIO),), (Channel(name, Kind.VELOCITY),), stroke, (Channel("p", Kind.PRESSURE),), 10.0
-    )
+    velocity, pressure = (Channel(name, Kind.VELOCITY),), (Channel("p", Kind.PRESSURE),)
+    if swing:
+        velocity, stroke = (*velocity, Channel("swing", Kind.ANGULAR_VELOCITY)), (*stroke, Channel("pose", Kind.ANGLE))
+        pressure = ()
+    channels = TwinChannels((Channel("u", Kind.RATIO),), velocity, stroke, pressure, 10.0)
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(4, 30, len(channels.answers))).astype(np.float32)
     answers = truth + rng.normal(0, 1e-3, truth.shape).astype(np.float32)
@@ -56,6 +58,22 @@ def test_each_kind_of_channel_has_its_own_unit_and_figure():
     assert titles == ["Velocities [mm/s]", "Strokes [mm]", "Pressures [bar]"]
     assert "mm after 1 s" in headline(facts).replace("\xa0", " ")
     assert [unit for _, unit, what in tiles(facts) if "error" in what] == ["mm/s", "mm", "mm", ""]
+
+
+def test_actuators_of_different_units_stand_alone():
+    facts = facts_of(swing=True)
+    key_figures = [(unit, what) for _, unit, what in tiles(facts)]
+    assert key_figures[:2] == [("mm", "error of boom stroke after 1 s"), ("deg", "error of pose after 1 s")]
+    assert not any("pressures" in what for _, what in key_figures)
+    sheet = sheets_of(facts)["actuators"]
+    assert [row[:2] for row in sheet.rows] == [(a, m) for a in ("boom", "swing") for m in ("twin", "static")]
+    assert sheet.rows[0][2].endswith(" mm/s")
+    assert sheet.rows[3][3].endswith(" deg")
+    page = render(facts)
+    assert "each actuator in its units" in page
+    assert "The twin and its floors</caption>" not in page
+    headings = [column.heading for column in sheets_of(facts)["recordings"].columns]
+    assert headings == ["Recording", "Runs", "Diverged"]
 
 
 def test_a_run_is_drawn_with_its_interval():

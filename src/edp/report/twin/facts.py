@@ -28,6 +28,7 @@ from edp.evaluation.scores_file import (
 )
 from edp.report.common.sheets import Column, Sheet, Value, figures
 from edp.report.common.wording import number, percent
+from edp.report.twin.actuators import actuator_sheet, actuator_tiles, ahead_by_actuator, mixed_units
 from edp.report.twin.candidates import candidate_sheet, choice_sentence, read_candidates
 from edp.storage import read_object
 
@@ -39,7 +40,14 @@ MOST_ROWS = 40
 """Recordings of a table, the worst first: nobody reads more."""
 UNIT = Leaf(lambda value: value is None or isinstance(value, str), "a text or null")
 BY_CHANNEL = KeyedObject(
-    {"unit": UNIT, "mean": NUMBER, "median": NUMBER, "by_channel": NamedValues(NUMBER)}, ("unit", "mean", "by_channel")
+    {
+        "unit": UNIT,
+        "units": NamedValues(NAME),
+        "mean": NUMBER,
+        "median": NUMBER,
+        "by_channel": NamedValues(NUMBER),
+    },
+    ("unit", "mean", "by_channel"),
 )
 NRMSE = KeyedObject({"mean": NUMBER, "by_channel": NamedValues(NUMBER)}, ("mean", "by_channel"))
 AT = KeyedObject({"at_s": SIZE, **BY_CHANNEL.keys}, ("at_s", *BY_CHANNEL.needed))
@@ -227,12 +235,16 @@ def tiles(facts: FreeRunFacts) -> list[tuple[str, str, str]]:
     """Key figures: value, unit, what it is."""
     twin = facts.twin
     velocity = twin["velocity_mae"]
-    rows = [(number(velocity["mean"]), velocity["unit"] or "", "mean absolute error of the velocities")]
-    rows += [
-        (number(row["mean"]), row["unit"] or "", f"stroke error after {row['at_s']:g} s")
-        for row in (*twin["stroke_error"][:1], *twin["stroke_error"][-1:])
-    ]
-    rows.append((number(twin["pressure_nrmse"]["mean"]), "", "error of the pressures in their deviations (NRMSE)"))
+    if mixed_units(twin):
+        rows = actuator_tiles(twin)
+    else:
+        rows = [(number(velocity["mean"]), velocity["unit"] or "", "mean absolute error of the velocities")]
+        rows += [
+            (number(row["mean"]), row["unit"] or "", f"stroke error after {row['at_s']:g} s")
+            for row in (*twin["stroke_error"][:1], *twin["stroke_error"][-1:])
+        ]
+    if twin["pressure_nrmse"]["by_channel"]:
+        rows.append((number(twin["pressure_nrmse"]["mean"]), "", "error of the pressures in their deviations (NRMSE)"))
     rows.append((percent(twin["diverged"]), "", "of the runs diverged"))
     intervals = twin.get("intervals")
     if intervals is not None and intervals["at"]:
@@ -246,6 +258,7 @@ def sheets_of(facts: FreeRunFacts) -> dict[str, Sheet]:
     """Every table by name; those of which nothing is known are left out."""
     twin = facts.twin
     sheets = [
+        *([actuator_sheet(facts.models)] if mixed_units(twin) else []),
         _summary_sheet("models", "The twin and its floors", "Model", facts.models, frozenset({0})),
         _summary_sheet("recordings", "By recording, the worst first", "Recording", _worst(twin["by_recording"])),
         _summary_sheet("driving", "By way of driving", "Way of driving", twin["by_driving"]),
@@ -283,6 +296,10 @@ def _summary_sheet(
         rows.append((label, entry["runs"], *cells, percent(entry["diverged"])))
     unit = next((entry["velocity_mae"]["unit"] for entry in summaries.values()), None) or ""
     titles = [("Velocity MAE", unit), *heads, ("Pressure NRMSE", "")]
+    # Nothing is known of a column where units differ, or without pressures.
+    full = [i for i in range(len(titles)) if any(row[2 + i] is not None for row in rows)]
+    rows = [(*row[:2], *(row[2 + i] for i in full), row[-1]) for row in rows]
+    titles = [titles[i] for i in full]
     shown = [Column(title, u, figures(row[2 + i] for row in rows)) for i, (title, u) in enumerate(titles)]
     count = Column("Runs", "", figures([], decimals=0))
     return Sheet(name, caption, (Column(first), count, *shown, Column("Diverged")), tuple(rows), marked)
@@ -318,16 +335,18 @@ def _coverage_sheet(intervals: Mapping[str, Any]) -> Sheet:
 
 
 def _ahead_sheet(facts: FreeRunFacts) -> Sheet:
+    first = facts.twin["ahead"]
+    caption = f"{first['seconds']:g} s ahead of measured ports, told the commands in between"
+    if mixed_units(facts.twin):
+        return ahead_by_actuator(facts.models, caption)
     rows: list[tuple[Value, ...]] = []
     for name, scores in facts.models.items():
         if "ahead" in scores:
             ahead = scores["ahead"]
             rows.append((name, *(ahead[key]["mean"] for key in ("velocity_mae", "stroke_error", "pressure_nrmse"))))
-    first = facts.twin["ahead"]
     units = (first["velocity_mae"]["unit"] or "", first["stroke_error"]["unit"] or "", "")
     titles = ("Velocity MAE", "Stroke error", "Pressure NRMSE")
     shown = [Column(t, u, figures(r[1 + i] for r in rows)) for i, (t, u) in enumerate(zip(titles, units, strict=True))]
-    caption = f"{first['seconds']:g} s ahead of measured ports, told the commands in between"
     return Sheet("ahead", caption, (Column("Model"), *shown), tuple(rows), frozenset({0}))
 
 
