@@ -170,10 +170,16 @@ def error_table(scores: dict[str, Any]) -> None:
     strokes = scores["stroke_error"]
     rows = [[f"{row['at_s']:g} s", *map(_number, row["by_channel"].values())] for row in strokes]
     unit = "" if strokes[0]["unit"] is None else f", {strokes[0]['unit']}"
-    table(f"error after{unit}", ["", *strokes[0]["by_channel"]], rows)
+    units = strokes[0].get("units", {})
+    heads = [f"{name}, {units[name]}" if name in units else name for name in strokes[0]["by_channel"]]
+    table(f"error after{unit}", ["", *heads], rows)
     velocity, pressures = scores["velocity_mae"], scores["pressure_nrmse"]
     unit = "" if velocity["unit"] is None else f", {velocity['unit']}"
-    out.print(f"MAE{unit}: " + ", ".join(f"{name} {_number(value)}" for name, value in velocity["by_channel"].items()))
+    units = velocity.get("units", {})
+    errors = [
+        f"{name} {_number(value)} {units.get(name, '')}".rstrip() for name, value in velocity["by_channel"].items()
+    ]
+    out.print(f"MAE{unit}: " + ", ".join(errors))
     if pressures["by_channel"]:
         out.print("NRMSE: " + ", ".join(f"{name} {_number(value)}" for name, value in pressures["by_channel"].items()))
 
