@@ -76,7 +76,7 @@ class FreeRunSpec:
         optimizer: with the learning rate that rises over `warmup` and falls to zero by a cosine.
         warmup: share of all updates.
         validate_every: updates from one validation to the next.
-        validation_s: length of a free run of the validation.
+        validation_s: length of a free run of the validation, and of those that choose a formulation.
         patience: validations without an improvement after which the last stage ends; 0 never ends early.
 
     Raises:
