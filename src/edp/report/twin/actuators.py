@@ -38,9 +38,9 @@ def _sheet(name: str, caption: str, columns: Mapping[str, Sequence[tuple[str, Ma
     """Rows by actuator, then model; of each model titles and rows of errors, each by channel."""
     first = next(iter(columns.values()))
     rows: list[tuple[Value, ...]] = []
-    for place, velocity in enumerate(first[0][1]["by_channel"]):
+    for which, velocity in enumerate(first[0][1]["by_channel"]):
         for model, entries in columns.items():
-            cells = [_with_unit(row, list(row["by_channel"])[place]) for _, row in entries if row["by_channel"]]
+            cells = [_with_unit(row, list(row["by_channel"])[which]) for _, row in entries if row["by_channel"]]
             rows.append((velocity, model, *cells))
     titles = [title for title, row in first if row["by_channel"]]
     heads = tuple(Column(title) for title in ("Actuator", "Model", *titles))
