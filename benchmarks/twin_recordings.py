@@ -3,7 +3,7 @@
 Each set is a machine with one or two actuators: commands, and positions whose change from tick to tick is the
 velocity. The first 55 % of every recording train, then 20 % choose and calibrate, the last 25 % are judged: free runs
 of 30 s, or as long as the recordings allow. The twin is what `edp twin` gives without settings; the rivals are the
-static map, ARX and a subspace model, fitted in the same run. The error is the geometric mean over actuators, of
+static map, ARX and a subspace model, fitted in the same run to training and validation part together. The error is the geometric mean over actuators, of
 velocities and of strokes at each time, over that of the static map.
 
     python benchmarks/twin_recordings.py --logs LOGS --map MAP.toml --repair gaps=cut --repair nan=hold
@@ -103,9 +103,11 @@ def measure(channels: TwinChannels, data: Prepared, experiment: TwinExperiment) 
         fit = TwinFit(channels, scales, data, experiment, None, lambda text: None)
         result, tried = TwinChoice(fit, experiment.twin, KeyedRun(run, "0" * 32)).best()
     twins = {"twin": result.fitted.twin}
+    # The twin's validation part chose; what needs no choice has it to learn from.
+    everything = [*data.train, *data.validation]
     for name in RIVALS:
         spec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
-        twins[name] = spec.start(channels, scales, data.train, seed)
+        twins[name] = spec.start(channels, fit_scales(channels, everything), everything, seed)
     scores = {name: free_run_scores(free_runs(twin, data.test, judge.seconds, judge.starts), judge)
               for name, twin in twins.items()}  # fmt: skip
     chosen = next(one for one in tried if one.chosen)

@@ -117,6 +117,56 @@ def test_numbers_that_cannot_be_are_refused(folder, change, message):
     refused(folder, message)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda a: a["map_delay"].fill(2.5), "its delay is 2.5 ticks; an integer from 0"),
+        (lambda a: a["map_delay"].fill(-1), "its delay is -1 ticks"),
+        (lambda a: a["map_delay"].fill(3e38), "its delay is 3e\\+38 ticks"),
+        (lambda a: a["map_corners"].fill(0.0), "its corners do not rise evenly"),
+        (lambda a: a.update(map_corners=a["map_corners"][::-1].copy()), "its corners do not rise evenly"),
+        (lambda a: a["map_corners"][-1].fill(3e38), "its corners do not rise evenly"),
+        (lambda a: a.pop("map_rise"), "'map_rise' is in one of them only"),
+        (lambda a: a.update(map_weight=a["map_rise"]), "'map_weight' is in one of them only"),
+        (lambda a: a.pop("pull"), "'pull' is in one of them only"),
+        (lambda a: a["pull"].fill(np.inf), "'pull' holds a number that is not finite"),
+    ],
+)
+def test_a_static_map_that_cannot_be_is_refused(tmp_path, change, message):
+    spec = Recurrent(units=4, members=2, valve_map=True, prefix_ticks=5)
+    folder = save_twin(TwinBundle(spec, sample_twin(spec)[0], {"seconds": 1.0}, {"twin": {}}), tmp_path / "twin")
+    rewritten(folder, change)
+    refused(folder, message)
+
+
+@pytest.mark.parametrize("pull", [-1e30, 1e30])
+def test_a_pull_beyond_its_share_leaves_answers_within_the_bounds(tmp_path, pull):
+    spec = Recurrent(units=4, valve_map=True, prefix_ticks=5)
+    twin, commands, measured = sample_twin(spec)
+    folder = save_twin(TwinBundle(spec, twin), tmp_path / "twin")
+    rewritten(folder, lambda a: a["pull"].fill(pull))
+    loaded = load_twin(folder).twin
+    state = loaded.reset(commands[:, :5], measured[:, :5])
+    answers, _ = loaded.rollout(1e9 * commands[:, 5:], state)
+    slack = 1e-5 * (loaded.scales.high - loaded.scales.low)
+    assert ((answers >= loaded.scales.low - slack) & (answers <= loaded.scales.high + slack)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda h: h["twin"].update(members=3), "4 units and 3 members"),
+        (lambda h: h["twin"].update(members=10**9), "members = 1000000000"),
+        (lambda h: h["twin"].update(valve_map=True), "is in one of them only"),
+        (lambda h: h["twin"].update(valve_map="yes"), "valve_map"),
+        (lambda h: h.update(twin={"kind": "auto"}), "unknown twin 'auto'"),
+    ],
+)
+def test_options_of_a_choice_that_mean_harm_are_refused(folder, change, message):
+    changed(folder, change)
+    refused(folder, message)
+
+
 def test_weights_that_were_cut_off_are_refused(folder):
     file = folder / header_of(folder)["weights"]["file"]
     file.write_bytes(file.read_bytes()[:-4])

@@ -17,8 +17,7 @@ from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_
 def fit_members(
     form: Recurrent,
     parts: tuple[TwinChannels, TwinScales, StaticTwin | None],
-    train: Sequence[Series],
-    validation: Sequence[Series],
+    series: tuple[Sequence[Series], Sequence[Series]],
     training: FreeRunSpec,
     on_event: Callable[[FreeRunProgress], None] | None = None,
     run: KeyedRun | None = None,
@@ -29,8 +28,7 @@ def fit_members(
     Args:
         form: its options.
         parts: channels, scales, and the fitted static map that all members share, where there is one.
-        train: training stretches.
-        validation: stretches that choose among the weights of each member.
+        series: training stretches, and those that choose among the weights of each member.
         training: how; the first member has its seed, the others one of their own.
         on_event: called with progress of each member in turn.
         run: folder and key of the run; where given, each member's training is resumable.
@@ -45,7 +43,7 @@ def fit_members(
         seed = member_seed(training.seed, which)
         twin = form.member(*parts, seed)
         with part_of(run, f"member_{which}" if form.members > 1 else "") as own:
-            fits.append(fit_free_runs(twin, train, validation, replace(training, seed=seed), on_event, own))
+            fits.append(fit_free_runs(twin, *series, replace(training, seed=seed), on_event, own))
     if len(fits) == 1:
         return fits[0]
     rows = [row | {"member": which} for which, fit in enumerate(fits) for row in fit.history]

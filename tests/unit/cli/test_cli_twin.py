@@ -15,6 +15,7 @@ from edp.logs import write_recording
 from edp.logs.source import DataSource
 from edp.networks.backbones import HybridSpec
 from edp.networks.predictor import ModelSpec, build_model
+from edp.networks.twin import TWINS
 from edp.signals import Kind
 from edp.storage import read_object
 from edp.testing.twins import sample_actuators
@@ -94,8 +95,8 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
     (kept,) = (row for row in rows if row["chosen"])
     assert f"chosen: {kept['label']}: on free runs of the validation part" in shown
     bundle = load_twin(run)
-    assert bundle.provenance["chosen"] in kept["label"] + "recurrent"
-    assert kept["label"].startswith(type(bundle.spec).__name__.lower()[:5])
+    assert bundle.provenance["chosen"] == kept["label"]
+    assert TWINS.name_of(bundle.spec) == kept["label"].split()[0]
     assert edp("report", run, "--out", page).code == 0
     text = page.read_text()
     for part in ("It is ", 'id="candidates"', "n4sid", "as good as the best"):

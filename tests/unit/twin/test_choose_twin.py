@@ -16,7 +16,7 @@ from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, averaged, member_seed
 from edp.storage.runs import KeyedRun, RunFolder
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
-from edp.training.free_run import FreeRunSpec
+from edp.training.free_run import FreeRunDiverged, FreeRunSpec
 from edp.training.free_run_members import fit_members
 from edp.training.optimizers import AdamW
 from edp.workflows.twin import choose_twin
@@ -92,7 +92,6 @@ def test_trainings_get_longer_as_long_as_that_helps_and_the_last_word_has_the_av
 
     monkeypatch.setattr(choose_twin, "fit_free_runs", fitted)
     monkeypatch.setattr(TwinChoice, "_error", error)
-    monkeypatch.setattr(choose_twin, "LENGTHS", (0.05, 0.15, 0.45, 1.0))
     result, tried = choice(run, replace(TINY, updates=(20,)), candidates=("recurrent",)).best()
     # 0.595 is less than 1 % better than 0.6: neither the full length is tried, nor the third one kept.
     assert trained == [1, 1, 3, 3, 9]
@@ -100,6 +99,27 @@ def test_trainings_get_longer_as_long_as_that_helps_and_the_last_word_has_the_av
     assert result.spec == Recurrent(units=96, members=3, prefix_ticks=20)
     assert [one.label for one in tried if one.chosen] == ["recurrent (3 members, 96 units), 3 updates"]
     assert {row["member"] for row in result.fitted.history} == {0, 1, 2}
+
+
+def test_a_training_that_diverges_leaves_the_other_forms_in(run, monkeypatch):
+    plain_fit = choose_twin.fit_free_runs
+
+    def fitted(twin, *rest):
+        if twin.static is None:
+            raise FreeRunDiverged("not finite any more")
+        return plain_fit(twin, *rest)
+
+    monkeypatch.setattr(choose_twin, "fit_free_runs", fitted)
+    result, tried = choice(run, candidates=("recurrent",)).best()
+    assert result.spec.valve_map
+    assert {one.why for one in tried} == {"", "not finite any more"}
+
+    def diverging(*rest):
+        raise FreeRunDiverged("not finite any more")
+
+    monkeypatch.setattr(choose_twin, "fit_free_runs", diverging)
+    with pytest.raises(ConfigError, match=r"none of them can be fitted.*not finite any more"):
+        choice(run, candidates=("recurrent",)).best()
 
 
 class Stop(Exception):
@@ -173,8 +193,8 @@ def test_members_have_seeds_of_their_own_and_the_first_one_that_of_the_training(
     scales = fit_scales(channels, series[:3])
     form = Recurrent(units=6, members=2, prefix_ticks=10)
     parts = (channels, scales, None)
-    both = fit_members(form, parts, series[:3], series[3:], TINY).twin.network
-    alone = fit_members(form.alone(), parts, series[:3], series[3:], TINY).twin.network
+    both = fit_members(form, parts, (series[:3], series[3:]), TINY).twin.network
+    alone = fit_members(form.alone(), parts, (series[:3], series[3:]), TINY).twin.network
     own = slice(0, 3)
     np.testing.assert_array_equal(both.h_weight.detach()[own, own], alone.h_weight.detach()[:, own])
     assert not np.array_equal(both.h_weight.detach()[3:, 3:6], alone.h_weight.detach()[:, own])

@@ -164,9 +164,8 @@ class RecurrentTwin(Twin):
 
     def _run(self, commands: Array, measured: Array, state: TwinState) -> tuple[Array, TwinState]:
         network, batch, bounds = self.network, len(commands), self.bounds
-        arrays = tuple(weight.detach().numpy() for weight in network.looped)
+        weights = tuple(weight.detach().numpy() for weight in (*network.looped, network.pulls(bounds)))
         command_weight, bias = network.command_weight.detach().numpy(), network.bias.detach().numpy()
-        pull = network.pulls(bounds).detach().numpy()
         pieces, after = [], dict(state)
         for at in range(0, commands.shape[1], PIECE):
             piece = commands[:, at : at + PIECE]
@@ -180,9 +179,8 @@ class RecurrentTwin(Twin):
             if self.static is not None:
                 solved, after["commands"] = self.static.mapped(piece, after["commands"])
                 mapped = np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1))
-            start = (after["answer"], after["h"])
-            shape = (bounds.arrays, bounds.velocities)
-            run_forward(projected, np.nan_to_num(read), port, arrays, (mapped, pull), *shape, start, saved)
+            inputs = (projected, np.nan_to_num(read), port, mapped)
+            run_forward(inputs, weights, bounds.arrays, bounds.velocities, (after["answer"], after["h"]), saved)
             pieces.append(saved[0].swapaxes(0, 1))
             after["answer"], after["h"] = saved[0][-1].copy(), saved[5][-1].copy()
         answers = np.concatenate(pieces, axis=1) * self.scales.answer_width + self.scales.answer_offset
@@ -246,9 +244,9 @@ def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
     first, count = twins[0], len(twins)
     if count == 1:
         return first
-    network = TwinNetwork(len(first.channels.commands), len(first.channels.answers), count * first.network.units,
-                          0 if first.network.pull is None else len(first.network.pull))  # fmt: skip
-    units, total = first.network.units, network.units
+    units, pulled = first.network.units, 0 if first.network.pull is None else len(first.network.pull)
+    total = count * units
+    network = TwinNetwork(len(first.channels.commands), len(first.channels.answers), total, pulled)
     with torch.no_grad():
         for weight in network.parameters():
             weight.zero_()

@@ -84,8 +84,8 @@ class TwinNetwork(CellWeights):
         """
         projected = nn.functional.linear(commands, self.command_weight, self.bias)
         mapped = torch.zeros(0, 0, 0) if mapped is None else mapped
-        parts = (mapped, self.pulls(bounds))
-        result = _Steps.apply(projected, measured, port, *start, *self.looped, *parts, bounds)  # type: ignore[no-untyped-call]
+        weights = (*self.looped, self.pulls(bounds))
+        result = _Steps.apply(projected, measured, port, *start, *weights, mapped, bounds)  # type: ignore[no-untyped-call]
         return result[0], result[1]
 
     def pulls(self, bounds: Bounds) -> Tensor:
@@ -134,17 +134,16 @@ class _Steps(torch.autograd.Function):
     def forward(
         ctx: Any, projected: Tensor, measured: Tensor, port: Tensor, answer: Tensor, h: Tensor, *rest: Any
     ) -> tuple[Tensor, Tensor]:
-        weights = tuple(weight.detach().numpy() for weight in rest[:5])
-        mapped, pull = (np.ascontiguousarray(part.detach().numpy()) for part in rest[5:7])
         bounds: Bounds = rest[7]
         ticks, batch, width = measured.shape
         saved = buffers(ticks, batch, width, h.shape[1])
-        into, values, ports, last, memory = (
-            np.ascontiguousarray(tensor.detach().numpy()) for tensor in (projected, measured, port, answer, h)
+        inputs, weights = (
+            tuple(np.ascontiguousarray(tensor.detach().numpy()) for tensor in tensors)
+            for tensors in ((projected, measured, port, rest[6]), rest[:6])
         )
-        shape = (bounds.arrays, bounds.velocities)
-        run_forward(into, values, ports, weights, (mapped, pull), *shape, (last, memory), saved)
-        ctx.saved, ctx.port, ctx.weights, ctx.map, ctx.bounds = saved, ports, weights, (mapped, pull), bounds
+        start = (np.ascontiguousarray(answer.detach().numpy()), np.ascontiguousarray(h.detach().numpy()))
+        run_forward(inputs, weights, bounds.arrays, bounds.velocities, start, saved)
+        ctx.saved, ctx.inputs, ctx.weights, ctx.bounds = saved, inputs, weights, bounds
         return torch.from_numpy(saved[0]), torch.from_numpy(saved[5][-1])
 
     @staticmethod
@@ -155,8 +154,9 @@ class _Steps(torch.autograd.Function):
         by_answer, by_h = np.zeros_like(fed[0]), np.array(grad_h.numpy(), order="C")
         grads = (by_gates, by_inner, by_out, by_answer, by_h)
         incoming = np.ascontiguousarray(grad_answers.numpy())
-        (mapped, pull), bounds = ctx.map, ctx.bounds
-        run_backward(incoming, ctx.port, ctx.weights, pull, bounds.arrays, bounds.velocities, ctx.saved, grads)
+        (_, _, port, mapped), bounds = ctx.inputs, ctx.bounds
+        run_backward(incoming, port, ctx.weights, bounds.arrays, bounds.velocities, ctx.saved, grads)
+        pull = ctx.weights[5]
         by_pull = ((mapped - fed) * (by_out / bounds.change)).sum((0, 1)) if len(pull) else np.zeros(0, np.float32)
         by_weights = weight_gradients(fed, hs, by_gates, by_inner, by_out)
         return (
@@ -166,8 +166,8 @@ class _Steps(torch.autograd.Function):
             torch.from_numpy(by_answer),
             torch.from_numpy(by_h),
             *by_weights,
-            None,
             torch.from_numpy(by_pull),
+            None,
             None,
         )
 

@@ -85,9 +85,14 @@ class StaticTwin(Twin):
         self, channels: TwinChannels, scales: TwinScales, prefix_ticks: int, numbers: Mapping[str, Array]
     ) -> None:
         super().__init__(channels, scales, prefix_ticks)
-        self.numbers, self.delay = dict(numbers), int(numbers["delay"][0])
-        if not 0 <= self.delay <= MOST_TICKS:
-            raise ValueError(f"its delay is {self.delay} ticks; 0 to {MOST_TICKS:,} must hold")
+        self.numbers, delay = dict(numbers), float(numbers["delay"][0])
+        if not (0 <= delay <= MOST_TICKS and delay == int(delay)):
+            raise ValueError(f"its delay is {delay:g} ticks; an integer from 0 to {MOST_TICKS:,} must hold")
+        self.delay = int(delay)
+        lengths = np.diff(numbers["corners"].astype(np.float64), axis=0)
+        # Evenly spaced up to the rounding of single precision; a length of zero would divide by it.
+        if not (lengths > 0).all() or not (lengths <= 1.5 * _lengths(numbers["corners"])).all():
+            raise ValueError("its corners do not rise evenly")
 
     def initial_state(self, command: Array, measured: Array) -> TwinState:
         return {"answer": measured, "commands": np.repeat(command[:, None], self.delay, axis=1)}

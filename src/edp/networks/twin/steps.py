@@ -95,11 +95,8 @@ def _answer(
 
 @compiler.compiled
 def run_forward(
-    projected: Array,
-    measured: Array,
-    port: Array,
+    inputs: tuple[Array, ...],
     weights: tuple[Array, ...],
-    map_of: tuple[Array, Array],
     bounds: tuple[Array, ...],
     velocities: int,
     start: tuple[Array, Array],
@@ -108,22 +105,21 @@ def run_forward(
     """Run all ticks.
 
     Args:
-        projected: the commands' part of the gates ``(time, batch, 3 units)``, biases included.
-        measured: ``(time, batch, answer)``, any finite number where `port` is 0.
-        port: 1 where a port reads `measured`, 0 where it reads the last answer; the shape of `measured`.
+        inputs: the commands' part of the gates ``(time, batch, 3 units)``, biases included; measured values ``(time,
+            batch, answer)``, any finite number where a port is free; ports of that shape, 1 where one reads what was
+            measured, 0 where it reads the last answer; and what the static map says, of that shape, empty without one.
         weights: of feedback ``(answer, 3 units)``, of h ``(units, 3 units)``, bias of n's inner sum ``(units,)``, of
-            the answers ``(units, answer)`` and their bias ``(answer,)``.
-        map_of: what the static map says ``(time, batch, answer)``, and p ``(answer,)``, zero for strokes; without a
-            map p is empty.
+            the answers ``(units, answer)`` and their bias ``(answer,)``, and p ``(answer,)``, zero for strokes; without
+            a map p is empty.
         bounds: scale of changes, low, high ``(answer,)``, and the trapezoid ``(stroke,)``.
         velocities: number of velocities, the first answers.
         start: last answer ``(batch, answer)`` and h ``(batch, units)``.
         saved: written: answers, fed values, and where no bound acts, each ``(time, batch, answer)``; gates ``(time,
             batch, 3 units)``; inner ``(time, batch, units)``; h ``(time + 1, batch, units)``.
     """
-    feedback_weight, h_weight, inner_bias, out_weight, out_bias = weights
+    projected, measured, port, mapped = inputs
+    feedback_weight, h_weight, inner_bias, out_weight, out_bias, pull = weights
     scale, low, high, trapezoid = bounds
-    mapped, pull = map_of
     answers, fed, free, gates, inner, hs = saved
     ticks, batch, width = measured.shape
     into, up = np.empty_like(gates[0]), np.empty_like(gates[0])
@@ -187,7 +183,6 @@ def run_backward(
     grad_answers: Array,
     port: Array,
     weights: tuple[Array, ...],
-    pull: Array,
     bounds: tuple[Array, ...],
     velocities: int,
     saved: tuple[Array, ...],
@@ -199,7 +194,6 @@ def run_backward(
         grad_answers: gradient by the answers ``(time, batch, answer)``.
         port: as in the forward run; `weights`, `bounds`, `velocities` and `saved` likewise.
         weights: of the cell.
-        pull: to the static map, see `run_forward`.
         bounds: of the answers.
         velocities: number of them.
         saved: what the forward run wrote.
@@ -207,7 +201,7 @@ def run_backward(
             units)``, by o ``(time, batch, answer)``; and by the start: last answer and h. The last one comes in as the
             gradient by the final h, the one before it as that by the final answer.
     """
-    feedback_weight, h_weight, _, out_weight, _ = weights
+    feedback_weight, h_weight, _, out_weight, _, pull = weights
     scale, _, _, trapezoid = bounds
     _, _, free, gates, inner, hs = saved
     by_gates, by_inner, by_out, by_answer, by_h = grads

@@ -10,6 +10,8 @@ from edp.evaluation.scores_file import COUNT, NAME, NUMBER, REAL, KeyedObject, L
 from edp.report.common.sheets import Column, Sheet, Value, figures
 
 CANDIDATES = "candidates.json"
+MOST_CANDIDATES = 100
+"""Rows that are read; a choice leaves a dozen."""
 TRUTH = Leaf(lambda value: isinstance(value, bool), "true or false")
 ROW = KeyedObject(
     {"label": NAME, "error": NUMBER, "seconds": REAL, "chosen": TRUTH, "why": NAME},
@@ -26,7 +28,7 @@ def read_candidates(folder: str | Path) -> list[dict[str, Any]]:
     """
     path = Path(folder) / CANDIDATES
     rows: list[dict[str, Any]] = read_shaped(path, SHAPE)["candidates"] if path.is_file() else []
-    return rows
+    return rows[:MOST_CANDIDATES]
 
 
 def choice_sentence(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -128,11 +128,8 @@ class TwinChoice:
         except (ConfigError, DataError, NotFiniteError) as problem:
             # What does not suit these channels is no reason to give up on what does.
             return [TwinCandidate(name, time.process_time() - began, why=str(problem))]
-        return [
-            TwinCandidate(
-                described(result.spec), max(result.fitted.seconds, time.process_time() - began), result, error
-            )
-        ]
+        seconds = max(result.fitted.seconds, time.process_time() - began)
+        return [TwinCandidate(described(result.spec), seconds, result, error)]
 
     def _recurrent(self, reference: dict[str, Any]) -> list[TwinCandidate]:
         """The recurrent twin on a static map or not, as long as longer training helps; last the average of members."""
@@ -142,21 +139,27 @@ class TwinChoice:
         forms = [replace(plain, valve_map=True), plain]
         statics = {form: form.static_map(*self._shared) for form in forms}
         trained: list[_Trained] = []
+        diverged: list[TwinCandidate] = []
         for round_, share in enumerate(LENGTHS):
             before = min((one.error for one in trained), default=math.inf)
             training = shortened(self.fit.experiment.training, share)
-            for form in forms if round_ < BOTH_FORMS else [self._simplest(trained).form]:
-                trained.append(self._member(form, statics[form], training, reference))
-            if min(one.error for one in trained) > before * (1.0 - LENGTHENED):
+            for form in forms if round_ < BOTH_FORMS or not trained else [self._simplest(trained).form]:
+                try:
+                    trained.append(self._member(form, statics[form], training, reference))
+                except NotFiniteError as problem:
+                    diverged.append(TwinCandidate(labelled(form.alone(), training), 0.0, why=str(problem)))
+            if trained and min(one.error for one in trained) > before * (1.0 - LENGTHENED):
                 break
+        if not trained:
+            return diverged
         first, form = self._simplest(trained), self._simplest(trained).form
-        tried = [TwinCandidate(one.label, one.fitted.seconds, one.result, one.error) for one in trained]
+        tried = [TwinCandidate(one.label, one.fitted.seconds, one.result, one.error) for one in trained] + diverged
         if form.members == 1:
             return tried
         self.fit.tell(f"training {form.members - 1} further members")
         shared = (self.fit.channels, self.fit.scales, statics[form])
         with part_of(self.run, _part_name(form, first.training)) as own:
-            fitted = fit_members(form, shared, *parts, first.training, self.fit.on_event, own, [first.fitted])
+            fitted = fit_members(form, shared, parts, first.training, self.fit.on_event, own, [first.fitted])
         error = self._error(fitted.twin, reference)
         if error < first.error:  # an average takes the place of its first member, however little better it is
             label = labelled(form, first.training)

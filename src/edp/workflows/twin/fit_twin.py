@@ -73,7 +73,7 @@ class TwinFit:
             static = spec.static_map(self.channels, self.scales, self.data.train)
             shared = (self.channels, self.scales, static)
             return FittedFormulation(
-                spec, fit_members(spec, shared, *parts, self.experiment.training, self.on_event, run)
+                spec, fit_members(spec, shared, parts, self.experiment.training, self.on_event, run)
             )
         started = time.process_time()
         twin = spec.start(self.channels, self.scales, self.data.train, seed)
