@@ -3,8 +3,8 @@
 Each set is a machine with one or two actuators: commands, and positions whose change from tick to tick is the
 velocity. The first 55 % of every recording train, then 20 % choose and calibrate, the last 25 % are judged: free runs
 of 30 s, or as long as the recordings allow. The twin is what `edp twin` gives without settings; the rivals are the
-static map, ARX and a subspace model, fitted in the same run to training and validation part together. The error is the geometric mean over actuators, of
-velocities and of strokes at each time, over that of the static map.
+static map, ARX and a subspace model, fitted in the same run to training and validation part together. The error is the
+geometric mean over actuators, of velocities and of strokes at each time, over that of the static map.
 
     python benchmarks/twin_recordings.py --logs LOGS --map MAP.toml --repair gaps=cut --repair nan=hold
 
