@@ -1,5 +1,6 @@
 """``edp twin`` and ``edp rollout``, from logs of two actuators to a free run beside what was measured."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -27,6 +28,10 @@ SMALL = (
     *("training.updates=[6]", "training.validate_every=3", "judge.seconds=4", "judge.starts=2", "judge.at_s=[1, 4]"),
 )
 WORDS = [word for change in SMALL for word in ("--set", change)]
+
+
+def candidate(label):
+    return {"label": label, "error": 1.0, "seconds": 1.0, "chosen": True, "why": label}
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +111,42 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
     assert (run / "candidates.json").read_text() == before
     (run / "candidates.json").write_text(before.replace('"chosen": true', '"chosen": "yes"'))
     assert "chosen is 'yes'; true or false must hold" in " ".join(edp("report", run).err.split())
+
+
+HOSTILE = "</table><script>alert(1)</script>{{7*7}}[red]\x1b[31m"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"schema": 1, "candidates": [{"label": "x"}]}', "an object with the key 'error'"),
+        ('{"schema": 1, "candidates": {}}', "a list must hold"),
+        ('{"schema": 1, "candidates": [{"label": "x", "error": NaN}]}', "the number NaN is not finite"),
+        (f'{{"schema": 1, "candidates": {"[" * 5000}{"]" * 5000}}}', "nested deeper than"),
+        (json.dumps({"schema": 1, "candidates": [candidate("x" * 3000)]}), "a text of at most 2,000 characters"),
+    ],
+)
+def test_candidates_that_cannot_be_are_refused(edp, trained, tmp_path, content, message):
+    run = shutil.copytree(trained, tmp_path / "run")
+    (run / "candidates.json").write_text(content)
+    ended = edp("report", run)
+    assert ended.code == 1
+    assert message in " ".join(ended.err.split())
+
+
+def test_candidates_of_a_stranger_are_text_and_few(edp, logs, trained, tmp_path):
+    run, page = shutil.copytree(trained, tmp_path / "run"), tmp_path / "page.html"
+    rows = [candidate(HOSTILE), *(candidate(f"row {i}") for i in range(1000))]
+    (run / "candidates.json").write_text(json.dumps({"schema": 1, "candidates": rows}))
+    assert edp("report", run, "--out", page).code == 0
+    text = page.read_text()
+    assert "<script>alert(1)" not in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert "row 98" in text
+    assert "row 99" not in text
+    shown = edp("twin", logs, "--out", run, *WORDS).out
+    assert "\x1b[31m" not in shown
+    assert "[red]" in shown
 
 
 def test_floors_are_formulations_of_their_own(edp, logs, tmp_path):

@@ -6,15 +6,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from edp.evaluation.scores_file import COUNT, NAME, NUMBER, REAL, KeyedObject, Leaf, Listed, read_shaped
+from edp.evaluation.scores_file import COUNT, NUMBER, REAL, KeyedObject, Leaf, Listed, read_shaped
 from edp.report.common.sheets import Column, Sheet, Value, figures
 
 CANDIDATES = "candidates.json"
 MOST_CANDIDATES = 100
 """Rows that are read; a choice leaves a dozen."""
+MOST_TEXT = 2_000
+"""Characters of a label or reason: EDP's own messages are shorter."""
+TEXT = Leaf(
+    lambda value: isinstance(value, str) and len(value) <= MOST_TEXT, f"a text of at most {MOST_TEXT:,} characters"
+)
 TRUTH = Leaf(lambda value: isinstance(value, bool), "true or false")
 ROW = KeyedObject(
-    {"label": NAME, "error": NUMBER, "seconds": REAL, "chosen": TRUTH, "why": NAME},
+    {"label": TEXT, "error": NUMBER, "seconds": REAL, "chosen": TRUTH, "why": TEXT},
     ("label", "error", "seconds", "chosen", "why"),
 )
 SHAPE = KeyedObject({"schema": COUNT, "candidates": Listed(ROW)}, ("schema", "candidates"))

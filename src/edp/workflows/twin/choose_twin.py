@@ -15,6 +15,7 @@ from edp.networks.twin import TWINS, Twin, TwinSpec
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.static_map import StaticTwin
+from edp.report.twin.candidates import MOST_TEXT
 from edp.storage.runs import KeyedRun, part_of
 from edp.training.free_run import FittedTwin, FreeRunSpec, fit_free_runs
 from edp.training.free_run_members import fit_members
@@ -61,7 +62,7 @@ class TwinCandidate:
     def row(self) -> dict[str, Any]:
         """For ``free_run.json``."""
         plain = {"label": self.label, "error": self.error, "seconds": round(self.seconds, 2), "chosen": self.chosen}
-        return plain | {"why": self.why}
+        return plain | {"why": self.why[:MOST_TEXT]}
 
 
 @dataclass(frozen=True, eq=False)
