@@ -24,7 +24,7 @@ from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
 """Shares of the updates of `[training]` that are tried in turn, each with a whole schedule of its learning rate.
 
-A longer one is not always better: on 3 min of a measured cylinder under a hanging load 350 updates were best of all."""
+A longer one is not always better: on 3 min of a measured cylinder under a hanging load 350 updates were better than 1,050."""
 BOTH_FORMS = 2
 """Lengths at which a recurrent twin is trained with and without a static map; the better one goes on."""
 LENGTHENED = 0.01
@@ -32,7 +32,7 @@ LENGTHENED = 0.01
 LONG_TICKS = 100_000
 """Training ticks from which one wide network takes the place of three narrow ones, of the same width in all.
 
-On 126,000 simulated ticks they had 0.60 and 0.63 of the static map's error; on 27,000 measured ones 0.97 both, the
+On 126,000 simulated ticks velocities had 0.60 and 0.63 of the static map's error; on 27,000 measured ones 0.97, the
 average of three with less spread from seed to seed."""
 MEMBERS = 3
 AT = (0.1, 0.5, 1.0)
