@@ -75,13 +75,13 @@ def kept(path: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def finish(script: str, verdicts: Sequence[Verdict], seed: int, details: object = None) -> None:
-    """Print the verdicts, keep the results of the full form, end with one line of JSON."""
+def finish(script: str, verdicts: Sequence[Verdict], seed: int, details: object = None, keep: bool = True) -> None:
+    """Print the verdicts, keep the results of the full form unless told otherwise, end with one line of JSON."""
     print()
     rows = [[v.name, v.ours, v.rival, v.ratio, v.goal, "met" if v.met else "NOT MET", v.unit] for v in verdicts]
     table(["question", "ours", "rival", "ratio", "goal", "verdict", "unit"], rows)
     plain = [asdict(v) for v in verdicts]
-    if not any(v.quick for v in verdicts):
+    if keep and not any(v.quick for v in verdicts):
         kept = {
             "command": command_line(),
             "date": time.strftime("%Y-%m-%d"),

@@ -169,7 +169,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.logs is None and shared_folder(given.shared) is None:
         return
     found = public_sets(given.seed, given.quick) if given.logs is None else own_logs(given)
-    finish("twin_recordings", show(found, given.quick), given.seed, found)
+    # What somebody's own logs give is theirs, and takes no other result's place.
+    finish("twin_recordings", show(found, given.quick), given.seed, found, keep=given.logs is None)
 
 
 if __name__ == "__main__":
