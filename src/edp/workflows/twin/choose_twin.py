@@ -24,7 +24,7 @@ from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
 """Shares of the updates of `[training]` that are tried in turn, each with a whole schedule of its learning rate.
 
-A longer one is not always better: on 3 min of a measured cylinder under a hanging load 350 updates were better than 1,050."""
+A longer one is not always better: on 3 min of a cylinder under a hanging load 350 updates were better than 1,050."""
 BOTH_FORMS = 2
 """Lengths at which a recurrent twin is trained with and without a static map; the better one goes on."""
 LENGTHENED = 0.01
