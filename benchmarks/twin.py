@@ -80,7 +80,7 @@ def main() -> None:
     scores: dict[str, dict[str, Any]] = {}
     for name, (twin, seconds) in models.items():
         taught = name not in experiment.judge.floors
-        intervals = calibrated(twin, data.validation, experiment.judge) if taught else None
+        intervals = calibrated([(twin, data.validation)], experiment.judge) if taught else None
         scores[name] = free_run_scores(free_runs(twin, data.test, 60.0, starts), experiment.judge, intervals)
         scores[name] |= {"ahead": ahead_scores(look_ahead(twin, data.test, AHEAD)), "training_s": seconds}
         if taught:

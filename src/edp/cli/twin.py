@@ -27,7 +27,8 @@ def twin(
 ) -> None:
     """Train a plant model that runs on commands alone: velocities, strokes and pressures over a minute.
 
-    Without settings, several formulations are fitted and free runs of the validation part choose; twin.kind names one.
+    Without settings, several formulations are fitted, and free runs that the fits had not seen choose; twin.kind names
+    one.
     Judged on held-out recordings beside a static valve map and ARX. Ends with exit code 4 where the training diverged.
 
     Example: `edp twin data/m22 --out runs/twin`
@@ -120,7 +121,7 @@ def candidate_table(candidates: list[dict[str, Any]]) -> None:
         ]
         for row in candidates
     ]
-    table("error of free runs in the validation part, over the static map's", ["", "error", "processor time"], rows)
+    table("error of free runs that the fits had not seen, over the static map's", ["", "error", "processor time"], rows)
     for row in candidates:
         if row["why"]:
             out.print(f"{row['label']} was left out: {row['why']}")

@@ -93,6 +93,17 @@ class FreeRuns:
             return np.abs(self.answers[..., count : 2 * count].astype(np.float64) - self.truth[..., count : 2 * count])
         return np.abs(self._integral(self.answers) - self._integral(self.truth))
 
+    @staticmethod
+    def joined(parts: Sequence[FreeRuns]) -> FreeRuns:
+        """Runs of twins over the same channels as one, each cut to the shortest."""
+        first, ticks = parts[0], min(part.truth.shape[1] for part in parts)
+        if len(parts) == 1:
+            return first
+        names = tuple(name for part in parts for name in part.names)
+        answers, truth = (np.concatenate([getattr(p, n)[:, :ticks] for p in parts]) for n in ("answers", "truth"))
+        low, high = np.min([part.low for part in parts], axis=0), np.max([part.high for part in parts], axis=0)
+        return FreeRuns(first.channels, names, answers, truth, np.concatenate([p.before for p in parts]), low, high)
+
     def only(self, of: NDArray[np.int64]) -> FreeRuns:
         """Some of the runs, by their places."""
         names = tuple(self.names[i] for i in of)
@@ -165,14 +176,20 @@ def runs_of(twin: Twin, names: tuple[str, ...], answers: Array, truth: Array) ->
     return FreeRuns(twin.channels, names, answers, truth[:, 1:], truth[:, 0], twin.scales.low, twin.scales.high)
 
 
-def calibrated(twin: Twin, validation: Sequence[Series], spec: FreeRunJudgeSpec) -> FreeRunIntervals:
-    """Intervals of the twin's free runs, from free runs of the validation part.
+def calibrated(unseen: Sequence[tuple[Twin, Sequence[Series]]], spec: FreeRunJudgeSpec) -> FreeRunIntervals:
+    """Intervals of a twin's free runs, from free runs of what it was not trained on.
+
+    Args:
+        unseen: the twin beside the validation part; or of a twin that is the mean of several, or that was fitted anew
+            to all of them, each fit beside the stretches that it left out (the residuals of CV+, Barber et al. 2021).
+        spec: their length and number, and the coverage.
 
     Raises:
-        DataError: no validation stretch has a tick behind the prefix.
+        DataError: no stretch has a tick behind the prefix.
     """
-    runs = free_runs(twin, validation, spec.seconds, spec.calibration_starts)
-    return calibrate(runs.answers - runs.truth, spec.coverage)
+    runs = [free_runs(twin, series, spec.seconds, spec.calibration_starts) for twin, series in unseen]
+    whole = FreeRuns.joined(runs)
+    return calibrate(whole.answers - whole.truth, spec.coverage)
 
 
 def free_run_scores(

@@ -21,7 +21,6 @@ def fit_members(
     training: FreeRunSpec,
     on_event: Callable[[FreeRunProgress], None] | None = None,
     run: KeyedRun | None = None,
-    trained: Sequence[FittedTwin] = (),
 ) -> FittedTwin:
     """Train each member of a recurrent twin on free runs of its own, and average them.
 
@@ -32,18 +31,23 @@ def fit_members(
         training: how; the first member has its seed, the others one of their own.
         on_event: called with progress of each member in turn.
         run: folder and key of the run; where given, each member's training is resumable.
-        trained: members that are trained already, the first ones.
+    """
+    fits = []
+    for which in range(form.members):
+        seed = member_seed(training.seed, which)
+        twin = form.member(*parts, seed)
+        with part_of(run, f"member_{which}" if form.members > 1 else "") as own:
+            fits.append(fit_free_runs(twin, *series, replace(training, seed=seed), on_event, own))
+    return joined_members(fits)
+
+
+def joined_members(fits: Sequence[FittedTwin]) -> FittedTwin:
+    """Members that were trained apart, on one map and with one scale, as one twin.
 
     Returns:
         The average, the rows of all trainings one behind the other (each with its ``member`` where there are
         several), and the processor time of all.
     """
-    fits = list(trained)
-    for which in range(len(fits), form.members):
-        seed = member_seed(training.seed, which)
-        twin = form.member(*parts, seed)
-        with part_of(run, f"member_{which}" if form.members > 1 else "") as own:
-            fits.append(fit_free_runs(twin, *series, replace(training, seed=seed), on_event, own))
     if len(fits) == 1:
         return fits[0]
     rows = [row | {"member": which} for which, fit in enumerate(fits) for row in fit.history]

@@ -1,4 +1,4 @@
-"""Choosing a formulation by free runs of the validation part, and averages of recurrent members."""
+"""Choosing a formulation by free runs of what its fits left out, and averages of recurrent members."""
 
 from dataclasses import replace
 
@@ -10,10 +10,12 @@ from edp.data.prepared import prepare
 from edp.data.splits import ByRecording
 from edp.data.twin_channels import twin_channels
 from edp.errors import ConfigError, DataError
+from edp.ir.memory import Gru
 from edp.networks.twin import TWINS, fit_scales
 from edp.networks.twin.arx import Arx
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, averaged, member_seed
+from edp.networks.twin.static_map import StaticMap
 from edp.storage.runs import KeyedRun, RunFolder
 from edp.testing.twins import sample_actuators, sample_series, sample_twin
 from edp.training.free_run import FreeRunDiverged, FreeRunSpec
@@ -44,13 +46,13 @@ def run(tmp_path):
 
 @pytest.mark.parametrize(("least_gain", "kept"), [(0.0, "n4sid"), (0.2, "arx"), (0.5, "static")])
 def test_the_simplest_candidate_that_is_as_good_as_the_best_is_kept(run, monkeypatch, least_gain, kept):
-    errors = {"StaticTwin": 1.0, "ArxTwin": 0.7, "N4sidTwin": 0.6}
-    monkeypatch.setattr(TwinChoice, "_error", lambda self, twin, reference: errors[type(twin).__name__])
+    errors = iter([1.0, 0.7, 0.6])
+    monkeypatch.setattr(TwinChoice, "_error", lambda self, runs, reference: next(errors))
     result, tried = choice(run, candidates=("static", "arx", "n4sid"), least_gain=least_gain).best()
     assert [one.error for one in tried] == [1.0, 0.7, 0.6]
     assert [one.label for one in tried if one.chosen] == [kept]
     assert TWINS.name_of(result.spec) == kept
-    assert result.facts == {"chosen": kept}
+    assert result.facts == {"chosen": kept, "folds": 5}
 
 
 def test_errors_are_those_of_the_static_map_and_of_free_runs(run):
@@ -72,33 +74,95 @@ def test_what_cannot_be_fitted_is_left_out_and_says_why(run, monkeypatch):
         choice(run, candidates=("arx",)).best()
 
 
-@pytest.mark.training
-def test_trainings_get_longer_as_long_as_that_helps_and_the_last_word_has_the_average(run, monkeypatch):
+def judged_by(monkeypatch, errors, behind=1.0):
+    """Let a training's errors be those by map and updates; of what was trained, in order, the keys."""
     trained = []
-    errors = {(True, 1): 0.9, (False, 1): 0.8, (True, 3): 0.85, (False, 3): 0.6, (False, 9): 0.595}
-
-    def error(self, twin, reference):
-        if twin.network.units > 32:
-            return 0.5
-        trained.append(updates := sum(self_now[-1]))
-        return errors[(twin.static is not None, updates)]
-
-    self_now = []
     plain_fit = choose_twin.fit_free_runs
 
     def fitted(twin, train, validation, training, *rest):
-        self_now.append(training.updates)
+        trained.append((twin.static is not None, sum(training.updates)))
         return plain_fit(twin, train, validation, training, *rest)
+
+    def error(self, runs, reference):
+        return errors[trained[-1]] if len(runs) == len(self.folds) else behind
 
     monkeypatch.setattr(choose_twin, "fit_free_runs", fitted)
     monkeypatch.setattr(TwinChoice, "_error", error)
-    result, tried = choice(run, replace(TINY, updates=(20,)), candidates=("recurrent",)).best()
+    return trained
+
+
+@pytest.mark.training
+def test_trainings_get_longer_as_long_as_that_helps_and_the_twin_is_the_average_over_the_folds(run, monkeypatch):
+    errors = {(True, 1): 0.9, (False, 1): 0.8, (True, 3): 0.85, (False, 3): 0.6, (False, 9): 0.595}
+    trained = judged_by(monkeypatch, errors)
+    result, tried = choice(run, candidates=("recurrent",)).best()
     # 0.595 is less than 1 % better than 0.6: neither the full length is tried, nor the third one kept.
-    assert trained == [1, 1, 3, 3, 9]
-    assert [one.error for one in tried] == [0.9, 0.8, 0.85, 0.5, 0.595]
-    assert result.spec == Recurrent(units=96, members=3, prefix_ticks=20)
-    assert [one.label for one in tried if one.chosen] == ["recurrent (3 members, 96 units), 3 updates"]
-    assert {row["member"] for row in result.fitted.history} == {0, 1, 2}
+    assert trained == [key for key in errors for _ in range(5)]
+    assert [one.error for one in tried] == list(errors.values())
+    assert result.spec == Recurrent(units=160, members=5, prefix_ticks=20)
+    assert [one.label for one in tried if one.chosen] == ["recurrent (5 members, 160 units), 3 updates"]
+    assert {row["member"] for row in result.fitted.history} == {0, 1, 2, 3, 4}
+    assert result.fitted.twin.network.units == 160
+    assert len(result.unseen) == 5
+
+
+@pytest.mark.training
+def test_a_training_far_behind_the_best_one_is_given_up_after_two_folds(run, monkeypatch):
+    errors = {(True, 1): 0.9, (True, 3): 0.95}
+    trained = judged_by(monkeypatch, errors, behind=1.6)
+    monkeypatch.setattr(choose_twin, "FAR_BEHIND", 1.5)
+    result, tried = choice(run, candidates=("recurrent",)).best()
+    # Against a rival nothing else is better here; lengths end with the second one, which helped nobody.
+    assert trained == [(True, 1)] * 5 + [(False, 1)] * 2 + [(True, 3)] * 2 + [(False, 3)] * 2
+    assert [one.error for one in tried] == [0.9, None, None, None]
+    assert tried[1].why == (
+        "given up after 2 of 5 folds, with 1.60 times the error of recurrent (5 members, 160 units, on the static "
+        "map), 1 updates there"
+    )
+    assert result.spec.valve_map
+    monkeypatch.setattr(choose_twin, "FAR_BEHIND", 1.7)
+    errors |= {(False, 1): 0.95, (False, 3): 0.8, (False, 9): 0.7}
+    with RunFolder(run.path / "again") as other:
+        _, tried = choice(other, candidates=("recurrent",)).best()
+    # Of a longer training yet, two folds without a gain are enough.
+    assert [one.error for one in tried] == [0.9, 0.95, 0.95, 0.8, None]
+    assert "given up after 2 of 5 folds" in tried[-1].why
+
+
+def test_every_tick_that_may_be_learned_from_is_left_out_by_one_fit_and_the_twin_has_learned_from_all(run):
+    one = choice(run, candidates=("static",))
+    result, _ = one.best()
+    everything = [*one.fit.data.train, *one.fit.data.validation]
+    left_out = sum(part.samples for _, series in result.unseen for part in series)
+    assert left_out == sum(part.samples for part in everything)
+    whole = StaticMap(prefix_ticks=20).start(one.fit.channels, fit_scales(one.fit.channels, everything), everything, 0)
+    for name, values in whole.arrays().items():
+        np.testing.assert_array_equal(result.fitted.twin.arrays()[name], values)
+    fold = one.folds[2]
+    alone = StaticMap(prefix_ticks=20).start(one.fit.channels, whole.scales, fold.train, 0)
+    for name, values in alone.arrays().items():
+        np.testing.assert_array_equal(result.unseen[2][0].arrays()[name], values)
+
+
+@pytest.mark.training
+def test_long_recordings_are_judged_by_the_validation_part_and_have_one_wide_network(run, monkeypatch):
+    monkeypatch.setattr(choose_twin, "LONG_TICKS", 1)
+    one = choice(run, candidates=("static", "recurrent"), least_gain=0.0)
+    result, tried = one.best()
+    assert [fold.train for fold in one.folds] == [one.fit.data.train]
+    assert [fold.validation for fold in one.folds] == [one.fit.data.validation]
+    assert tried[1].label.startswith("recurrent (96 units, on the static map)")
+    assert [twin for twin, _ in result.unseen] == [tried[i].trial.fits[0].fitted.twin for i in range(len(tried))
+                                                   if tried[i].chosen]  # fmt: skip
+    assert result.facts["folds"] == 1
+
+
+@pytest.mark.parametrize(
+    ("auto", "training"), [({"folds": 1}, {}), ({}, {"lengths_s": (30.0,)}), ({"folds": 32}, {"lengths_s": (2.0,)})]
+)
+def test_what_is_too_short_for_folds_keeps_the_division_of_the_settings(run, auto, training):
+    one = choice(run, replace(TINY, **training), candidates=("static",), **auto)
+    assert [fold.validation for fold in one.folds] == [one.fit.data.validation]
 
 
 def test_a_training_that_diverges_leaves_the_other_forms_in(run, monkeypatch):
@@ -174,6 +238,15 @@ def test_an_average_answers_with_the_mean_of_the_changes_of_its_members(valve_ma
     assert averaged(members[:1]) is members[0]
 
 
+def test_members_are_layers_of_their_own_in_exports_until_they_read_one_another():
+    twin, _, _ = sample_twin(Recurrent(units=6, members=3))
+    memories = [layer for layer in twin.graph().layers if isinstance(layer, Gru)]
+    assert [layer.weight_h.shape for layer in memories] == [(6, 2)] * 3
+    twin.network.h_weight.data[0, 3] = 0.5
+    memories = [layer for layer in twin.graph().layers if isinstance(layer, Gru)]
+    assert [layer.weight_h.shape for layer in memories] == [(18, 6)]
+
+
 def test_an_untrained_network_on_a_static_map_that_changes_nothing_is_the_map():
     spec = Recurrent(units=4, valve_map=True)
     twin, commands, measured = sample_twin(spec)
@@ -217,6 +290,8 @@ def test_a_share_of_a_training_keeps_its_stages():
         ("twin.candidates=['auto']", "unknown twin 'auto'"),
         ("twin.units=64", "unknown key 'twin.units'; it belongs to kind = 'recurrent' or 'residual'"),
         ("twin.least_gain=1.5", "least_gain = 1.5"),
+        ("twin.folds=0", "folds = 0"),
+        ("twin.folds=33", "folds = 33"),
         ("twin={kind='recurrent',units=10,members=3}", "10 units and 3 members; a whole number"),
         ("twin={kind='recurrent',units=66,members=33}", "members = 33"),
     ],

@@ -63,7 +63,7 @@ def twin_and_series():
 def test_those_of_a_twin_hold_on_recordings_that_calibrated_nothing():
     twin, series = twin_and_series()
     spec = FreeRunJudgeSpec(seconds=5.0, calibration_starts=20, covered_at_s=(0.1, 1.0, 5.0, 60.0))
-    intervals = calibrated(twin, series[1:9], spec)
+    intervals = calibrated([(twin, series[1:9])], spec)
     runs = free_runs(twin, series[9:], 5.0, 20)
     scores = free_run_scores(runs, spec, intervals)["intervals"]
     assert [row["at_s"] for row in scores["at"]] == [0.1, 1.0, 5.0]
@@ -93,7 +93,7 @@ def test_coverage_is_counted_by_channel_and_time():
 
 def test_they_come_back_with_the_twin_and_earlier_twins_have_none(tmp_path):
     twin, series = twin_and_series()
-    intervals = calibrated(twin, series[:2], FreeRunJudgeSpec(seconds=2.0))
+    intervals = calibrated([(twin, series[:2])], FreeRunJudgeSpec(seconds=2.0))
     save_twin(TwinBundle(StaticMap(prefix_ticks=10), twin, {}, {}, intervals), tmp_path)
     loaded = load_twin(tmp_path).intervals
     assert loaded.to_plain() == intervals.to_plain()

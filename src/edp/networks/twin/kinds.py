@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from edp.errors import ConfigError
 from edp.networks.twin import TWINS
 from edp.networks.twin.base import PREFIX
+from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.registry import Registry
-from edp.settings.bounds import MOST_NAMES, SHARE, check_bounds, check_count
+from edp.settings.bounds import MOST_NAMES, SHARE, check_bounds, check_count, integer
 
 KINDS: Registry[type] = Registry("twin")
 """Every formulation, and the choice among several of them."""
+FOLDS = integer(1, MOST_MEMBERS)
+"""Of a choice: a recurrent twin has a member for each."""
 for _name, _formulation in TWINS.items():
     KINDS.register(_name)(_formulation)
 
@@ -19,11 +22,13 @@ for _name, _formulation in TWINS.items():
 @KINDS.register("auto")
 @dataclass(frozen=True, kw_only=True)
 class AutoTwin:
-    """Several formulations are fitted to the training part, and free runs of the validation part choose.
+    """Several formulations are fitted, and free runs of what each fit left out choose (cross-validation).
 
     Attributes:
         candidates: formulations, the simplest first.
         least_gain: share of error by which a candidate must be better than a simpler one.
+        folds: parts of training and validation part together that are left out in turn, where both are short; with 1
+            the validation part alone is left out.
         prefix_ticks: measured ticks before a free run.
 
     Raises:
@@ -32,10 +37,11 @@ class AutoTwin:
 
     candidates: tuple[str, ...] = ("static", "arx", "n4sid", "recurrent")
     least_gain: float = 0.02
+    folds: int = 5
     prefix_ticks: int = 30
 
     def __post_init__(self) -> None:
-        check_bounds("automatic twin", self, least_gain=SHARE, prefix_ticks=PREFIX)
+        check_bounds("automatic twin", self, least_gain=SHARE, folds=FOLDS, prefix_ticks=PREFIX)
         check_count("automatic twin", "candidates", self.candidates, MOST_NAMES, least=1)
         for name in self.candidates:
             try:

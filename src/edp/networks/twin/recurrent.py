@@ -98,7 +98,7 @@ class Recurrent:
         network.load_state_dict({name: torch.from_numpy(np.array(arrays[name])) for name in network.state_dict()})
         numbers = {name: arrays[MAP + name] for name in self._map_shapes(channels)}
         static = self._map_spec.build(channels, scales, numbers) if numbers else None
-        return RecurrentTwin(channels, scales, self.prefix_ticks, network, static)
+        return RecurrentTwin(channels, scales, self.prefix_ticks, network, static, self.members)
 
     def _network(self, channels: TwinChannels) -> TwinNetwork:
         pulled = len(solved_columns(channels)) if self.valve_map else 0
@@ -123,6 +123,7 @@ class RecurrentTwin(Twin):
         prefix_ticks: least number of measured ticks before a free run.
         network: the cell.
         static: the map to which its answers are pulled; None where the network has no pull.
+        members: networks that it is the average of.
     """
 
     def __init__(
@@ -132,9 +133,11 @@ class RecurrentTwin(Twin):
         prefix_ticks: int,
         network: TwinNetwork,
         static: StaticTwin | None = None,
+        members: int = 1,
     ) -> None:
         super().__init__(channels, scales, prefix_ticks)
         self.network, self.static, self.bounds = network, static, Bounds.of(channels, scales)
+        self.members = members
 
     def initial_state(self, command: Array, measured: Array) -> TwinState:
         state = {"answer": self.scaled(measured), "h": np.zeros((len(measured), self.network.units), np.float32)}
@@ -196,17 +199,8 @@ class RecurrentTwin(Twin):
     def lower(self, build: Builder, commands: str, fed: str) -> str:
         network, solved = self.network, solved_columns(self.channels)
         arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
-        # The commands' part has the gates' biases; the inner bias is that of n alone.
-        inner = np.concatenate([np.zeros(2 * network.units, np.float32), arrays["inner_bias"]])
-        h = build.add(
-            Gru,
-            "memory",
-            build.join("read", commands, fed),
-            weight_x=np.concatenate([arrays["command_weight"], arrays["feedback_weight"].T], axis=1),
-            weight_h=arrays["h_weight"].T,
-            bias_x=arrays["bias"],
-            bias_h=inner,
-        )
+        read = build.join("read", commands, fed)
+        h = build.join("memories", *(self._lowered(build, read, rows) for rows in self._member_rows()))
         unit = self.bounds.change[solved]
         weight, bias = unit[:, None] * arrays["out_weight"].T[solved], unit * arrays["out_bias"][solved]
         change = build.add(Dense, "change", h, weight=weight, bias=bias)
@@ -220,6 +214,34 @@ class RecurrentTwin(Twin):
             rest = build.add(ScaleShift, "kept", before, gain=1.0 - pull, shift=zero)
             before = build.combine("pulled_before", BinaryOperation.ADD, rest, near)
         return build.combine("proposed", BinaryOperation.ADD, before, change)
+
+    def _lowered(self, build: Builder, read: str, rows: slice) -> str:
+        """The memory of a member, with these rows of h."""
+        network = self.network
+        arrays = {name: weight.detach().numpy() for name, weight in network.named_parameters()}
+        gates = np.concatenate([np.arange(network.units)[rows] + gate * network.units for gate in range(3)])
+        own = arrays["inner_bias"][rows]
+        weight_x = np.concatenate([arrays["command_weight"], arrays["feedback_weight"].T], axis=1)
+        # The commands' part has the gates' biases; the inner bias is that of n alone.
+        return build.add(
+            Gru,
+            "memory" if rows == slice(0, network.units) else f"memory_{rows.start}",
+            read,
+            weight_x=weight_x[gates],
+            weight_h=arrays["h_weight"].T[gates][:, rows],
+            bias_x=arrays["bias"][gates],
+            bias_h=np.concatenate([np.zeros(2 * len(own), np.float32), own]),
+        )
+
+    def _member_rows(self) -> list[slice]:
+        """Rows of h of each member; all of them as one where members read one another, as after a further training."""
+        units, weight = self.network.units, self.network.h_weight.detach().numpy()
+        width = units // self.members
+        rows = [slice(first, first + width) for first in range(0, units, width)]
+        between = weight.reshape(units, 3, units).copy()
+        for own in rows:
+            between[own, :, own] = 0.0
+        return [slice(0, units)] if between.any() else rows
 
     def arrays(self) -> dict[str, Array]:
         weights = {name: weight.detach().numpy().copy() for name, weight in self.network.named_parameters()}
@@ -263,4 +285,4 @@ def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
             network.out_bias.add_(member.out_bias / count)
             if network.pull is not None and member.pull is not None:
                 network.pull.add_(member.pull.clamp(0.0, 1.0) / count)
-    return RecurrentTwin(first.channels, first.scales, first.prefix_ticks, network, first.static)
+    return RecurrentTwin(first.channels, first.scales, first.prefix_ticks, network, first.static, count)

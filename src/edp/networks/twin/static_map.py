@@ -55,10 +55,13 @@ class StaticMap:
         corners = np.linspace(low, np.where(high > low, high, low + 1), self.knots + 1, dtype=np.float32)[:-1]
         solved = solved_columns(channels)
         rows = [Series(s.name, polygon(s.inputs, corners), s.targets[:, solved]) for s in train]
-        delays = tuple(sorted(set(self.delays)))
+        longest = max(s.samples for s in train)
+        delays = tuple(sorted({delay for delay in self.delays if delay + 1 < longest} or {min(self.delays)}))
         task = LagTask(tuple(delay + 1 for delay in delays), (None,) * len(solved), 1)
         solution = ridge_solution(rows, task, penalties=(PENALTY,))
-        best = int(np.argmin([_error(solution, rows, i, delay) for i, delay in enumerate(delays)]))
+        # All delays are judged by the same stretches: those that have an answer after the longest one.
+        judged = [s for s in rows if s.samples > delays[-1] + 1]
+        best = int(np.argmin([_error(solution, judged, i, delay) for i, delay in enumerate(delays)]))
         arrays = {
             "corners": corners,
             "rise": np.ascontiguousarray(solution.weights[0, :, best], dtype=np.float32),

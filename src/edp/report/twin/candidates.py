@@ -43,7 +43,7 @@ def choice_sentence(rows: Sequence[Mapping[str, Any]]) -> str:
         return ""
     others = [row for row in rows if row is not chosen and row["error"] is not None]
     share = f"{chosen['error']:.2f} of the static map's error"
-    text = f"{chosen['label']}: on free runs of the validation part it has {share}"
+    text = f"{chosen['label']}: on free runs that its fits had not seen it has {share}"
     if not others:
         return f"{text}."
     least = min(others, key=lambda row: float(row["error"]))
@@ -63,5 +63,7 @@ def candidate_sheet(rows: Sequence[Mapping[str, Any]]) -> Sheet:
     )
     heads = heads if any(row["why"] for row in rows) else heads[:3]
     lines = [line[: len(heads)] for line in lines]
-    caption = "Candidates on free runs of the validation part: the simplest one that is as good as the best is kept"
+    caption = (
+        "Candidates on free runs that their fits had not seen: the simplest one that is as good as the best is kept"
+    )
     return Sheet("candidates", caption, heads, tuple(lines), marked)

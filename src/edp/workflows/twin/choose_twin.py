@@ -1,42 +1,64 @@
-"""Which twin suits these recordings: several formulations are fitted, and free runs of the validation part choose."""
+"""Which twin suits these recordings: several formulations are fitted, and what each fit left out chooses."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+from edp.data.series import Series
+from edp.data.stretch_folds import StretchFold, stretch_folds
 from edp.errors import ConfigError, DataError, NotFiniteError
-from edp.evaluation.free_run import free_run_scores, free_runs
+from edp.evaluation.free_run import FreeRuns, free_run_scores, free_runs
 from edp.evaluation.guard import free_run_error
-from edp.networks.twin import TWINS, Twin, TwinSpec
+from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.kinds import AutoTwin
-from edp.networks.twin.recurrent import Recurrent
-from edp.networks.twin.static_map import StaticTwin
+from edp.networks.twin.recurrent import Recurrent, member_seed
 from edp.report.twin.candidates import MOST_TEXT
 from edp.storage.runs import KeyedRun, part_of
-from edp.training.free_run import FittedTwin, FreeRunSpec, fit_free_runs
-from edp.training.free_run_members import fit_members
+from edp.training.free_run import FreeRunSpec, fit_free_runs
+from edp.training.free_run_members import joined_members
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
 """Shares of the updates of `[training]` that are tried in turn, each with a whole schedule of its learning rate.
 
-A longer one is not always better: on 3 min of a cylinder under a hanging load 350 updates were better than 1,050."""
+A longer one is not always better: on 3 min of a cylinder under a hanging load 1,050 updates were better than 3,150."""
 BOTH_FORMS = 2
 """Lengths at which a recurrent twin is trained with and without a static map; the better one goes on."""
 LENGTHENED = 0.01
 """Share of error that a longer training must save, for the next length to be tried."""
 LONG_TICKS = 100_000
-"""Training ticks from which one wide network takes the place of three narrow ones, of the same width in all.
+"""Training ticks from which one wide network takes the place of the average of narrow ones, one for each fold.
 
 On 126,000 simulated ticks velocities had 0.60 and 0.63 of the static map's error; on 27,000 measured ones 0.97, the
 average of three with less spread from seed to seed."""
-MEMBERS = 3
+MEMBER_UNITS = 32
+"""Width of a member's memory."""
+RACED = 2
+"""Folds after which a training that is far behind another is given up."""
+FAR_BEHIND = 1.5
+"""Times the error of the best training so far, in the same folds; less may be the folds' own difference."""
 AT = (0.1, 0.5, 1.0)
 """Shares of a free run after which strokes are compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A formulation, fitted for each fold.
+
+    Attributes:
+        spec: its options.
+        fits: a fit for each fold.
+        runs: free runs of the stretches that each fit left out.
+    """
+
+    spec: TwinSpec
+    fits: tuple[FittedFormulation, ...]
+    runs: tuple[FreeRuns, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,41 +68,23 @@ class TwinCandidate:
     Attributes:
         label: how sentences and tables call it.
         seconds: processor time.
-        result: None where it could not be fitted.
-        error: of its free runs in the validation part, over that of the static map; None where it could not be fitted.
-        why: why it could not be fitted.
+        trial: None where it could not be fitted, or was given up.
+        error: of free runs in what each of its fits left out, over that of the static map; None without a trial.
+        why: why there is no trial.
         chosen: whether it is kept.
     """
 
     label: str
     seconds: float
-    result: FittedFormulation | None = None
+    trial: Trial | None = None
     error: float | None = None
     why: str = ""
     chosen: bool = False
 
     def row(self) -> dict[str, Any]:
-        """For ``free_run.json``."""
+        """For ``candidates.json``."""
         plain = {"label": self.label, "error": self.error, "seconds": round(self.seconds, 2), "chosen": self.chosen}
         return plain | {"why": self.why[:MOST_TEXT]}
-
-
-@dataclass(frozen=True, eq=False)
-class _Trained:
-    """A member of a recurrent twin after a training of some length."""
-
-    error: float
-    form: Recurrent
-    training: FreeRunSpec
-    fitted: FittedTwin
-
-    @property
-    def result(self) -> FittedFormulation:
-        return FittedFormulation(self.form.alone(), self.fitted)
-
-    @property
-    def label(self) -> str:
-        return labelled(self.form.alone(), self.training)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +92,7 @@ class TwinChoice:
     """A choice among formulations.
 
     Attributes:
-        fit: what every fit needs.
+        fit: what every fit needs; its training and validation part are divided anew.
         auto: the settings of the choice.
         run: folder and key; trainings that were stopped go on.
     """
@@ -103,111 +107,198 @@ class TwinChoice:
         Raises:
             ConfigError: none can be fitted to these recordings.
         """
-        reference = self._scores(self._floor("static").start(*self._shared, self.fit.experiment.training.seed))
-        tried = [one for name in self.auto.candidates for one in self._tried(name, reference)]
-        fits = [(i, one.result, one.error) for i, one in enumerate(tried) if one.result and one.error is not None]
-        if not fits:
+        tried = [one for name in self.auto.candidates for one in self._tried(name)]
+        trials = [(i, one.trial, one.error) for i, one in enumerate(tried) if one.trial and one.error is not None]
+        if not trials:
             reasons = "; ".join(f"{one.label}: {one.why}" for one in tried)
             raise ConfigError(f"twin.candidates: none of them can be fitted to these recordings: {reasons}")
-        enough = self._enough([error for _, _, error in fits])
-        which, result, _ = next(entry for entry in fits if entry[2] <= enough)
+        enough = self._enough([error for _, _, error in trials])
+        which, trial, _ = next(entry for entry in trials if entry[2] <= enough)
         tried[which] = replace(tried[which], chosen=True)
-        seconds = sum(one.seconds for one in tried)
-        facts = result.facts | {"chosen": tried[which].label}
-        return replace(result, fitted=replace(result.fitted, seconds=seconds), facts=facts), tried
+        result = self._settled(trial)
+        # What chose is no less work than what was chosen.
+        fitted = replace(result.fitted, seconds=sum(one.seconds for one in tried))
+        facts = result.facts | {"chosen": tried[which].label, "folds": len(self.folds)}
+        return replace(result, fitted=fitted, facts=facts), tried
 
-    def _tried(self, name: str, reference: dict[str, Any]) -> list[TwinCandidate]:
-        """A formulation with the default options; the recurrent one in several forms, the simplest first."""
-        began = time.process_time()
+    @cached_property
+    def folds(self) -> list[StretchFold]:
+        """How training and validation part are divided: as the settings say, or each stretch left out in turn.
+
+        From `LONG_TICKS` on, and where a fold would be shorter than what is trained on, the settings' own division.
+        """
+        data, count, training = self.fit.data, self.auto.folds, self.fit.experiment.training
+        own = [StretchFold(data.train, data.validation)]
+        if count == 1 or sum(part.samples for part in data.train) >= LONG_TICKS:
+            return own
+        prefix = self.auto.prefix_ticks
+        least = prefix + round(max(training.lengths_s) * self.fit.channels.rate_hz) + 1
         try:
-            if name == "recurrent":
-                return self._recurrent(reference)
-            self.fit.tell(f"fitting {name}")
-            with part_of(self.run, name) as own:
-                result = self.fit.fitted(self._floor(name), own)
-            error = self._error(result.fitted.twin, reference)
-        except (ConfigError, DataError, NotFiniteError) as problem:
-            # What does not suit these channels is no reason to give up on what does.
-            return [TwinCandidate(name, time.process_time() - began, why=str(problem))]
-        seconds = max(result.fitted.seconds, time.process_time() - began)
-        return [TwinCandidate(described(result.spec), seconds, result, error)]
+            divided = stretch_folds(self._everything, count, prefix, prefix + 2, training.seed)
+        except DataError:
+            return own
+        sides = [side for fold in divided for side in (fold.train, fold.validation)]
+        return divided if all(any(part.samples > least for part in side) for side in sides) else own
 
-    def _recurrent(self, reference: dict[str, Any]) -> list[TwinCandidate]:
-        """The recurrent twin on a static map or not, as long as longer training helps; last the average of members."""
-        parts = (self.fit.data.train, self.fit.data.validation)
-        wide = sum(part.samples for part in parts[0]) >= LONG_TICKS
-        plain = Recurrent(prefix_ticks=self.auto.prefix_ticks, members=1 if wide else MEMBERS)
+    @property
+    def _everything(self) -> list[Series]:
+        return [*self.fit.data.train, *self.fit.data.validation]
+
+    @cached_property
+    def _whole(self) -> TwinFit:
+        """With all that may be learned from as training part: closed forms are fitted to it, maps and scales, too."""
+        data = replace(self.fit.data, train=self._everything)
+        return replace(self.fit, scales=fit_scales(self.fit.channels, self._everything), data=data)
+
+    @cached_property
+    def _reference(self) -> list[FreeRuns]:
+        """Free runs of the static map in each fold."""
+        spec, seed = self._default("static"), self.fit.experiment.training.seed
+        shared = (self._whole.channels, self._whole.scales)
+        return [self._runs(spec.start(*shared, fold.train, seed), fold) for fold in self.folds]
+
+    def _tried(self, name: str) -> list[TwinCandidate]:
+        """A formulation with the default options; the recurrent one in several forms, the simplest first."""
+        if name == "recurrent":
+            return self._recurrent()
+        spec = self._default(name)
+
+        def fitted(which: int, own: KeyedRun | None) -> FittedFormulation:
+            fold = self.folds[which]
+            data = replace(self.fit.data, train=fold.train, validation=fold.validation)
+            return replace(self._whole, data=data).fitted(spec, own)
+
+        self.fit.tell(f"fitting {name}")
+        return [self._attempt(described(spec), name, spec, fitted)]
+
+    def _recurrent(self) -> list[TwinCandidate]:
+        """The recurrent twin on a static map or not, as long as longer training helps."""
+        count = len(self.folds)
+        plain = Recurrent(prefix_ticks=self.auto.prefix_ticks)
+        if count > 1:
+            plain = replace(plain, members=count, units=count * MEMBER_UNITS)
         forms = [replace(plain, valve_map=True), plain]
-        statics = {form: form.static_map(*self._shared) for form in forms}
-        trained: list[_Trained] = []
-        diverged: list[TwinCandidate] = []
+        tried: list[TwinCandidate] = []
         for round_, share in enumerate(LENGTHS):
-            before = min((one.error for one in trained), default=math.inf)
-            training = shortened(self.fit.experiment.training, share)
-            for form in forms if round_ < BOTH_FORMS or not trained else [self._simplest(trained).form]:
-                try:
-                    trained.append(self._member(form, statics[form], training, reference))
-                except NotFiniteError as problem:
-                    diverged.append(TwinCandidate(labelled(form.alone(), training), 0.0, why=str(problem)))
-            if trained and min(one.error for one in trained) > before * (1.0 - LENGTHENED):
+            before = _least(tried)
+            simplest = self._simplest(tried)
+            for form in forms if round_ < BOTH_FORMS or simplest is None else [simplest]:
+                training = shortened(self.fit.experiment.training, share)
+                # A length that helped neither form would take more time than all before it.
+                most = FAR_BEHIND if round_ < BOTH_FORMS else 1.0
+                tried.append(self._trained(form, training, _best(tried), most))
+            # Before the first training has ended there is nothing to be better than.
+            if before * (1.0 - LENGTHENED) < _least(tried) < math.inf:
                 break
-        if not trained:
-            return diverged
-        first, form = self._simplest(trained), self._simplest(trained).form
-        tried = [TwinCandidate(one.label, one.fitted.seconds, one.result, one.error) for one in trained] + diverged
-        if form.members == 1:
-            return tried
-        self.fit.tell(f"training {form.members - 1} further members")
-        shared = (self.fit.channels, self.fit.scales, statics[form])
-        with part_of(self.run, _part_name(form, first.training)) as own:
-            fitted = fit_members(form, shared, parts, first.training, self.fit.on_event, own, [first.fitted])
-        error = self._error(fitted.twin, reference)
-        if error < first.error:  # an average takes the place of its first member, however little better it is
-            label = labelled(form, first.training)
-            tried[trained.index(first)] = TwinCandidate(label, fitted.seconds, FittedFormulation(form, fitted), error)
         return tried
 
-    def _simplest(self, trained: Sequence[_Trained]) -> _Trained:
-        enough = self._enough([one.error for one in trained])
-        return next(one for one in trained if one.error <= enough)
+    def _trained(
+        self, form: Recurrent, training: FreeRunSpec, rival: TwinCandidate | None, most: float
+    ) -> TwinCandidate:
+        """A form whose members are trained for a length, each without one of the folds."""
+        whole, label = self._whole, labelled(form, training)
+        static = form.static_map(whole.channels, whole.scales, whole.data.train)
+
+        def fitted(which: int, own: KeyedRun | None) -> FittedFormulation:
+            self.fit.tell(f"training {label}: fold {which + 1} of {len(self.folds)}")
+            fold, seed = self.folds[which], member_seed(training.seed, which)
+            twin = form.member(whole.channels, whole.scales, static, seed)
+            seeded = replace(training, seed=seed)
+            fit = fit_free_runs(twin, fold.train, fold.validation, seeded, whole.on_event, own)
+            return FittedFormulation(form.alone(), fit)
+
+        name = f"recurrent{'_map' if form.valve_map else ''}_{sum(training.updates)}"
+        return self._attempt(label, name, form, fitted, rival, most)
+
+    def _attempt(
+        self,
+        label: str,
+        name: str,
+        spec: TwinSpec,
+        fitted: Callable[[int, KeyedRun | None], FittedFormulation],
+        rival: TwinCandidate | None = None,
+        most: float = FAR_BEHIND,
+    ) -> TwinCandidate:
+        """Fit for each fold in turn, up to where it has more than `most` times the error of a rival."""
+        began, count = time.process_time(), len(self.folds)
+        fits: list[FittedFormulation] = []
+        runs: list[FreeRuns] = []
+        error, why = None, ""
+        try:
+            for which, fold in enumerate(self.folds):
+                with part_of(self.run, f"{name}_fold_{which}" if count > 1 else name) as own:
+                    fits.append(fitted(which, own))
+                runs.append(self._runs(fits[-1].fitted.twin, fold))
+                if rival and rival.trial and len(runs) == RACED < count:
+                    behind = self._error(runs, rival.trial.runs)
+                    if behind > most:
+                        why = f"given up after {RACED} of {count} folds, with {behind:.2f} times the error of "
+                        why += f"{rival.label} there"
+                        break
+            else:
+                error = self._error(runs, self._reference)
+        except (ConfigError, DataError, NotFiniteError) as problem:
+            # What does not suit these channels is no reason to give up on what does.
+            why = str(problem)
+        # A training that was read from an earlier start took its time then.
+        seconds = max(sum(fit.fitted.seconds for fit in fits), time.process_time() - began)
+        trial = None if error is None else Trial(spec, tuple(fits), tuple(runs))
+        return TwinCandidate(label, seconds, trial, error, why)
+
+    def _settled(self, trial: Trial) -> FittedFormulation:
+        """The twin of all that may be learned from; intervals have what each fold left out."""
+        first, several = trial.fits[0], len(trial.fits) > 1
+        unseen = [(fit.fitted.twin, fold.validation) for fit, fold in zip(trial.fits, self.folds, strict=True)]
+        if isinstance(trial.spec, Recurrent):
+            result = FittedFormulation(trial.spec, joined_members([fit.fitted for fit in trial.fits]))
+        elif not first.fitted.history:
+            result = self._whole.fitted(trial.spec, None)
+        elif several:
+            # Weights of several such fits have no mean; and each needs stretches that tell it when to stop.
+            with part_of(self.run, TWINS.name_of(trial.spec)) as own:
+                result = self.fit.fitted(trial.spec, own)
+        else:
+            result = first
+        return replace(result, unseen=tuple(unseen))
+
+    def _simplest(self, tried: Sequence[TwinCandidate]) -> Recurrent | None:
+        """Form of the simplest of the trainings that are as good as the best."""
+        ended = [(one.trial.spec, one.error) for one in tried if one.trial and one.error is not None]
+        enough = self._enough([error for _, error in ended]) if ended else 0.0
+        return next((spec for spec, error in ended if isinstance(spec, Recurrent) and error <= enough), None)
 
     def _enough(self, errors: Sequence[float]) -> float:
         """The error up to which a simpler candidate is as good as the best."""
         return min(errors) / (1.0 - self.auto.least_gain)
 
-    def _member(
-        self, form: Recurrent, static: StaticTwin | None, training: FreeRunSpec, reference: dict[str, Any]
-    ) -> _Trained:
-        """The first member of a form, trained for a length."""
-        fit = self.fit
-        fit.tell(f"training {labelled(form.alone(), training)}")
-        twin = form.member(fit.channels, fit.scales, static, training.seed)
-        with part_of(self.run, _part_name(form, training)) as own:
-            fitted = fit_free_runs(twin, fit.data.train, fit.data.validation, training, fit.on_event, own)
-        return _Trained(self._error(fitted.twin, reference), form, training, fitted)
-
-    @property
-    def _shared(self) -> tuple[Any, Any, Any]:
-        return self.fit.channels, self.fit.scales, self.fit.data.train
-
-    def _floor(self, name: str) -> TwinSpec:
+    def _default(self, name: str) -> TwinSpec:
         """The defaults of a formulation, with the prefix of all candidates."""
         spec: TwinSpec = replace(TWINS[name](), prefix_ticks=self.auto.prefix_ticks)
         return spec
 
-    def _scores(self, twin: Twin) -> dict[str, Any]:
-        """Of free runs as long as those that choose among weights.
+    def _runs(self, twin: Any, fold: StretchFold) -> FreeRuns:
+        """Free runs of what a fold leaves out, as long as those that choose among weights.
 
-        More of them fit into the validation part, and differ more from one another, than long ones.
+        More of them fit into it, and differ more from one another, than long ones.
         """
-        experiment = self.fit.experiment
-        seconds = experiment.training.validation_s
-        at_s = tuple(sorted({share * seconds for share in AT}))
-        judge = replace(experiment.judge, seconds=seconds, at_s=at_s)
-        return free_run_scores(free_runs(twin, self.fit.data.validation, seconds, experiment.training.lanes), judge)
+        training = self.fit.experiment.training
+        return free_runs(twin, fold.validation, training.validation_s, training.lanes)
 
-    def _error(self, twin: Twin, reference: dict[str, Any]) -> float:
-        return free_run_error(self._scores(twin), reference)
+    def _error(self, runs: Sequence[FreeRuns], reference: Sequence[FreeRuns]) -> float:
+        """Error over that of a reference in the same folds."""
+        seconds = self.fit.experiment.training.validation_s
+        judge = replace(self.fit.experiment.judge, seconds=seconds, at_s=tuple(sorted({a * seconds for a in AT})))
+        ours, theirs = (FreeRuns.joined(some) for some in (runs, reference[: len(runs)]))
+        return free_run_error(free_run_scores(ours, judge), free_run_scores(theirs, judge))
+
+
+def _least(tried: Sequence[TwinCandidate]) -> float:
+    return min((one.error for one in tried if one.error is not None), default=math.inf)
+
+
+def _best(tried: Sequence[TwinCandidate]) -> TwinCandidate | None:
+    least = _least(tried)
+    return next((one for one in tried if one.error == least), None)
 
 
 def shortened(training: FreeRunSpec, share: float) -> FreeRunSpec:
@@ -228,7 +319,3 @@ def described(spec: TwinSpec) -> str:
 def labelled(form: Recurrent, training: FreeRunSpec) -> str:
     """How sentences call a recurrent twin that was trained so."""
     return f"{described(form)}, {sum(training.updates):,} updates"
-
-
-def _part_name(form: Recurrent, training: FreeRunSpec) -> str:
-    return f"recurrent{'_map' if form.valve_map else ''}_{sum(training.updates)}"

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from edp.config.twin import TwinExperiment
 from edp.data.prepared import Prepared
+from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.networks.twin import TwinScales, TwinSpec
+from edp.networks.twin import Twin, TwinScales, TwinSpec
 from edp.networks.twin.elements import ElementsTwin
 from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.greybox import GreyTwin
@@ -33,12 +34,15 @@ class FittedFormulation:
         fitted: twin, history, processor time.
         datasheet: numbers of the machine with units and intervals; empty where the formulation has none.
         facts: what provenance says of it.
+        unseen: twins beside stretches that trained none of their weights; they calibrate the intervals. Empty where
+            these are the twin itself and the validation part.
     """
 
     spec: TwinSpec
     fitted: FittedTwin
     datasheet: list[dict[str, Any]] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
+    unseen: tuple[tuple[Twin, Sequence[Series]], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +98,12 @@ class TwinFit:
             self.tell("the network does not help on the validation part: the grey box stays alone")
         fitted = FittedTwin(network.twin, grey.history + network.history, grey.seconds + network.seconds)
         return FittedFormulation(spec, fitted, numbers, {"residual": network.facts()})
+
+    def refitted(self, first: FittedFormulation) -> FittedFormulation:
+        """What needs no stretches to choose its weights, fitted anew to the validation part as well.
+
+        The first fit, of the training part alone, calibrates the intervals.
+        """
+        data = replace(self.data, train=[*self.data.train, *self.data.validation])
+        again = replace(self, data=data).fitted(first.spec, None)
+        return replace(again, unseen=((first.fitted.twin, self.data.validation),))

@@ -49,7 +49,8 @@ def judge_twin(
 
     Args:
         bundle: the twin.
-        experiment: its settings; floors are fitted to the training part with the same prefix.
+        experiment: its settings; floors are fitted to training and validation part, with the same prefix: the twin
+            has seen both.
         data: prepared series.
         labels: see `driving_labels`.
         tell: called with what begins.
@@ -61,7 +62,7 @@ def judge_twin(
     for name in spec.floors:
         tell(f"free runs of {name}")
         floor_spec: TwinSpec = replace(TWINS[name](), prefix_ticks=experiment.twin.prefix_ticks)
-        floor = floor_spec.start(twin.channels, twin.scales, data.train, experiment.training.seed)
+        floor = floor_spec.start(twin.channels, twin.scales, [*data.train, *data.validation], experiment.training.seed)
         floor_runs = free_runs(floor, data.test, spec.seconds, spec.starts)
         scores[name] = free_run_scores(floor_runs, spec, None, labels) | _ahead(floor, data, spec)
     return scores, runs

@@ -86,7 +86,7 @@ def train_twin(
             write_json(run.file(f"{DATASHEET}.json"), {"schema": 1, "basis": BASIS, "numbers": result.datasheet})
             write_bytes(run.file(f"{DATASHEET}.txt"), datasheet_text(result.datasheet).encode())
         tell("calibrating intervals")
-        intervals = calibrated(fitted.twin, data.validation, experiment.judge)
+        intervals = calibrated(result.unseen or ((fitted.twin, data.validation),), experiment.judge)
         provenance = _provenance(source, experiment, data, fitted) | result.facts
         bundle = TwinBundle(result.spec, fitted.twin, provenance, {}, intervals)
         scores, runs = judge_twin(bundle, experiment, data, labels, tell)
@@ -101,7 +101,8 @@ def _chosen(fit: TwinFit, run: KeyedRun) -> FittedFormulation:
     """The twin that the settings ask for; where they leave the formulation open, ``candidates.json`` has the choice."""
     spec = fit.experiment.twin
     if not isinstance(spec, AutoTwin):
-        return fit.fitted(spec, run)
+        result = fit.fitted(spec, run)
+        return result if result.fitted.history else fit.refitted(result)
     result, tried = TwinChoice(fit, spec, run).best()
     write_json(run.folder.file(CANDIDATES), {"schema": 1, "candidates": [one.row() for one in tried]})
     return result

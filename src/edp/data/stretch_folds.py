@@ -1,0 +1,77 @@
+"""Blocked cross-validation of what learns from unbroken stretches, and is judged by such."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.data.folds import blocked_folds
+from edp.data.series import Series
+
+
+@dataclass(frozen=True, eq=False)
+class StretchFold:
+    """One way to divide stretches.
+
+    Attributes:
+        train: stretches to learn from.
+        validation: those that are left out.
+    """
+
+    train: list[Series]
+    validation: list[Series]
+
+
+def stretch_folds(series: Sequence[Series], count: int, gap: int, shortest: int, seed: int) -> list[StretchFold]:
+    """Divide stretches `count` times; each tick is left out in one of the folds at most (see `blocked_folds`).
+
+    Args:
+        series: at least one stretch. They are laid end to end in an order drawn by the seed, since files often lie in
+            the order of what was driven.
+        count: folds, at least 2.
+        gap: ticks beside a fold that it does not learn from.
+        shortest: ticks of a stretch that says something; what is cut shorter is in neither part.
+        seed: of the order.
+
+    Raises:
+        DataError: too few ticks.
+    """
+    dealt = [series[i] for i in np.random.default_rng(seed).permutation(len(series))]
+    lengths = [part.samples for part in dealt]
+    divided = blocked_folds(lengths, count, gap)
+    rows = [(divided.training[i], divided.left_out(i)) for i in range(count)]
+    sides = [[_stretches(dealt, lengths, side) for side in both] for both in rows]
+    return [StretchFold(*([part for part in side if part.samples >= shortest] for side in both)) for both in sides]
+
+
+def _stretches(series: Sequence[Series], lengths: Sequence[int], rows: NDArray[np.int64]) -> list[Series]:
+    """Rows of all stretches as the unbroken ones that they make up."""
+    first = np.cumsum(lengths) - lengths
+    owner = np.searchsorted(first, rows, side="right") - 1
+    breaks = np.flatnonzero((np.diff(rows) != 1) | (np.diff(owner) != 0)) + 1
+    runs = zip(np.split(rows, breaks), np.split(owner, breaks), strict=True)
+    return [_part(series[of[0]], int(run[0] - first[of[0]]), int(run[-1] + 1 - first[of[0]])) for run, of in runs]
+
+
+def _part(whole: Series, start: int, stop: int) -> Series:
+    """Rows of a stretch; named after the recording with its rows, as `prepare` does."""
+    if (start, stop) == (0, whole.samples):
+        return whole
+    name, bracket, rows = whole.name.removesuffix("]").rpartition("[")
+    before = rows.partition(":")[0]
+    offset = 0
+    if bracket and whole.name.endswith("]") and before.isdigit():
+        offset = int(before)
+    else:
+        name = whole.name
+    taught = None if whole.teacher_targets is None else whole.teacher_targets[start:stop]
+    return replace(
+        whole,
+        name=f"{name}[{offset + start}:{offset + stop}]",
+        inputs=whole.inputs[start:stop],
+        targets=whole.targets[start:stop],
+        teacher_targets=taught,
+    )
