@@ -55,7 +55,7 @@ class BusyError(StorageError):
 
 
 class LostError(EdpError):
-    """Processes were killed again and again, so that nothing is known of what they did; to be tried again."""
+    """Processes were killed, so that nothing is known of what they did; to be tried again."""
 
     exit_code = 75
 

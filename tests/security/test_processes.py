@@ -1,10 +1,12 @@
 """No process outlives the command that started it, however that ends; a request to end is taken as Ctrl-C is."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,10 @@ import torch
 
 from edp.cli import ending
 from edp.cli.console import run_app
+from edp.errors import LostError
+from edp.sandbox.helpers import Helpers
+from edp.training.free_run import FreeRunDiverged
+from edp.training.free_run_members import member_died
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 # Two jobs that last for ever in a pool of two; the process says who works for it once both have begun.
@@ -161,3 +167,42 @@ def test_other_errors_are_not_taken_for_want_of_memory():
 
     with pytest.raises(RuntimeError, match="shapes"):
         run_app(app)
+
+
+@dataclass(frozen=True)
+class Member:
+    label: str
+    ends: str
+
+
+def ending_job(job):
+    if job.ends == "killed":
+        os._exit(1)
+    if job.ends == "diverged":
+        raise FreeRunDiverged(f"{job.label} is not finite any more")
+    return job.label
+
+
+@pytest.mark.parametrize(
+    ("ends", "error", "message"),
+    [
+        ("killed", LostError, r"a worker process died during 'a' .* run the same command again with fewer workers"),
+        ("diverged", FreeRunDiverged, "a is not finite any more"),
+    ],
+)
+def test_the_end_of_a_helper_is_told_as_it_would_be_without_one(ends, error, message):
+    before = set(multiprocessing.active_children())
+    with pytest.raises(error, match=message), Helpers(2, member_died) as helpers:
+        list(helpers.ordered(ending_job, [Member("a", ends), Member("b", "well")]))
+    until(lambda: set(multiprocessing.active_children()) <= before)
+
+
+def test_helpers_answer_in_the_order_of_the_jobs_and_one_worker_starts_no_process():
+    jobs = [Member(name, "well") for name in "abcdef"]
+    with Helpers(2, member_died) as helpers:
+        assert list(helpers.ordered(ending_job, jobs)) == list("abcdef")
+        assert list(helpers.ordered(ending_job, jobs[:2])) == ["a", "b"]  # the same processes again
+    before = set(multiprocessing.active_children())
+    with Helpers(1, member_died) as helpers:
+        assert list(helpers.ordered(ending_job, jobs)) == list("abcdef")
+        assert set(multiprocessing.active_children()) <= before

@@ -23,6 +23,7 @@ def twin(
     changes: Annotated[list[str], typer.Option("--set", help="One setting, for example twin.kind=recurrent.")] = [],  # noqa: B006
     signal_map: MapOption = None,
     repair: RepairOption = [],  # noqa: B006
+    workers: Annotated[int, typer.Option(min=0, help="Parallel trainings; 0: one for each core.")] = 0,
     as_json: JsonFlag = False,
 ) -> None:
     """Train a plant model that runs on commands alone: velocities, strokes and pressures over a minute.
@@ -41,7 +42,8 @@ def twin(
     experiment = load_twin_experiment(config, changes)
     with progress(as_json) as shown:
         display = FitDisplay(shown, as_json)
-        trained = train_twin(source_of(data, signal_map, repair), experiment, folder, display.on_event, display.on_step)
+        source = source_of(data, signal_map, repair)
+        trained = train_twin(source, experiment, folder, display.on_event, display.on_step, workers)
     seconds = trained.bundle.provenance["seconds"]
     beaten = twin_beaten_by(trained.scores)
     facts = {"run": str(folder), "twin": str(folder / "twin"), "seconds": seconds, "models": trained.scores}

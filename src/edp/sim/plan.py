@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
 from edp.errors import ConfigError
 from edp.recording import Recording
-from edp.sandbox.processes import begin_helper
+from edp.sandbox.helpers import Helpers, Job, Result
 from edp.settings.bounds import above, check_bounds, integer, span
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine.family import MASSES_T, WIDEST, member_mass, member_name
@@ -241,57 +236,18 @@ def simulate_many(
         yield recording
 
 
-class Labelled(Protocol):
-    """A job with a name for messages."""
-
-    @property
-    def label(self) -> str:
-        """The name."""
-        ...
-
-
-Job = TypeVar("Job", bound=Labelled)
-Result = TypeVar("Result")
-
-
 def ordered(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
     """`function` of each job in `workers` processes, in the order of the jobs.
 
     Raises:
         SimulationError: a worker process died.
     """
-    if workers <= 1 or len(jobs) <= 1:
-        return (function(job) for job in jobs)
-    return _parallel(function, jobs, workers)
+    with Helpers(min(workers, len(jobs)), _died) as helpers:
+        yield from helpers.ordered(function, jobs)
 
 
-def _parallel(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    # Spawned rather than forked: a forked child may inherit locks of threads that do not exist in it.
-    context = multiprocessing.get_context("spawn")
-    running: deque[tuple[Job, Future[Result]]] = deque()
-    others, finished = set(multiprocessing.active_children()), False
-    with ProcessPoolExecutor(min(workers, len(jobs)), context, begin_helper, (os.getpid(),)) as pool:
-        try:
-            for job in jobs:
-                running.append((job, pool.submit(function, job)))
-                # At most two a worker: finished recordings must not pile up in memory while an early one is late.
-                if len(running) >= 2 * workers:
-                    yield _result(*running.popleft())
-            while running:
-                yield _result(*running.popleft())
-            finished = True
-        finally:
-            if not finished:  # stopped or failed: nobody waits for what they are at
-                for child in set(multiprocessing.active_children()) - others:
-                    child.terminate()
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _result(job: Job, future: Future[Result]) -> Result:
-    try:
-        return future.result()
-    except BrokenProcessPool as error:
-        raise SimulationError(
-            f"a worker process died while '{job.label}' was being simulated (out of memory, or stopped from "
-            "outside; a calling script needs `if __name__ == '__main__':`); run again with fewer workers"
-        ) from error
+def _died(label: str) -> SimulationError:
+    return SimulationError(
+        f"a worker process died while '{label}' was being simulated (out of memory, or stopped from outside; a "
+        "calling script needs `if __name__ == '__main__':`); run again with fewer workers"
+    )

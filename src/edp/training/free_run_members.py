@@ -2,16 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.errors import LostError
 from edp.networks.twin import TwinScales
 from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, member_seed
 from edp.networks.twin.static_map import StaticTwin
-from edp.storage.runs import KeyedRun, part_of
+from edp.sandbox.helpers import Helpers
+from edp.storage.runs import PARTS, KeyedRun, RunFolder
 from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
+
+
+@dataclass(frozen=True, eq=False)
+class MemberTraining:
+    """The training of one network on free runs, ready for another process.
+
+    Attributes:
+        label: how messages call it.
+        twin: untrained.
+        train: stretches to learn from.
+        validation: those that choose among its weights.
+        training: how, with its own seed.
+        folder: where its checkpoints stand, with the key of the run; None: it cannot go on after a stop.
+    """
+
+    label: str
+    twin: RecurrentTwin
+    train: Sequence[Series]
+    validation: Sequence[Series]
+    training: FreeRunSpec
+    folder: tuple[Path, str] | None
+
+
+def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], None] | None = None) -> FittedTwin:
+    """The network that a job trains; the same in any process.
+
+    Raises:
+        EdpError: see `fit_free_runs`.
+    """
+    what = (job.twin, job.train, job.validation, job.training, on_event)
+    if job.folder is None:
+        return fit_free_runs(*what)
+    with RunFolder(job.folder[0]) as folder:
+        return fit_free_runs(*what, KeyedRun(folder, job.folder[1]))
+
+
+def train_members(
+    jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None, helpers: Helpers | None
+) -> Iterator[FittedTwin]:
+    """Train networks in helpers, side by side and without their progress, or in this process with it; in order.
+
+    Raises:
+        EdpError: see `fit_free_runs`, or a helper died.
+    """
+    if helpers is None or helpers.workers <= 1:
+        yield from (trained_member(job, on_event) for job in jobs)
+    else:
+        yield from helpers.ordered(trained_member, jobs)
+
+
+def member_died(label: str) -> LostError:
+    """Error for the label of a training whose process died."""
+    return LostError(
+        f"a worker process died during '{label}' (out of memory, or stopped from outside; a calling script needs "
+        "`if __name__ == '__main__':`); run the same command again with fewer workers: it goes on where it stopped"
+    )
 
 
 def fit_members(
@@ -21,6 +80,7 @@ def fit_members(
     training: FreeRunSpec,
     on_event: Callable[[FreeRunProgress], None] | None = None,
     run: KeyedRun | None = None,
+    helpers: Helpers | None = None,
 ) -> FittedTwin:
     """Train each member of a recurrent twin on free runs of its own, and average them.
 
@@ -31,14 +91,17 @@ def fit_members(
         training: how; the first member has its seed, the others one of their own.
         on_event: called with progress of each member in turn.
         run: folder and key of the run; where given, each member's training is resumable.
+        helpers: that train members side by side; none: one after the other.
     """
-    fits = []
+    if form.members == 1:
+        return fit_free_runs(form.member(*parts, training.seed), *series, training, on_event, run)
+    jobs = []
     for which in range(form.members):
         seed = member_seed(training.seed, which)
-        twin = form.member(*parts, seed)
-        with part_of(run, f"member_{which}" if form.members > 1 else "") as own:
-            fits.append(fit_free_runs(twin, *series, replace(training, seed=seed), on_event, own))
-    return joined_members(fits)
+        folder = None if run is None else (run.folder.path / PARTS / f"member_{which}", run.key)
+        seeded = replace(training, seed=seed)
+        jobs.append(MemberTraining(f"member {which + 1}", form.member(*parts, seed), *series, seeded, folder))
+    return joined_members(list(train_members(jobs, on_event, helpers)))
 
 
 def joined_members(fits: Sequence[FittedTwin]) -> FittedTwin:

@@ -91,7 +91,7 @@ def test_a_stopped_training_goes_on(edp, logs, trained, tmp_path, monkeypatch):
 def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs, tmp_path):
     run, page = tmp_path / "run", tmp_path / "page.html"
     words = ["--set", "twin.candidates=['static','n4sid','recurrent']", *WORDS[4:]]
-    shown = " ".join(edp("twin", logs, "--out", run, *words).out.split())
+    shown = " ".join(edp("twin", logs, "--out", run, *words, "--workers", "1").out.split())
     assert "chosen: " in shown
     ended = edp("twin", logs, "--out", run, *words, "--json").json
     rows = ended["candidates"]
@@ -111,6 +111,18 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
     assert (run / "candidates.json").read_text() == before
     (run / "candidates.json").write_text(before.replace('"chosen": true', '"chosen": "yes"'))
     assert "chosen is 'yes'; true or false must hold" in " ".join(edp("report", run).err.split())
+
+
+def test_any_number_of_workers_trains_the_same_twin(edp, logs, tmp_path):
+    words = ["--set", "twin.candidates=['recurrent']", *WORDS[4:]]
+    rows, arrays = [], []
+    for workers in (1, 2):
+        ended = edp("twin", logs, "--out", tmp_path / f"run_{workers}", *words, "--workers", workers, "--json")
+        rows.append([row | {"seconds": 0.0} for row in ended.json["candidates"]])
+        arrays.append(load_twin(tmp_path / f"run_{workers}").twin.arrays())
+    assert rows[0] == rows[1]
+    assert all(np.array_equal(values, arrays[1][name]) for name, values in arrays[0].items())
+    assert edp("twin", logs, "--out", tmp_path / "run_3", *words, "--workers", -1).code == 2
 
 
 HOSTILE = "</table><script>alert(1)</script>{{7*7}}[red]\x1b[31m"

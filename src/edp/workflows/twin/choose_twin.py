@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,9 +18,9 @@ from edp.networks.twin import TWINS, TwinSpec, fit_scales
 from edp.networks.twin.kinds import AutoTwin
 from edp.networks.twin.recurrent import Recurrent, member_seed
 from edp.report.twin.candidates import MOST_TEXT
-from edp.storage.runs import KeyedRun, part_of
-from edp.training.free_run import FreeRunSpec, fit_free_runs
-from edp.training.free_run_members import joined_members
+from edp.storage.runs import PARTS, KeyedRun, part_of
+from edp.training.free_run import FreeRunSpec
+from edp.training.free_run_members import MemberTraining, joined_members, train_members
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
@@ -81,6 +81,11 @@ class TwinCandidate:
     why: str = ""
     chosen: bool = False
 
+    @property
+    def spec(self) -> TwinSpec | None:
+        """Its options, where there is a trial."""
+        return None if self.trial is None else self.trial.spec
+
     def row(self) -> dict[str, Any]:
         """For ``candidates.json``."""
         plain = {"label": self.label, "error": self.error, "seconds": round(self.seconds, 2), "chosen": self.chosen}
@@ -107,18 +112,18 @@ class TwinChoice:
         Raises:
             ConfigError: none can be fitted to these recordings.
         """
-        tried = [one for name in self.auto.candidates for one in self._tried(name)]
-        trials = [(i, one.trial, one.error) for i, one in enumerate(tried) if one.trial and one.error is not None]
-        if not trials:
+        tried: list[TwinCandidate] = []
+        for name in self.auto.candidates:
+            tried += self._tried(name, _best(tried))
+        chosen = self._simplest(tried)
+        if chosen is None or chosen.trial is None:
             reasons = "; ".join(f"{one.label}: {one.why}" for one in tried)
             raise ConfigError(f"twin.candidates: none of them can be fitted to these recordings: {reasons}")
-        enough = self._enough([error for _, _, error in trials])
-        which, trial, _ = next(entry for entry in trials if entry[2] <= enough)
-        tried[which] = replace(tried[which], chosen=True)
-        result = self._settled(trial)
+        tried[tried.index(chosen)] = replace(chosen, chosen=True)
+        result = self._settled(chosen.trial)
         # What chose is no less work than what was chosen.
         fitted = replace(result.fitted, seconds=sum(one.seconds for one in tried))
-        facts = result.facts | {"chosen": tried[which].label, "folds": len(self.folds)}
+        facts = result.facts | {"chosen": chosen.label, "folds": len(self.folds)}
         return replace(result, fitted=fitted, facts=facts), tried
 
     @cached_property
@@ -157,19 +162,20 @@ class TwinChoice:
         shared = (self._whole.channels, self._whole.scales)
         return [self._runs(spec.start(*shared, fold.train, seed), fold) for fold in self.folds]
 
-    def _tried(self, name: str) -> list[TwinCandidate]:
+    def _tried(self, name: str, rival: TwinCandidate | None) -> list[TwinCandidate]:
         """A formulation with the default options; the recurrent one in several forms, the simplest first."""
-        if name == "recurrent":
+        if name == "recurrent":  # a short training far behind a floor may be ahead of it as a long one
             return self._recurrent()
         spec = self._default(name)
 
-        def fitted(which: int, own: KeyedRun | None) -> FittedFormulation:
-            fold = self.folds[which]
-            data = replace(self.fit.data, train=fold.train, validation=fold.validation)
-            return replace(self._whole, data=data).fitted(spec, own)
+        def fitted(some: range) -> Iterator[FittedFormulation]:
+            for which in some:
+                data = replace(self.fit.data, train=self.folds[which].train, validation=self.folds[which].validation)
+                with part_of(self.run, self._part(name, which)) as own:
+                    yield replace(self._whole, data=data).fitted(spec, own)
 
         self.fit.tell(f"fitting {name}")
-        return [self._attempt(described(spec), name, spec, fitted)]
+        return [self._attempt(described(spec), spec, fitted, rival, FAR_BEHIND)]
 
     def _recurrent(self) -> list[TwinCandidate]:
         """The recurrent twin on a static map or not, as long as longer training helps."""
@@ -181,8 +187,8 @@ class TwinChoice:
         tried: list[TwinCandidate] = []
         for round_, share in enumerate(LENGTHS):
             before = _least(tried)
-            simplest = self._simplest(tried)
-            for form in forms if round_ < BOTH_FORMS or simplest is None else [simplest]:
+            ahead = self._simplest(tried)
+            for form in forms if round_ < BOTH_FORMS or ahead is None else [one for one in forms if one == ahead.spec]:
                 training = shortened(self.fit.experiment.training, share)
                 # A length that helped neither form would take more time than all before it.
                 most = FAR_BEHIND if round_ < BOTH_FORMS else 1.0
@@ -198,49 +204,64 @@ class TwinChoice:
         """A form whose members are trained for a length, each without one of the folds."""
         whole, label = self._whole, labelled(form, training)
         static = form.static_map(whole.channels, whole.scales, whole.data.train)
-
-        def fitted(which: int, own: KeyedRun | None) -> FittedFormulation:
-            self.fit.tell(f"training {label}: fold {which + 1} of {len(self.folds)}")
-            fold, seed = self.folds[which], member_seed(training.seed, which)
-            twin = form.member(whole.channels, whole.scales, static, seed)
-            seeded = replace(training, seed=seed)
-            fit = fit_free_runs(twin, fold.train, fold.validation, seeded, whole.on_event, own)
-            return FittedFormulation(form.alone(), fit)
-
         name = f"recurrent{'_map' if form.valve_map else ''}_{sum(training.updates)}"
-        return self._attempt(label, name, form, fitted, rival, most)
+
+        def fitted(some: range) -> Iterator[FittedFormulation]:
+            jobs = []
+            for which in some:
+                fold, seed = self.folds[which], member_seed(training.seed, which)
+                member = form.member(whole.channels, whole.scales, static, seed)
+                folder = (self.run.folder.path / PARTS / self._part(name, which), self.run.key)
+                seeded = replace(training, seed=seed)
+                jobs.append(MemberTraining(label, member, fold.train, fold.validation, seeded, folder))
+            for which, fit in zip(some, train_members(jobs, whole.on_event, whole.helpers), strict=True):
+                self.fit.tell(f"trained {label}: fold {which + 1} of {len(self.folds)}")
+                yield FittedFormulation(form.alone(), fit)
+
+        self.fit.tell(f"training {label}")
+        return self._attempt(label, form, fitted, rival, most)
+
+    def _part(self, name: str, which: int) -> str:
+        """Folder of a fold's fit in the run."""
+        return f"{name}_fold_{which}" if len(self.folds) > 1 else name
 
     def _attempt(
         self,
         label: str,
-        name: str,
         spec: TwinSpec,
-        fitted: Callable[[int, KeyedRun | None], FittedFormulation],
-        rival: TwinCandidate | None = None,
-        most: float = FAR_BEHIND,
+        fitted: Callable[[range], Iterator[FittedFormulation]],
+        rival: TwinCandidate | None,
+        most: float,
     ) -> TwinCandidate:
-        """Fit for each fold in turn, up to where it has more than `most` times the error of a rival."""
+        """Fit for each fold, up to where it has more than `most` times the error of a rival.
+
+        Args:
+            label: how sentences call it.
+            spec: its options.
+            fitted: fits for some of the folds, in order.
+            rival: the best one so far, None: there is none.
+            most: see above.
+        """
         began, count = time.process_time(), len(self.folds)
         fits: list[FittedFormulation] = []
         runs: list[FreeRuns] = []
         error, why = None, ""
         try:
-            for which, fold in enumerate(self.folds):
-                with part_of(self.run, f"{name}_fold_{which}" if count > 1 else name) as own:
-                    fits.append(fitted(which, own))
-                runs.append(self._runs(fits[-1].fitted.twin, fold))
-                if rival and rival.trial and len(runs) == RACED < count:
-                    behind = self._error(runs, rival.trial.runs)
-                    if behind > most:
-                        why = f"given up after {RACED} of {count} folds, with {behind:.2f} times the error of "
-                        why += f"{rival.label} there"
-                        break
+            for some in (range(min(RACED, count)), range(RACED, count)):
+                for which, fit in zip(some, fitted(some), strict=True):
+                    fits.append(fit)
+                    runs.append(self._runs(fit.fitted.twin, self.folds[which]))
+                behind = self._error(runs, rival.trial.runs) if rival and rival.trial and len(runs) < count else 0.0
+                if behind > most:
+                    share = f"{behind:.2f} times the error of {rival.label if rival else ''} there"
+                    why = f"given up after {len(runs)} of {count} folds, with {share}"
+                    break
             else:
                 error = self._error(runs, self._reference)
         except (ConfigError, DataError, NotFiniteError) as problem:
             # What does not suit these channels is no reason to give up on what does.
             why = str(problem)
-        # A training that was read from an earlier start took its time then.
+        # Helpers, and a training that was read from an earlier start, took time of their own.
         seconds = max(sum(fit.fitted.seconds for fit in fits), time.process_time() - began)
         trial = None if error is None else Trial(spec, tuple(fits), tuple(runs))
         return TwinCandidate(label, seconds, trial, error, why)
@@ -261,15 +282,11 @@ class TwinChoice:
             result = first
         return replace(result, unseen=tuple(unseen))
 
-    def _simplest(self, tried: Sequence[TwinCandidate]) -> Recurrent | None:
-        """Form of the simplest of the trainings that are as good as the best."""
-        ended = [(one.trial.spec, one.error) for one in tried if one.trial and one.error is not None]
-        enough = self._enough([error for _, error in ended]) if ended else 0.0
-        return next((spec for spec, error in ended if isinstance(spec, Recurrent) and error <= enough), None)
-
-    def _enough(self, errors: Sequence[float]) -> float:
-        """The error up to which a simpler candidate is as good as the best."""
-        return min(errors) / (1.0 - self.auto.least_gain)
+    def _simplest(self, tried: Sequence[TwinCandidate]) -> TwinCandidate | None:
+        """The simplest formulation that is as good as the best, of trainings of the same one the best."""
+        enough = _least(tried) / (1.0 - self.auto.least_gain)
+        spec = next((one.spec for one in tried if one.error is not None and one.error <= enough), None)
+        return None if spec is None else _best([one for one in tried if one.spec == spec])
 
     def _default(self, name: str) -> TwinSpec:
         """The defaults of a formulation, with the prefix of all candidates."""

@@ -17,6 +17,7 @@ from edp.networks.twin.grey.datasheet import datasheet
 from edp.networks.twin.greybox import GreyTwin
 from edp.networks.twin.recurrent import Recurrent
 from edp.networks.twin.residual import Residual, ResidualTwin
+from edp.sandbox.helpers import Helpers
 from edp.storage.runs import KeyedRun
 from edp.training.elements_fit import fit_elements
 from edp.training.free_run import FittedTwin, FreeRunProgress
@@ -56,6 +57,7 @@ class TwinFit:
         experiment: the settings.
         on_event: called with progress of a training on free runs.
         tell: called with what begins.
+        helpers: processes that train members of an average side by side; none: one after the other.
     """
 
     channels: TwinChannels
@@ -64,6 +66,7 @@ class TwinFit:
     experiment: TwinExperiment
     on_event: Callable[[FreeRunProgress], None] | None
     tell: Callable[[str], None]
+    helpers: Helpers | None = None
 
     def fitted(self, spec: TwinSpec, run: KeyedRun | None) -> FittedFormulation:
         """One formulation, fitted.
@@ -76,9 +79,9 @@ class TwinFit:
             self.tell("training on free runs")
             static = spec.static_map(self.channels, self.scales, self.data.train)
             shared = (self.channels, self.scales, static)
-            return FittedFormulation(
-                spec, fit_members(spec, shared, parts, self.experiment.training, self.on_event, run)
-            )
+            training = self.experiment.training
+            fitted = fit_members(spec, shared, parts, training, self.on_event, run, self.helpers)
+            return FittedFormulation(spec, fitted)
         started = time.process_time()
         twin = spec.start(self.channels, self.scales, self.data.train, seed)
         if isinstance(twin, ElementsTwin):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,9 +18,11 @@ from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
 from edp.networks.twin.kinds import AutoTwin
 from edp.report.twin.candidates import CANDIDATES
+from edp.sandbox.helpers import Helpers
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.free_run import FittedTwin, FreeRunProgress
+from edp.training.free_run_members import member_died
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
@@ -52,6 +55,7 @@ def train_twin(
     out: str | Path,
     on_event: Callable[[FreeRunProgress], None] | None = None,
     on_step: Callable[[str], None] | None = None,
+    workers: int = 1,
 ) -> TrainedTwin:
     """Train a twin and write a run folder: ``twin/``, settings, history, ``free_run.json``, and where the
     formulation was left open ``candidates.json``. A finished one is read,
@@ -63,6 +67,8 @@ def train_twin(
         out: run folder.
         on_event: called with progress of the training.
         on_step: called with what begins.
+        workers: processes that train the networks of an average side by side; 0 for one a core. The twin has the same
+            bits with any number.
 
     Raises:
         EdpError: the recordings, settings or folder cannot be used; what was on disk stays.
@@ -73,12 +79,12 @@ def train_twin(
     channels, data = prepared_twin(recordings, experiment)
     labels = driving_labels(recordings)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment)}, data.digest)
-    with RunFolder(out) as run:
+    with RunFolder(out) as run, Helpers(workers or os.cpu_count() or 1, member_died) as helpers:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
         run.write_status("running")
-        fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell)
+        fit = TwinFit(channels, fit_scales(channels, data.train), data, experiment, on_event, tell, helpers)
         result = _chosen(fit, KeyedRun(run, key))
         fitted = result.fitted
         run.write_history(fitted.history)
