@@ -218,6 +218,28 @@ def test_a_stopped_choice_goes_on_to_the_same_bits(tmp_path):
     assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
+@pytest.mark.parametrize("pulls", [(1.0, 1.0, 1.0), (0.9, 0.2, 0.0), (0.0, 0.0, 0.0)])
+def test_an_average_of_members_on_maps_of_their_own_is_pulled_to_one_map(pulls):
+    spec = Recurrent(units=6, members=3, valve_map=True)
+    whole, commands, measured = sample_twin(spec)
+    channels, scales = whole.channels, whole.scales
+    # Nothing may be bounded: the map of one recording alone goes far.
+    scales = replace(scales, low=scales.low - 1e4 * scales.answer_width, high=scales.high + 1e4 * scales.answer_width)
+    series = [channels.task().series(sample_actuators(seed=seed)) for seed in range(3)]
+    static = spec.static_map(channels, scales, series)
+    members = [spec.member(channels, scales, static.refitted(series[i : i + 1]), i) for i in range(3)]
+    for member, pull in zip(members, pulls, strict=True):
+        member.network.pull.data *= pull
+    answers = [twin.rollout(commands, twin.initial_state(commands[:, 0], measured[:, 0]), measured)[0]
+               for twin in (averaged(members), *members)]  # fmt: skip
+    assert not np.array_equal(members[0].static.numbers["rise"], members[1].static.numbers["rise"])
+    count = len(channels.velocities)
+    columns = [*range(count), *range(2 * count, len(channels.answers))]
+    mean = np.mean([one[..., columns] for one in answers[1:]], axis=0)
+    np.testing.assert_allclose(answers[0][..., columns] / scales.answer_width[columns],
+                               mean / scales.answer_width[columns], rtol=2e-5, atol=2e-5)  # fmt: skip
+
+
 @pytest.mark.parametrize("valve_map", [False, True])
 def test_an_average_answers_with_the_mean_of_the_changes_of_its_members(valve_map):
     spec = Recurrent(units=6, members=3, valve_map=valve_map)

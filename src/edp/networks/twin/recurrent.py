@@ -261,7 +261,7 @@ def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
     gates are theirs side by side and whose answers have their weights over the number of twins.
 
     Args:
-        twins: at least one; with one static map for all of them, or none.
+        twins: at least one; none with a static map, or all, with the same corners and delay.
     """
     first, count = twins[0], len(twins)
     if count == 1:
@@ -285,4 +285,17 @@ def averaged(twins: Sequence[RecurrentTwin]) -> RecurrentTwin:
             network.out_bias.add_(member.out_bias / count)
             if network.pull is not None and member.pull is not None:
                 network.pull.add_(member.pull.clamp(0.0, 1.0) / count)
-    return RecurrentTwin(first.channels, first.scales, first.prefix_ticks, network, first.static, count)
+    return RecurrentTwin(first.channels, first.scales, first.prefix_ticks, network, _mean_map(twins), count)
+
+
+def _mean_map(twins: Sequence[RecurrentTwin]) -> StaticTwin | None:
+    """The map to which their mean is pulled: theirs, weighted by how strongly each member is pulled to its own."""
+    maps = [twin.static for twin in twins if twin.static is not None]
+    if not maps:
+        return None
+    pulls = [np.zeros(0) if twin.network.pull is None else twin.network.pull.detach().numpy() for twin in twins]
+    shares = np.clip(np.stack(pulls), 0.0, 1.0).astype(np.float64)
+    total = shares.sum(axis=0)
+    # Where nobody is pulled the map is not heard, but its numbers must be some.
+    weights = np.where(total > 0.0, shares / np.where(total > 0.0, total, 1.0), 1.0 / len(maps))
+    return StaticTwin.mean(maps, weights.astype(np.float32))

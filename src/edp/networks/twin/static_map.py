@@ -62,13 +62,8 @@ class StaticMap:
         # All delays are judged by the same stretches: those that have an answer after the longest one.
         judged = [s for s in rows if s.samples > delays[-1] + 1]
         best = int(np.argmin([_error(solution, judged, i, delay) for i, delay in enumerate(delays)]))
-        arrays = {
-            "corners": corners,
-            "rise": np.ascontiguousarray(solution.weights[0, :, best], dtype=np.float32),
-            "intercept": solution.intercept[best].astype(np.float32),
-            "delay": np.array([delays[best]], dtype=np.float32),
-        }
-        return self.build(channels, scales, arrays)
+        arrays = {"corners": corners, "delay": np.array([delays[best]], dtype=np.float32)}
+        return self.build(channels, scales, arrays | _solved(solution, best))
 
     def shapes(self, channels: TwinChannels) -> dict[str, tuple[int, ...]]:
         """Corners, rises of each answer from corner to corner, intercepts, and the delay."""
@@ -96,6 +91,32 @@ class StaticTwin(Twin):
         # Evenly spaced up to the rounding of single precision; a length of zero would divide by it.
         if not (lengths > 0).all() or not (lengths <= 1.5 * _lengths(numbers["corners"])).all():
             raise ValueError("its corners do not rise evenly")
+
+    def refitted(self, train: Sequence[Series]) -> StaticTwin:
+        """The map of other stretches, with the corners and the delay of this one."""
+        solved = solved_columns(self.channels)
+        corners = self.numbers["corners"]
+        rows = [Series(s.name, polygon(s.inputs, corners), s.targets[:, solved]) for s in train]
+        solution = ridge_solution(rows, LagTask((self.delay + 1,), (None,) * len(solved), 1), penalties=(PENALTY,))
+        numbers = self.numbers | _solved(solution, 0)
+        return StaticTwin(self.channels, self.scales, self.prefix_ticks, numbers)
+
+    @staticmethod
+    def mean(maps: Sequence[StaticTwin], weights: Array) -> StaticTwin:
+        """The map that says the weighted mean of what maps with the same corners and delay say.
+
+        Args:
+            maps: at least one.
+            weights: of each map and answer ``(map, all answers but strokes)``, their sum over maps 1.
+        """
+        first = maps[0]
+        if all(one is first for one in maps):
+            return first
+        mean = {
+            name: np.sum([w * one.numbers[name] for w, one in zip(weights, maps, strict=True)], axis=0)
+            for name in ("rise", "intercept")
+        }
+        return StaticTwin(first.channels, first.scales, first.prefix_ticks, first.numbers | mean)
 
     def initial_state(self, command: Array, measured: Array) -> TwinState:
         return {"answer": measured, "commands": np.repeat(command[:, None], self.delay, axis=1)}
@@ -172,6 +193,12 @@ def polygon(commands: Array, corners: Array) -> Array:
     """
     past = np.clip((commands[:, None] - corners) / _lengths(corners), 0.0, 1.0)
     return np.asarray(past.reshape(len(commands), -1), dtype=np.float32)
+
+
+def _solved(solution: RidgeSolution, which: int) -> dict[str, Array]:
+    """Rises and intercepts of one delay."""
+    rise = np.ascontiguousarray(solution.weights[0, :, which], dtype=np.float32)
+    return {"rise": rise, "intercept": solution.intercept[which].astype(np.float32)}
 
 
 def _lengths(corners: Array) -> Array:

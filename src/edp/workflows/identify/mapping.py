@@ -15,6 +15,7 @@ in other units. What differs:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,16 +142,22 @@ def _put_valve(
         band = axis[bands[d]]
         si[places[grey.BAND + d]] = band / reach
         si[places[grey.GAIN + d]] = axis[demand[d]]
-        # Where the simulator's spool is: the curve of the grey box counts from its own full command.
-        spool = band + (reach - band) * np.linspace(0.0, 1.0, FINE)
-        r = np.clip((spool - band) / (1.0 - band), 0.0, 1.0)
-        curve = POLYGON @ (r * (0.25 + 0.75 * r))
+        curve = _curve(float(band), float(reach))
         for first, column in ((grey.INTO, into[d]), (grey.OUT_OF, out[d])):
             at = places[first + d]
             if at >= 0:
                 si[at : at + len(curve)] = axis[column] * curve
         if places[grey.REGENERATION + d] >= 0:
             si[places[grey.REGENERATION + d]] = axis[again[d]] / axis[out[d]]
+
+
+@lru_cache(maxsize=256)  # differences by other numbers ask for the same curve thousands of times
+def _curve(band: float, reach: float) -> Doubles:
+    """Rises between the knots of the grey box's opening curve, of a spool with this dead band that reaches so far."""
+    # Where the simulator's spool is: the curve of the grey box counts from its own full command.
+    spool = band + (reach - band) * np.linspace(0.0, 1.0, FINE)
+    r = np.clip((spool - band) / (1.0 - band), 0.0, 1.0)
+    return np.asarray(POLYGON @ (r * (0.25 + 0.75 * r)))
 
 
 def _polygon() -> Doubles:

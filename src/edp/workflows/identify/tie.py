@@ -11,6 +11,7 @@ deviations from a guess. Free runs then refine theta itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,15 +60,19 @@ class MachineTie:
         """Plausible deviations of the load."""
         return self.parts.table.width[self.parts.load]
 
+    @cached_property
+    def _base_values(self) -> tuple[Doubles, Doubles]:
+        """Guesses of the base, and what its file states; differences ask for them thousands of times."""
+        return guesses(self.base), np.array([number.of(self.base) for number in MACHINE_NUMBERS])
+
     def machine(self, theta: Doubles) -> Machine:
         """The machine of these coordinates; numbers that are not free are those of the guess, zeros included."""
         return with_values(self.base, self._values(theta))
 
     def _values(self, theta: Doubles) -> Doubles:
         own = np.clip(theta[: len(MACHINE_NUMBERS)], -FARTHEST, FARTHEST)
-        grown = guesses(self.base) * np.exp(WIDTHS * own)
-        stated = np.array([number.of(self.base) for number in MACHINE_NUMBERS])
-        values = np.where(self.free, np.minimum(grown, MOST), stated)
+        guess, stated = self._base_values
+        values = np.where(self.free, np.minimum(guess * np.exp(WIDTHS * own), MOST), stated)
         # Cushions that meet in the middle are refused by a machine file.
         values[CUSHIONS] = np.minimum(values[CUSHIONS], LONGEST_CUSHION * values[STROKES])
         return values

@@ -210,7 +210,9 @@ class TwinChoice:
             jobs = []
             for which in some:
                 fold, seed = self.folds[which], member_seed(training.seed, which)
-                member = form.member(whole.channels, whole.scales, static, seed)
+                # A map that knows what is left out would flatter the form that stands on it.
+                own = static and static.refitted(fold.train)
+                member = form.member(whole.channels, whole.scales, own, seed)
                 folder = (self.run.folder.path / PARTS / self._part(name, which), self.run.key)
                 seeded = replace(training, seed=seed)
                 jobs.append(MemberTraining(label, member, fold.train, fold.validation, seeded, folder))
@@ -251,10 +253,11 @@ class TwinChoice:
                 for which, fit in zip(some, fitted(some), strict=True):
                     fits.append(fit)
                     runs.append(self._runs(fit.fitted.twin, self.folds[which]))
-                behind = self._error(runs, rival.trial.runs) if rival and rival.trial and len(runs) < count else 0.0
-                if behind > most:
-                    share = f"{behind:.2f} times the error of {rival.label if rival else ''} there"
-                    why = f"given up after {len(runs)} of {count} folds, with {share}"
+                if rival is None or rival.trial is None or len(runs) == count:
+                    continue
+                if (behind := self._error(runs, rival.trial.runs)) > most:
+                    there = f"{behind:.2f} times the error of {rival.label} there"
+                    why = f"given up after {len(runs)} of {count} folds, with {there}"
                     break
             else:
                 error = self._error(runs, self._reference)
