@@ -33,7 +33,8 @@ def train(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="auto tries several models and keeps the best; quick, small, committee, standard, thesis. "
+            help="auto tries several models and keeps the best; quick, small, committee, standard, thesis, "
+            "pressures, positions. "
             "Default: auto, or standard where the settings name a network or how to train it."
         ),
     ] = None,
