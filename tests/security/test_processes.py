@@ -18,7 +18,7 @@ from edp.cli.console import run_app
 from edp.errors import LostError
 from edp.sandbox.helpers import Helpers
 from edp.training.free_run import FreeRunDiverged
-from edp.training.free_run_members import member_died
+from edp.workflows.twin.fit_twin import member_died
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 # Two jobs that last for ever in a pool of two; the process says who works for it once both have begun.

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
-from edp.errors import LostError
 from edp.networks.twin import TwinScales
 from edp.networks.twin.recurrent import Recurrent, RecurrentTwin, averaged, member_seed
 from edp.networks.twin.static_map import StaticTwin
-from edp.sandbox.helpers import Helpers
 from edp.storage.runs import PARTS, KeyedRun, RunFolder
 from edp.training.free_run import FittedTwin, FreeRunProgress, FreeRunSpec, fit_free_runs
 
@@ -51,26 +49,19 @@ def trained_member(job: MemberTraining, on_event: Callable[[FreeRunProgress], No
         return fit_free_runs(*what, KeyedRun(folder, job.folder[1]))
 
 
-def train_members(
-    jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None, helpers: Helpers | None
+def one_by_one(
+    jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None
 ) -> Iterator[FittedTwin]:
-    """Train networks in helpers, side by side and without their progress, or in this process with it; in order.
+    """Train networks in this process, in order.
 
     Raises:
-        EdpError: see `fit_free_runs`, or a helper died.
+        EdpError: see `fit_free_runs`.
     """
-    if helpers is None or helpers.workers <= 1:
-        yield from (trained_member(job, on_event) for job in jobs)
-    else:
-        yield from helpers.ordered(trained_member, jobs)
+    return (trained_member(job, on_event) for job in jobs)
 
 
-def member_died(label: str) -> LostError:
-    """Error for the label of a training whose process died."""
-    return LostError(
-        f"a worker process died during '{label}' (out of memory, or stopped from outside; a calling script needs "
-        "`if __name__ == '__main__':`); run the same command again with fewer workers: it goes on where it stopped"
-    )
+TrainAll = Callable[[Sequence[MemberTraining], Callable[[FreeRunProgress], None] | None], Iterable[FittedTwin]]
+"""How several networks are trained: one by one as `one_by_one` does, or side by side."""
 
 
 def fit_members(
@@ -80,7 +71,7 @@ def fit_members(
     training: FreeRunSpec,
     on_event: Callable[[FreeRunProgress], None] | None = None,
     run: KeyedRun | None = None,
-    helpers: Helpers | None = None,
+    train_all: TrainAll = one_by_one,
 ) -> FittedTwin:
     """Train each member of a recurrent twin on free runs of its own, and average them.
 
@@ -91,7 +82,7 @@ def fit_members(
         training: how; the first member has its seed, the others one of their own.
         on_event: called with progress of each member in turn.
         run: folder and key of the run; where given, each member's training is resumable.
-        helpers: that train members side by side; none: one after the other.
+        train_all: how members are trained.
     """
     if form.members == 1:
         return fit_free_runs(form.member(*parts, training.seed), *series, training, on_event, run)
@@ -101,7 +92,7 @@ def fit_members(
         folder = None if run is None else (run.folder.path / PARTS / f"member_{which}", run.key)
         seeded = replace(training, seed=seed)
         jobs.append(MemberTraining(f"member {which + 1}", form.member(*parts, seed), *series, seeded, folder))
-    return joined_members(list(train_members(jobs, on_event, helpers)))
+    return joined_members(list(train_all(jobs, on_event)))
 
 
 def joined_members(fits: Sequence[FittedTwin]) -> FittedTwin:

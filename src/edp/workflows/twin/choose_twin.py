@@ -20,7 +20,7 @@ from edp.networks.twin.recurrent import Recurrent, member_seed
 from edp.report.twin.candidates import MOST_TEXT
 from edp.storage.runs import PARTS, KeyedRun, part_of
 from edp.training.free_run import FreeRunSpec
-from edp.training.free_run_members import MemberTraining, joined_members, train_members
+from edp.training.free_run_members import MemberTraining, joined_members
 from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
 
 LENGTHS = (0.05, 0.15, 0.45, 1.0)
@@ -47,7 +47,7 @@ AT = (0.1, 0.5, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class TwinTrial:
     """A formulation, fitted for each fold.
 
     Attributes:
@@ -76,7 +76,7 @@ class TwinCandidate:
 
     label: str
     seconds: float
-    trial: Trial | None = None
+    trial: TwinTrial | None = None
     error: float | None = None
     why: str = ""
     chosen: bool = False
@@ -216,7 +216,7 @@ class TwinChoice:
                 folder = (self.run.folder.path / PARTS / self._part(name, which), self.run.key)
                 seeded = replace(training, seed=seed)
                 jobs.append(MemberTraining(label, member, fold.train, fold.validation, seeded, folder))
-            for which, fit in zip(some, train_members(jobs, whole.on_event, whole.helpers), strict=True):
+            for which, fit in zip(some, whole.train_members(jobs, whole.on_event), strict=True):
                 self.fit.tell(f"trained {label}: fold {which + 1} of {len(self.folds)}")
                 yield FittedFormulation(form.alone(), fit)
 
@@ -266,10 +266,10 @@ class TwinChoice:
             why = str(problem)
         # Helpers, and a training that was read from an earlier start, took time of their own.
         seconds = max(sum(fit.fitted.seconds for fit in fits), time.process_time() - began)
-        trial = None if error is None else Trial(spec, tuple(fits), tuple(runs))
+        trial = None if error is None else TwinTrial(spec, tuple(fits), tuple(runs))
         return TwinCandidate(label, seconds, trial, error, why)
 
-    def _settled(self, trial: Trial) -> FittedFormulation:
+    def _settled(self, trial: TwinTrial) -> FittedFormulation:
         """The twin of all that may be learned from; intervals have what each fold left out."""
         first, several = trial.fits[0], len(trial.fits) > 1
         unseen = [(fit.fitted.twin, fold.validation) for fit, fold in zip(trial.fits, self.folds, strict=True)]

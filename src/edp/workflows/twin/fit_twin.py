@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from edp.config.twin import TwinExperiment
 from edp.data.prepared import Prepared
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.errors import LostError
 from edp.networks.twin import Twin, TwinScales, TwinSpec
 from edp.networks.twin.elements import ElementsTwin
 from edp.networks.twin.grey.datasheet import datasheet
@@ -21,7 +22,7 @@ from edp.sandbox.helpers import Helpers
 from edp.storage.runs import KeyedRun
 from edp.training.elements_fit import fit_elements
 from edp.training.free_run import FittedTwin, FreeRunProgress
-from edp.training.free_run_members import fit_members
+from edp.training.free_run_members import MemberTraining, fit_members, one_by_one, trained_member
 from edp.training.grey_fit import fit_grey_box
 from edp.training.residual_fit import fit_residual
 
@@ -80,7 +81,7 @@ class TwinFit:
             static = spec.static_map(self.channels, self.scales, self.data.train)
             shared = (self.channels, self.scales, static)
             training = self.experiment.training
-            fitted = fit_members(spec, shared, parts, training, self.on_event, run, self.helpers)
+            fitted = fit_members(spec, shared, parts, training, self.on_event, run, self.train_members)
             return FittedFormulation(spec, fitted)
         started = time.process_time()
         twin = spec.start(self.channels, self.scales, self.data.train, seed)
@@ -102,6 +103,18 @@ class TwinFit:
         fitted = FittedTwin(network.twin, grey.history + network.history, grey.seconds + network.seconds)
         return FittedFormulation(spec, fitted, numbers, {"residual": network.facts()})
 
+    def train_members(
+        self, jobs: Sequence[MemberTraining], on_event: Callable[[FreeRunProgress], None] | None
+    ) -> Iterable[FittedTwin]:
+        """Train networks side by side and without their progress, or one by one with it; in order.
+
+        Raises:
+            EdpError: see `fit_free_runs`, or a helper died.
+        """
+        if self.helpers is None or self.helpers.workers <= 1:
+            return one_by_one(jobs, on_event)
+        return self.helpers.ordered(trained_member, jobs)
+
     def refitted(self, first: FittedFormulation) -> FittedFormulation:
         """What needs no stretches to choose its weights, fitted anew to the validation part as well.
 
@@ -110,3 +123,11 @@ class TwinFit:
         data = replace(self.data, train=[*self.data.train, *self.data.validation])
         again = replace(self, data=data).fitted(first.spec, None)
         return replace(again, unseen=((first.fitted.twin, self.data.validation),))
+
+
+def member_died(label: str) -> LostError:
+    """Error for the label of a training whose process died."""
+    return LostError(
+        f"a worker process died during '{label}' (out of memory, or stopped from outside; a calling script needs "
+        "`if __name__ == '__main__':`); run the same command again with fewer workers: it goes on where it stopped"
+    )

@@ -22,10 +22,9 @@ from edp.sandbox.helpers import Helpers
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
 from edp.training.free_run import FittedTwin, FreeRunProgress
-from edp.training.free_run_members import member_died
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
-from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit
+from edp.workflows.twin.fit_twin import FittedFormulation, TwinFit, member_died
 from edp.workflows.twin.judge_twin import SCORES, judge_twin, write_scores
 from edp.workflows.twin.prepare_twin import driving_labels, prepare_twin, prepared_twin
 
