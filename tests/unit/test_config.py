@@ -13,6 +13,7 @@ from edp.config.experiment import (
     merged,
     plain_tree,
 )
+from edp.data.features import FG2
 from edp.data.task import TargetMode
 from edp.errors import ConfigError, DataError
 from edp.logs.repair import Repair
@@ -34,6 +35,17 @@ def test_presets_load_and_survive_a_round_trip(preset, tmp_path):
     experiment = load_experiment(preset=preset)
     again = load_experiment(saved(tmp_path, experiment_toml(experiment)))  # as a run folder is read
     assert plain_tree(again) == plain_tree(experiment)
+
+
+@pytest.mark.parametrize("preset", ["pressures", "positions"])
+def test_presets_of_other_targets_are_the_quick_one_with_these_beside_its_features(preset):
+    own, quick = load_experiment(preset=preset), load_experiment(preset="quick")
+    assert plain_tree(dataclasses.replace(own, task=quick.task)) == plain_tree(quick)
+    assert (own.task.horizons, own.task.mode) == (quick.task.horizons, quick.task.mode)
+    features, before = own.task.features, FG2
+    assert features.channels[: len(before.channels)] == before.channels
+    assert features.derived[: len(before.derived)] == before.derived
+    assert set(own.task.targets) <= set(features.channels)
 
 
 def test_every_registered_part_survives_a_round_trip(tmp_path):

@@ -1,6 +1,7 @@
 """Stretches divided for cross-validation: nothing lost, nothing on both sides, each part unbroken and named by rows."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -70,6 +71,15 @@ def test_parts_cut_too_short_are_in_neither_part():
     whole, cut = (stretch_folds(stretches([100, 110]), 5, 0, shortest, 0) for shortest in (1, 30))
     assert min(part.samples for fold in whole for part in fold.validation) < 30
     assert min(part.samples for fold in cut for part in (*fold.train, *fold.validation)) >= 30
+
+
+@pytest.mark.parametrize(
+    "name", ["log[²:5]", "log[3:]", "log[:", "[]", "]", "log[-3:4]", "log[3:9].csv", "x[" + "9" * 240 + ":5]"]
+)
+def test_any_file_name_is_a_name(name):
+    (series,) = stretches([100])
+    parts = [part for fold in stretch_folds([replace(series, name=name)], 2, 0, 1, 0) for part in fold.validation]
+    assert len({part.name for part in parts}) == len(parts) == 2
 
 
 def test_too_few_ticks_are_refused():

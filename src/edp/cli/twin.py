@@ -29,8 +29,8 @@ def twin(
     """Train a plant model that runs on commands alone: velocities, strokes and pressures over a minute.
 
     Without settings, several formulations are fitted, and free runs that the fits had not seen choose; twin.kind names
-    one.
-    Judged on held-out recordings beside a static valve map and ARX. Ends with exit code 4 where the training diverged.
+    one. Judged on held-out recordings beside a static valve map and ARX. Ends with exit code 4 where the training
+    diverged.
 
     Example: `edp twin data/m22 --out runs/twin`
     """

@@ -191,7 +191,7 @@ def read_layers(path: str | Path | None = None, overrides: Sequence[Change] = ()
 
 
 def preset_table(name: str) -> Table:
-    """The table of a preset.
+    """The table of a preset, laid over that of its `base` where it names one.
 
     Raises:
         ConfigError: there is none of this name.
@@ -199,7 +199,9 @@ def preset_table(name: str) -> Table:
     if name not in (*PRESETS, AUTO):
         raise ConfigError(f"there is no preset '{name}'{closest(name, (*PRESETS, AUTO))}")
     text = resources.files("edp.config").joinpath(f"presets/{name}.toml").read_text(encoding="utf-8")
-    return storage.parse_toml(text, f"preset '{name}'", ConfigError)
+    table = storage.parse_toml(text, f"preset '{name}'", ConfigError)
+    base = table.pop("base", None)
+    return table if base is None else merged(preset_table(str(base)), table)
 
 
 def experiment_toml(experiment: Experiment) -> str:

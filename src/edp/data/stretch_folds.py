@@ -63,7 +63,8 @@ def _part(whole: Series, start: int, stop: int) -> Series:
     name, bracket, rows = whole.name.removesuffix("]").rpartition("[")
     before = rows.partition(":")[0]
     offset = 0
-    if bracket and whole.name.endswith("]") and before.isdigit():
+    # A file may be called `log[²:5]`: digits of which int() makes no number.
+    if bracket and whole.name.endswith("]") and before.isdecimal():
         offset = int(before)
     else:
         name = whole.name

@@ -116,7 +116,7 @@ def test_without_a_formulation_the_best_of_several_is_chosen_and_told(edp, logs,
 def test_any_number_of_workers_trains_the_same_twin(edp, logs, tmp_path):
     words = ["--set", "twin.candidates=['recurrent']", "--set", "twin.folds=2", *WORDS[4:]]
     rows, arrays = [], []
-    for workers in (1, 2):
+    for workers in (1, 10**12):  # as many as there is something to do for
         ended = edp("twin", logs, "--out", tmp_path / f"run_{workers}", *words, "--workers", workers, "--json")
         rows.append([row | {"seconds": 0.0} for row in ended.json["candidates"]])
         arrays.append(load_twin(tmp_path / f"run_{workers}").twin.arrays())

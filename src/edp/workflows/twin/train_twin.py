@@ -17,6 +17,7 @@ from edp.logs.source import DataSource
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey.datasheet import BASIS, datasheet_text
 from edp.networks.twin.kinds import AutoTwin
+from edp.networks.twin.recurrent import MOST_MEMBERS
 from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
 from edp.storage import write_bytes, write_json
@@ -78,7 +79,7 @@ def train_twin(
     channels, data = prepared_twin(recordings, experiment)
     labels = driving_labels(recordings)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment)}, data.digest)
-    with RunFolder(out) as run, Helpers(workers or os.cpu_count() or 1, member_died) as helpers:
+    with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
@@ -100,6 +101,11 @@ def train_twin(
         save_twin(bundle, run.file(FOLDER))
         run.write_status("finished")
     return TrainedTwin(bundle, scores, False)
+
+
+def _helpers(workers: int) -> int:
+    """Processes that have something to do: no average has more members."""
+    return min(workers or os.cpu_count() or 1, MOST_MEMBERS)
 
 
 def _chosen(fit: TwinFit, run: KeyedRun) -> FittedFormulation:
