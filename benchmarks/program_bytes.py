@@ -17,7 +17,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -162,10 +162,22 @@ def kernels() -> tuple[dict[str, int], dict[str, list[str]]]:
                 "image.elf",
             )
             lines = run(folder, "arm-none-eabi-nm", "-S", "image.elf").splitlines()
-            symbols = [line.split() for line in lines if re.search(r" [tTrR] \S+$", line) and len(line.split()) == 4]
-            needs[function] = sorted(name for _, _, _, name in symbols)
-            sizes |= {name: words(int(size, 16)) for _, size, _, name in symbols}
+            symbols = distinct([line.split() for line in lines if re.search(r" [tTrR] \S+$", line)])
+            needs[function] = sorted(symbols)
+            sizes |= symbols
     return sizes, needs
+
+
+def distinct(symbols: Sequence[Sequence[str]]) -> dict[str, int]:
+    """Bytes by name of symbols ``(address, size, kind, name)`` that do not lie within another one, as aliases do."""
+    sized = [(int(row[0], 16), int(row[1], 16), row[3]) for row in symbols if len(row) == 4]
+    sizes, end = {}, 0
+    # Double precision of the compiler's library: subtraction goes on into addition, each under two names.
+    for start, size, name in sorted(sized, key=lambda one: (one[0], -one[1], one[2])):
+        if start + size > end:
+            sizes[name] = words(size)
+            end = start + size
+    return sizes
 
 
 def write_kernels() -> None:
@@ -173,7 +185,9 @@ def write_kernels() -> None:
     sizes, needs = kernels()
     version = run(ROOT, COMPILER, "--version").splitlines()[0]
     lines = [HEAD.format(version=version, flags=" ".join(FLAGS)), "[bytes]"]
-    lines += [f"{name} = {size}" for name, size in sorted(sizes.items())]
+    # The compiler's copies of a function have a dot in their names, which TOML would read as a table's.
+    keys = {name: f'"{name}"' if "." in name else name for name in sizes}
+    lines += [f"{keys[name]} = {size}" for name, size in sorted(sizes.items())]
     lines += ["", "[needs]", *(f"{name} = {symbols}".replace("'", '"') for name, symbols in sorted(needs.items()))]
     KERNELS.write_text("\n".join(lines) + "\n")
 

@@ -38,6 +38,11 @@ def in_layers(name: str) -> bool:
 LOWERED = [ON_A_MAP, *(name for name in TWINS if in_layers(name))]
 
 
+C_ALONE = ("greybox", "residual")
+REFUSED = {"onnx": "has no form in ONNX", "casadi": "has no form in CasADi"}
+"""Forms without Newton's method, which a grey box needs."""
+
+
 def plant_of(name: str, sensors: str = "all") -> TwinPlant:
     return TwinPlant(sample_twin(SPECS.get(name) or TWINS[name](), sample_actuators(**SENSORS[sensors]))[0], name)
 
@@ -74,7 +79,11 @@ def test_a_free_run_of_the_plant_is_the_rollout_of_the_twin(name):
         measured[:prefix], twin.scales.low, twin.scales.high
     )
     free, _ = twin.rollout(commands[None, prefix:], state)
-    assert np.array_equal(stream(plant, rows)[prefix:], free[0])
+    if name in C_ALONE:
+        # Lags of valves forget by an exponential, so a trace of the start is left.
+        assert deviations(plant, stream(plant, rows)[prefix:], free[0]) < 1e-5
+    else:
+        assert np.array_equal(stream(plant, rows)[prefix:], free[0])
 
 
 @pytest.mark.parametrize("name", LOWERED)
@@ -99,8 +108,12 @@ def test_the_feedback_edge_is_a_slot_that_an_answer_writes():
 
 @pytest.mark.parametrize("target", list(TARGETS))
 @pytest.mark.parametrize("name", LOWERED)
-def test_every_form_writes_a_twin(name, target, tmp_path):
-    assert refusal_of(target, bundle_of(name), tmp_path / "made", QUICK.get(target)) == ""
+def test_every_form_writes_a_twin_or_says_why_not(name, target, tmp_path):
+    refusal = refusal_of(target, bundle_of(name), tmp_path / "made", QUICK.get(target))
+    if name in C_ALONE and target in REFUSED:
+        assert f"'cell.machine' is a HydraulicTick, which {REFUSED[target]}; these have:" in refusal
+    else:
+        assert refusal == ""
 
 
 @pytest.mark.parametrize("target", list(TARGETS))

@@ -10,6 +10,7 @@ import pytest
 
 from edp.errors import ConfigError, ExportError
 from edp.export import make_target
+from edp.export.c.tangents import differentiable
 from edp.export.golden import grown_tolerance, random_inputs, stream
 from edp.ir.reference import Reference
 from edp.networks.input_range import usual_range
@@ -36,6 +37,7 @@ def in_layers(name: str) -> bool:
 
 
 LOWERED = [ON_A_MAP, *(name for name in TWINS if in_layers(name))]
+EQUATIONS = ("greybox", "residual")
 
 
 def twin_of(name, hostile=False):
@@ -53,8 +55,9 @@ def twin_of(name, hostile=False):
 
 def built(c, bundle, folder, program, *flags):
     c.need("gcc")
-    make_target("c", {"tangent": True}).write(bundle, "predictor", folder)
-    own = [*c.sources(folder), "predictor_tangent.c", program]
+    tangent = differentiable(bundle.predictor.graph())
+    make_target("c", {"tangent": tangent}).write(bundle, "predictor", folder)
+    own = [*c.sources(folder), *(["predictor_tangent.c"] if tangent else []), program]
     c.run("gcc", *c.flags, *flags, "-I", folder, *dict.fromkeys(own), "-lm", "-o", "program", folder=folder)
     return folder / "program"
 
@@ -84,7 +87,15 @@ def test_a_state_space_model_has_no_integers():
         in_integers(twin_of("n4sid"), Recordings())
 
 
-@pytest.mark.parametrize("name", [name for name in LOWERED if name != "n4sid"])
+@pytest.mark.parametrize("name", EQUATIONS)
+def test_equations_have_neither_integers_nor_tangents(name, tmp_path):
+    with pytest.raises(ExportError, match=r"HydraulicTick.*integer arithmetic; its equations need double precision"):
+        in_integers(twin_of(name), Recordings())
+    with pytest.raises(ExportError, match=r"'cell\.machine' is a HydraulicTick, which has no tangent in C"):
+        make_target("c", {"tangent": True}).write(twin_of(name), "predictor", tmp_path)
+
+
+@pytest.mark.parametrize("name", [name for name in LOWERED if name not in ("n4sid", *EQUATIONS)])
 def test_integers_are_those_of_the_reference(c, name, tmp_path):
     bundle = twin_of(name)
     whole = in_integers(bundle, Recordings())

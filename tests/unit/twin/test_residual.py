@@ -1,5 +1,6 @@
 """A network on top of a grey box: the adjoint through both, the grey box itself where the network answers zero."""
 
+import copy
 from dataclasses import fields, replace
 
 import numpy as np
@@ -8,9 +9,10 @@ import torch
 
 from edp.config.twin import load_twin_experiment, twin_toml
 from edp.data.series import Series
-from edp.errors import ConfigError, ExportError
+from edp.errors import ConfigError
 from edp.evaluation.free_run import FreeRunJudgeSpec, free_run_scores, free_runs
-from edp.networks.twin import fit_scales
+from edp.export.golden import random_inputs, stream
+from edp.networks.twin import TwinPlant, fit_scales
 from edp.networks.twin.greybox import GreyBox
 from edp.networks.twin.residual import Residual
 from edp.testing.twins import sample_actuators, sample_twin
@@ -162,7 +164,7 @@ def test_settings_come_back_and_what_cannot_be_is_refused(tmp_path):
         Residual(updates=(1, 2))
 
 
-def test_it_comes_back_from_disk_and_is_exported_to_nothing(tmp_path):
+def test_it_comes_back_from_disk_and_its_layers_are_a_network_on_a_grey_box(tmp_path):
     spec = Residual(units=UNITS)
     twin, commands, measured = sample_twin(spec)
     twin = drawn(twin, 0.3)
@@ -170,5 +172,8 @@ def test_it_comes_back_from_disk_and_is_exported_to_nothing(tmp_path):
     again = load_twin(tmp_path).twin
     answers = [each.rollout(commands, each.initial_state(commands[:, 0], measured[:, 0]))[0] for each in (twin, again)]
     assert np.array_equal(*answers)
-    with pytest.raises(ExportError, match="ResidualTwin has no form as a list of layers; run it with edp rollout"):
-        twin.graph()
+    plant = TwinPlant(twin, "a network on a grey box")
+    rows = random_inputs(plant, 120, seed=4)
+    exact = stream(copy.deepcopy(plant).double(), rows)
+    assert np.abs((stream(plant, rows) - exact) / twin.scales.answer_width).max() < 1e-4
+    assert np.abs(stream(TwinPlant(twin.without_network(), ""), rows) - exact).max() > 1e-2

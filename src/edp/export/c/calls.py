@@ -11,6 +11,7 @@ from edp.export.c.text import call, identifier, number
 from edp.export.escape import c_comment
 from edp.ir import Graph, Layer, layers, memory
 from edp.ir.base import INPUT, Number
+from edp.ir.hydraulics import HydraulicTick
 from edp.ir.layers import runs as neighbours
 from edp.ir.w8a16.layers import QGather
 
@@ -189,6 +190,21 @@ def _feed(calls: Calls, layer: memory.Feed) -> list[str]:
     return [call("edp_copy", calls.value(source), calls.graph.width_of(source), slot(layer.into, "last"))]
 
 
+def _hydraulics(calls: Calls, layer: HydraulicTick) -> list[str]:
+    commands, fed = (calls.value(name) for name in layer.inputs)
+    past = ", ".join(slot(layer, part.name) for part in layer.slots)
+    machine = f"&{identifier(layer.name)}_machine"
+    tick = call("edp_hydraulic_tick", commands, fed, machine, "&past", "room", calls.value(layer.name))
+    # Stiff equations need double precision; their room is on the stack, as nothing in it is kept.
+    return [
+        "{",
+        f"    double room[{layer.room}];",
+        f"    const edp_hydraulic_state past = {{{past}}};",
+        f"    {tick}",
+        "}",
+    ]
+
+
 CALLS: dict[type[Layer], Write] = {
     layers.Gather: _gather,
     layers.Standardise: lambda c, x: c.simple(x, "edp_standardise", x.width),
@@ -203,6 +219,7 @@ CALLS: dict[type[Layer], Write] = {
     layers.TreeSums: lambda c, x: c.simple(x, "edp_trees", *x.leaf.shape[:2], x.depth),
     layers.LayerNorm: _norm,
     layers.RowAttention: lambda c, x: c.simple(x, "edp_row_attention", x.rows, x.size, c.scratch(x)),
+    HydraulicTick: _hydraulics,
     memory.Difference: _difference,
     # The correction is added behind a condition, since the runtime says when the prefix has ended.
     memory.Starting: lambda c, x: c.simple(x, "edp_starting", len(x.mean), x.ticks, ring(x)),
@@ -240,6 +257,13 @@ def structs(layer: Layer) -> list[str]:
         parts = [at[key] for key in ("first_weight", "first_bias", "second_weight", "second_bias")]
         sizes = [f"{len(layer.first_bias)}u", f"{len(layer.second_bias)}u", f"{layer.ticks}u"]
         return [f"static const edp_prefix_weights {name}_weights = {{{', '.join([*parts, *sizes])}}};"]
+    if isinstance(layer, HydraulicTick):
+        counts = (
+            *(*layer.sizes, len(layer.ports), len(layer.knots), len(layer.exponents), layer.powers),
+            *(layer.remembered, layer.steps, *layer.load, layer.circuit),
+        )
+        machine = ", ".join([*at.values(), *(f"{count}u" for count in counts), number(layer.tick_s)])
+        return [f"static const edp_hydraulics {name}_machine = {{{machine}}};"]
     return []
 
 

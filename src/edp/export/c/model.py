@@ -19,11 +19,13 @@ from edp.export.hashes import little_endian, model_hash, scale_hash
 from edp.export.sizes import MOST_COLUMNS, check_numbers, check_sizes
 from edp.ir import Graph, Layer, memory
 from edp.ir.base import Number
+from edp.ir.hydraulics import HydraulicTick
 from edp.networks.input_range import HOLD_TICKS, LIMIT, input_limits
 from edp.networks.integer import IntegerPredictor
 from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
+HYDRAULICS = ("edp_hydraulics.h", "edp_hydraulics.c")
 CLIPPED = Code("    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n")
 COUNTED = (
     memory.Difference,
@@ -75,9 +77,15 @@ class Model:
         return isinstance(self.bundle.predictor, IntegerPredictor)
 
     @property
+    def hydraulic(self) -> bool:
+        """Whether one of its layers is a grey box."""
+        return any(isinstance(layer, HydraulicTick) for layer in self.graph.layers)
+
+    @property
     def runtime(self) -> tuple[str, ...]:
         """Files of the runtime that it needs."""
         more: tuple[str, ...] = integer_calls.FILES if self.integer else ()
+        more += HYDRAULICS if self.hydraulic else ()
         more += () if self.changes is None else tangents.FILES
         return RUNTIME + more + (adaptation.FILES if self.adapts else ())
 
@@ -88,6 +96,11 @@ class Model:
         own += () if self.changes is None else (f"{self.name}_tangent.c",)
         own += (f"{self.name}_adaptation.c",) if self.adapts else ()
         return own + tuple(name for name in self.runtime if name.endswith(".c"))
+
+    @property
+    def _header(self) -> str:
+        """Header of the runtime that includes all others which it needs."""
+        return "edp_integer.h" if self.integer else (HYDRAULICS[0] if self.hydraulic else RUNTIME[0])
 
     def weights(self) -> str:
         """The file of constants."""
@@ -126,7 +139,7 @@ class Model:
             "format": self.bundle.predictor.number_format,
             "flash": total_bytes(constants_of(self.graph, self.plan)),
             "ram": self.state_bytes(),
-            "runtime": "edp_integer.h" if self.integer else "edp_runtime.h",
+            "runtime": self._header,
             "counters": CLIPPED if self.integer else "",
             "clear_counters": Code("    s->clipped = 0u;\n") if self.integer else "",
             "sources": " ".join(self.sources),

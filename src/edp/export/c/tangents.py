@@ -297,3 +297,8 @@ TANGENTS: dict[type[Layer], Write] = {
     memory.PrefixCorrection: _prefix,
 }
 """By kind of layer."""
+
+
+def differentiable(graph: Graph) -> bool:
+    """Whether every layer has a tangent."""
+    return all(type(layer) in TANGENTS for layer in graph.layers)

@@ -14,6 +14,7 @@ from pathlib import Path
 from edp.errors import ExportError
 from edp.export.base import TARGETS
 from edp.export.c.model import Model, make_model
+from edp.export.c.tangents import differentiable
 from edp.export.c.target import check_name, core_files
 from edp.export.description import Description, as_json
 from edp.export.escape import Code, c_string, fill, visible
@@ -52,7 +53,8 @@ class FmuTarget:
     Attributes:
         version: of FMI: 2, 3 or both.
         binaries: shared libraries beside the sources: linux64, win64, both or none.
-        derivatives: with directional derivatives, float32 only; a second copy of the weights is in the code for them.
+        derivatives: with directional derivatives, float32 only and not of grey boxes; a second copy of the weights is
+            in the code for them.
     """
 
     version: str = "both"
@@ -68,8 +70,7 @@ class FmuTarget:
     def write(self, bundle: Bundle, name: str, folder: Path) -> list[Path]:
         """See `edp.export.ExportTarget`."""
         check_name(name)
-        # A staircase of integers has no derivative.
-        tangent = self.derivatives and not isinstance(bundle.predictor, IntegerPredictor)
+        tangent = self.derivatives and _differentiable(bundle)
         model, versions = make_model(name, bundle, tangent), VERSIONS[self.version]
         listed = variables(model)
         core, plumbing = core_files(model), _plumbing(*COMMON, *(file for v in versions for file in OWN[v]))
@@ -85,6 +86,11 @@ class FmuTarget:
             content = _files(version, about, sources, Description(name, bundle, model.graph))
             files[f"{name}_fmi{version}.fmu"] = _packed(content | built[version])
         return write_export(folder, files)
+
+
+def _differentiable(bundle: Bundle) -> bool:
+    """Whether directional derivatives can be given: a staircase of integers has none, nor a grey box's C code."""
+    return not isinstance(bundle.predictor, IntegerPredictor) and differentiable(bundle.predictor.graph())
 
 
 def _files(version: int, about: About, sources: Mapping[str, str], described: Description) -> dict[str, bytes]:

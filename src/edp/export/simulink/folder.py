@@ -78,8 +78,8 @@ class Folder:
 
     @property
     def native(self) -> Native | None:
-        """The network as MATLAB code; there is none in integer arithmetic."""
-        return None if self.model.integer else Native(self.model.graph)
+        """The network as MATLAB code; there is none in integer arithmetic and of a grey box."""
+        return None if self.model.integer or self.model.hydraulic else Native(self.model.graph)
 
     def content(self) -> dict[str, Any]:
         """The description as plain values."""
@@ -241,6 +241,10 @@ class Folder:
         missing = "" if self.window else "\n\nThe ONNX window is not in this folder."
         if self.model.integer:
             missing = "\n\nThe network computes in integer arithmetic: C code only, no plain MATLAB code and no ONNX."
+        elif self.native is None:
+            missing = (
+                "\n\nThe equations of a grey box are solved by C code only: there is no plain MATLAB code of them."
+            )
         first = f" `{name}_golden` then compares the plain MATLAB code with PyTorch."
         return {
             "first_check": Code(first) if self.native is not None else "",

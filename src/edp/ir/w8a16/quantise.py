@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edp.errors import ExportError
 from edp.ir import layers, memory
 from edp.ir.base import INPUT, Graph, Layer, Number
+from edp.ir.hydraulics import HydraulicTick
 from edp.ir.layers import BinaryOperation, Function
 from edp.ir.w8a16 import arithmetic as fixed
 from edp.ir.w8a16 import layers as quantised
@@ -26,8 +27,9 @@ from edp.ir.w8a16.rows import halves, rows, to_gates
 
 Ranges = Mapping[str, float]
 """Largest magnitude of each value, and of each slot as ``layer/slot``."""
-REFUSED = {
+REFUSED: dict[type[Layer], str] = {
     memory.LayerNormLstm: "train with the cell 'lstm', or export in float32",
+    HydraulicTick: "its equations need double precision: export in float32",
     memory.PrefixCorrection: "train with the initial state 'zero' or 'learned', or export in float32",
 }
 

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError, closest
+from edp.ir import Builder
 from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState
 from edp.networks.twin.grey import layout as at
+from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
 from edp.networks.twin.grey.correction import Cell, Trace
 from edp.networks.twin.grey.elements import (
     CylinderElement,
@@ -23,6 +25,7 @@ from edp.networks.twin.grey.elements import (
     default_elements,
 )
 from edp.networks.twin.grey.fit_spec import GreyFitSpec
+from edp.networks.twin.grey.lowering import add_layer
 from edp.networks.twin.grey.numbers import KNOTS, LEFT_OUT, NumberTable, Travel, number_table
 from edp.networks.twin.grey.run import run_lanes
 from edp.networks.twin.grey.start import load_start
@@ -241,17 +244,6 @@ class RunTarget:
     normal: tuple[Doubles, Doubles, Doubles]
 
 
-EMPTY = (np.zeros((0, 0)), np.zeros(0), np.zeros(0))
-
-
-def _singles(*dimensions: int) -> tuple[Array, ...]:
-    return tuple(np.zeros((0,) * count, np.float32) for count in dimensions)
-
-
-NO_CELL: Cell = (*_singles(3, 2, 2, 2, 1, 2, 1), *EMPTY[1:], np.zeros(0), np.zeros(0, np.int64))  # type: ignore[assignment]
-NO_TRACE: Trace = _singles(3, 3, 3, 3, 3, 4, 2)  # type: ignore[assignment]
-
-
 class GreyTwin(Twin):
     """State: ``answer`` in SI units, and in units of `edp.networks.twin.grey.layout` what the elements remember."""
 
@@ -364,13 +356,16 @@ class GreyTwin(Twin):
     ) -> None:
         """`edp.networks.twin.grey.run.run_lanes` with these elements: a free run, or the errors of one."""
         nothing = np.zeros((0, 0, 0))
-        judged = judge or RunTarget(nothing, np.zeros(len(self.wiring.ports)), 1.0, (0, 0, 1), EMPTY)
+        judged = judge or RunTarget(nothing, np.zeros(len(self.wiring.ports)), 1.0, (0, 0, 1), NO_SUMS)
         limits = (self.scales.low / self.units, self.scales.high / self.units, self.units)
         run_lanes(
             demands, measured, judged.truth, state, judged.counts, (judged.weight, judged.delta), limits,
             (numbers, KNOTS, *self.wiring.z_of), self.form, self.wiring.ports, self.table.places, self.table.exponents,
             self.time, full, nothing if answers is None else answers, judged.normal, *network,
         )  # fmt: skip
+
+    def lower(self, build: Builder, commands: str, fed: str) -> str:
+        return add_layer(build, self, fed)
 
     def arrays(self) -> dict[str, Array]:
         return self.scales.arrays() | {"numbers": self.numbers.astype(np.float32), "full": self.full}

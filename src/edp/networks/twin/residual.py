@@ -13,6 +13,9 @@ from torch.autograd.function import once_differentiable
 
 from edp.data.twin_channels import TwinChannels
 from edp.errors import ConfigError
+from edp.ir import Builder
+from edp.ir.layers import BinaryOperation, Dense, ScaleShift
+from edp.ir.memory import Gru
 from edp.networks.twin.base import TWINS, TwinState, solved_columns
 from edp.networks.twin.grey.correction import Cell, Trace, run_back
 from edp.networks.twin.greybox import Doubles, GreyBox, GreyTwin
@@ -151,6 +154,27 @@ class ResidualTwin(GreyTwin):
         fed = np.where(port.numpy() > 0, fed, np.float32(np.nan)).swapaxes(0, 1)
         result = _Corrected.apply(projected, *network.looped, self, inputs, fed, port.numpy())  # type: ignore[no-untyped-call]
         return torch.as_tensor(result)
+
+    def lower(self, build: Builder, commands: str, fed: str) -> str:
+        solved, scales = solved_columns(self.channels), self.scales
+        arrays = {name: weight.detach().numpy() for name, weight in self.network.named_parameters()}
+        grey, before = super().lower(build, commands, fed), build.pick("before", fed, solved)
+        unit = (scales.change_width / scales.answer_width)[solved]
+        own = build.combine("own_change", BinaryOperation.SUBTRACT, grey, before)
+        change = build.add(ScaleShift, "scaled_change", own, gain=1.0 / unit, shift=np.zeros(len(solved)))
+        inner = arrays["inner_bias"]
+        h = build.add(
+            Gru,
+            "memory",
+            build.join("read", commands, fed, change),
+            weight_x=np.concatenate([arrays["command_weight"], arrays["feedback_weight"].T], axis=1),
+            weight_h=arrays["h_weight"].T,
+            bias_x=arrays["bias"],
+            bias_h=np.concatenate([np.zeros(2 * len(inner), np.float32), inner]),
+        )
+        weight, bias = unit[:, None] * arrays["out_weight"].T, unit * arrays["out_bias"]
+        correction = build.add(Dense, "correction", h, weight=weight, bias=bias)
+        return build.combine("corrected", BinaryOperation.ADD, grey, correction)
 
     def arrays(self) -> dict[str, Array]:
         weights = {name: weight.detach().numpy().copy() for name, weight in self.network.named_parameters()}

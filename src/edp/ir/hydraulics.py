@@ -1,0 +1,112 @@
+"""The layer of a grey box: one tick of pumps, valves, cylinders and their load as differential equations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.ir.base import Array, Indices, Layer, Slot
+
+NONE = 2**16 - 1
+"""Entry of a table of places: there is no such thing."""
+VALVE_STATES = 5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HydraulicTick(Layer):
+    """Velocities and pressures after a tick, scaled as the answers are, from commands in SI units and what ports read.
+
+    The equations are those of `edp.networks.twin.grey`, in double precision; what is carried on is single precision.
+    Units within are m, s, MPa, MN and Gg. Places are those of numbers in `numbers`, `NONE` where there is none.
+
+    Attributes:
+        numbers: of the machine.
+        full: the largest command of each valve.
+        knots: of all opening curves.
+        middle: of each stroke; `scale` from a stroke to -1..1, 0 where it is not measured.
+        scale: see there.
+        offset: of each answer, in units within; `answer_width` likewise.
+        answer_width: see there.
+        sides: commands that extend and retract ``(valve, 2)``.
+        valve_at: places of each valve's numbers ``(valve, 13)``.
+        valve_actuator: of each valve.
+        valve_pump: of each valve; `NONE`: it is fed at constant pressure.
+        actuator_at: places of each actuator's numbers.
+        pump_at: places of each pump's; without any, one entry `NONE`.
+        ports: velocity 0, stroke 1 or pressure 2, and which ``(answer, 2)``.
+        exponents: of the load's monomials ``(term, actuator)``.
+        load: places of the first coefficient of the inertia's root and of the potential, and coefficients of each entry
+            of the root between them.
+        circuit: place of the circuit's numbers.
+        remembered: ticks of demands.
+        steps: implicit steps in a tick.
+        tick_s: length of a tick.
+    """
+
+    numbers: Array
+    full: Array
+    knots: Array
+    middle: Array
+    scale: Array
+    offset: Array
+    answer_width: Array
+    sides: Indices
+    valve_at: Indices
+    valve_actuator: Indices
+    valve_pump: Indices
+    actuator_at: Indices
+    pump_at: Indices
+    ports: Indices
+    exponents: Indices
+    load: tuple[int, int, int]
+    circuit: int
+    remembered: int
+    steps: int
+    tick_s: float
+
+    @property
+    def width(self) -> int:
+        return int((self.ports[:, 0] != 1).sum())
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Actuators, valves and pumps."""
+        return len(self.actuator_at), len(self.full), int((self.pump_at != NONE).sum())
+
+    @property
+    def unknown(self) -> int:
+        """Pressures and velocities that an implicit stage solves for."""
+        actuators, _, pumps = self.sizes
+        return 3 * actuators + pumps
+
+    @property
+    def powers(self) -> int:
+        """Powers of a stroke in the load: its degree and one."""
+        return int(self.exponents.max(initial=0)) + 1
+
+    @property
+    def slots(self) -> tuple[Slot, ...]:
+        actuators, valves, pumps = self.sizes
+        return (
+            Slot("pressures_and_velocities", (self.unknown,)),
+            Slot("strokes", (actuators,)),
+            Slot("bristles", (actuators,)),
+            # C has no empty arrays.
+            Slot("displacements", (max(pumps, 1),)),
+            Slot("valves", (valves, VALVE_STATES)),
+            Slot("history", (self.remembered, valves)),
+        )
+
+    @property
+    def macs(self) -> int:
+        """Of one factorisation and one assembly of the network a stage: the least that a tick takes."""
+        size = self.unknown
+        return 2 * self.steps * (size * (size + 1) * (2 * size + 1) // 6 + 4 * len(self.knots) * len(self.full))
+
+    @property
+    def room(self) -> int:
+        """Double-precision numbers that a tick works in, as the C code divides them."""
+        n, valves, pumps = self.sizes
+        nodes, terms = self.unknown + 2 - n, len(self.exponents)
+        network = 4 * self.unknown + self.unknown**2 + 2 * nodes + nodes**2
+        load = 13 * n + 3 * n**2 + n**3 + terms * (1 + n) + 2 * n * self.powers
+        return network + load + valves * (1 + VALVE_STATES) + 2 * pumps

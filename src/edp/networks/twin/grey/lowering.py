@@ -1,0 +1,129 @@
+"""A grey box as a layer: its constants, its state after a reset, and what a tick of it means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.ir import Builder
+from edp.ir.base import INPUT
+from edp.ir.builder import indices
+from edp.ir.hydraulics import NONE, HydraulicTick
+from edp.ir.reference import STEPS
+from edp.networks.twin.grey.absent import NO_CELL, NO_SUMS, NO_TRACE
+from edp.networks.twin.grey.numbers import KNOTS
+from edp.networks.twin.grey.run import run_lanes
+
+if TYPE_CHECKING:
+    from edp.networks.twin.greybox import GreyTwin
+
+Values = NDArray[np.floating]
+
+
+def add_layer(build: Builder, twin: GreyTwin, fed: str) -> str:
+    """Add the layer of a twin; after a reset it rests at the means of the training data.
+
+    Args:
+        build: the layers in the making.
+        twin: whose tick it is.
+        fed: what the ports read, scaled.
+    """
+    table, wiring, scales = twin.table, twin.wiring, twin.scales
+    tick_s, steps = twin.time
+    inertia, per_entry, potential, circuit = (int(first) for first in table.places)
+    rest = twin.initial_state(scales.command_offset[None], scales.answer_offset[None])
+    commands = build.pick("commands", INPUT, range(len(twin.channels.commands)))
+    before = len(build.layers)
+    name = build.add(
+        HydraulicTick,
+        "machine",
+        commands,
+        fed,
+        numbers=twin.numbers,
+        full=twin.full,
+        knots=KNOTS,
+        middle=wiring.z_of[0],
+        scale=wiring.z_of[1],
+        offset=scales.answer_offset / twin.units,
+        answer_width=scales.answer_width / twin.units,
+        sides=_places(wiring.sides),
+        valve_at=_places(table.valve_at),
+        valve_actuator=_places(wiring.actuator),
+        valve_pump=_places(wiring.pump),
+        actuator_at=_places(table.actuator_at),
+        pump_at=_places(table.pump_at if len(table.pump_at) else [-1]),
+        ports=_places(wiring.ports),
+        exponents=_places(table.exponents),
+        load=(inertia, per_entry, potential),
+        circuit=circuit,
+        remembered=rest["history"].shape[1],
+        steps=steps,
+        tick_s=tick_s,
+    )
+    slots = build.slots_since(before)
+    build.start_from(slots, np.concatenate([_padded(rest[slot.name].ravel(), slot.size) for _, slot in slots]))
+    return name
+
+
+def _padded(values: Values, size: int) -> Values:
+    return np.pad(values, (0, size - len(values)))
+
+
+def _places(values: Any) -> NDArray[np.uint16]:
+    """A table of places with `NONE` for what is not there."""
+    return indices(np.where(np.asarray(values) < 0, NONE, values))
+
+
+def _signed(values: NDArray[np.uint16]) -> NDArray[np.int64]:
+    whole = values.astype(np.int64)
+    return np.where(whole == NONE, -1, whole)
+
+
+def _tick(
+    layer: HydraulicTick, w: Mapping[str, Values], memory: dict[str, Values], commands: Values, fed: Values
+) -> Values:
+    """One tick of the layer by the compiled kernel of the twin, without bounds on what it answers."""
+    values = {name: np.asarray(array, np.float64) for name, array in w.items()}
+    sides, ports = _signed(layer.sides), _signed(layer.ports)
+    demand = commands[sides[:, 0]] - np.where(sides[:, 1] >= 0, commands[sides[:, 1]], 0.0)
+    demand = np.clip(np.asarray(demand / values["full"], np.float32), -1.0, 1.0)
+    measured = values["offset"] + values["answer_width"] * fed
+    state = [np.array(memory[slot.name], np.float64)[None] for slot in layer.slots]
+    pumps = layer.sizes[2]
+    state[3] = state[3][:, :pumps]
+    answers, unbounded = np.empty((1, 1, len(ports))), np.full(len(ports), np.inf)
+    inertia, per_entry, potential = layer.load
+    run_lanes(
+        np.array(demand, np.float64)[None, None],
+        measured[None, None],
+        np.zeros((0, 0, 0)),
+        (np.zeros((1, len(ports))), *state),
+        (0, 0, 1),
+        (np.zeros(len(ports)), 1.0),
+        (-unbounded, unbounded, np.ones(len(ports))),
+        (values["numbers"], values["knots"], values["middle"], values["scale"]),
+        tuple(_signed(table) for table in (layer.valve_at, layer.valve_actuator, layer.valve_pump)) + _places_of(layer),
+        ports,
+        (inertia, per_entry, potential, layer.circuit),
+        _signed(layer.exponents),
+        (layer.tick_s, layer.steps),
+        False,
+        answers,
+        NO_SUMS,
+        NO_CELL,
+        NO_TRACE,
+    )
+    for slot, value in zip(layer.slots, state, strict=True):
+        memory[slot.name] = _padded(value[0], slot.size) if slot.shape != value[0].shape else value[0]
+    scaled = (answers[0, 0] - values["offset"]) / values["answer_width"]
+    return np.asarray(scaled[ports[:, 0] != 1], commands.dtype)
+
+
+def _places_of(layer: HydraulicTick) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return _signed(layer.actuator_at), _signed(layer.pump_at[: layer.sizes[2]])
+
+
+STEPS[HydraulicTick] = _tick
