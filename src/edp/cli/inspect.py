@@ -148,6 +148,8 @@ def show_coverage(coverage: Coverage) -> None:
         for j in coverage.joints
     ]
     table("joint histograms", ["", "with", "bins filled", "correlation", "mutual information, nat"], pairs)
+    for warning in coverage.contradictions:
+        out.print(f"  warning: {warning}")
     for note in coverage.absent:
         out.print(f"  note: {note}")
     out.print()

@@ -6,7 +6,7 @@ It works on any recordings: roles come from names or kinds (`edp.data.roles`), a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from edp.data import events, spectrum
 from edp.data.distance import Distance, split_distance
+from edp.data.integrals import contradiction, integral_fit
 from edp.data.roles import Axis, Roles, roles_of, signed
 from edp.data.splits import Split
+from edp.data.twin_channels import INTEGRAL
 from edp.errors import DataError
 from edp.recording import Recording
 from edp.signals import KINDS, Kind
@@ -113,6 +115,7 @@ class Coverage:
         singular: smallest singular value of the input Hankel matrix by lags; inputs of deviation 1.
         constant: inputs that never change, left out of `singular`.
         absent: what could not be looked at, and why.
+        contradictions: strokes that are no integrals of their velocities, and what to do.
     """
 
     recordings: int
@@ -129,6 +132,7 @@ class Coverage:
     events: tuple[events.RareEvent, ...]
     distance: Distance | None
     absent: tuple[str, ...] = field(default=())
+    contradictions: tuple[str, ...] = field(default=())
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; arrays as lists, share of cells with them."""
@@ -185,7 +189,20 @@ def cover(
         events.events_of(recordings, None if occupancy is None or not occupancy.full_stroke else _ends(occupancy)),
         None if split is None else split_distance(recordings, roles.axes, split),
         tuple(absent),
+        tuple(_contradictions(recordings, roles.axes)),
     )
+
+
+def _contradictions(recordings: Sequence[Recording], axes: Sequence[Axis]) -> Iterator[str]:
+    """Of each axis whose stroke is no integral of its velocity."""
+    kinds = {channel.name: channel.kind for channel in recordings[0].channels}
+    for axis in axes:
+        # What answers where no velocity is recorded may be anything.
+        if axis.stroke and INTEGRAL.get(kinds.get(axis.velocity, Kind.GENERIC)) is kinds[axis.stroke]:
+            pairs = [(r.column(axis.velocity), r.column(axis.stroke)) for r in recordings]
+            fit = integral_fit(pairs, recordings[0].rate_hz)
+            if fit.contradicts:
+                yield contradiction(axis.velocity, axis.stroke, fit)
 
 
 def _inputs(recordings: Sequence[Recording], roles: Roles) -> tuple[list[str], tuple[str, ...]]:

@@ -6,9 +6,12 @@ from collections.abc import Sequence
 
 from edp.config.twin import TwinExperiment
 from edp.data.derived_velocities import complete_velocities
+from edp.data.integrals import contradiction, integral_fit
 from edp.data.prepared import Prepared, prepare
+from edp.data.series import Series
 from edp.data.splits import FAMILY
 from edp.data.twin_channels import TwinChannels, same_channels, twin_channels
+from edp.errors import DataError
 from edp.logs.source import DataSource
 from edp.networks.twin.base import check_length
 from edp.recording import Recording
@@ -35,7 +38,22 @@ def prepared_twin(recordings: Sequence[Recording], experiment: TwinExperiment) -
         same_channels(channels, recording)
     data = prepare(recordings, channels.task(), experiment.split, experiment.twin.prefix_ticks)
     check_length(channels, experiment.twin.prefix_ticks, data.train)
+    check_integrals(channels, data.train)
     return channels, data
+
+
+def check_integrals(channels: TwinChannels, train: Sequence[Series]) -> None:
+    """Refuse strokes that are no integrals of their velocities, as a twin makes them.
+
+    Raises:
+        DataError: names both channels and the ratio.
+    """
+    count = len(channels.velocities)
+    for which, (velocity, stroke) in enumerate(zip(channels.velocities, channels.strokes, strict=False)):
+        pairs = [(series.targets[:, which], series.targets[:, count + which]) for series in train]
+        fit = integral_fit(pairs, channels.rate_hz)
+        if fit.contradicts:
+            raise DataError(f"{contradiction(velocity.name, stroke.name, fit)}; or leave out all velocities")
 
 
 def driving_labels(recordings: Sequence[Recording]) -> dict[str, str]:

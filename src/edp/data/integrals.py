@@ -1,0 +1,72 @@
+"""Whether measured strokes are the integrals of measured velocities, as units and scales that are right make them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+WINDOW_S = 1.0
+"""Over which changes are compared: lags of sensors and noise of velocities are small in it, drift as well."""
+LEAST_TICKS = 5
+TOLD = 0.9
+"""Correlation from which the two say the same; below it noise, drift or another actuator may be the reason."""
+LOW, HIGH = 0.8, 1.25
+"""What the ratio may be: wide enough for sensors that are not calibrated, too narrow for any mistake of a unit."""
+
+Rows = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class IntegralFit:
+    """How a stroke changes, beside what its velocity adds up to.
+
+    Attributes:
+        ratio: root-mean-square change of the stroke over that of the integral; negative where they go against each
+            other, 0 where one of them rests.
+        correlation: of the two changes, about zero.
+    """
+
+    ratio: float
+    correlation: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the two tell the same story at another scale, or the other way round."""
+        return abs(self.correlation) >= TOLD and not LOW <= self.ratio <= HIGH
+
+
+def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> IntegralFit:
+    """Compare a stroke with the integral of its velocity by the trapezoidal rule, over windows of `WINDOW_S`.
+
+    Args:
+        pairs: velocity and stroke of each stretch ``(tick,)``, in units that belong together.
+        rate_hz: of the samples.
+    """
+    ticks = max(LEAST_TICKS, round(WINDOW_S * rate_hz))
+    of_stroke, of_velocity, both = 0.0, 0.0, 0.0
+    for velocity, stroke in pairs:
+        speed = velocity.astype(np.float64)
+        way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) / rate_hz])
+        moved = stroke[ticks:].astype(np.float64) - stroke[:-ticks]
+        wanted = way[ticks:] - way[:-ticks]
+        of_stroke += float(moved @ moved)
+        of_velocity += float(wanted @ wanted)
+        both += float(moved @ wanted)
+    if not of_stroke or not of_velocity:
+        return IntegralFit(0.0, 0.0)
+    correlation = both / np.sqrt(of_stroke * of_velocity)
+    return IntegralFit(float(np.copysign(np.sqrt(of_stroke / of_velocity), both)), float(correlation))
+
+
+def contradiction(velocity: str, stroke: str, fit: IntegralFit) -> str:
+    """What a fit that `contradicts` says of two channels, and what to do."""
+    scale = f"{fit.ratio:.3g}"
+    return (
+        f"stroke '{stroke}' changes by {scale} times what velocity '{velocity}' adds up to (over {WINDOW_S:g} s, "
+        f"correlation {fit.correlation:.2f}); {LOW:g} to {HIGH:g} must hold, since a stroke is the integral of its "
+        f"velocity: correct the unit, the sign or the scale of one of them in the signal map (scale = {scale} for "
+        f"'{velocity}', if it is the wrong one)"
+    )
