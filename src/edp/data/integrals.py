@@ -51,10 +51,10 @@ def integral_fit(pairs: Sequence[tuple[Rows, Rows]], rate_hz: float) -> Integral
         speed = velocity.astype(np.float64)
         way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) / rate_hz])
         moved = stroke[ticks:].astype(np.float64) - stroke[:-ticks]
-        wanted = way[ticks:] - way[:-ticks]
+        integrated = way[ticks:] - way[:-ticks]
         of_stroke += float(moved @ moved)
-        of_velocity += float(wanted @ wanted)
-        both += float(moved @ wanted)
+        of_velocity += float(integrated @ integrated)
+        both += float(moved @ integrated)
     if not of_stroke or not of_velocity:
         return IntegralFit(0.0, 0.0)
     correlation = both / np.sqrt(of_stroke * of_velocity)
