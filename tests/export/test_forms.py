@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from edp.errors import ConfigError, DataError, ExportError
+from edp.networks.twin.greybox import GreyBox
+from edp.testing.twins import sample_twin
+from edp.training.twin_bundle import TwinBundle, plant_bundle
 from edp.workflows.parity import FORMS, Broken, Missing, Ran, compare, golden_case
 from edp.workflows.parity.base import compared
 
@@ -39,6 +42,14 @@ def test_whole_numbers_in_every_form_are_the_same_bits_or_refused(bundle_of):
         r.form for r in rows if r.verdict == "not run"
     }
     assert all(row.tolerance == "bits" for row in rows if row.verdict == "same" and row.form in WHOLE)
+
+
+def test_a_grey_box_is_the_same_or_refused_in_every_form():
+    spec = GreyBox()
+    rows = compare(golden_case(plant_bundle(TwinBundle(spec, sample_twin(spec)[0])), 150))
+    assert {row.verdict for row in rows} <= {"same", "refused", "not run"}, rows
+    assert {row.form for row in rows if row.verdict == "refused"} >= {"c_w8a16", "matlab"}, rows
+    assert all("grey box" in row.why for row in rows if row.form == "matlab")
 
 
 def test_forms_that_differ_fail_break_or_are_missing_are_told_apart(case, monkeypatch):

@@ -15,6 +15,7 @@ from edp.errors import ExportError
 from edp.export.golden import GOLDEN_TICKS, golden_recording, stream
 from edp.export.hashes import model_hash, scale_hash
 from edp.ir import Graph
+from edp.ir.hydraulics import HydraulicTick
 from edp.networks.integer import IntegerPredictor
 from edp.networks.predictor import Predictor
 from edp.signals import KINDS
@@ -81,7 +82,7 @@ def float_graph(predictor: Predictor, form: str) -> Graph:
     """The layers of a network in single precision, for a form that has no other numbers.
 
     Raises:
-        ExportError: the network computes in integer arithmetic.
+        ExportError: the network computes in integer arithmetic, or is a grey box.
     """
     if isinstance(predictor, IntegerPredictor):
         raise ExportError(
@@ -89,7 +90,13 @@ def float_graph(predictor: Predictor, form: str) -> Graph:
             "hold; export "
             "the run that it was quantised from, or take a form around the C code"
         )
-    return predictor.graph()
+    graph = predictor.graph()
+    if any(isinstance(layer, HydraulicTick) for layer in graph.layers):
+        raise ExportError(
+            f"the equations of a grey box are solved by Newton's method, which has no form in {form}; export it to c, "
+            "fmu, simulink or ros2"
+        )
+    return graph
 
 
 def golden(predictor: Predictor, window: int) -> dict[str, Any]:
