@@ -295,13 +295,15 @@ def _inputs_of(pairs: Sequence[Pair], a: Doubles, c: Doubles) -> Doubles:
     powers[0] = c
     for t in range(1, length):
         powers[t] = powers[t - 1] @ a
-    own = np.linalg.qr(powers.reshape(-1, order))[0]
+    own, own_state = np.linalg.qr(powers.reshape(-1, order))[0], np.arange(order)
     normal, right = np.zeros((order * commands,) * 2), np.zeros(order * commands)
     for u, y, first in chosen:
         driven, rows = np.zeros((order, order * commands)), np.empty((length, answers, order * commands))
         for t in range(length):
             rows[t] = c @ driven
-            driven = a @ driven + np.kron(np.eye(order), u[first + t])
+            driven = a @ driven
+            # Plus the Kronecker product of a unit matrix and the command: state by state its own copy of it.
+            driven.reshape(order, order, commands)[own_state, own_state] += u[first + t]
         flat, goal = rows.reshape(length * answers, -1), y[first : first + length].reshape(-1)
         flat = flat - own @ (own.T @ flat)
         normal += flat.T @ flat

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.data.prepared import Prepared
@@ -79,7 +81,12 @@ def train_twin(
     channels, data = prepared_twin(recordings, experiment)
     labels = driving_labels(recordings)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment)}, data.digest)
-    with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
+    with (
+        RunFolder(out) as run,
+        Helpers(_helpers(workers), member_died) as helpers,
+        # Threads of the linear algebra wait by spinning: on a busy machine they took 14 times the processor time.
+        threadpool_limits(limits=1, user_api="blas"),
+    ):
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)
