@@ -39,6 +39,7 @@ from edp.report.run.choice import note_test_result
 from edp.storage import check_writable, make_folder, write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, read_provenance, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle, make_bundle, save_bundle
+from edp.training.blas import one_blas_thread
 from edp.training.bundle import weights_digest
 from edp.training.fit import fit
 from edp.training.spec import check_fitted_parts, check_training, thread_count
@@ -47,9 +48,8 @@ from edp.training.strategy import DirectFit, TrainingStrategy
 if TYPE_CHECKING:
     from edp.sim.data_set import SimulationOrder, simulate_data_set
 
-SHOWN_RECORDINGS = 6
 # 60,000 ticks are ten minutes at 100 Hz: more than a picture can show.
-SHOWN_TICKS = 60_000
+SHOWN_RECORDINGS, SHOWN_TICKS = 6, 60_000
 
 
 def coverage(source: DataSource, inputs: Sequence[str] = (), split: str = "") -> Coverage:
@@ -114,6 +114,7 @@ class StrategyFactory:
     frozen: Mapping[str, str] = field(default_factory=dict)
 
 
+@one_blas_thread()
 def train(
     source: DataSource,
     experiment: Experiment,
@@ -247,6 +248,7 @@ def _provenance(
     }
 
 
+@one_blas_thread()
 def evaluate(
     run: str | Path,
     source: DataSource | None = None,

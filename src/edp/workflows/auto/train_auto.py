@@ -24,6 +24,7 @@ from edp.storage import make_folder, read_object, write_json
 from edp.storage.runs import KeyedRun, RunFolder, run_key
 from edp.training import Bundle, Diverged, Fitted, TrainingProgress, load_bundle
 from edp.training.bagging.fit import fit_bagged
+from edp.training.blas import one_blas_thread
 from edp.training.fit import fit
 from edp.workflows.auto.candidates import CANDIDATES, LEAST_SPAN, Amount
 from edp.workflows.auto.promise import (
@@ -72,6 +73,7 @@ class _Trained:
     promise: Promise
 
 
+@one_blas_thread()
 def train_auto(
     source: DataSource,
     settings: AutoSettings,

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from edp import __version__
 from edp.config.twin import TWIN_SETTINGS, TwinExperiment, twin_toml
 from edp.data.prepared import Prepared
@@ -24,6 +22,7 @@ from edp.report.twin.candidates import CANDIDATES
 from edp.sandbox.helpers import Helpers
 from edp.storage import write_bytes, write_json
 from edp.storage.runs import KeyedRun, RunFolder, command_line, environment, run_key
+from edp.training.blas import one_blas_thread
 from edp.training.free_run import FittedTwin, FreeRunProgress
 from edp.training.twin_bundle import TwinBundle, load_twin, save_twin
 from edp.workflows.twin.choose_twin import TwinChoice
@@ -51,6 +50,7 @@ class TrainedTwin:
     resumed: bool
 
 
+@one_blas_thread()
 def train_twin(
     source: DataSource,
     experiment: TwinExperiment,
@@ -81,12 +81,7 @@ def train_twin(
     channels, data = prepared_twin(recordings, experiment)
     labels = driving_labels(recordings)
     key = run_key({"twin": TWIN_SETTINGS.plain(experiment)}, data.digest)
-    with (
-        RunFolder(out) as run,
-        Helpers(_helpers(workers), member_died) as helpers,
-        # Threads of the linear algebra wait by spinning: on a busy machine they took 14 times the processor time.
-        threadpool_limits(limits=1, user_api="blas"),
-    ):
+    with RunFolder(out) as run, Helpers(_helpers(workers), member_died) as helpers:
         if run.claim(key, twin_toml(experiment)) and run.status().get("status") == "finished":
             bundle = load_twin(run.path)
             return TrainedTwin(bundle, dict(bundle.scores), True)

@@ -1,0 +1,19 @@
+"""Threads of NumPy's linear algebra while models are fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from threadpoolctl import threadpool_limits
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """One thread for NumPy's linear algebra within, also as a decorator; those of torch stay.
+
+    Matrices here are small. Threads of OpenBLAS wait for one another by spinning, which costs processor time wherever
+    another process has a core: docs/findings.md has what it cost trainings.
+    """
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
