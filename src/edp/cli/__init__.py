@@ -34,6 +34,7 @@ from edp.cli import (
 from edp.cli.console import run_app
 from edp.cli.ending import stop_on_request
 from edp.cli.slow import tell_of_slow_logs
+from edp.cli.threads import use_one_blas_thread
 
 app = typer.Typer(
     name="edp",
@@ -86,6 +87,7 @@ def _root(
 def main() -> None:
     """Entry point of ``edp``."""
     stop_on_request()
+    use_one_blas_thread()
     if isinstance(sys.stdout, TextIOWrapper):  # a terminal that lacks a character gets its escape
         # An old terminal must not end a training because of a Greek letter.
         sys.stdout.reconfigure(errors="backslashreplace")
