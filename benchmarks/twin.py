@@ -49,6 +49,7 @@ BARE, TOPPED = "greybox without parts", "residual on it"
 SOIL = Path(__file__).parents[1] / "examples" / "scenarios" / "c14_soil.toml"
 SOIL_MINUTES = 20.0
 """Of the logs of a machine in soil that train and choose; the rest tests."""
+QUICK_FIT = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(1, 1), ticks=1000, starts=1)
 VALIDATION_S = 10.0
 """Length of the free runs by which one of them is chosen: that of the validation in a training."""
 
@@ -59,7 +60,7 @@ def main() -> None:
     arguments_of.add_argument("--specialist", action="store_true", help="train a second one, which takes as long")
     arguments = arguments_of.parse_args()
     quick = arguments.quick
-    minutes, recordings, starts = (24.0, 8, 4) if quick else (180.0, 60, 16)
+    minutes, recordings, starts = (10.0, 8, 3) if quick else (180.0, 60, 16)
     with tempfile.TemporaryDirectory() as temporary:
         source = arguments.data or Path(temporary) / "data"
         simulate_data_set(source, SimulationOrder(minutes=minutes, recordings=recordings, seed=arguments.seed + 1))
@@ -68,7 +69,7 @@ def main() -> None:
     scales = fit_scales(channels, data.train)
     training = replace(experiment.training, seed=arguments.seed)
     if quick:
-        training = replace(training, lengths_s=(0.1, 0.5, 2.0), updates=(200, 200, 60), validate_every=100)
+        training = replace(training, lengths_s=(0.1, 0.5, 2.0), updates=(60, 40, 16), validate_every=40)
     models: dict[str, tuple[Twin, float]] = {}
     closed = (*experiment.judge.floors, "n4sid")
     for name in closed:
@@ -148,7 +149,7 @@ def trained(experiment: TwinExperiment, training: FreeRunSpec, parts: Any) -> tu
 def fitted_grey_box(parts: Any, seed: int, quick: bool) -> tuple[GreyTwin, float]:
     """A grey box and the processor seconds of its fit; nothing of the machine but its channels is told."""
     channels, scales, data = parts
-    spec = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(2, 2), ticks=2000) if quick else GreyFitSpec()
+    spec = QUICK_FIT if quick else GreyFitSpec()
     twin = GreyBox(fit=spec).start(channels, scales, data.train, seed)
     fit = fit_grey_box(
         twin,
@@ -165,7 +166,7 @@ def fitted_residual(
 ) -> tuple[tuple[Twin, float], tuple[Twin, float]]:
     """A grey box without some parts, and a network on top of it; each with its processor seconds."""
     channels, scales, data = parts
-    spec = GreyFitSpec(lengths_s=(0.1, 0.3), rounds=(2, 2), ticks=2000) if quick else GreyFitSpec()
+    spec = QUICK_FIT if quick else GreyFitSpec()
     form = Residual(fit=spec, without=without)
     form = replace(form, units=16, updates=(8, 4, 2), validate_every=7) if quick else form
     start = form.start(channels, scales, data.train, seed)
