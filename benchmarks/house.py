@@ -218,13 +218,19 @@ def _circles(imports: dict[str, set[str]]) -> list[list[str]]:
 
 
 def _processor_seconds(target: str) -> float:
-    """Processor time of a make target and its child processes; a failure counts as no time at all (NaN)."""
+    """Processor time of a make target and its child processes.
+
+    Raises:
+        SystemExit: the target fails; says what it printed at last.
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(["make", target], cwd=ROOT, env=environment, capture_output=True, check=False)
+    done = subprocess.run(["make", target], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return seconds if done.returncode == 0 else float("nan")
+    if done.returncode:
+        raise SystemExit(f"make {target} failed, so its time says nothing:\n{(done.stdout + done.stderr)[-3000:]}")
+    return seconds
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from edp.errors import ExportError
-from edp.ir import base, layers, memory
+from edp.ir import base, hydraulics, layers, memory
 from edp.ir.reference import STEPS
 from edp.testing.streaming import check_graph, check_graph_costs
 from edp.training.bundle import blank_scaler
@@ -59,7 +59,7 @@ def test_a_covering_set_meets_every_layer_and_every_pair_of_layers(parts, coveri
 def test_every_kind_of_layer_has_a_reference():
     kinds = {
         kind
-        for module in (layers, memory)
+        for module in (layers, memory, hydraulics)
         for name, kind in vars(module).items()
         if isinstance(kind, type) and issubclass(kind, base.Layer) and kind is not base.Layer and name[0] != "_"
     }

@@ -16,6 +16,7 @@ from edp.export.onnx.plain import PLAIN
 from edp.export.onnx.step import INPUTS, SPOILT, states_of, step_model
 from edp.export.onnx.window import rows_needed, window_model
 from edp.ir import memory
+from edp.ir.hydraulics import HydraulicTick
 from edp.ir.reference import STEPS as REFERENCE
 
 needed = "needs the packages onnx and onnxruntime: pip install 'excavator-dynamics-predictor[dev]'"
@@ -192,7 +193,8 @@ def test_what_does_not_fit_is_refused_by_the_runtime(step_of):
 
 
 def test_every_kind_of_layer_has_nodes():
-    assert set(PLAIN) | set(STEPS) == set(REFERENCE)
+    # A grey box is solved by C code alone.
+    assert set(PLAIN) | set(STEPS) == set(REFERENCE) - {HydraulicTick}
     assert not set(PLAIN) & set(STEPS)
 
 
