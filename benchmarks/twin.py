@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from threadpoolctl import threadpool_limits
 
 from common import finish, parser, table, verdict
 from edp.config.twin import TwinExperiment, load_twin_experiment
@@ -33,6 +32,7 @@ from edp.networks.twin.recurrent_cell import TwinNetwork
 from edp.networks.twin.residual import Residual
 from edp.sim.data_set import SimulationOrder, simulate_data_set
 from edp.testing.twin_cell import plain_steps
+from edp.training.blas import one_blas_thread
 from edp.training.free_run import FreeRunSampler, FreeRunSpec, fit_free_runs
 from edp.training.grey_fit import fit_grey_box
 from edp.training.residual_fit import fit_residual
@@ -226,7 +226,7 @@ def update_ms(experiment: TwinExperiment, parts: Any, how: Callable[..., Any]) -
     port, start = torch.zeros_like(truth), (truth[0], torch.zeros(64, twin.network.units))
     spent = []
     # As a training runs: idle threads of the linear algebra library would spin, and count, in both ways.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         for _ in range(5):
             began = time.process_time()
             answers, _ = how(twin.network, commands, truth, port, start, twin.bounds)

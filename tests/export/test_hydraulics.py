@@ -10,7 +10,9 @@ import pytest
 
 from edp.data.series import Series
 from edp.data.twin_channels import TwinChannels
+from edp.errors import ExportError
 from edp.export import make_target
+from edp.export.c import model
 from edp.export.c.sizes import constant_bytes
 from edp.export.golden import grown_tolerance, random_inputs, stream
 from edp.ir.hydraulics import NONE, HydraulicTick
@@ -144,6 +146,32 @@ def test_cppcheck_and_clang_object_to_nothing(c, tmp_path):
     options = ("--std=c99", "--enable=warning,performance,portability", "--inline-suppr", "--error-exitcode=1", "-q")
     c.run("cppcheck", *options, "--suppress=missingIncludeSystem", "edp_hydraulics.c", "predictor.c", folder=tmp_path)
     c.run("clang", *c.flags, "-O2", "-c", "edp_hydraulics.c", "predictor.c", folder=tmp_path)
+
+
+def test_the_header_says_that_the_time_of_a_tick_varies_and_what_stack_it_takes(tmp_path):
+    bundle = bench()
+    make_target("c").write(bundle, "predictor", tmp_path)
+    layer = next(layer for layer in bundle.predictor.graph().layers if isinstance(layer, HydraulicTick))
+    header = (tmp_path / "predictor.h").read_text()
+    assert "THE TIME OF A TICK VARIES" in header
+    assert f"and {8 * layer.room} bytes of stack" in header
+    assert "number of operations is the same" not in header
+
+
+def test_a_machine_whose_tick_needs_too_large_a_stack_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(model, "MOST_STACK", 1000)
+    with pytest.raises(ExportError, match=r"works in [0-9,]+ bytes of stack; at most 1,000.*smaller twin"):
+        make_target("c").write(bench(), "predictor", tmp_path / "made")
+    assert not (tmp_path / "made").exists()
+
+
+def test_its_products_are_those_of_an_elimination():
+    layer = next(layer for layer in bench().predictor.graph().layers if isinstance(layer, HydraulicTick))
+    size, products = layer.unknown, 0
+    for k in range(size):
+        products += (size - 1 - k) * (size - 1 - k + 1)  # rows below: their rest, and the right side
+        products += size - 1 - k  # and once back
+    assert layer.macs == 2 * layer.steps * products
 
 
 def test_its_room_and_its_bytes_are_counted(c, tmp_path):

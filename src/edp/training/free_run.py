@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from edp.data.series import Series
@@ -40,6 +39,7 @@ from edp.settings.bounds import (
     integer,
 )
 from edp.storage.runs import KeyedRun
+from edp.training.blas import one_blas_thread
 from edp.training.checkpoint import FILE, Progress, Weights, damaged, load_checkpoint, save_checkpoint
 from edp.training.optimizers import OptimizerSpec, Soap
 
@@ -229,9 +229,7 @@ def fit_free_runs(
         StorageError: a checkpoint is damaged, or of another run.
     """
     torch.set_num_threads(1)  # the products of a tick are too small to share
-    # Threads of the linear algebra library would spin between two such products: on a busy machine a training took
-    # 4.6 times as long with two of them.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         return _fitted(twin, train, validation, spec, on_event, run)
 
 

@@ -150,7 +150,7 @@ class GreyProblem:
         state = (drawn.measured[:, 0].copy(), *(np.ascontiguousarray(values, dtype=np.float64) for values in rest))
         normal = (np.zeros((size, size)), np.zeros(size), np.zeros(len(drawn.demands)))
         judged = RunTarget(drawn.truth, self.weight, self.delta, drawn.counts, normal)
-        twin.lanes(numbers, drawn.demands, drawn.measured, state, judge=judged, full=full)
+        twin.lanes(numbers, drawn.demands, drawn.measured, state, judge=judged)
         matrix, gradient, losses = normal
         if full and self.tie is not None:
             slopes = self.tie.slopes(theta)

@@ -1,6 +1,7 @@
 """Grey boxes: exact tangents, physics that must hold, elements that must connect, numbers that a fit finds again."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from edp.errors import ConfigError
 from edp.networks.twin import fit_scales
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.datasheet import datasheet, datasheet_text
-from edp.networks.twin.grey.elements import CylinderElement, PumpElement, ValveElement
-from edp.networks.twin.grey.numbers import monomials
+from edp.networks.twin.grey.elements import CylinderElement, Elements, PumpElement, ValveElement
+from edp.networks.twin.grey.numbers import Travel, monomials, number_table
 from edp.networks.twin.greybox import GreyBox, GreyFitSpec, RunTarget
 from edp.signals import Channel, Kind
 from edp.testing.twins import sample_actuators
@@ -82,7 +83,7 @@ def errors(twin, numbers, series, starts, full, ticks=8):
     normal = (np.zeros((count, count)), np.zeros(count), np.zeros(len(starts)))
     weight = twin.units / twin.scales.answer_width.astype(np.float64)
     target = RunTarget(np.ascontiguousarray(values[:, 1:]), weight, 1e9, (PREFIX, 0, 1), normal)
-    twin.lanes(numbers, demands, measured, state, judge=target, full=full)
+    twin.lanes(numbers, demands, measured, state, judge=target)
     return normal
 
 
@@ -186,6 +187,21 @@ def test_a_part_that_cannot_be_left_out_is_refused_by_name():
 def test_monomials_are_sorted_by_degree():
     assert monomials(2, 2).tolist() == [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]
     assert len(monomials(3, 4)) == 35
+    for variables, degree in ((1, 3), (3, 4), (4, 2)):
+        every = [e for e in product(range(degree + 1), repeat=variables) if sum(e) <= degree]
+        assert monomials(variables, degree).tolist() == sorted(
+            map(list, every), key=lambda e: (sum(e), [-x for x in e])
+        )
+
+
+@pytest.mark.parametrize("cylinders", [12, 40, 2000])
+def test_a_load_of_too_many_numbers_is_refused_before_they_are_made(cylinders):
+    """A file of a few kilobytes may ask for it; seven to the power of its cylinders were counted through before."""
+    elements = Elements((), tuple(CylinderElement(name=f"c{i}", velocity=f"v{i}") for i in range(cylinders)), ())
+    with pytest.raises(
+        ConfigError, match=rf"load of {cylinders} cylinders .* numbers; at most 5,000 must hold: smaller"
+    ):
+        number_table(elements, [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * cylinders, [], (2, 6))
 
 
 def test_elements_of_a_settings_file_come_back(tmp_path):

@@ -26,6 +26,9 @@ from edp.training.bundle import Bundle
 
 RUNTIME = ("edp_runtime.h", "edp_runtime.c", "edp_memory.c")
 HYDRAULICS = ("edp_hydraulics.h", "edp_hydraulics.c")
+DOUBLE_BYTES = 8
+MOST_STACK = 2**18
+"""Bytes: a quarter of the smallest stack that threads of desktop systems have (1 MiB, Windows)."""
 CLIPPED = Code("    uint32_t clipped;  /* numbers beyond the range of their format, chosen on training data */\n")
 COUNTED = (
     memory.Difference,
@@ -46,6 +49,16 @@ PLANT = (
     " * without any it rests at the means of its training data. The state has no pointers: its copy is a saved state.",
 )
 """Lines of the header of a plant model."""
+COST = """\
+ * COST PER TICK. {macs} multiply-accumulates; the number of operations is the same at every tick, up to {hold}
+ * times that in {name}_missed. Constants {flash} bytes on a 32-bit
+ * controller, state {ram} bytes."""
+EQUATIONS_COST = """\
+ * COST PER TICK. Its equations are solved by Newton's method in double precision, so THE TIME OF A TICK VARIES:
+ * an iteration of all stages has {macs} multiply-accumulates for linear equations alone, and a stage may need
+ * EDP_MOST_ITERATIONS of them; up to {hold} times that in {name}_missed. Constants {flash} bytes on a
+ * 32-bit controller, state {ram} bytes, and {stack} bytes of stack in which a tick works."""
+"""Lines of the header on what a tick costs, of networks and of grey boxes."""
 STATES = {Number.FLOAT: "float", Number.INT16: "int16_t", Number.INT32: "int32_t"}
 FILLS = {Number.FLOAT: "edp_fill(0.0f, ", Number.INT16: "edp_q_zero16(", Number.INT32: "edp_q_fill32(0, "}
 COPIES = {Number.FLOAT: "edp_copy", Number.INT16: "edp_q_copy16", Number.INT32: "edp_q_copy32"}
@@ -135,10 +148,7 @@ class Model:
             "window": self.graph.window,
             "hold": HOLD_TICKS,
             "limit": f"{LIMIT:.0f}",
-            "macs": self.graph.macs,
             "format": self.bundle.predictor.number_format,
-            "flash": total_bytes(constants_of(self.graph, self.plan)),
-            "ram": self.state_bytes(),
             "runtime": self._header,
             "counters": CLIPPED if self.integer else "",
             "clear_counters": Code("    s->clipped = 0u;\n") if self.integer else "",
@@ -146,6 +156,7 @@ class Model:
             "low": filled(map(number, low)),
             "high": filled(map(number, high)),
             "what": self._what(),
+            "cost": self._cost(),
             **self._enums(),
             **self._state(),
             **self._work(),
@@ -165,6 +176,13 @@ class Model:
         if self.graph.fed_back:
             lines += [line.format(ticks=self.graph.window) for line in PLANT]
         return Code("\n".join(lines))
+
+    def _cost(self) -> Code:
+        text = EQUATIONS_COST if self.hydraulic else COST
+        room = max((layer.room for layer in self.graph.layers if isinstance(layer, HydraulicTick)), default=0)
+        facts = {"macs": self.graph.macs, "ram": self.state_bytes(), "stack": DOUBLE_BYTES * room}
+        flash = total_bytes(constants_of(self.graph, self.plan))
+        return Code(text.format(**facts, flash=flash, name=self.name, hold=f"{self.name.upper()}_HOLD_TICKS"))
 
     def _enums(self) -> dict[str, str]:
         task, upper = self.bundle.task, self.name.upper()
@@ -329,6 +347,13 @@ def _check(model: Model) -> None:
     constants = sum(values.nbytes for _, _, values in graph.tensors())
     check_sizes({"window": graph.window, "bytes of constants": constants, "bytes of the state": model.state_bytes()})
     check_sizes(layers)
+    for layer in graph.layers:
+        stack = DOUBLE_BYTES * layer.room if isinstance(layer, HydraulicTick) else 0
+        if stack > MOST_STACK:
+            raise ExportError(
+                f"a tick of layer '{layer.name}' works in {stack:,} bytes of stack; at most {MOST_STACK:,} must hold: "
+                "train with fewer cylinders, or with a smaller twin.inertia_degree or twin.potential_degree"
+            )
     calls = Calls(graph, model.plan)
     chosen = {x.name: max(x.columns) + 1 for x in graph.layers if needs_columns(calls, x)}  # type: ignore[attr-defined]
     check_sizes({f"numbers that '{name}' chooses from": size for name, size in chosen.items()}, MOST_COLUMNS)

@@ -243,6 +243,11 @@ class RunTarget:
     counts: tuple[int, int, int]
     normal: tuple[Doubles, Doubles, Doubles]
 
+    @property
+    def full(self) -> bool:
+        """Whether matrix and gradient are summed up too: where they have room."""
+        return self.normal[0].size > 0
+
 
 class GreyTwin(Twin):
     """State: ``answer`` in SI units, and in units of `edp.networks.twin.grey.layout` what the elements remember."""
@@ -351,7 +356,6 @@ class GreyTwin(Twin):
         state: tuple[Doubles, ...],
         answers: Doubles | None = None,
         judge: RunTarget | None = None,
-        full: bool = False,
         network: tuple[Cell, Trace] = (NO_CELL, NO_TRACE),
     ) -> None:
         """`edp.networks.twin.grey.run.run_lanes` with these elements: a free run, or the errors of one."""
@@ -361,7 +365,7 @@ class GreyTwin(Twin):
         run_lanes(
             demands, measured, judged.truth, state, judged.counts, (judged.weight, judged.delta), limits,
             (numbers, KNOTS, *self.wiring.z_of), self.form, self.wiring.ports, self.table.places, self.table.exponents,
-            self.time, full, nothing if answers is None else answers, judged.normal, *network,
+            self.time, judged.full, nothing if answers is None else answers, judged.normal, *network,
         )  # fmt: skip
 
     def lower(self, build: Builder, commands: str, fed: str) -> str:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations_with_replacement
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edp.errors import ConfigError
 from edp.networks.twin.grey import layout as at
 from edp.networks.twin.grey.elements import Elements
 
@@ -17,6 +19,8 @@ IntArray = NDArray[np.int64]
 KNOTS = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """Of the opening curves, as shares of the spool's travel behind the dead band: denser where levers are finer."""
 MEGA, LITRE = 1e6, 1e3
+MOST_OF_LOAD = 5_000
+"""Numbers of a load: a fit holds their matrix, 200 MB of it."""
 LEFT_OUT = {
     "power_limit": {"power_limit": 1e6},
     "cushions": {"cushion_length": 1.0, "cushion_least": 1.0},
@@ -111,8 +115,8 @@ class NumberTable:
 
 def monomials(variables: int, degree: int) -> IntArray:
     """Exponents of all monomials up to a degree, the lower ones first ``(term, variable)``."""
-    every = [e for e in product(range(degree + 1), repeat=variables) if sum(e) <= degree]
-    return np.array(sorted(every, key=lambda e: (sum(e), tuple(-x for x in e))), dtype=np.int64)
+    chosen = [which for total in range(degree + 1) for which in combinations_with_replacement(range(variables), total)]
+    return np.array([[which.count(variable) for variable in range(variables)] for which in chosen], dtype=np.int64)
 
 
 def number_table(
@@ -130,7 +134,11 @@ def number_table(
         highest_pump: highest pressure of each pump's line, MPa.
         degrees: of the polynomials of L and of U.
         left_out: keys of `LEFT_OUT`.
+
+    Raises:
+        ConfigError: the load would have more numbers than can be fitted.
     """
+    _check_load(len(elements.cylinders), degrees)
     numbers: list[GreyNumber] = []
     actuator_at, areas = [], []
     for cylinder, travel in zip(elements.cylinders, travels, strict=True):
@@ -171,6 +179,17 @@ def number_table(
         every, valve_at, np.array(actuator_at), np.array(pump_at, dtype=np.int64), circuit_at, inertia_at,
         inertia_terms, potential_at, exponents,
     )  # fmt: skip
+
+
+def _check_load(actuators: int, degrees: tuple[int, int]) -> None:
+    """Refuse a load before its numbers are made: they grow with a power of the actuators."""
+    entries = actuators * (actuators + 1) // 2
+    count = entries * comb(actuators + degrees[0], actuators) + comb(actuators + max(degrees), actuators)
+    if count > MOST_OF_LOAD:
+        raise ConfigError(
+            f"grey box: the load of {actuators} cylinders with inertia_degree = {degrees[0]} and potential_degree = "
+            f"{degrees[1]} has {count:,} numbers; at most {MOST_OF_LOAD:,} must hold: lower the degrees"
+        )
 
 
 def _fixed(number: GreyNumber, value: float) -> GreyNumber:
