@@ -198,9 +198,7 @@ def test_monomials_are_sorted_by_degree():
 def test_a_load_of_too_many_numbers_is_refused_before_they_are_made(cylinders):
     """A file of a few kilobytes may ask for it; seven to the power of its cylinders were counted through before."""
     elements = Elements((), tuple(CylinderElement(name=f"c{i}", velocity=f"v{i}") for i in range(cylinders)), ())
-    with pytest.raises(
-        ConfigError, match=rf"load of {cylinders} cylinders .* numbers; at most 5,000 must hold: lower"
-    ):
+    with pytest.raises(ConfigError, match=rf"load of {cylinders} cylinders .* numbers; at most 5,000 must hold: lower"):
         number_table(elements, [Travel(0.0, 1.0, 1.0, (1.0, 1.0))] * cylinders, [], (2, 6))
 
 
