@@ -1,0 +1,236 @@
+"""What every controller shares: its registry, the plant as it sees it, and the command that is always safe."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.geometry import AXES, TipGeometry
+from edp.control.limits import LoopLimits
+from edp.control.reference import TipReference
+from edp.errors import ConfigError, closest
+from edp.registry import Registry
+from edp.signals import Channel
+
+Array = NDArray[np.float64]
+MOST_EVENTS = 1_000
+"""Events that a loop logs; a sensor that flickers must not fill the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlantInterface:
+    """A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry.
+
+    Attributes:
+        channels: of an observation, in its order; SI units.
+        rate_hz: ticks per second.
+        geometry: kinematics of the machine.
+        command_channels: pilot pressures that levers command, in the order of `commands`.
+        commands: nominal pilot pressures (Pa), shape (..., command), of lever positions, shape (..., 3).
+        source: how messages call the plant.
+    """
+
+    channels: tuple[Channel, ...]
+    rate_hz: float
+    geometry: TipGeometry
+    command_channels: tuple[Channel, ...]
+    commands: Callable[[Array], Array]
+    source: str = "plant"
+
+    def columns(self, names: tuple[str, ...]) -> NDArray[np.int64]:
+        """Where channels lie in an observation.
+
+        Raises:
+            ConfigError: one is not measured; the closest is offered.
+        """
+        measured = [channel.name for channel in self.channels]
+        for name in names:
+            if name not in measured:
+                raise ConfigError(f"{self.source} does not measure '{name}'{closest(name, measured)}")
+        return np.array([measured.index(name) for name in names])
+
+
+STROKES = ("CylStroke_1", "CylStroke_2", "CylStroke_3")
+VELOCITIES = ("CylVels_1", "CylVels_2", "CylVels_3")
+
+
+@dataclass(frozen=True)
+class ControlEvent:
+    """Something that a controller had to answer otherwise than asked.
+
+    Attributes:
+        tick: at which it began.
+        ticks: for how many ticks in a row.
+        text: what it was.
+    """
+
+    tick: int
+    ticks: int
+    text: str
+
+
+class ControlFault(Exception):
+    """A controller has no answer at this tick, since a solver failed; `Controller.step` gives the safe command."""
+
+
+class Controller(ABC):
+    """Levers for a reference, tick by tick.
+
+    A subclass gives `begin` and `levers`. `step` guards it: where a channel of `reads` is missing or not finite, where
+    `levers` raises `ControlFault` or answers something that is not finite, the levers go back to neutral at the slew
+    limit and an event is logged; nothing is raised in a loop. What a controller asks for is cut to the limits.
+
+    Args:
+        plant: what it controls.
+        limits: of its levers.
+        reads: names of the measured channels without which it has no answer.
+
+    Attributes:
+        events: what was logged since `reset`, at most `MOST_EVENTS`.
+        info: figures of the last tick, such as the iterations of a solver; numbers only.
+
+    Raises:
+        ConfigError: the plant does not measure a channel that is read.
+    """
+
+    def __init__(self, plant: PlantInterface, limits: LoopLimits, reads: tuple[str, ...]) -> None:
+        self.plant, self.limits, self.reads = plant, limits, reads
+        self.events: list[ControlEvent] = []
+        self.info: dict[str, float] = {}
+        self._columns = plant.columns(reads)
+        self._before = np.zeros(AXES)
+
+    @abstractmethod
+    def begin(self, measured: Array, reference: TipReference) -> None:
+        """Prepare for a reference.
+
+        Args:
+            measured: the channels of `reads` at the start, finite.
+            reference: to follow.
+        """
+
+    @abstractmethod
+    def levers(self, measured: Array, tick: int) -> Array:
+        """Levers of a tick, shape (3,), before limits.
+
+        Args:
+            measured: the channels of `reads`, finite.
+            tick: row of the reference that belongs to now.
+
+        Raises:
+            ControlFault: there is no answer.
+        """
+
+    def missed(self, tick: int) -> None:
+        """Called at each tick at which the safe command is given; a controller with memory brings it up to date."""
+        self.info = {}
+
+    @property
+    def before(self) -> Array:
+        """Levers of the last tick, after limits, shape (3,)."""
+        return self._before
+
+    def reset(self, observation: Array, reference: TipReference) -> None:
+        """Start a loop with all levers at neutral.
+
+        Args:
+            observation: SI values in the order of the plant's channels.
+            reference: to follow, at the rate of the plant.
+
+        Raises:
+            ConfigError: another rate, or a channel that is missing at the start.
+        """
+        if reference.rate_hz != self.plant.rate_hz:
+            raise ConfigError(
+                f"the reference has {reference.rate_hz:g} Hz, {self.plant.source} {self.plant.rate_hz:g} Hz; give both "
+                "the same rate"
+            )
+        measured = np.asarray(observation, float)[self._columns]
+        if not np.isfinite(measured).all():
+            name = self.reads[int(np.argmin(np.isfinite(measured)))]
+            raise ConfigError(
+                f"'{name}' is missing at the start of the loop; start where all of {self.reads} are measured"
+            )
+        self.events, self.info = [], {}
+        self._before = np.zeros(AXES)
+        self.begin(measured, reference)
+
+    def step(self, observation: Array, tick: int) -> Array:
+        """Levers to apply from now to the next tick, shape (3,), within the limits; never raises.
+
+        Args:
+            observation: SI values in the order of the plant's channels; NaN where one is missing.
+            tick: row of the reference that belongs to now.
+        """
+        asked, fault = self._asked(observation, tick)
+        if fault:
+            self._log(tick, fault)
+            self.missed(tick)
+        self._before = self.limits.applied(asked, self._before, self.plant.rate_hz)
+        return self._before.copy()
+
+    def _asked(self, observation: Array, tick: int) -> tuple[Array, str]:
+        """Levers before limits, and the fault for which they are neutral; empty without one."""
+        values = np.asarray(observation, float)
+        neutral = np.zeros(AXES)
+        if values.shape != (len(self.plant.channels),):
+            return neutral, f"an observation of shape {values.shape} came for {len(self.plant.channels)} channels"
+        measured = values[self._columns]
+        finite = np.isfinite(measured)
+        if not finite.all():
+            return neutral, f"{self.reads[int(np.argmin(finite))]} is missing: spools to neutral"
+        try:
+            levers = np.asarray(self.levers(measured, tick), float)
+        except (ControlFault, ArithmeticError, np.linalg.LinAlgError) as error:
+            return neutral, f"no answer ({error}): spools to neutral"
+        if levers.shape != (AXES,) or not np.isfinite(levers).all():
+            return neutral, "the levers are not finite: spools to neutral"
+        return levers, ""
+
+    def _log(self, tick: int, text: str) -> None:
+        """Keep an event; one that goes on is made longer."""
+        last = self.events[-1] if self.events else None
+        if last is not None and last.text == text and last.tick + last.ticks == tick:
+            self.events[-1] = ControlEvent(last.tick, last.ticks + 1, text)
+        elif len(self.events) < MOST_EVENTS:
+            self.events.append(ControlEvent(tick, 1, text))
+
+
+class ControllerSpec(Protocol):
+    """Options of a controller: a frozen dataclass with bounds; models that it needs are loaded by `build`."""
+
+    def build(self, plant: PlantInterface, limits: LoopLimits) -> Controller:
+        """The controller for a plant.
+
+        Raises:
+            ConfigError: the plant lacks what it needs, or the limits contradict it.
+        """
+        ...
+
+
+CONTROLLERS: Registry[type] = Registry("controller")
+"""Specs by name: one file and one registration each."""
+
+
+def interface_of(env: Any) -> PlantInterface:
+    """What a controller sees of an environment.
+
+    Args:
+        env: a gymnasium environment with `channels`, `rate_hz`, `machine`, `command_channels` and `commands`, such as
+            `edp.sim.environment.ExcavatorEnv` or `edp.control.twin_environment.TwinEnvironment`.
+    """
+    plain = env.unwrapped
+    source = getattr(plain, "source", type(plain).__name__)
+    return PlantInterface(
+        tuple(plain.channels),
+        float(plain.rate_hz),
+        TipGeometry(plain.machine),
+        tuple(plain.command_channels),
+        plain.commands,
+        source,
+    )
