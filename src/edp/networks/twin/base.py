@@ -150,6 +150,22 @@ class Twin(ABC):
             return np.empty(shape, np.float32), state
         return self._run(commands, np.where(np.isfinite(measured), measured, np.float32(np.nan)), state)
 
+    def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
+        """Free runs of one machine that are the first of them up to a tick each: what a search over commands asks for.
+
+        Args:
+            commands: ``(run, tick, command)``, those of a run the first one's before it branches off.
+            state: of that one machine, a batch of one.
+            measured: what its ports read at the first tick ``(answer,)``, NaN where a port is free.
+            first: tick at which each run branches off the first one ``(run,)``, ascending, its own zero.
+
+        Returns:
+            Answers ``(run, tick, answer)``.
+        """
+        fed = np.full((*commands.shape[:2], len(measured)), np.nan, np.float32)
+        fed[:, 0] = measured
+        return self.rollout(commands, {name: np.repeat(rows, len(commands), 0) for name, rows in state.items()}, fed)[0]
+
     def scaled(self, answers: Array) -> Array:
         """Answers in SI units as a network reads them."""
         return np.asarray((answers - self.scales.answer_offset) / self.scales.answer_width, dtype=np.float32)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from edp.data.series import Series
@@ -19,7 +20,7 @@ from edp.networks.twin.base import PREFIX, TWINS, Twin, TwinState, solved_column
 from edp.networks.twin.recurrent_cell import Bounds, TwinNetwork, buffers
 from edp.networks.twin.scales import Array, TwinScales
 from edp.networks.twin.static_map import StaticMap, StaticTwin
-from edp.networks.twin.steps import run_forward
+from edp.networks.twin.steps import run_branches, run_forward
 from edp.settings.bounds import MOST_UNITS, check_bounds, integer
 
 PIECE = 256
@@ -188,6 +189,22 @@ class RecurrentTwin(Twin):
             after["answer"], after["h"] = saved[0][-1].copy(), saved[5][-1].copy()
         answers = np.concatenate(pieces, axis=1) * self.scales.answer_width + self.scales.answer_offset
         return np.asarray(answers, dtype=np.float32), after
+
+    def branches(self, commands: Array, state: TwinState, measured: Array, first: NDArray[np.int64]) -> Array:
+        network, bounds = self.network, self.bounds
+        weights = tuple(weight.detach().numpy() for weight in (*network.looped, network.pulls(bounds)))
+        command_weight, bias = network.command_weight.detach().numpy(), network.bias.detach().numpy()
+        rows = self.scaled_commands(np.asarray(commands, np.float32)).swapaxes(0, 1)
+        mapped = np.zeros((0, 0, 0), np.float32)
+        if self.static is not None:
+            solved, _ = self.static.mapped(commands, np.repeat(state["commands"], len(commands), axis=0))
+            mapped = np.ascontiguousarray(self._scaled_map(solved).swapaxes(0, 1))
+        read = self.scaled(measured)
+        start = (np.where(np.isfinite(read), read, state["answer"][0]), state["h"][0])
+        answers = np.empty((*rows.shape[:2], len(measured)), np.float32)
+        inputs = (np.ascontiguousarray(rows @ command_weight.T + bias), mapped)
+        run_branches(inputs, weights, bounds.arrays, bounds.velocities, start, first, answers)
+        return np.asarray((answers * self.scales.answer_width + self.scales.answer_offset).swapaxes(0, 1), np.float32)
 
     def _scaled_map(self, solved: Array) -> Array:
         """Scaled answers ``(..., answer)`` of what the map says ``(..., all but strokes)``, zero for strokes."""

@@ -146,6 +146,67 @@ def run_forward(
 
 
 @compiler.compiled
+def run_branches(
+    inputs: tuple[Array, Array],
+    weights: tuple[Array, ...],
+    bounds: tuple[Array, ...],
+    velocities: int,
+    start: tuple[Array, Array],
+    first: NDArray[np.int64],
+    answers: Array,
+) -> None:
+    """Run lanes free that are one lane up to the tick at which each branches off: what is alike is computed once.
+
+    Args:
+        inputs: the commands' part of the gates ``(time, lane, 3 units)``, biases included, and what the static map says
+            ``(time, lane, answer)``, empty without one.
+        weights: as in `run_forward`; `bounds` and `velocities` likewise.
+        bounds: of the answers.
+        velocities: number of them.
+        start: what the ports read at the first tick ``(answer,)``, and h ``(units,)``, of all lanes.
+        first: tick at which each lane branches off lane 0 ``(lane,)``, ascending, that of lane 0 zero.
+        answers: written ``(time, lane, answer)``; before a lane branches off, those of lane 0.
+    """
+    projected, mapped = inputs
+    feedback_weight, h_weight, inner_bias, out_weight, out_bias, pull = weights
+    scale, low, high, trapezoid = bounds
+    ticks, lanes, width = answers.shape
+    units = h_weight.shape[0]
+    fed, free, change = np.empty_like(answers[0]), np.empty_like(answers[0]), np.empty_like(answers[0])
+    into, up, gates = np.empty_like(projected[0]), np.empty_like(projected[0]), np.empty_like(projected[0])
+    h = np.empty((lanes, units), np.float32)
+    next_h, inner = np.empty_like(h), np.empty_like(h)
+    fed[0], h[0] = start[0], start[1]
+    running = 1
+    for t in range(ticks):
+        while running < lanes and first[running] <= t:
+            fed[running], h[running] = fed[0], h[0]
+            running += 1
+        # The first rows: contiguous, as the products want them.
+        np.dot(fed[:running], feedback_weight, into[:running])
+        np.dot(h[:running], h_weight, up[:running])
+        for row in range(running):
+            for i in range(3 * units):
+                into[row, i] += projected[t, row, i]
+        gates_of(into, up, inner_bias, h[:running], gates, inner, next_h)
+        np.dot(next_h[:running], out_weight, change[:running])
+        for row in range(running):
+            for j in range(width):
+                change[row, j] = scale[j] * (change[row, j] + out_bias[j])
+            for j in range(len(pull)):
+                change[row, j] += pull[j] * (mapped[t, row, j] - fed[row, j])
+        _answer(fed[:running], change, low, high, trapezoid, velocities, answers[t], free)
+        for row in range(running):
+            for j in range(width):
+                fed[row, j] = answers[t, row, j]
+            for i in range(units):
+                h[row, i] = next_h[row, i]
+        for row in range(running, lanes):
+            for j in range(width):
+                answers[t, row, j] = answers[t, 0, j]
+
+
+@compiler.compiled
 def gates_back(
     by_h: Array, from_out: Array, gates: Array, inner: Array, h: Array, grads: tuple[Array, Array, Array]
 ) -> None:
