@@ -1,0 +1,70 @@
+"""A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.geometry import TipGeometry
+from edp.errors import ConfigError, closest
+from edp.signals import Channel
+
+Array = NDArray[np.float64]
+STROKES = ("CylStroke_1", "CylStroke_2", "CylStroke_3")
+VELOCITIES = ("CylVels_1", "CylVels_2", "CylVels_3")
+
+
+@dataclass(frozen=True, eq=False)
+class PlantInterface:
+    """A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry.
+
+    Attributes:
+        channels: of an observation, in its order; SI units.
+        rate_hz: ticks per second.
+        geometry: kinematics of the machine.
+        command_channels: pilot pressures that levers command, in the order of `commands`.
+        commands: nominal pilot pressures (Pa), shape (..., command), of lever positions, shape (..., 3).
+        source: how messages call the plant.
+    """
+
+    channels: tuple[Channel, ...]
+    rate_hz: float
+    geometry: TipGeometry
+    command_channels: tuple[Channel, ...]
+    commands: Callable[[Array], Array]
+    source: str = "plant"
+
+    def columns(self, names: tuple[str, ...]) -> NDArray[np.int64]:
+        """Where channels lie in an observation.
+
+        Raises:
+            ConfigError: one is not measured; the closest is offered.
+        """
+        measured = [channel.name for channel in self.channels]
+        for name in names:
+            if name not in measured:
+                raise ConfigError(f"{self.source} does not measure '{name}'{closest(name, measured)}")
+        return np.array([measured.index(name) for name in names])
+
+
+def interface_of(env: Any) -> PlantInterface:
+    """What a controller sees of an environment.
+
+    Args:
+        env: a gymnasium environment with `channels`, `rate_hz`, `machine`, `command_channels` and `commands`, such as
+            `edp.sim.environment.ExcavatorEnv` or `edp.control.twin_environment.TwinEnvironment`.
+    """
+    plain = env.unwrapped
+    source = getattr(plain, "source", type(plain).__name__)
+    return PlantInterface(
+        tuple(plain.channels),
+        float(plain.rate_hz),
+        TipGeometry(plain.machine),
+        tuple(plain.command_channels),
+        plain.commands,
+        source,
+    )
