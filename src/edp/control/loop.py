@@ -124,7 +124,7 @@ def _driven(
 def start_options(task: ControlTask, geometry: TipGeometry) -> dict[str, Any]:
     """Options of the environment's reset that put the machine at the start of a task."""
     shares = np.clip(task.reference.strokes[0] / geometry.full_m, 0.0, 1.0)
-    return {"start_strokes": tuple(map(float, shares)), "material": task.material}
+    return {"strokes": tuple(map(float, shares)), "material": task.material}
 
 
 def _trace(rows: _Rows, names: tuple[str, ...], geometry: TipGeometry, controller: Controller) -> LoopTrace:

@@ -75,7 +75,7 @@ def measure_valve_map(env: Any, plant: PlantInterface, seed: int = 0) -> ValveMa
             for n, level in enumerate(LEVELS):
                 start = np.full(AXES, 0.5)
                 start[axis] -= sign * BEGINS
-                env.reset(seed=seed, options={"start_strokes": tuple(map(float, start)), "material": ""})
+                env.reset(seed=seed, options={"strokes": tuple(map(float, start)), "material": ""})
                 levers = np.zeros(AXES, np.float32)
                 levers[axis] = sign * level
                 rows = [env.step(levers)[0][columns[axis]] for _ in range(ticks)]
