@@ -13,6 +13,7 @@ from edp.cli import (
     adapt,
     animate,
     compress,
+    control,
     demo,
     distil,
     evaluate,
@@ -54,6 +55,7 @@ app.command("train")(train.train)
 app.command("evaluate")(evaluate.evaluate)
 app.command("twin")(twin.twin)
 app.command("rollout")(twin.rollout)
+app.command("control")(control.control)
 app.command("identify")(identify.identify)
 app.add_typer(search.app, name="search")
 app.command("distil")(distil.distil)

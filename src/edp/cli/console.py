@@ -68,7 +68,7 @@ PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
         *("budget", "config", "data", "features", "further", "limit", "map", "out", "page", "scenario", "start"),
-        *("plots", "predictor", "run", "study", "teacher", "w8a16"),
+        *("plant", "plots", "predictor", "run", "study", "teacher", "twin", "w8a16"),
     )
 )
 """Options of all commands that name a file or folder."""

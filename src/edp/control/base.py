@@ -3,60 +3,26 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.control.geometry import AXES, TipGeometry
+from edp.control.geometry import AXES
 from edp.control.limits import LoopLimits
+from edp.control.models import ControlModels
+from edp.control.plant import STROKES as STROKES
+from edp.control.plant import VELOCITIES as VELOCITIES
+from edp.control.plant import PlantInterface as PlantInterface
+from edp.control.plant import interface_of as interface_of
 from edp.control.reference import TipReference
-from edp.errors import ConfigError, closest
+from edp.errors import ConfigError
 from edp.registry import Registry
-from edp.signals import Channel
 
 Array = NDArray[np.float64]
 MOST_EVENTS = 1_000
 """Events that a loop logs; a sensor that flickers must not fill the memory."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlantInterface:
-    """A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry.
-
-    Attributes:
-        channels: of an observation, in its order; SI units.
-        rate_hz: ticks per second.
-        geometry: kinematics of the machine.
-        command_channels: pilot pressures that levers command, in the order of `commands`.
-        commands: nominal pilot pressures (Pa), shape (..., command), of lever positions, shape (..., 3).
-        source: how messages call the plant.
-    """
-
-    channels: tuple[Channel, ...]
-    rate_hz: float
-    geometry: TipGeometry
-    command_channels: tuple[Channel, ...]
-    commands: Callable[[Array], Array]
-    source: str = "plant"
-
-    def columns(self, names: tuple[str, ...]) -> NDArray[np.int64]:
-        """Where channels lie in an observation.
-
-        Raises:
-            ConfigError: one is not measured; the closest is offered.
-        """
-        measured = [channel.name for channel in self.channels]
-        for name in names:
-            if name not in measured:
-                raise ConfigError(f"{self.source} does not measure '{name}'{closest(name, measured)}")
-        return np.array([measured.index(name) for name in names])
-
-
-STROKES = ("CylStroke_1", "CylStroke_2", "CylStroke_3")
-VELOCITIES = ("CylVels_1", "CylVels_2", "CylVels_3")
 
 
 @dataclass(frozen=True)
@@ -202,35 +168,19 @@ class Controller(ABC):
 
 
 class ControllerSpec(Protocol):
-    """Options of a controller: a frozen dataclass with bounds; models that it needs are loaded by `build`."""
+    """Options of a controller: a frozen dataclass with bounds."""
 
-    def build(self, plant: PlantInterface, limits: LoopLimits) -> Controller:
+    needs: ClassVar[tuple[str, ...]]
+    """Attributes of `ControlModels` without which it cannot be built."""
+
+    def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
         """The controller for a plant.
 
         Raises:
-            ConfigError: the plant lacks what it needs, or the limits contradict it.
+            ConfigError: the plant or the models lack what it needs, or the limits contradict it.
         """
         ...
 
 
 CONTROLLERS: Registry[type] = Registry("controller")
 """Specs by name: one file and one registration each."""
-
-
-def interface_of(env: Any) -> PlantInterface:
-    """What a controller sees of an environment.
-
-    Args:
-        env: a gymnasium environment with `channels`, `rate_hz`, `machine`, `command_channels` and `commands`, such as
-            `edp.sim.environment.ExcavatorEnv` or `edp.control.twin_environment.TwinEnvironment`.
-    """
-    plain = env.unwrapped
-    source = getattr(plain, "source", type(plain).__name__)
-    return PlantInterface(
-        tuple(plain.channels),
-        float(plain.rate_hz),
-        TipGeometry(plain.machine),
-        tuple(plain.command_channels),
-        plain.commands,
-        source,
-    )

@@ -2,6 +2,8 @@
 
 from edp.report.compression.facts import CompressionFacts, read_compression
 from edp.report.compression.page import write_compression_page
+from edp.report.control.facts import ControlFacts
+from edp.report.control.page import write_control_page
 from edp.report.coverage.page import build_coverage_page
 from edp.report.run.facts import Facts, comparison_rows, headline, read_facts
 from edp.report.run.page import build_report
@@ -15,6 +17,7 @@ from edp.report.twin.page import build_twin_report, write_twin_page
 
 __all__ = [
     "CompressionFacts",
+    "ControlFacts",
     "Facts",
     "FreeRunFacts",
     "StudyReport",
@@ -30,6 +33,7 @@ __all__ = [
     "read_facts",
     "read_transfer",
     "write_compression_page",
+    "write_control_page",
     "write_rollout_plots",
     "write_screening_pictures",
     "write_study_page",

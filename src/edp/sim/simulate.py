@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 from edp.recording import Recording
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1
+from edp.sim.episodes.episodes import Episodes, EpisodeStart
 from edp.sim.excitation import EXCITATIONS
 from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_files import known_mass
 from edp.sim.machine.parameters import pack
-from edp.sim.physics import pose, soil
+from edp.sim.physics import pose, valve
 from edp.sim.physics.jit import rehearsal
 from edp.sim.physics.plant import Plant
 from edp.sim.physics.snapshot import Snapshot, capture, restored
 from edp.sim.scenario import Scenario, SimulationError, plain
 from edp.sim.sensors import sensors
+from edp.sim.start import seeds_of, start_of
 from edp.sim.view import view_of
 
 Array = NDArray[np.float64]
-START_CLEARANCE_M, START_TRIES = 0.3, 100
-"""Least height of the tip above ground at the start, and how often strokes are drawn for it."""
 
 
 class Simulation:
@@ -36,16 +36,12 @@ class Simulation:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        rehearsal.once(_rehearse)
+        rehearse()
         self.scenario = scenario
         machine = scenario.load()
-        start, hand = (np.random.default_rng(s) for s in _seeds(scenario)[:2])
+        hand = np.random.default_rng(seeds_of(scenario)[1])
         self.machine = machine
-        ground = None
-        if scenario.material:
-            material = soil.load_material(scenario.material)
-            ground = soil.Ground(material, machine, np.random.default_rng(_seeds(scenario)[3]))
-        strokes = _start_strokes(scenario, machine, ground, start)
+        ground, strokes = start_of(scenario, machine)
         self.plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground)
         self.operator = EXCITATIONS[scenario.excitation](hand, scenario.rate_hz, machine)
         self.samples = 0
@@ -105,7 +101,7 @@ class Simulation:
         """What the sensors made of the log so far."""
         noise = None
         if self.scenario.sensor_noise:
-            noise = np.random.default_rng(_seeds(self.scenario)[2])
+            noise = np.random.default_rng(seeds_of(self.scenario)[2])
         return _recording(self.scenario, self.machine, self.log, self.plant.clamps, noise)
 
     def snapshot(self) -> Snapshot:
@@ -157,28 +153,6 @@ class Simulation:
 _CHANGING = ("plant", "operator", "_hand", "_waiting")
 
 
-def _seeds(scenario: Scenario) -> list[np.random.SeedSequence]:
-    """Seeds of start, operator, sensors and soil, in this order."""
-    # The order is fixed: another one would give other recordings for the same seed.
-    return np.random.SeedSequence(scenario.seed).spawn(4)
-
-
-def _start_strokes(scenario: Scenario, machine: Machine, ground: soil.Ground | None, rng: np.random.Generator) -> Array:
-    """Strokes (shares of full) to start from, near the middle, and with the bucket clear of any ground."""
-    strokes = rng.uniform(*scenario.start_strokes, 3)
-    if ground is None:
-        return strokes
-    kinematics = pose.Kinematics(*pack(machine))
-    for _ in range(START_TRIES):
-        x, y, _ = kinematics.pose_at(strokes)
-        if y > ground.height(x) + START_CLEARANCE_M:
-            break
-        strokes = rng.uniform(*scenario.start_strokes, 3)
-        # A raised boom clears most grounds.
-        strokes[0] = rng.uniform(scenario.start_strokes[1], 0.9)
-    return strokes
-
-
 def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Recording:
     """Simulate one scenario.
 
@@ -221,7 +195,27 @@ def _recording(
     )
 
 
-def _rehearse() -> None:
+def rehearse() -> None:
+    """Compile everything that this part of EDP has compiled, once for each cache folder."""
+    rehearsal.once(_play)
+
+
+def _play() -> None:
     """Call all compiled code: in free air and in soil, open and closed loops, light and full sensors."""
     simulate(Scenario(excitation="combined", duration_s=0.5))
-    simulate(Scenario(machine="C14", excitation="dig", material="clay", duration_s=0.5))
+    digging = Scenario(machine="C14", excitation="dig", material="clay", duration_s=0.5)
+    simulate(digging)
+    columns = np.arange(len(TABLE_A1))
+    episodes = Episodes(1, columns)
+    episodes.begin(0, EpisodeStart(digging, digging.load()))
+    episodes.step(np.zeros((1, at.AXES)), np.empty((1, len(columns)), np.float32))
+    kinematics = pose.Kinematics(*pack(digging.load()))
+    kinematics.strokes(kinematics.poses(np.ones(at.AXES)))
+    valve.fill_pilots(
+        np.zeros((1, at.AXES)),
+        1.0,
+        kinematics.axes,
+        kinematics.plant,
+        np.empty(at.SPOOLS),
+        np.empty((1, 2 * at.SPOOLS)),
+    )

@@ -194,12 +194,16 @@ def write_animation(scene: Scene, output: str | Path) -> Path:
         machine=f"{scene.machine.name}, {scene.machine.description}",
         stretch=f"{scene.start_s:g} to {scene.start_s + seconds:g} s",
         style=Markup(_asset("animation.css")),
-        script=Markup(_asset("animation.js")),
-        data=Markup(_script_json(_plain(scene))),
+        **animation_parts(scene),
     )
     target = Path(output)
     write_bytes(target, page.encode("utf-8", "replace"))
     return target
+
+
+def animation_parts(scene: Scene) -> dict[str, Markup]:
+    """Script and data of a scene for a page with the elements of ``animation.html.jinja``."""
+    return {"script": Markup(_asset("animation.js")), "data": Markup(_script_json(_plain(scene)))}
 
 
 def _plain(scene: Scene) -> dict[str, Any]:

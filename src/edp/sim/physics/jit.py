@@ -28,6 +28,11 @@ def fingerprinted() -> tuple[Path, ...]:
 
 compiler = Compiler("sim", fingerprinted, OPTIONS, facts=str(GROUND_POINTS))
 compiled, inlined = compiler.compiled, compiler.inlined
+# Operations in the order written, none fused: the bits do not depend on which loop a function is a part of.
+_plain = Compiler("sim", fingerprinted, {**OPTIONS, "fastmath": False}, facts=str(GROUND_POINTS))
+plainly_compiled, plainly_inlined = _plain.compiled, _plain.inlined
+# Pasted into callers before these are compiled: without reference counts, no others may return parts of arrays.
+pasted = Compiler("sim", fingerprinted, {**OPTIONS, "inline": "always"}, facts=str(GROUND_POINTS)).compiled
 
 
 class WarmUp:

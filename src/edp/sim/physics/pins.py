@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edp.sim.machine import layout as at
 from edp.sim.physics import dynamics, friction, linkage
-from edp.sim.physics.jit import compiled
+from edp.sim.physics.jit import compiled, plainly_compiled, plainly_inlined
 
 Array = NDArray[np.float64]
 FILM = 4e5
@@ -51,7 +51,36 @@ def fill_loads(log: Array, axes: Array, plant: Array, force: Array, mass: Array)
             mass[k, i] = inertia[i] / (lever * lever)
 
 
-@compiled
+@plainly_inlined
+def cross_play(
+    pull: tuple[float, float], mass: float, half: float, step_s: float, before: tuple[float, float]
+) -> tuple[float, float]:
+    """Offset (m) and speed (m/s) of a pin in its bore after a sample, from those before it.
+
+    `pull` is the force at the beginning and at the end of the sample, `half` the half of the play.
+    """
+    part = step_s / PARTS
+    pin_offset, speed = before
+    for n in range(PARTS):
+        # Midpoint rule: the force is linear between samples.
+        share = (n + 0.5) / PARTS
+        force = pull[0] + share * (pull[1] - pull[0])
+        # Implicit in the grease: stable for however light a mass behind the pin.
+        speed = (speed - force / mass * part) / (1.0 + FILM / mass * part)
+        pin_offset += speed * part
+        if abs(pin_offset) >= half:
+            pin_offset = half if pin_offset > 0.0 else -half
+            speed = 0.0
+    return pin_offset, speed
+
+
+@plainly_inlined
+def first_offset(force: float, half: float) -> float:
+    """Where a pin lies at the start: on the side that its force pushes it to."""
+    return -half if force >= 0.0 else half
+
+
+@plainly_compiled
 def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Array) -> None:
     """Velocity of each joint against its cylinder in the play of its pins, m/s, shape (time, 3), into `out`.
 
@@ -60,24 +89,14 @@ def follow_play(force: Array, mass: Array, width: Array, step_s: float, out: Arr
     grease, `FILM`. It does not bounce.
     The mean since the sample before, so that its sum is the way within the play.
     """
-    part = step_s / PARTS
     for i in range(force.shape[1]):
         half = 0.5 * width[i]
-        pin_offset = -half if force[0, i] >= 0.0 else half
-        speed = 0.0
+        pin_offset, speed = first_offset(force[0, i], half), 0.0
         out[0, i] = 0.0
         for k in range(1, force.shape[0]):
             before = pin_offset
-            for n in range(PARTS):
-                # Midpoint rule: the force is linear between samples.
-                share = (n + 0.5) / PARTS
-                pull = force[k - 1, i] + share * (force[k, i] - force[k - 1, i])
-                # Implicit in the grease: stable for however light a mass behind the pin.
-                speed = (speed - pull / mass[k, i] * part) / (1.0 + FILM / mass[k, i] * part)
-                pin_offset += speed * part
-                if abs(pin_offset) >= half:
-                    pin_offset = half if pin_offset > 0.0 else -half
-                    speed = 0.0
+            pull = (force[k - 1, i], force[k, i])
+            pin_offset, speed = cross_play(pull, mass[k, i], half, step_s, (before, speed))
             out[k, i] = (pin_offset - before) / step_s
 
 

@@ -13,7 +13,7 @@ from edp.sim.machine import layout as at
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import dynamics, integrator, linkage, soil, terrain, terramechanics, thermal, valve
-from edp.sim.physics.jit import compiled
+from edp.sim.physics.jit import compiled, inlined
 from edp.sim.sensors import logbook
 
 Array = NDArray[np.float64]
@@ -42,6 +42,43 @@ def near_end(row: Array, axes: Array) -> bool:
     return False
 
 
+@inlined
+def run_sample(
+    state: Array,
+    valves: Array,
+    demands: Array,
+    newest: int,
+    times: tuple[Array, tuple[Clock, Clock]],
+    setup: tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]],
+    row: Array,
+    held_commands: Array,
+) -> int:
+    """From one logged instant, whose log is `row`, to the next; returns the number of clamped pressures.
+
+    `newest` is the row of `demands` that belongs to the sample; the rest as in `run_samples`.
+    """
+    delays, clocks = times
+    axes, plant, work, ground = setup
+    # Steps in a sample times their length: fine and coarse clocks give the same.
+    time_s = clocks[0][0] * clocks[0][1]
+    # Once a sample: the oil's temperature changes over minutes.
+    thermal.warm(row, axes, plant, time_s)
+    near, fine = False, near_end(row, axes)
+    if ground[0][terramechanics.ACTIVE] > 0.0:
+        near, touching = terrain.look(row, time_s, axes, ground)
+        fine = fine or touching
+    integrator.begin_sample(state, work)
+    clamps = 0
+    steps, step_s, share, filters = clocks[1] if fine else clocks[0]
+    for n in range(steps):
+        for j in range(at.SPOOLS):
+            # whole samples of delay, plus the part of a sample that is left, at mid-step
+            when = newest + (n + 0.5) / steps - delays[j]
+            held_commands[j] = demands[max(int(np.floor(when)), 0), j]
+        clamps += integrator.step(state, valves, held_commands, (step_s, share, filters), setup, near)
+    return clamps
+
+
 @compiled
 def run_samples(
     state: Array,
@@ -59,29 +96,12 @@ def run_samples(
     one value per spool.
     """
     first = demands.shape[0] - log.shape[0]
-    delays, clocks = times
-    axes, plant, work, ground = setup
-    # Steps in a sample times their length: fine and coarse clocks give the same.
-    time_s = clocks[0][0] * clocks[0][1]
-    in_soil = ground[0][terramechanics.ACTIVE] > 0.0
+    axes, plant, _, ground = setup
     clamps = 0
     for k in range(log.shape[0]):
         # Logged before the steps: row k is the instant at which lever k is applied.
         logbook.write_log(state, valves, demands[first + k], axes, plant, ground, log[k])
-        # Once a sample: the oil's temperature changes over minutes.
-        thermal.warm(log[k], axes, plant, time_s)
-        near, fine = False, near_end(log[k], axes)
-        if in_soil:
-            near, touching = terrain.look(log[k], time_s, axes, ground)
-            fine = fine or touching
-        integrator.begin_sample(state, work)
-        steps, step_s, share, filters = clocks[1] if fine else clocks[0]
-        for n in range(steps):
-            for j in range(at.SPOOLS):
-                # whole samples of delay, plus the part of a sample that is left, at mid-step
-                when = first + k + (n + 0.5) / steps - delays[j]
-                held_commands[j] = demands[max(int(np.floor(when)), 0), j]
-            clamps += integrator.step(state, valves, held_commands, (step_s, share, filters), setup, near)
+        clamps += run_sample(state, valves, demands, first + k, times, setup, log[k], held_commands)
     return clamps
 
 
@@ -179,18 +199,23 @@ class Plant:
         self._counts = np.zeros(1, dtype=np.int64)
         self.ground = ground
         self._ground = soil.no_ground() if ground is None else ground.arrays()
-        self._delays = valve.dead_times(machine) * rate_hz
+        self.delays = valve.dead_times(machine) * rate_hz
         # One sample more than the longest dead time: a delay between samples reads the older one.
-        self._past = int(np.ceil(self._delays.max())) + 1
+        self._past = int(np.ceil(self.delays.max())) + 1
         self._demands = np.zeros((self._past, at.SPOOLS))
         coarse, fine = ((n * steps, *integrator.clock_of(machine, step_s / n)) for n in (1, FINE))
-        self._clocks = coarse, fine
+        self.clocks = coarse, fine
 
     @property
     def strokes(self) -> Array:
         """Strokes as a share of each cylinder's stroke, shape (3,)."""
         lengths = [linkage.cylinder(i, self.state[at.PSI + i], self.plant)[0] for i in range(at.AXES)]
         return (np.array(lengths) - self.axes[:, at.CLOSED]) / self.axes[:, at.STROKE]
+
+    @property
+    def past(self) -> Array:
+        """Demands of the last samples, the newest last, shape (samples, 6), live."""
+        return self._demands
 
     @property
     def payload_kg(self) -> float:
@@ -270,7 +295,7 @@ class Plant:
         setup = (self.axes, self.plant, self.work, self._ground)
         samples = len(demands) - self._past
         log = np.empty((samples, at.LOG_COLUMNS if self.ground is None else at.LOG_GROUND + at.GROUND_POINTS))
-        times = (self._delays, self._clocks)
+        times = (self.delays, self.clocks)
         self._counts[0] += run_samples(self.state, self.valves, demands, times, setup, log, self._held)
         return log
 

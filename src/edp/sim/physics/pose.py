@@ -71,6 +71,46 @@ def reach(x: float, y: float, attitude: float, axes: Array, plant: Array, limits
     reached[REACHABLE] = 1.0 if fits else 0.0
 
 
+@compiled
+def angle_at(axis: int, stroke: float, axes: Array, plant: Array, limits: Array) -> float:
+    """Joint angle (rad) at a stroke (m from closed), by bisection between `joint_limits`."""
+    target = stroke + axes[axis, at.CLOSED]
+    low, high = limits[axis, 0], limits[axis, 1]
+    # The boom's length alone grows with its angle.
+    rising = linkage.cylinder(axis, low, plant)[0] < linkage.cylinder(axis, high, plant)[0]
+    # 52 halvings of at most pi end at the spacing of float64.
+    for _ in range(52):
+        middle = 0.5 * (low + high)
+        if (linkage.cylinder(axis, middle, plant)[0] < target) == rising:
+            low = middle
+        else:
+            high = middle
+    angle: float = 0.5 * (low + high)
+    return angle
+
+
+@compiled
+def fill_poses(strokes: Array, axes: Array, plant: Array, limits: Array, out: Array) -> None:
+    """Tip poses at strokes in m from closed, both of shape (time, 3), into `out`."""
+    for k in range(strokes.shape[0]):
+        x = y = angle = 0.0
+        for i in range(at.AXES):
+            angle += angle_at(i, strokes[k, i], axes, plant, limits)
+            x += axes[i, at.LENGTH] * math.cos(angle)
+            y += axes[i, at.LENGTH] * math.sin(angle)
+        out[k, 0], out[k, 1], out[k, 2] = x, y, angle
+
+
+@compiled
+def fill_strokes(poses: Array, axes: Array, plant: Array, limits: Array, reached: Array, out: Array) -> None:
+    """Strokes in m from closed at tip poses, both of shape (time, 3), into `out`; NaN out of reach."""
+    for k in range(poses.shape[0]):
+        reach(poses[k, 0], poses[k, 1], poses[k, 2], axes, plant, limits, reached)
+        for i in range(at.AXES):
+            stroke = reached[REACHED_STROKE + i] * axes[i, at.STROKE]
+            out[k, i] = stroke if reached[REACHABLE] > 0.5 else math.nan
+
+
 def joint_limits(axes: Array, plant: Array) -> Array:
     """Joint angles (rad) at the ends of each stroke, lower first, shape (3, 2)."""
     ends = [[linkage.angle_at_stroke(i, share * axes[i, at.STROKE], axes, plant) for share in (0, 1)] for i in range(3)]
@@ -121,3 +161,27 @@ class Kinematics:
         reached = np.empty(REACHED_VALUES)
         reach(x, y, attitude, self.axes, self.plant, self.limits, reached)
         return reached[:3] if reached[REACHABLE] > 0.5 else None
+
+    def poses(self, strokes: Array) -> Array:
+        """Tip x, y (m) and attitude (rad) at strokes in m from closed, both of shape (..., 3)."""
+        strokes = np.asarray(strokes, dtype=float)
+        out = np.empty((strokes.size // 3, 3))
+        fill_poses(np.ascontiguousarray(strokes.reshape(-1, 3)), self.axes, self.plant, self.limits, out)
+        return out.reshape(strokes.shape)
+
+    def strokes(self, poses: Array) -> Array:
+        """Strokes in m from closed that put the tip at poses (x, y in m, attitude in rad), both of shape (..., 3).
+
+        NaN where a pose cannot be reached.
+        """
+        poses = np.asarray(poses, dtype=float)
+        out = np.empty((poses.size // 3, 3))
+        fill_strokes(
+            np.ascontiguousarray(poses.reshape(-1, 3)),
+            self.axes,
+            self.plant,
+            self.limits,
+            np.empty(REACHED_VALUES),
+            out,
+        )
+        return out.reshape(poses.shape)

@@ -170,22 +170,7 @@ class Ground:
 
     def redraw(self, rng: np.random.Generator) -> None:
         """Draw the resistance that is still to be met anew; what the edge is in now goes on from its present value."""
-        old = self.course.copy()
-        fresh = terramechanics.draw_course(self.material, rng)
-        count = len(old)
-        # The unit process forgets its present value over a few cells: fresh[0] is independent, so it is bridged.
-        here = int(self.memory[at.DISTANCE] / self.numbers[terramechanics.COURSE_STEP])
-        keep = np.exp(-np.arange(count) / 8.0)
-        ahead = (here + np.arange(count)) % count
-        self.course[ahead, 0] = keep * old[here % count, 0] + np.sqrt(1.0 - keep**2) * fresh[:, 0]
-        stone = (int(self.memory[at.DISTANCE] / terramechanics.STONE_STEP) + np.arange(count)) % count
-        # A stone that the edge is in now stays until it has passed.
-        inside = np.logical_and.accumulate(old[stone, 1] > 0.0)
-        self.course[stone, 1] = np.where(inside, old[stone, 1], fresh[:, 1])
-        # The strength of the present dig was already felt; that of the later ones was not.
-        dig = int(self.memory[at.DIGS]) % count
-        self.course[:, 2] = fresh[:, 2]
-        self.course[dig, 2] = old[dig, 2]
+        redraw_course(self.material, self.numbers, self.memory, self.course, rng)
 
     def arrays(self) -> tuple[Array, ...]:
         """What the compiled code reads and writes: numbers, tables, course, heights, memory."""
@@ -195,3 +180,23 @@ class Ground:
 def no_ground() -> tuple[Array, ...]:
     """Stand-in of `Ground.arrays` in free air."""
     return np.zeros(terramechanics.NUMBERS), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(2), np.zeros(at.MEMORY)
+
+
+def redraw_course(material: Material, numbers: Array, memory: Array, course: Array, rng: np.random.Generator) -> None:
+    """Draw the part of `course` that is still to be met anew, in place; see `Ground.redraw`."""
+    old = course.copy()
+    fresh = terramechanics.draw_course(material, rng)
+    count = len(old)
+    # The unit process forgets its present value over a few cells: fresh[0] is independent, so it is bridged.
+    here = int(memory[at.DISTANCE] / numbers[terramechanics.COURSE_STEP])
+    keep = np.exp(-np.arange(count) / 8.0)
+    ahead = (here + np.arange(count)) % count
+    course[ahead, 0] = keep * old[here % count, 0] + np.sqrt(1.0 - keep**2) * fresh[:, 0]
+    stone = (int(memory[at.DISTANCE] / terramechanics.STONE_STEP) + np.arange(count)) % count
+    # A stone that the edge is in now stays until it has passed.
+    inside = np.logical_and.accumulate(old[stone, 1] > 0.0)
+    course[stone, 1] = np.where(inside, old[stone, 1], fresh[:, 1])
+    # The strength of the present dig was already felt; that of the later ones was not.
+    dig = int(memory[at.DIGS]) % count
+    course[:, 2] = fresh[:, 2]
+    course[dig, 2] = old[dig, 2]

@@ -104,7 +104,7 @@ def draw_course(material: Material, rng: np.random.Generator) -> Array:
     shocks = rng.normal(0.0, math.sqrt(1.0 - keep * keep), (COURSE, 1))
     # The first value comes from the stationary distribution, so the process has no transient.
     shocks[0] /= math.sqrt(1.0 - keep * keep)
-    course[:, 0] = filters.lfilter([1.0], [1.0, -keep], shocks)[:, 0]
+    course[:, 0] = filters.lfilter(np.array([1.0, 0.0, 0.0, -keep, 0.0]), shocks)[:, 0]
     for _ in range(rng.poisson(material.stones_per_m * STONE_STEP * COURSE)):
         length = max(2, round(rng.uniform(0.02, 0.08) / STONE_STEP))
         where = (int(rng.integers(COURSE)) + np.arange(length)) % COURSE

@@ -29,6 +29,19 @@ def shape_demand(lever: Array, axes: Array, plant: Array, out: Array) -> None:
         out[i + 3] = sign * second * share
 
 
+@compiled
+def fill_pilots(levers: Array, full: float, axes: Array, plant: Array, demand: Array, out: Array) -> None:
+    """One-sided pilot pressures (Pa), shape (time, 12), of lever positions, shape (time, 3), into `out`.
+
+    In the order of Table A.1; `demand` is scratch, one value per spool.
+    """
+    for k in range(levers.shape[0]):
+        shape_demand(levers[k], axes, plant, demand)
+        for j in range(at.SPOOLS):
+            out[k, 2 * j] = full * demand[j] if demand[j] > 0.0 else 0.0
+            out[k, 2 * j + 1] = -full * demand[j] if demand[j] < 0.0 else 0.0
+
+
 def _oscillator(frequency_hz: float, damping: float, step_s: float) -> list[float]:
     """Exact transition of (error, rate) of a low-pass of damping <= 1 over one step, row by row, 4 values."""
     omega = 2.0 * math.pi * frequency_hz

@@ -7,21 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim.physics.jit import compiled
-
 Array = NDArray[np.float64]
-
-
-@compiled
-def read_between(values: Array, positions: Array, out: Array) -> None:
-    """`values` at `positions` (in samples), linear between samples and constant beyond them, into `out`."""
-    last = values.shape[0] - 1
-    for k in range(positions.shape[0]):
-        position = min(max(positions[k], 0.0), float(last))
-        low = int(position)
-        part, high = position - low, min(low + 1, last)
-        for channel in range(values.shape[1]):
-            out[k, channel] = values[low, channel] + part * (values[high, channel] - values[low, channel])
 
 
 @dataclass(frozen=True)
@@ -45,6 +31,9 @@ class Bus:
 class Frames:
     """The frames of one ECU during a recording.
 
+    A frame taken between samples k and k + 1 is seen at k + 1 at the earliest, so that reading between the two looks at
+    no later sample than the one that shows it.
+
     Attributes:
         positions: when the values of each frame were taken, in samples of the log, shape ``(frame,)``.
         arrivals: when it arrived, in samples; infinite for a lost frame.
@@ -54,20 +43,6 @@ class Frames:
     positions: Array
     arrivals: Array
     seen: NDArray[np.intp]
-
-    def take(self, values: Array) -> Array:
-        """A signal at the instants of the frames, linear between samples, shape ``(frame, channel)``.
-
-        What lies before the first sample has its value. A frame taken between samples k and k + 1 is seen at k + 1 at
-        the earliest, so that reading between the two looks at no later sample than the one that shows it.
-        """
-        frame_values = np.empty((len(self.positions), values.shape[1]))
-        read_between(np.ascontiguousarray(values), self.positions, frame_values)
-        return frame_values
-
-    def hold(self, values: Array) -> Array:
-        """The newest value that had arrived at each sample, shape ``(sample, channel)``."""
-        return values[self.seen]
 
 
 def frames(samples: int, rate_hz: float, bus: Bus, phase: float, latency_s: float, rng: np.random.Generator) -> Frames:

@@ -1,41 +1,60 @@
-"""Causal linear filters along time, compiled: importing SciPy's would take longer than most simulations."""
+"""Causal linear filters along time, compiled: importing SciPy's filters would take longer than most simulations."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim.physics.jit import compiled
+from edp.sim.physics.jit import plainly_compiled, plainly_inlined
 
 Array = NDArray[np.float64]
+DERIVATIVE_DAMPING = 0.7
+"""Share of critical: nearly flat up to the bandwidth, with hardly any overshoot of the acceleration."""
 
 
-@compiled
-def _filter(b: Array, a: Array, values: Array, out: Array) -> None:
-    """Transposed direct form II with up to two states per channel."""
+@plainly_inlined
+def biquad(x: float, numbers: Array, state: Array) -> float:
+    """One sample of a filter of order two with a[0] = 1, transposed direct form II.
+
+    `numbers` is b[0], b[1], b[2], a[1], a[2]; `state`, two values, goes on.
+    """
+    y: float = numbers[0] * x + state[0]
+    state[0] = numbers[1] * x - numbers[3] * y + state[1]
+    state[1] = numbers[2] * x - numbers[4] * y
+    return y
+
+
+@plainly_compiled
+def _filter(numbers: Array, values: Array, state: Array, out: Array) -> None:
     for channel in range(values.shape[1]):
-        first = second = 0.0
+        state[0] = state[1] = 0.0
         for k in range(values.shape[0]):
-            x = values[k, channel]
-            y = b[0] * x + first
-            first = b[1] * x - a[1] * y + second
-            second = b[2] * x - a[2] * y
-            out[k, channel] = y
+            out[k, channel] = biquad(values[k, channel], numbers, state)
 
 
-def lfilter(b: list[float], a: list[float], values: Array) -> Array:
-    """Filter of order one or two with a[0] = 1, from rest, shape ``(time, channel)``."""
+def lfilter(numbers: Array, values: Array) -> Array:
+    """The filter of `biquad` along time, from rest, shape ``(time, channel)``."""
     out = np.empty(values.shape)
-    # Padded to order two, so that one compiled function serves both orders.
-    numerator, denominator = (np.array([*c, 0.0, 0.0][:3]) for c in (b, a))
-    _filter(numerator, denominator, np.ascontiguousarray(values, dtype=float), out)
+    _filter(numbers, np.ascontiguousarray(values, dtype=float), np.zeros(2), out)
     return out
 
 
-def bilinear_derivative(omega: float, damping: float, rate_hz: float) -> tuple[list[float], list[float]]:
-    """Coefficients of w^2 s / (s^2 + 2 zeta w s + w^2) by the bilinear rule: numerator and denominator."""
+def derivative_numbers(bandwidth_hz: float, rate_hz: float) -> Array:
+    """Of w^2 s / (s^2 + 2 zeta w s + w^2) by the bilinear rule, as `biquad` takes them, shape (5,)."""
+    # Below half of the rate, where the bilinear rule warps frequencies.
+    omega = 2.0 * math.pi * min(bandwidth_hz, 0.4 * rate_hz)
     k = 2.0 * rate_hz
-    scale = k * k + 2.0 * damping * omega * k + omega * omega
+    scale = k * k + 2.0 * DERIVATIVE_DAMPING * omega * k + omega * omega
     gain = omega * omega * k / scale
     middle = 2.0 * (omega * omega - k * k) / scale
-    return [gain, 0.0, -gain], [1.0, middle, (k * k - 2.0 * damping * omega * k + omega * omega) / scale]
+    return np.array([gain, 0.0, -gain, middle, (k * k - 2.0 * DERIVATIVE_DAMPING * omega * k + omega * omega) / scale])
+
+
+def filtered_derivative(values: Array, bandwidth_hz: float, rate_hz: float) -> Array:
+    """Causal derivative along time by the filter of `derivative_numbers`, shape ``(time, channel)``.
+
+    The filter starts at rest at the first value.
+    """
+    return lfilter(derivative_numbers(bandwidth_hz, rate_hz), values - values[:1])

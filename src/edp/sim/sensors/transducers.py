@@ -1,21 +1,25 @@
-"""What sensors do to a signal: one pure function an effect, a size of zero changes nothing.
-
-Signals have the shape ``(time, channel)``.
-"""
+"""What sensors do to a value; a size of zero changes nothing."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edp.sim.sensors import filters
+from edp.sim.physics.jit import plainly_inlined
 
 Array = NDArray[np.float64]
 
 
-def quantised(values: Array, quantum: float) -> Array:
-    """The nearest multiples of `quantum`."""
-    return np.asarray(np.round(values / quantum) * quantum) if quantum > 0.0 else values
+@plainly_inlined
+def quantised(value: float, quantum: float) -> float:
+    """The nearest multiple of `quantum`."""
+    return float(np.rint(value / quantum) * quantum) if quantum > 0.0 else value
+
+
+@plainly_inlined
+def limited(value: float, full_scale: float) -> float:
+    """Cut to what a transmitter can show, 0 to `full_scale`."""
+    return min(max(value, 0.0), full_scale) if full_scale > 0.0 else value
 
 
 def random_walk(shape: tuple[int, int], step_s: float, size: float, rng: np.random.Generator) -> Array:
@@ -26,15 +30,14 @@ def random_walk(shape: tuple[int, int], step_s: float, size: float, rng: np.rand
     return np.asarray(np.cumsum(steps, axis=0))
 
 
-def lagged(values: Array, time_constant_s: float, step_s: float) -> Array:
-    """First-order lag, exact for a signal that is linear between samples; at rest at the first value."""
+def lag(time_constant_s: float, step_s: float) -> tuple[float, float, float]:
+    """First-order lag that is exact for a signal that is linear between samples.
+
+    Returns:
+        a, b and c of y[k] = a x[k] + s[k - 1] and s[k] = b x[k] + c y[k].
+    """
     if time_constant_s <= 0.0:
-        return values
-    decay = np.exp(-step_s / time_constant_s)
+        return 1.0, 0.0, 0.0
+    decay = float(np.exp(-step_s / time_constant_s))
     new = 1.0 - time_constant_s * (1.0 - decay) / step_s
-    return values[:1] + filters.lfilter([new, 1.0 - decay - new], [1.0, -decay], values - values[:1])
-
-
-def limited(values: Array, full_scale: float) -> Array:
-    """Cut to what a transmitter can show, 0 to `full_scale`."""
-    return np.clip(values, 0.0, full_scale) if full_scale > 0.0 else values
+    return new, 1.0 - decay - new, decay

@@ -1,0 +1,78 @@
+"""The settings of closed loops: TOML in, validated specs out, as those of an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tomli_w
+
+from edp.control.controllers import CONTROLLERS, ControllerSpec
+from edp.control.controllers.pi import ProportionalIntegral
+from edp.control.tasks import TASKS, TaskSpec
+from edp.control.tasks.grade import Grade
+from edp.settings.bounds import MOST_SEED, above, check_bounds, integer
+from edp.settings.tree import SettingsTree, Table, merged, override, read_toml
+
+CONTROL_SETTINGS = SettingsTree(
+    {"task": TASKS, "controller": CONTROLLERS}, {"task": "grade", "controller": "pi"}, what="settings"
+)
+MOST_LOOPS = 10_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlExperiment:
+    """Everything that settles closed loops.
+
+    Attributes:
+        task: what is to be followed.
+        controller: what moves the levers.
+        machine: name of a machine, or path of a machine file.
+        loops: number of loops, each of a seed of its own.
+        seed: of the first loop; the next ones count on.
+        rate_hz: ticks per second.
+    """
+
+    task: TaskSpec = field(default_factory=Grade)
+    controller: ControllerSpec = field(default_factory=ProportionalIntegral)
+    machine: str = "M22"
+    loops: int = 6
+    seed: int = 0
+    rate_hz: float = 100.0
+
+    def __post_init__(self) -> None:
+        # The last loop's seed must be one, too.
+        check_bounds(
+            "control",
+            self,
+            loops=integer(1, MOST_LOOPS),
+            seed=integer(0, MOST_SEED - MOST_LOOPS),
+            rate_hz=above(0.0, 1000.0),
+        )
+
+
+def load_control_experiment(
+    path: str | Path | None = None, overrides: Sequence[str] = (), options: Table | None = None
+) -> ControlExperiment:
+    """Settings from a TOML file, changed by options of the command and ``key.path=value`` overrides.
+
+    Args:
+        path: settings file.
+        overrides: each ``key.path=value``; they go before options.
+        options: plain values of options that were given, by key.
+
+    Raises:
+        ConfigError: names every unknown key, wrong type and impossible value at once.
+    """
+    table: Table = {} if path is None else read_toml(path)
+    table = merged(table, options or {})
+    for text in overrides:
+        table = merged(table, override(text))
+    where = "of closed loops" if path is None else f"'{path}'"
+    return CONTROL_SETTINGS.build(ControlExperiment, table, where + (" with --set" if overrides else ""))
+
+
+def control_toml(experiment: ControlExperiment) -> str:
+    """The whole settings as TOML, defaults included: what a run folder keeps."""
+    return tomli_w.dumps(CONTROL_SETTINGS.plain(experiment))

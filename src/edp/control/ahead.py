@@ -1,0 +1,152 @@
+"""Velocities some ticks ahead, for commands that are tried: of a look-ahead predictor, or of a twin."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edp.control.plant import PILOTS, VELOCITIES
+from edp.errors import ConfigError, closest
+from edp.networks.streaming import map_state
+from edp.networks.twin import Twin
+from edp.training.bundle import Bundle
+
+Array = NDArray[np.float64]
+NEAR = 0.25
+"""Share by which a predictor's horizon may differ from the time that is asked for."""
+
+
+class VelocityModel(ABC):
+    """Velocities of the three cylinders ahead, under commands that begin now and stay.
+
+    Attributes:
+        reads: measured channels of a row, commands not among them.
+        ticks: how far ahead it looks.
+    """
+
+    reads: tuple[str, ...]
+    ticks: int
+
+    @abstractmethod
+    def begin(self, measured: Array, command: Array) -> None:
+        """Form the memory as if the machine had rested with this row of `reads` and command of `PILOTS`, (12,)."""
+
+    @abstractmethod
+    def ahead(self, measured: Array, commands: Array) -> Array:
+        """Velocities (m/s), shape (candidate, 3), of candidate commands (Pa), shape (candidate, 12); memory stays."""
+
+    @abstractmethod
+    def advance(self, measured: Array, command: Array) -> None:
+        """Let a tick pass in which this row was measured and this command given."""
+
+
+class PredictorAhead(VelocityModel):
+    """A look-ahead predictor: what it says of commands now is what usually follows them.
+
+    Args:
+        bundle: it must read pilot pressures and predict the velocities.
+        ticks: how far ahead; its nearest horizon is taken.
+
+    Raises:
+        ConfigError: other targets, no commands, or no horizon near `ticks`.
+    """
+
+    def __init__(self, bundle: Bundle, ticks: int) -> None:
+        task = bundle.task
+        lacking = [name for name in VELOCITIES if name not in task.targets]
+        names = [channel.name for channel in bundle.inputs]
+        if lacking or not any(name in PILOTS for name in names):
+            what = (
+                f"does not predict '{lacking[0]}'{closest(lacking[0], task.targets)}" if lacking else "reads no pilot"
+            )
+            raise ConfigError(
+                f"the predictor {what}; an inversion needs velocities by pilot pressures: train it on both"
+            )
+        self.ticks = min(task.horizons, key=lambda horizon: abs(horizon - ticks))
+        if abs(self.ticks - ticks) > NEAR * ticks:
+            raise ConfigError(
+                f"the predictor looks {self.ticks} ticks ahead, the inversion {ticks}; train one with "
+                f"task.horizons = [{ticks}], or set controller.lead_s"
+            )
+        self._predictor, self._horizon = bundle.predictor, task.horizons.index(self.ticks)
+        self._targets = [task.targets.index(name) for name in VELOCITIES]
+        self.reads = tuple(name for name in names if name not in PILOTS)
+        self._measured = [n for n, name in enumerate(names) if name not in PILOTS]
+        self._commands = [n for n, name in enumerate(names) if name in PILOTS]
+        self._pilots = [PILOTS.index(names[n]) for n in self._commands]
+        self._width, self._state = len(names), None
+
+    def begin(self, measured: Array, command: Array) -> None:
+        """Fill the predictor's window with one row."""
+        rows = self._rows(measured, command[None])
+        with torch.inference_mode():
+            start = self._predictor.initial_state(1, rows)
+            _, self._state = self._predictor.predict(rows.expand(1, self._predictor.window, self._width), start)
+
+    def ahead(self, measured: Array, commands: Array) -> Array:
+        """Every candidate is a lane of one step."""
+        rows = self._rows(measured, commands)
+        with torch.inference_mode():
+            lanes = map_state(lambda tensor: tensor.expand(len(rows), *tensor.shape[1:]).contiguous(), self._state)
+            answers, _ = self._predictor.predict(rows, lanes)
+        return np.asarray(answers[:, -1, self._horizon, self._targets].numpy(), float)
+
+    def advance(self, measured: Array, command: Array) -> None:
+        """One step with what was given."""
+        with torch.inference_mode():
+            _, self._state = self._predictor.predict(self._rows(measured, command[None]), self._state)
+
+    def _rows(self, measured: Array, commands: Array) -> torch.Tensor:
+        """Inputs, shape (candidate, 1, input)."""
+        rows = np.empty((len(commands), 1, self._width), np.float32)
+        rows[:, 0, self._measured] = measured
+        rows[:, 0, self._commands] = commands[:, self._pilots]
+        return torch.from_numpy(rows)
+
+
+class TwinAhead(VelocityModel):
+    """A twin: it is told the commands and runs on them alone from what is measured now.
+
+    Args:
+        twin: of the channels of Table A.1.
+        ticks: how far ahead.
+
+    Raises:
+        ConfigError: it answers other velocities, or other commands drive it.
+    """
+
+    def __init__(self, twin: Twin, ticks: int) -> None:
+        names = [channel.name for channel in twin.channels.answers]
+        for name, options in [(v, names) for v in VELOCITIES] + [(c.name, PILOTS) for c in twin.channels.commands]:
+            if name not in options:
+                raise ConfigError(f"the twin is not one of an excavator's levers: '{name}'{closest(name, options)}")
+        self.twin, self.ticks, self.reads = twin, ticks, tuple(names)
+        self._velocities = [names.index(name) for name in VELOCITIES]
+        self._pilots = [PILOTS.index(channel.name) for channel in twin.channels.commands]
+        self._state: Any = None
+
+    def begin(self, measured: Array, command: Array) -> None:
+        """Form the memory by a prefix at rest."""
+        ticks = max(self.twin.prefix_ticks, 1)
+        rows = np.repeat(np.asarray(measured, np.float32)[None, None], ticks, axis=1)
+        commands = np.repeat(np.asarray(command[self._pilots], np.float32)[None, None], ticks, axis=1)
+        self._state = self.twin.reset(commands, rows)
+
+    def ahead(self, measured: Array, commands: Array) -> Array:
+        """Candidates are lanes; the first tick reads what is measured, the others run free."""
+        count = len(commands)
+        lasting = np.repeat(commands[:, None, self._pilots], self.ticks, axis=1)
+        ports = np.full((count, self.ticks, len(self.reads)), np.nan, np.float32)
+        ports[:, 0] = measured
+        lanes = {name: np.repeat(values, count, axis=0) for name, values in self._state.items()}
+        answers, _ = self.twin.rollout(lasting, lanes, ports)
+        return np.asarray(answers[:, -1, self._velocities], float)
+
+    def advance(self, measured: Array, command: Array) -> None:
+        """One tick that reads what was measured."""
+        rows = np.asarray(measured, np.float32)[None]
+        _, self._state = self.twin.step(command[None, self._pilots], self._state, rows)

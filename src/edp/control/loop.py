@@ -1,0 +1,160 @@
+"""A closed loop: a controller and a plant, tick by tick, with all that was measured, done and true."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.base import ControlEvent, Controller
+from edp.control.geometry import AXES, TipGeometry
+from edp.control.plant import STROKES
+from edp.control.score import LoopScore, LoopTrace, scored
+from edp.control.tasks.base import ControlTask
+from edp.errors import ConfigError
+from edp.recording import Recording
+from edp.signals import VOCABULARY, Channel, Kind
+
+Array = NDArray[np.float64]
+TRUE = "_true"
+"""Behind the name of a channel, for its noise-free value."""
+TIP = ("TipX", "TipY", "TipAngle")
+PUMPS = ("PumpPressure_1", "PumpPressure_2", "PumpDisplacement_1", "PumpDisplacement_2")
+OTHERS = ("Payload", "OilTemperature", "TipForceX", "TipForceY")
+REFERENCE = tuple(
+    [Channel(f"Reference_{name}", VOCABULARY[name].kind, f"reference of {name}") for name in (*STROKES, *TIP)]
+)
+LEVERS = tuple(Channel(f"Lever_{i + 1}", Kind.RATIO, f"{c} lever") for i, c in enumerate(("Boom", "Arm", "Bucket")))
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResult:
+    """A loop that was run.
+
+    Attributes:
+        recording: a row a tick: observations, true values under names that end in `TRUE`, reference, levers.
+        score: over the judged ticks.
+        events: what the controller logged.
+        solve_s: time of each step of the controller, shape (ticks,), s.
+        infos: figures that the controller gave, by name, shape (ticks,) each; NaN where it gave none.
+    """
+
+    recording: Recording
+    score: LoopScore
+    events: tuple[ControlEvent, ...]
+    solve_s: Array
+    infos: Mapping[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """What is collected, a row a tick."""
+
+    observed: Array
+    truth: Array
+    levers: Array
+    solve_s: Array
+
+
+def run_loop(
+    env: Any,
+    controller: Controller,
+    task: ControlTask,
+    seed: int,
+    options: Mapping[str, Any] | None = None,
+) -> LoopResult:
+    """Run a controller on a plant along a task.
+
+    Args:
+        env: a gymnasium environment as `edp.control.base.interface_of` reads it, whose ``info["truth"]`` is a mapping
+            of noise-free values by channel.
+        controller: what moves the levers; made for an environment of the same channels.
+        task: reference and limits.
+        seed: of the environment.
+        options: further options of the environment's reset.
+
+    Raises:
+        ConfigError: the environment and the controller do not fit, or a channel is missing at the start.
+    """
+    reference, geometry = task.reference, controller.plant.geometry
+    observation, info = env.reset(seed=seed, options={**start_options(task, geometry), **(options or {})})
+    if len(np.asarray(observation)) != len(controller.plant.channels):
+        raise ConfigError(
+            f"the plant observes {len(np.asarray(observation))} channels, the controller was made for "
+            f"{len(controller.plant.channels)}; make it for this plant"
+        )
+    controller.reset(np.asarray(observation, float), reference)
+    names = tuple(name for name in (*STROKES, *TIP, *PUMPS, *OTHERS) if name in info["truth"])
+    rows, infos = _driven(env, controller, reference.ticks, names, (observation, info))
+    trace = _trace(rows, names, geometry, controller)
+    score = scored(trace, reference, task.limits, sum(event.ticks for event in controller.events))
+    recording = _recorded(rows, names, task, controller)
+    return LoopResult(recording, score, tuple(controller.events), rows.solve_s, infos)
+
+
+def _driven(
+    env: Any, controller: Controller, ticks: int, names: tuple[str, ...], start: tuple[Any, Mapping[str, Any]]
+) -> tuple[_Rows, dict[str, Array]]:
+    """Run tick by tick from an observation and its info; ends early where the plant does."""
+    observation, info = start
+    observed, truth = np.zeros((ticks, len(controller.plant.channels))), np.zeros((ticks, len(names)))
+    levers, solve_s = np.zeros((ticks, AXES)), np.zeros(ticks)
+    infos: dict[str, Array] = {}
+    end = ticks
+    for tick in range(ticks):
+        observed[tick] = observation
+        truth[tick] = [info["truth"][name] for name in names]
+        before = time.perf_counter()
+        levers[tick] = controller.step(observed[tick], tick)
+        solve_s[tick] = time.perf_counter() - before
+        for name, value in controller.info.items():
+            infos.setdefault(name, np.full(ticks, np.nan))[tick] = value
+        observation, _, terminated, truncated, info = env.step(levers[tick].astype(np.float32))
+        if terminated or truncated:
+            end = tick + 1
+            break
+    rows = _Rows(observed[:end], truth[:end], levers[:end], solve_s[:end])
+    return rows, {name: values[:end] for name, values in infos.items()}
+
+
+def start_options(task: ControlTask, geometry: TipGeometry) -> dict[str, Any]:
+    """Options of the environment's reset that put the machine at the start of a task."""
+    shares = np.clip(task.reference.strokes[0] / geometry.full_m, 0.0, 1.0)
+    return {"strokes": tuple(map(float, shares)), "material": task.material}
+
+
+def _trace(rows: _Rows, names: tuple[str, ...], geometry: TipGeometry, controller: Controller) -> LoopTrace:
+    """What the score reads; true values where the plant has them, else by the kinematics from its own answers."""
+    truth = {name: rows.truth[:, n] for n, name in enumerate(names)}
+    measured = {channel.name: rows.observed[:, n] for n, channel in enumerate(controller.plant.channels)}
+    strokes = np.stack([truth[name] for name in STROKES], axis=1)
+    tip = np.stack([truth[name] for name in TIP], axis=1) if TIP[0] in truth else geometry.tip(strokes)
+    pressures = [values for name, values in measured.items() if name.startswith("CylPressures_")]
+    power = None
+    if all(name in truth for name in PUMPS):
+        flow = geometry.machine.pumps.max_flow
+        power = flow * sum(truth[PUMPS[n]] * truth[PUMPS[n + 2]] for n in range(2))
+    stacked = np.stack(pressures, axis=1) if pressures else np.zeros((len(tip), 0))
+    return LoopTrace(tip, strokes / geometry.full_m, rows.levers, stacked, None if power is None else np.asarray(power))
+
+
+def _recorded(rows: _Rows, names: tuple[str, ...], task: ControlTask, controller: Controller) -> Recording:
+    reference, plant = task.reference, controller.plant
+    true = tuple(
+        replace(VOCABULARY[name], name=f"{name}{TRUE}", description=f"{VOCABULARY[name].description} (true)")
+        for name in names
+    )
+    ticks = len(rows.levers)
+    columns = [rows.observed, rows.truth, reference.strokes[:ticks], reference.tip[:ticks], rows.levers]
+    return Recording(
+        f"{task.name}_{task.seed}",
+        (*plant.channels, *true, *REFERENCE, *LEVERS),
+        np.ascontiguousarray(np.concatenate(columns, axis=1), dtype=np.float32),
+        reference.rate_hz,
+        f"loop:{plant.source}",
+        {"task": task.name, "seed": task.seed, "machine": plant.geometry.machine.name},
+    )

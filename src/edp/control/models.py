@@ -1,0 +1,45 @@
+"""What controllers know of a plant: a static valve map, and models that were learned from its recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from edp.control.valve_map import ValveMap
+from edp.errors import ConfigError
+from edp.networks.twin import Twin
+from edp.training.bundle import Bundle
+
+
+@dataclass(frozen=True, eq=False)
+class ControlModels:
+    """Models for controllers; None where there is none.
+
+    Attributes:
+        valve_map: cylinder speed by lever, measured on the plant or on a twin of it.
+        twin: a plant model that runs on commands alone.
+        predictor: a look-ahead predictor.
+    """
+
+    valve_map: ValveMap | None = None
+    twin: Twin | None = None
+    predictor: Bundle | None = None
+
+    def needed_map(self, who: str) -> ValveMap:
+        """The valve map.
+
+        Raises:
+            ConfigError: there is none; `who` needs it.
+        """
+        if self.valve_map is None:
+            raise ConfigError(f"controller '{who}' needs a valve map; measure one with measure_valve_map")
+        return self.valve_map
+
+    def needed_twin(self, who: str) -> Twin:
+        """The twin.
+
+        Raises:
+            ConfigError: there is none; `who` needs it.
+        """
+        if self.twin is None:
+            raise ConfigError(f"controller '{who}' needs a twin; train one with edp twin and name its run folder")
+        return self.twin

@@ -1,0 +1,87 @@
+"""A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.geometry import TipGeometry
+from edp.errors import ConfigError, closest
+from edp.signals import TABLE_A1, Channel, Kind
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import valve
+from edp.sim.sensors.sensors import pilot_demands
+
+Array = NDArray[np.float64]
+STROKES = ("CylStroke_1", "CylStroke_2", "CylStroke_3")
+PILOTS = tuple(name for name, channel in TABLE_A1.items() if channel.kind is Kind.PILOT_PRESSURE)
+VELOCITIES = ("CylVels_1", "CylVels_2", "CylVels_3")
+
+
+@dataclass(frozen=True, eq=False)
+class PlantInterface:
+    """A plant as a controller sees it: what is measured, how levers become commands, and the machine's geometry.
+
+    Attributes:
+        channels: of an observation, in its order; SI units.
+        rate_hz: ticks per second.
+        geometry: kinematics of the machine.
+        command_channels: pilot pressures that levers command, in the order of `commands`.
+        commands: nominal pilot pressures (Pa), shape (..., command), of lever positions, shape (..., 3).
+        source: how messages call the plant.
+    """
+
+    channels: tuple[Channel, ...]
+    rate_hz: float
+    geometry: TipGeometry
+    command_channels: tuple[Channel, ...]
+    commands: Callable[[Array], Array]
+    source: str = "plant"
+
+    def columns(self, names: tuple[str, ...]) -> NDArray[np.int64]:
+        """Where channels lie in an observation.
+
+        Raises:
+            ConfigError: one is not measured; the closest is offered.
+        """
+        measured = [channel.name for channel in self.channels]
+        for name in names:
+            if name not in measured:
+                raise ConfigError(f"{self.source} does not measure '{name}'{closest(name, measured)}")
+        return np.array([measured.index(name) for name in names])
+
+
+def interface_of(env: Any) -> PlantInterface:
+    """What a controller sees of an environment.
+
+    Args:
+        env: a gymnasium environment with `channels`, `rate_hz`, `machine` and `commands` to the channels `PILOTS`, such
+            as `edp.sim.environment.ExcavatorEnv` or `edp.control.twin_environment.TwinEnvironment`.
+    """
+    plain = env.unwrapped
+    source = getattr(plain, "source", "the simulator")
+    commands = tuple(TABLE_A1[name] for name in PILOTS)
+    geometry = TipGeometry(plain.machine)
+    return PlantInterface(tuple(plain.channels), float(plain.rate_hz), geometry, commands, plain.commands, source)
+
+
+def nominal_commands(machine: Machine) -> Callable[[Array], Array]:
+    """How levers become pilot pressures: a function of levers, shape (..., 3), to Pa, shape (..., 12), as `PILOTS`."""
+    axes, plant = pack(machine)
+
+    def commands(levers: Array) -> Array:
+        positions = np.asarray(levers, float)
+        rows = np.ascontiguousarray(positions.reshape(-1, at.AXES))
+        demands = np.empty((len(rows), at.SPOOLS))
+        for row, demand in zip(rows, demands, strict=True):
+            valve.shape_demand(row, axes, plant, demand)
+        pressures = pilot_demands(demands, machine.valves.pilot_pressure)
+        return np.asarray(pressures.reshape(*positions.shape[:-1], len(PILOTS)))
+
+    return commands

@@ -1,0 +1,155 @@
+"""What every task shares: its registry, the drawing of its numbers from a seed, and the check that it can be done."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.geometry import TipGeometry
+from edp.control.limits import LoopLimits
+from edp.control.reference import TipReference, check_speeds, reference_of_tip
+from edp.control.tasks.time_law import LAWS, duration_s, timed
+from edp.errors import ConfigError
+from edp.registry import Registry
+from edp.settings.bounds import SEED, above, below, check_bounds, integer, span
+from edp.sim.excitation.levers import speed_table
+
+Array = NDArray[np.float64]
+TRIES = 200
+"""Draws of a task's numbers before it is refused: at 1 % that fit, 87 % of the seeds find one."""
+SPEED_RESERVE = 0.8
+"""Share of a cylinder's free-air top speed that a reference may ask for: flow is shared where three move at once."""
+SPEED_M_S = (0.3, 0.5)
+"""Of the tip, where a task's speed is drawn: usual for grading."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControlTask:
+    """A reference to follow, with what belongs to it.
+
+    Attributes:
+        name: in `TASKS`.
+        reference: to follow.
+        limits: to keep.
+        material: soil in which the bucket works; empty for free air.
+        seed: of which it was drawn.
+    """
+
+    name: str
+    reference: TipReference
+    limits: LoopLimits
+    material: str
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskSpec(ABC):
+    """Options of a task; subclasses draw the path.
+
+    Attributes:
+        speed_m_s: top speed of the tip; None draws it from `SPEED_M_S`.
+        law: time law, see `edp.control.tasks.time_law.LAWS`.
+        ramp_s: of speeding up and slowing down.
+        lead_s: rest before the start, not judged.
+        hold_s: rest after the end, judged.
+        margin: share of the stroke at either end that a reference leaves free.
+        material: soil; empty for free air.
+        limits: of the loop.
+    """
+
+    speed_m_s: float | None = None
+    law: str = "s_curve"
+    ramp_s: float = 0.5
+    lead_s: float = 0.5
+    hold_s: float = 1.0
+    margin: float = 0.04
+    material: str = ""
+    limits: LoopLimits = field(default_factory=LoopLimits)
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            "task",
+            self,
+            speed_m_s=above(0.0, 10.0),
+            ramp_s=above(0.0, 10.0),
+            lead_s=span(0.0, 60.0),
+            hold_s=span(0.0, 60.0),
+            margin=below(0.0, 0.5),
+        )
+        LAWS[self.law]
+
+    @abstractmethod
+    def drawn(self, rng: np.random.Generator, geometry: TipGeometry, rate_hz: float, name: str) -> TipReference:
+        """A reference of drawn numbers.
+
+        Raises:
+            ConfigError: it cannot be reached; other numbers are drawn then.
+        """
+
+    def drawn_speed(self, rng: np.random.Generator) -> float:
+        """The speed of the tip, m/s."""
+        return float(rng.uniform(*SPEED_M_S)) if self.speed_m_s is None else self.speed_m_s
+
+    def tip_reference(
+        self, name: str, points: Array, speed: float, geometry: TipGeometry, rate_hz: float
+    ) -> TipReference:
+        """A reference along straight legs of tip poses, shape (legs + 1, 3), each at a top speed (m/s).
+
+        Raises:
+            ConfigError: it cannot be reached.
+        """
+        # A turn of the bucket counts as the way of a point half of its length from the pin.
+        turned = 0.5 * geometry.machine.bodies.length[2]
+        ways = np.hypot(np.hypot(*np.diff(points[:, :2], axis=0).T), turned * np.diff(points[:, 2]))
+        seconds = [duration_s(float(way), speed, self.ramp_s) for way in ways]
+        poses, judged = timed(points, seconds, rate_hz, self.ramp_s, self.law, self.lead_s, self.hold_s)
+        return reference_of_tip(name, poses, geometry, rate_hz, judged, self.margin)
+
+
+def check_order(what: str, **ranges: tuple[float, float]) -> None:
+    """Refuse ranges whose ends are the wrong way round.
+
+    Raises:
+        ConfigError: names the first one.
+    """
+    for name, (low, high) in ranges.items():
+        if low > high:
+            raise ConfigError(f"{what}: {name} = {[low, high]}; the smaller number first must hold")
+
+
+TASKS: Registry[type[TaskSpec]] = Registry("task")
+"""Specs by name: one file and one registration each."""
+
+
+def draw_task(spec: TaskSpec, geometry: TipGeometry, rate_hz: float, seed: int) -> ControlTask:
+    """A task that the machine can do: numbers are drawn until strokes and speeds lie within what it can.
+
+    Args:
+        spec: options of a registered task.
+        geometry: of the machine.
+        rate_hz: ticks per second.
+        seed: the same seed gives the same task.
+
+    Raises:
+        ConfigError: no draw fits; the message is that of the last one, with the pose or stroke and its time.
+    """
+    if not SEED.holds(seed):
+        raise ConfigError(f"task: seed = {seed}; {SEED.rule('seed')} must hold")
+    if not integer(1, 100_000).holds(round(rate_hz)):
+        raise ConfigError(f"task: {rate_hz:g} Hz; 1 to 100,000 Hz must hold")
+    name = TASKS.name_of(spec)
+    fastest = SPEED_RESERVE * speed_table(geometry.machine)[1][:, :, -1].T
+    rng = np.random.default_rng(seed)
+    reason = ""
+    for _ in range(TRIES):
+        try:
+            reference = spec.drawn(rng, geometry, rate_hz, name)
+            check_speeds(name, reference, geometry, fastest)
+        except ConfigError as error:
+            reason = str(error)
+            continue
+        return ControlTask(name, reference, spec.limits, spec.material, seed)
+    raise ConfigError(f"task '{name}', seed {seed}: none of {TRIES} draws can be done; the last: {reason}")

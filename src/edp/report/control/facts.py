@@ -1,0 +1,113 @@
+"""Closed loops as a reader sees them: sentence, key figures, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from edp.recording import Recording
+from edp.report.animation.page import Scene
+from edp.report.common.sheets import Column, Sheet, Value, figures
+from edp.report.common.wording import MISSING, number
+
+
+@dataclass(frozen=True, eq=False)
+class ControlFacts:
+    """Loops of one controller on one task.
+
+    Attributes:
+        title: of the page.
+        content: as ``results.json`` has it: ``sentence``, ``task``, ``controller``, ``plant``, ``machine``, ``loops``
+            (each with ``name``, ``seed``, ``score``, ``solve_us`` and ``events``), ``summary``.
+        recordings: of the loops, in their order: see `edp.control.loop.LoopResult`.
+        solve_us: times of the controller's steps, microseconds, in the order of the recordings.
+        scene: side view of the first loop.
+        provenance: name and text of where it comes from.
+    """
+
+    title: str
+    content: Mapping[str, Any]
+    recordings: Sequence[Recording]
+    solve_us: Sequence[Any]
+    scene: Scene
+    provenance: Sequence[tuple[str, str]] = ()
+
+    @property
+    def loops(self) -> Sequence[Mapping[str, Any]]:
+        """Name, seed, score, times and events of each loop."""
+        loops: Sequence[Mapping[str, Any]] = self.content["loops"]
+        return loops
+
+
+def verdict(facts: ControlFacts) -> list[str]:
+    """What the loops were, in sentences behind the headline."""
+    content = facts.content
+    summary = content["summary"]
+    lines = [
+        f"{len(facts.loops)} loops of the task {content['task']['kind']} on {content['plant']}.",
+        "The position error is the distance of the tip to where the reference is at that time; the path error is its "
+        "distance to the nearest point of the path, which alone would reward standing still.",
+    ]
+    if summary["violations"]:
+        lines.append(f"Limits were violated at {summary['violations']} ticks.")
+    if summary["missed"]:
+        lines.append(f"The controller had no answer at {summary['missed']} ticks and gave the safe command.")
+    return lines
+
+
+def tiles(facts: ControlFacts) -> list[tuple[str, str, str]]:
+    """Key figures: value, unit, what it is."""
+    summary = facts.content["summary"]
+    rows = [
+        (number(summary["position_rms_mm"]), "mm", "position error of the tip (rms, mean over the loops)"),
+        (number(summary["position_worst_mm"]), "mm", "position error in the worst loop (rms)"),
+        (number(summary["path_rms_mm"]), "mm", "distance to the path (rms, mean over the loops)"),
+        (number(summary["attitude_rms_deg"]), "deg", "attitude error of the bucket (rms)"),
+        (number(summary["lever_travel"]), "", "lever travel, in full positions"),
+        (number(summary["solve_us_median"], 0), "µs", "median time of a step of the controller"),
+    ]
+    if summary["energy_kj"] is not None:
+        rows.insert(4, (number(summary["energy_kj"], 0), "kJ", "hydraulic energy of the pumps"))
+    return rows
+
+
+def loop_sheet(facts: ControlFacts) -> Sheet:
+    """A row of figures a loop."""
+    heads = (
+        ("Position rms", "mm", "position_rms_mm"),
+        ("p95", "mm", "position_p95_mm"),
+        ("max", "mm", "position_max_mm"),
+        ("Path rms", "mm", "path_rms_mm"),
+        ("max", "mm", "path_max_mm"),
+        ("Attitude rms", "deg", "attitude_rms_deg"),
+        ("Arrived after", "s", "arrived_s"),
+        ("Energy", "kJ", "energy_kj"),
+        ("Lever travel", "", "lever_travel"),
+    )
+    rows: list[tuple[Value, ...]] = []
+    for loop in facts.loops:
+        score = loop["score"]
+        violated = ", ".join(f"{name} {ticks}" for name, ticks in score["violations"].items() if ticks) or MISSING
+        rows.append((loop["name"], *(score[key] for _, _, key in heads), violated))
+    shown = [Column(title, unit, figures(row[1 + n] for row in rows)) for n, (title, unit, _) in enumerate(heads)]
+    return Sheet("loops", "Loops", (Column("Loop"), *shown, Column("Violated, ticks")), tuple(rows))
+
+
+def event_sheet(facts: ControlFacts) -> Sheet:
+    """What controllers logged."""
+    rows: list[tuple[Value, ...]] = [
+        (loop["name"], event["tick"], event["ticks"], event["text"]) for loop in facts.loops for event in loop["events"]
+    ]
+    whole = figures([], decimals=0)
+    heads = (Column("Loop"), Column("From tick", "", whole), Column("Ticks", "", whole), Column("Event"))
+    return Sheet("events", "Safe commands", heads, tuple(rows))
+
+
+def solver_sheet(facts: ControlFacts) -> Sheet:
+    """Times of a step of the controller."""
+    rows: list[tuple[Value, ...]] = [
+        (loop["name"], *(loop["solve_us"][key] for key in ("median", "p99", "max"))) for loop in facts.loops
+    ]
+    shown = [Column(name, "µs", figures([], decimals=0)) for name in ("Median", "99 %", "Longest")]
+    return Sheet("solver", "Time of a step of the controller", (Column("Loop"), *shown), tuple(rows))

@@ -1,0 +1,16 @@
+"""Names by which `gymnasium.make` finds the environments."""
+
+from __future__ import annotations
+
+from edp.sim.environment.library import gymnasium
+from edp.sim.machine.machine_files import machine_names
+
+ENTRY = "edp.sim.environment:ExcavatorEnv"
+
+
+def register() -> None:
+    """Register ``edp/Excavator-M22-v0`` and the like, one a built-in machine; again is no error."""
+    for machine in machine_names():
+        name = f"edp/Excavator-{machine}-v0"
+        if name not in gymnasium.registry:
+            gymnasium.register(id=name, entry_point=ENTRY, kwargs={"machine": machine})

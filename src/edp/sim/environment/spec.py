@@ -1,0 +1,137 @@
+"""What an environment simulates and shows, checked before the first step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError, closest
+from edp.settings.bounds import check_bounds, integer, shown, span
+from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1, Channel
+from edp.sim.machine import layout as at
+from edp.sim.machine.family import MASSES_T, WIDEST
+from edp.sim.scenario import START_STROKES, Scenario
+from edp.sim.sensors import chain
+from edp.sim.sensors.sensors import truth_columns
+
+OBSERVED = (*TABLE_A1, "CylStroke_1", "CylStroke_2", "CylStroke_3")
+"""What is shown unless told otherwise: Table A.1, and the strokes, which have no model of a sensor."""
+MOST_LATENCY = 1000
+MOST_SAMPLES = 10_000_000
+"""Of an episode: its random numbers are drawn at reset, 152 bytes a tick."""
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """One environment.
+
+    Attributes:
+        machine: name of a machine, or path of a machine file (`.toml`).
+        material: soil that the bucket works in; empty for free air.
+        duration_s: length of an episode, in which there are ``duration_s * rate_hz`` observations with the first one.
+        rate_hz: ticks per second.
+        step_s: integration step; cut in four near the ends of the stroke.
+        sensor_noise: False shows the truth.
+        hand: whether an operator's hand smooths the levers, as in `Simulation`.
+        loop_latency: ticks by which observations come later.
+        lost_frames: share of ticks at which the observation before is shown again.
+        start_strokes: range of the strokes to start from, as shares of full.
+        observed: names of the channels shown, of Table A.1 or of those that `simulate` logs beside it.
+        sensors: values that replace those of the machine's ``[sensors]``, by key.
+        randomise: True or a spread draws a machine of the family of M22 at each reset; the spread widens its scatter.
+        masses_t: range of the masses of that family.
+
+    Raises:
+        ConfigError: a value is out of range, or a machine, material or channel is unknown (the closest is offered).
+    """
+
+    machine: str = "M22"
+    material: str = ""
+    duration_s: float = 60.0
+    rate_hz: float = 100.0
+    step_s: float = 1e-3
+    sensor_noise: bool = True
+    hand: bool = False
+    loop_latency: int = 0
+    lost_frames: float = 0.0
+    start_strokes: tuple[float, float] = START_STROKES
+    observed: tuple[str, ...] = OBSERVED
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+    randomise: bool | float = False
+    masses_t: tuple[float, float] = MASSES_T
+
+    def __post_init__(self) -> None:
+        for key in ("start_strokes", "observed", "masses_t"):
+            object.__setattr__(self, key, tuple(getattr(self, key)))
+        check_bounds("environment", self, loop_latency=integer(0, MOST_LATENCY), lost_frames=span(0.0, 0.99))
+        self.scenario(0)
+        if self.duration_s * self.rate_hz > MOST_SAMPLES:
+            raise ConfigError(
+                f"environment: duration_s = {self.duration_s} at rate_hz = {self.rate_hz} is more than {MOST_SAMPLES} "
+                "ticks; choose shorter episodes"
+            )
+        if not self.observed or len(set(self.observed)) < len(self.observed):
+            raise ConfigError(f"environment: observed = {shown(self.observed)}; name each channel once, at least one")
+        for name in self.observed:
+            self.source(name)
+        if self.randomise is not False and self.machine.upper() != "M22":
+            raise ConfigError(
+                f"environment: randomise draws from the family of M22, and machine = {self.machine!r}; leave one out"
+            )
+        if not 0.0 < self.spread <= WIDEST:
+            raise ConfigError(f"environment: randomise = {self.randomise}; a spread is above 0 and at most {WIDEST:g}")
+
+    @property
+    def spread(self) -> float:
+        """Factor on the scatter of the family."""
+        return 1.0 if isinstance(self.randomise, bool) else float(self.randomise)
+
+    def scenario(self, seed: int) -> Scenario:
+        """The scenario of one episode.
+
+        Raises:
+            ConfigError: it cannot be.
+        """
+        return Scenario(
+            machine=self.machine,
+            duration_s=self.duration_s,
+            rate_hz=self.rate_hz,
+            step_s=self.step_s,
+            sensor_noise=self.sensor_noise,
+            seed=seed,
+            material=self.material,
+            start_strokes=self.start_strokes,
+            sensors=self.sensors,
+        )
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Name, unit and kind of each value of an observation."""
+        known_channels = {**TABLE_A1, **EXTRA_CHANNELS, **GROUND_CHANNELS}
+        return tuple(known_channels[name] for name in self.observed)
+
+    @property
+    def columns(self) -> NDArray[np.int64]:
+        """Where each value of an observation comes from, see `edp.sim.episodes.tick.SOURCES`."""
+        return np.array([self.source(name) for name in self.observed], dtype=np.int64)
+
+    def source(self, name: str) -> int:
+        """Where a channel's value comes from.
+
+        Raises:
+            ConfigError: there is no such channel, or only in soil.
+        """
+        columns = truth_columns(at.LOG_GROUND + at.GROUND_POINTS)
+        if name in TABLE_A1:
+            return list(TABLE_A1).index(name)
+        if name not in columns:
+            raise ConfigError(
+                f"environment: observed channel '{name}' is unknown{closest(name, [*TABLE_A1, *columns])}"
+            )
+        if columns[name] >= at.LOG_GROUND and not self.material:
+            raise ConfigError(f"environment: observed channel '{name}' is there only in soil; choose a material")
+        return chain.MEASURED + columns[name]

@@ -1,0 +1,82 @@
+"""How an environment's next episode begins: its settings, what `reset` overrides of them, and a drawn machine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from edp.errors import ConfigError, closest
+from edp.sim.environment.spec import EnvironmentSpec
+from edp.sim.episodes.episodes import EpisodeStart
+from edp.sim.machine.family import member_name
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.machine_checks import check_machine
+from edp.sim.machine.machine_files import family_member
+
+OF_SPEC = ("machine", "material", "sensor_noise", "hand", "loop_latency", "lost_frames", "start_strokes", "sensors")
+"""Settings that the options of a reset may override for one episode."""
+OWN = ("strokes", "oil_temperature")
+"""Options besides: strokes to start from (shares of full), and the oil's temperature at the start (degC)."""
+MOST_SEED = 2**31 - 1
+
+
+def episode_start(
+    spec: EnvironmentSpec, seed: int, options: Mapping[str, Any] | None
+) -> tuple[EpisodeStart, dict[str, Any]]:
+    """The start of an episode, and what its `info` says of it.
+
+    Raises:
+        ConfigError: an option is unknown (the closest is offered) or out of range.
+    """
+    options = dict(options or {})
+    for name in options:
+        if name not in (*OF_SPEC, *OWN):
+            raise ConfigError(f"reset: option '{name}' is unknown{closest(str(name), [*OF_SPEC, *OWN])}")
+    if not seed >= 0:
+        raise ConfigError(f"reset: seed = {seed} must not be negative")
+    overrides = {name: value for name, value in options.items() if name in OF_SPEC}
+    if "machine" in overrides and spec.randomise is not False:
+        raise ConfigError("reset: option 'machine' and an environment that draws machines (randomise); leave one out")
+    if overrides:
+        spec = replace(spec, **overrides)
+    scenario = spec.scenario(seed)
+    machine = _drawn(spec, seed) if spec.randomise is not False else scenario.load()
+    if "oil_temperature" in options:
+        machine = _warmed(machine, options["oil_temperature"])
+    start = EpisodeStart(
+        scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
+    )
+    return start, {"seed": seed, "machine": machine.name, "material": spec.material}
+
+
+def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
+    """The machine of the family that this seed draws."""
+    low, high = spec.masses_t
+    # A family of its own for each seed, so that its first member has any mass.
+    family = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0]) % 10**9
+    machine = family_member(family, 0, low, high, spec.spread)
+    return replace(machine, name=member_name(family, 0, (low, high), spec.spread))
+
+
+def _warmed(machine: Machine, celsius: Any) -> Machine:
+    try:
+        warmed = replace(machine, oil=replace(machine.oil, temperature=float(celsius)))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"reset: oil_temperature = {celsius!r}; give a number in degC") from error
+    check_machine(warmed, f"{machine.name} with the reset's oil_temperature")
+    return warmed
+
+
+def _strokes(strokes: Any) -> tuple[float, float, float] | None:
+    if strokes is None:
+        return None
+    try:
+        boom, arm, bucket = (float(stroke) for stroke in strokes)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"reset: strokes = {strokes!r}; give three shares of full stroke from 0 to 1") from error
+    if not all(0.0 <= stroke <= 1.0 for stroke in (boom, arm, bucket)):
+        raise ConfigError(f"reset: strokes = {[boom, arm, bucket]}; give three shares of full stroke from 0 to 1")
+    return boom, arm, bucket

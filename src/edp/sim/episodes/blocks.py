@@ -1,0 +1,67 @@
+"""Where everything of one episode lies: a row of numbers that changes, and a row that was drawn before it began.
+
+A copy of the two rows is the episode at that moment, exactly. Blocks of the rows have sizes of their own in each
+episode (a machine's reach, its dead times, the latency of its bus), so that each row begins with a table of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.physics.jit import pasted
+
+Array = NDArray[np.float64]
+
+# numbers[...], the first block of a changing row
+TICK, SAMPLES, CLAMPS, HAND_S, IN_AIR, DELAY = range(6)
+"""Ticks done and in all, clamped pressures, time step of the hand (0: none), 1 in free air, ticks of loop latency."""
+NUMBERS = 6
+
+# blocks of the row that changes
+(
+    NUMBER, STATE, VALVES, HAND, PAST, AXES, PLANT, DELAYS, COARSE, FINE, COARSE_FILTERS, FINE_FILTERS,
+    HEIGHTS, GROUND_MEMORY, SENSOR_NUMBERS, SENSOR_AXES, SENSOR_PLANT, SENSOR_MEMORY, HISTORY, ROW, MEASURED, SHOWN,
+) = range(22)  # fmt: skip
+# blocks of the row that was drawn
+SENSOR_DRAWS, LOST, SOIL_NUMBERS, SOIL_TABLES, SOIL_COURSE = range(22, 27)
+BLOCKS = 27
+CHANGING = 22
+ENTRY = 3
+"""Numbers of a table's entry: first place in its row, rows and columns of the block."""
+
+
+@pasted
+def table(index: int, memory: Array, row: Array) -> Array:
+    """A block of two axes of `row`; `memory` is the changing row, which has the table."""
+    first, count, width = int(memory[ENTRY * index]), int(memory[ENTRY * index + 1]), int(memory[ENTRY * index + 2])
+    return row[first : first + count * width].reshape(count, width)
+
+
+@pasted
+def line(index: int, memory: Array, row: Array) -> Array:
+    """A block of one axis of `row`."""
+    first, count = int(memory[ENTRY * index]), int(memory[ENTRY * index + 1]) * int(memory[ENTRY * index + 2])
+    return row[first : first + count]
+
+
+def rows_of(parts: Mapping[int, Array]) -> tuple[Array, Array]:
+    """The two rows that hold these blocks, one value an index."""
+    head, changing, drawn = np.zeros((BLOCKS, ENTRY)), [np.zeros(0)], [np.zeros(0)]
+    ends = [BLOCKS * ENTRY, 0]
+    for index in range(BLOCKS):
+        part = np.asarray(parts[index], dtype=float)
+        side = 0 if index < CHANGING else 1
+        head[index] = ends[side], (1 if part.ndim < 2 else len(part)), part.shape[-1]
+        ends[side] += part.size
+        (changing, drawn)[side].append(part.ravel())
+    return np.concatenate([head.ravel(), *changing]), np.concatenate(drawn)
+
+
+def view(index: int, memory: Array, drawn: Array) -> Array:
+    """A block as a view, shape (rows, columns)."""
+    first, count, width = (int(v) for v in memory[ENTRY * index : ENTRY * index + ENTRY])
+    row = memory if index < CHANGING else drawn
+    return row[first : first + count * width].reshape(count, width)

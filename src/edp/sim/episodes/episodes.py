@@ -1,0 +1,254 @@
+"""Episodes in rows: each begins with its own machine, soil and seed; all go on by a tick in one compiled call."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.errors import ConfigError
+from edp.sim.episodes import blocks, tick
+from edp.sim.machine import layout as at
+from edp.sim.machine.machine import Machine
+from edp.sim.physics import soil
+from edp.sim.physics.plant import Plant
+from edp.sim.scenario import Scenario, SimulationError
+from edp.sim.sensors import chain, draws
+from edp.sim.start import seeds_of, start_of
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EpisodeStart:
+    """How one episode begins.
+
+    Attributes:
+        scenario: machine, soil, rate, seed and length; its excitation is not used.
+        machine: the machine itself, which may be drawn or changed.
+        hand: whether an operator's hand smooths the levers.
+        loop_latency: ticks by which observations come later.
+        lost_frames: share of ticks at which the observation before is shown again.
+        strokes: where the cylinders start, shares of full; drawn where None.
+    """
+
+    scenario: Scenario
+    machine: Machine
+    hand: bool = False
+    loop_latency: int = 0
+    lost_frames: float = 0.0
+    strokes: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One episode at one instant: its rows, which nothing that follows changes, and how it began."""
+
+    start: EpisodeStart
+    memory: Array
+    drawn: Array
+
+
+class Episodes:
+    """Machines under way, one a row.
+
+    Args:
+        count: how many.
+        columns: what observations show, numbers of `tick.SOURCES`.
+    """
+
+    def __init__(self, count: int, columns: NDArray[np.int64]) -> None:
+        self.count, self.columns = count, columns
+        self.memory, self.drawn = np.zeros((count, 0)), np.zeros((count, 0))
+        self.starts: list[EpisodeStart | None] = [None] * count
+        self._scratch = tick.new_scratch()
+        self._all = np.ones(count, dtype=np.bool_)
+
+    def begin(self, index: int, start: EpisodeStart) -> NDArray[np.float32]:
+        """Begin an episode anew; its first observation, shape (column,).
+
+        Raises:
+            ConfigError: the machine's dead times are too long.
+        """
+        memory, drawn = _rows(start, len(self.columns))
+        self._put(index, start, memory, drawn)
+        out = np.empty(len(self.columns), np.float32)
+        tick.begin(self.memory[index], self.drawn[index], self.columns, self._scratch, out)
+        return out
+
+    def step(self, levers: Array, out: NDArray[np.float32], active: NDArray[np.bool_] | None = None) -> None:
+        """One tick with lever positions of shape (count, 3); observations go to `out`, shape (count, column).
+
+        Raises:
+            ConfigError: a lever is not a finite number; no episode has moved.
+            SimulationError: a state became non-finite.
+        """
+        active = self._all if active is None else active
+        failed, how = tick.step_all(self.memory, self.drawn, levers, active, self.columns, self._scratch, out)
+        if how == tick.FINE:
+            return
+        if how == tick.NOT_FINITE_LEVER:
+            raise ConfigError(
+                f"levers of episode {failed} are {levers[failed].tolist()}; give three finite numbers from -1 to 1"
+            )
+        start = self.starts[failed]
+        if start is None:
+            raise ConfigError(f"episode {failed} has not begun; reset it first")
+        raise SimulationError(
+            f"episode {failed} diverged at t = {self.tick(failed) / start.scenario.rate_hz:.2f} s (machine "
+            f"{start.machine.name}, seed {start.scenario.seed}); choose a smaller step_s than {start.scenario.step_s}"
+        )
+
+    def tick(self, index: int) -> int:
+        """Ticks done since an episode began."""
+        return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
+
+    def ended(self) -> NDArray[np.bool_]:
+        """Which episodes have all their ticks behind them, shape (count,)."""
+        first = blocks.BLOCKS * blocks.ENTRY
+        ended: NDArray[np.bool_] = self.memory[:, first + blocks.TICK] >= self.memory[:, first + blocks.SAMPLES] - 1.0
+        return ended
+
+    def row(self, index: int) -> Array:
+        """A copy of the present row of an episode's log, columns of `edp.sim.machine.layout`."""
+        row: Array = blocks.view(blocks.ROW, self.memory[index], self.drawn[index])[0].copy()
+        return row
+
+    def measured(self, index: int) -> Array:
+        """A copy of the 24 signals of Table A.1 as sensors show them at this tick."""
+        signals: Array = blocks.view(blocks.MEASURED, self.memory[index], self.drawn[index])[0].copy()
+        return signals
+
+    def moment(self, index: int) -> Moment:
+        """This instant of an episode."""
+        start = self.starts[index]
+        if start is None:
+            raise ConfigError(f"episode {index} has not begun; reset it first")
+        # Of one episode the drawn row is replaced, never changed, so that it needs no copy.
+        drawn = self.drawn[index] if self.count == 1 else self.drawn[index].copy()
+        return Moment(start, self.memory[index].copy(), drawn)
+
+    def go_to(self, index: int, moment: Moment) -> None:
+        """Make an episode what it was at a moment, to the bit."""
+        self._put(index, moment.start, moment.memory.copy(), moment.drawn)
+
+    def redraw(self, index: int, seed: np.random.SeedSequence) -> None:
+        """Fresh randomness of sensors and soil from here on; what was shown and what the edge is in now stays."""
+        start = self.starts[index]
+        if start is None:
+            raise ConfigError(f"episode {index} has not begun; reset it first")
+        noise, lost, course = seed.spawn(3)
+        drawn, done = self.drawn[index].copy(), self.tick(index) + 1
+        present = blocks.view(blocks.SENSOR_DRAWS, self.memory[index], drawn)
+        if start.scenario.sensor_noise:
+            fresh = draws.draw(start.machine, len(present), start.scenario.rate_hz, np.random.default_rng(noise))
+            _bridge(present, fresh, done, len(blocks.view(blocks.HISTORY, self.memory[index], drawn)))
+        losses = blocks.view(blocks.LOST, self.memory[index], drawn)[0]
+        losses[done:] = _losses(start, len(losses), lost)[done:]
+        if start.scenario.material:
+            soil.redraw_course(
+                soil.load_material(start.scenario.material),
+                blocks.view(blocks.SOIL_NUMBERS, self.memory[index], drawn)[0],
+                blocks.view(blocks.GROUND_MEMORY, self.memory[index], drawn)[0],
+                blocks.view(blocks.SOIL_COURSE, self.memory[index], drawn),
+                np.random.default_rng(course),
+            )
+        self._put(index, start, self.memory[index].copy(), drawn)
+
+    def _put(self, index: int, start: EpisodeStart, memory: Array, drawn: Array) -> None:
+        """Give an episode these rows; all rows become as long as the longest."""
+        self.starts[index] = start
+        if self.count == 1:
+            self.memory, self.drawn = memory[None], drawn[None]
+            return
+        self.memory, self.drawn = _long_enough(self.memory, len(memory)), _long_enough(self.drawn, len(drawn))
+        self.memory[index, : len(memory)], self.drawn[index, : len(drawn)] = memory, drawn
+
+
+def _long_enough(rows: Array, length: int) -> Array:
+    if rows.shape[1] >= length:
+        return rows
+    longer = np.zeros((len(rows), length))
+    longer[:, : rows.shape[1]] = rows
+    return longer
+
+
+def _bridge(present: Array, fresh: Array, done: int, depth: int) -> None:
+    """Replace the draws of the ticks from `done` on, in place.
+
+    A bias goes on from where it is. No frame is shown that is older than the one before it, nor one that is older than
+    the sensors remember, `depth` ticks.
+    """
+    late = slice(chain.AT_JOINTS, chain.AT_VALVES + 1)
+    earliest = (np.arange(len(present)) - (depth - 1.0))[:, None]
+    present[done:, late] = np.maximum(np.maximum(fresh[done:, late], earliest[done:]), present[done - 1, late])
+    bias, errors = slice(chain.RATE_BIAS, chain.RATE_ERROR), slice(chain.RATE_ERROR, chain.DRAWS)
+    present[done:, bias] = present[done - 1, bias] + fresh[done:, bias] - fresh[done - 1, bias]
+    present[done:, errors] = fresh[done:, errors]
+
+
+def _losses(start: EpisodeStart, samples: int, seed: np.random.SeedSequence) -> Array:
+    """1 at each tick whose observation is lost, shape (samples,)."""
+    if start.lost_frames <= 0.0:
+        return np.zeros(samples)
+    return (np.random.default_rng(seed).random(samples) < start.lost_frames).astype(float)
+
+
+def _rows(start: EpisodeStart, width: int) -> tuple[Array, Array]:
+    """Both rows of an episode at rest at its start; `width` is that of its observations."""
+    scenario, machine = start.scenario, start.machine
+    ground, strokes = start_of(scenario, machine)
+    if start.strokes is not None:
+        strokes = np.array(start.strokes)
+    plant = Plant(machine, strokes, scenario.rate_hz, scenario.step_s, ground)
+    if len(plant.past) > tick.MOST_PAST:
+        raise ConfigError(
+            f"machine {machine.name} has dead times of {len(plant.past)} ticks at {scenario.rate_hz} Hz; at most "
+            f"{tick.MOST_PAST} are taken: choose a lower rate_hz"
+        )
+    seeds = seeds_of(scenario)
+    rng = np.random.default_rng(seeds[2]) if scenario.sensor_noise else None
+    drawn = draws.draw(machine, scenario.samples, scenario.rate_hz, rng)
+    sensor_numbers, sensor_axes, sensor_plant = draws.pack_sensors(machine, scenario.rate_hz, rng is not None)
+    coarse, fine = plant.clocks
+    soil_numbers, tables, course, heights, ground_memory = soil.no_ground() if ground is None else ground.arrays()
+    columns = at.LOG_COLUMNS if ground is None else at.LOG_GROUND + at.GROUND_POINTS
+    numbers = [
+        0.0,
+        scenario.samples,
+        0.0,
+        1.0 / scenario.rate_hz if start.hand else 0.0,
+        ground is None,
+        start.loop_latency,
+    ]
+    parts = {
+        blocks.NUMBER: np.array(numbers, dtype=float),
+        blocks.STATE: plant.state,
+        blocks.VALVES: plant.valves,
+        blocks.HAND: plant.hand,
+        blocks.PAST: plant.past,
+        blocks.AXES: plant.axes,
+        blocks.PLANT: plant.plant,
+        blocks.DELAYS: plant.delays,
+        blocks.COARSE: np.array(coarse[:3]),
+        blocks.FINE: np.array(fine[:3]),
+        blocks.COARSE_FILTERS: coarse[3].reshape(at.SPOOLS, -1),
+        blocks.FINE_FILTERS: fine[3].reshape(at.SPOOLS, -1),
+        blocks.HEIGHTS: heights,
+        blocks.GROUND_MEMORY: ground_memory,
+        blocks.SENSOR_NUMBERS: sensor_numbers,
+        blocks.SENSOR_AXES: sensor_axes,
+        blocks.SENSOR_PLANT: sensor_plant,
+        blocks.SENSOR_MEMORY: np.zeros(chain.SENSOR_MEMORY),
+        blocks.HISTORY: np.zeros((draws.depth(drawn), chain.REMEMBERED)),
+        blocks.ROW: np.zeros((1, columns)),
+        blocks.MEASURED: np.zeros(chain.MEASURED),
+        blocks.SHOWN: np.zeros((start.loop_latency + 2, width)),
+        blocks.SENSOR_DRAWS: drawn,
+        blocks.LOST: _losses(start, len(drawn), seeds[1]),
+        blocks.SOIL_NUMBERS: soil_numbers,
+        blocks.SOIL_TABLES: tables,
+        blocks.SOIL_COURSE: course,
+    }
+    return blocks.rows_of(parts)

@@ -1,0 +1,202 @@
+"""One tick of many episodes: lever positions in, plant and sensors a sample on, observations out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.episodes import blocks
+from edp.sim.machine import layout as at
+from edp.sim.physics import integrator, plant, terramechanics
+from edp.sim.physics.jit import compiled, inlined, pasted
+from edp.sim.sensors import chain, logbook
+
+Array = NDArray[np.float64]
+SOURCES = chain.MEASURED + at.LOG_GROUND + at.GROUND_POINTS
+"""What an observation may show: the measured signals, then every column of the log."""
+KELVIN = 273.15
+
+# what `step_all` reports
+FINE, NOT_FINITE_LEVER, DIVERGED = 0, 1, 2
+Setup = tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]
+
+
+@pasted
+def scratch_of(scratch: Array) -> tuple[Array, ...]:
+    """The work arrays of `integrator.new_work`, cut from one array of at least `SCRATCH` values."""
+    ends = (
+        integrator.FROZEN,
+        integrator.FROZEN + 3,
+        integrator.FROZEN + 3 + 3 * at.OPENINGS,
+        integrator.FROZEN + 28 + 3 * at.OPENINGS,
+        integrator.FROZEN + 28 + 3 * at.OPENINGS + 4 * integrator.SLOPES,
+        integrator.FROZEN + 28 + 3 * at.OPENINGS + 4 * integrator.SLOPES + terramechanics.CONTACTS,
+    )
+    return (
+        scratch[: ends[0]],
+        scratch[ends[0] : ends[1]],
+        scratch[ends[1] : ends[2]].reshape(3, at.OPENINGS),
+        scratch[ends[2] : ends[3]].reshape(5, 5),
+        scratch[ends[3] : ends[4]].reshape(4, integrator.SLOPES),
+        scratch[ends[4] : ends[5]],
+        scratch[ends[5] : ends[5] + at.STATES],
+        scratch[ends[5] + at.STATES : ends[5] + 2 * at.STATES],
+        scratch[ends[5] + 2 * at.STATES : ends[5] + 3 * at.STATES],
+        scratch[ends[5] + 3 * at.STATES : ends[5] + 4 * at.STATES],
+        scratch[ends[5] + 4 * at.STATES : ends[5] + 5 * at.STATES],
+    )
+
+
+SCRATCH = integrator.FROZEN + 28 + 3 * at.OPENINGS + 4 * integrator.SLOPES + terramechanics.CONTACTS + 5 * at.STATES
+MOST_PAST = 256
+"""Samples of dead time that a machine may have."""
+
+
+@pasted
+def setup_of(memory: Array, drawn: Array, scratch: Array) -> Setup:
+    """What the plant's step takes: axes, plant, work and the arrays of the ground."""
+    ground = (
+        blocks.line(blocks.SOIL_NUMBERS, memory, drawn),
+        blocks.table(blocks.SOIL_TABLES, memory, drawn),
+        blocks.table(blocks.SOIL_COURSE, memory, drawn),
+        blocks.line(blocks.HEIGHTS, memory, memory),
+        blocks.line(blocks.GROUND_MEMORY, memory, memory),
+    )
+    axes, numbers = blocks.table(blocks.AXES, memory, memory), blocks.line(blocks.PLANT, memory, memory)
+    return axes, numbers, scratch_of(scratch), ground
+
+
+@inlined
+def move(memory: Array, lever: Array, setup: Setup, room: Array) -> int:
+    """Run the plant for one sample from its logged row; returns the number of clamped pressures.
+
+    `lever` has shape (1, 3); `room` is scratch, which ends with the past demands and the new one.
+    """
+    state, valves = blocks.line(blocks.STATE, memory, memory), blocks.table(blocks.VALVES, memory, memory)
+    past, hand = blocks.table(blocks.PAST, memory, memory), blocks.table(blocks.HAND, memory, memory)
+    coarse, fine = blocks.line(blocks.COARSE, memory, memory), blocks.line(blocks.FINE, memory, memory)
+    numbers = blocks.line(blocks.NUMBER, memory, memory)
+    coarse_filters = blocks.line(blocks.COARSE_FILTERS, memory, memory).reshape(at.SPOOLS, 2, 4)
+    fine_filters = blocks.line(blocks.FINE_FILTERS, memory, memory).reshape(at.SPOOLS, 2, 4)
+    clocks = (
+        (int(coarse[0]), coarse[1], coarse[2], coarse_filters),
+        (int(fine[0]), fine[1], fine[2], fine_filters),
+    )
+    times = (blocks.line(blocks.DELAYS, memory, memory), clocks)
+    count = past.shape[0]
+    one_demand = room[: at.SPOOLS]
+    demands = room[at.SPOOLS : at.SPOOLS * (count + 2)].reshape(count + 1, at.SPOOLS)
+    plant.shape_commands(lever, hand, numbers[blocks.HAND_S], past, setup, demands, one_demand)
+    row = blocks.line(blocks.ROW, memory, memory)
+    return plant.run_sample(state, valves, demands, count, times, setup, row, one_demand)
+
+
+@inlined
+def look(memory: Array, drawn: Array, setup: Setup, work: Array) -> None:
+    """Log the present instant and let the sensors take it."""
+    state, valves = blocks.line(blocks.STATE, memory, memory), blocks.table(blocks.VALVES, memory, memory)
+    past, row = blocks.table(blocks.PAST, memory, memory), blocks.table(blocks.ROW, memory, memory)
+    tick = int(blocks.line(blocks.NUMBER, memory, memory)[blocks.TICK])
+    # The newest demand is that of the sample that ends here: the next one is not yet decided.
+    logbook.write_log(state, valves, past[past.shape[0] - 1], setup[0], setup[1], setup[3], row[0])
+    sensor_setup = (
+        blocks.line(blocks.SENSOR_NUMBERS, memory, memory),
+        blocks.table(blocks.SENSOR_AXES, memory, memory),
+        blocks.line(blocks.SENSOR_PLANT, memory, memory),
+    )
+    sensor_state = (
+        blocks.line(blocks.SENSOR_MEMORY, memory, memory),
+        blocks.table(blocks.HISTORY, memory, memory),
+        work,
+    )
+    draws = blocks.table(blocks.SENSOR_DRAWS, memory, drawn)
+    measured = blocks.line(blocks.MEASURED, memory, memory)
+    chain.sense(row, row[0, at.LOG_OIL] + KELVIN, tick, draws[tick], sensor_setup, sensor_state, measured)
+
+
+@inlined
+def show(memory: Array, drawn: Array, columns: NDArray[np.int64], out: NDArray[np.float32]) -> None:
+    """The observation of this tick: what was measured, `DELAY` ticks late, and the one before where one was lost."""
+    numbers, shown = blocks.line(blocks.NUMBER, memory, memory), blocks.table(blocks.SHOWN, memory, memory)
+    measured, row = blocks.line(blocks.MEASURED, memory, memory), blocks.line(blocks.ROW, memory, memory)
+    tick, ring = int(numbers[blocks.TICK]), shown.shape[0] - 1
+    late = int(numbers[blocks.DELAY])
+    # The last row of the block is what was shown last.
+    last, now = shown[ring], shown[tick % ring]
+    for c in range(columns.shape[0]):
+        source = columns[c]
+        value = measured[source] if source < chain.MEASURED else row[source - chain.MEASURED]
+        if source == chain.MEASURED + at.LOG_OIL:
+            value += KELVIN
+        now[c] = value
+    visible = shown[max(tick - late, 0) % ring]
+    if tick == 0 or blocks.line(blocks.LOST, memory, drawn)[tick] == 0.0:
+        for c in range(columns.shape[0]):
+            last[c] = visible[c]
+    for c in range(columns.shape[0]):
+        out[c] = last[c]
+
+
+@compiled
+def step_all(
+    memory: Array,
+    drawn: Array,
+    levers: Array,
+    active: NDArray[np.bool_],
+    columns: NDArray[np.int64],
+    scratch: Array,
+    out: NDArray[np.float32],
+) -> tuple[int, int]:
+    """A tick of every active episode; the first that failed, and how.
+
+    Args:
+        memory: rows that change, shape (episode, ...).
+        drawn: rows that were drawn, shape (episode, ...).
+        levers: positions, shape (episode, 3); beyond [-1, 1] they stand at the end.
+        active: episodes to step, shape (episode,).
+        columns: what is shown, see `SOURCES`.
+        scratch: at least `SCRATCH` and ``6 (MOST_PAST + 2) + 9`` values.
+        out: observations, shape (episode, column), of the active ones.
+    """
+    for e in range(memory.shape[0]):
+        # Before any episode has moved: a bad lever must leave all as they are.
+        if active[e] and not math.isfinite(levers[e, 0] + levers[e, 1] + levers[e, 2]):
+            return e, NOT_FINITE_LEVER
+    lever, work = scratch[:3].reshape(1, 3), scratch[3:9].reshape(2, 3)
+    room = scratch[9 : 9 + at.SPOOLS * (MOST_PAST + 2)]
+    rest = scratch[9 + at.SPOOLS * (MOST_PAST + 2) :]
+    failed, how = -1, FINE
+    for e in range(memory.shape[0]):
+        if not active[e]:
+            continue
+        setup = setup_of(memory[e], drawn[e], rest)
+        for i in range(at.AXES):
+            lever[0, i] = min(max(levers[e, i], -1.0), 1.0)
+        numbers = blocks.line(blocks.NUMBER, memory[e], memory[e])
+        numbers[blocks.CLAMPS] += move(memory[e], lever, setup, room)
+        numbers[blocks.TICK] += 1.0
+        look(memory[e], drawn[e], setup, work)
+        show(memory[e], drawn[e], columns, out[e])
+        total = 0.0
+        for n in range(at.STATES):
+            total += blocks.line(blocks.STATE, memory[e], memory[e])[n]
+        # What once is not finite stays so, and one sum shows it.
+        if not math.isfinite(total) and failed < 0:
+            failed, how = e, DIVERGED
+    return failed, how
+
+
+@compiled
+def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Array, out: NDArray[np.float32]) -> None:
+    """The first observation of one episode, shape (column,)."""
+    rest, work = scratch[9 + at.SPOOLS * (MOST_PAST + 2) :], scratch[3:9].reshape(2, 3)
+    setup = setup_of(memory, drawn, rest)
+    look(memory, drawn, setup, work)
+    show(memory, drawn, columns, out)
+
+
+def new_scratch() -> Array:
+    """The scratch that `step_all` and `begin` take."""
+    return np.zeros(9 + at.SPOOLS * (MOST_PAST + 2) + SCRATCH)

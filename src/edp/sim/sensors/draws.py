@@ -1,0 +1,121 @@
+"""Everything random that sensors and bus do to a recording, drawn at once before it begins: one row a tick."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import pack
+from edp.sim.sensors import can, chain, filters, transducers
+
+Array = NDArray[np.float64]
+ECUS = ("joints", "pressures", "valves")
+"""Senders on the bus: rates of the joints, cylinder pressures, and pilot demands."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """What differs between two machines of one type and stays the same from recording to recording.
+
+    Attributes:
+        pressure_offset: offsets of the six cylinder pressures as a share of full scale.
+        phase: clock of each of `ECUS` against the logger's, as a share of the frame period.
+        latency_s: usual latency of each of them.
+    """
+
+    pressure_offset: Array
+    phase: Array
+    latency_s: Array
+
+
+def instance_of(machine: Machine) -> Instance:
+    """The fixed instance of a machine, drawn from its name and ``instance_seed``."""
+    own = machine.sensors
+    # crc32, since hash() of a text differs from process to process.
+    rng = np.random.default_rng([zlib.crc32(machine.name.encode()), int(own.instance_seed)])
+    return Instance(
+        rng.choice([-1.0, 1.0], 6) * rng.uniform(*own.pressure_offset, 6),
+        rng.uniform(0.0, 1.0, len(ECUS)),
+        rng.uniform(*own.can_latency, len(ECUS)),
+    )
+
+
+def draw(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generator | None) -> Array:
+    """What is random in a recording of so many samples, shape (samples, chain.DRAWS); without `rng` nothing is.
+
+    Args:
+        machine: whose ``[sensors]`` holds.
+        samples: of the recording.
+        rate_hz: their rate.
+        rng: source of noise, bias, jitter and losses of this recording.
+    """
+    drawn = np.zeros((samples, chain.DRAWS))
+    if rng is None:
+        drawn[:, : len(ECUS)] = np.arange(samples)[:, None]
+        return drawn
+    own = machine.sensors
+    # The order of the draws is fixed: another one would give other recordings for the same seed.
+    joints, transmitters, valves = _bus(machine, samples, rate_hz, rng)
+    for column, frames in ((chain.AT_JOINTS, joints), (chain.AT_PRESSURES, transmitters), (chain.AT_VALVES, valves)):
+        # What lies before the first sample has its value.
+        drawn[:, column] = np.maximum(frames.positions[frames.seen], 0.0)
+    shape = (len(joints.positions), 3)
+    # Without a bus each sample is a frame.
+    frame_s = own.can_period or 1.0 / rate_hz
+    drift, noise = rng.spawn(2)
+    # Files state the walk per root of a minute.
+    bias = transducers.random_walk(shape, frame_s, np.deg2rad(own.joint_bias_walk_deg) / np.sqrt(60.0), drift)
+    error = noise.normal(0.0, np.deg2rad(own.joint_rate_deg), shape)
+    drawn[:, chain.RATE_BIAS : chain.RATE_BIAS + 3] = bias[joints.seen]
+    drawn[:, chain.RATE_ERROR : chain.RATE_ERROR + 3] = error[joints.seen]
+    drawn[:, chain.VELOCITY_ERROR : chain.VELOCITY_ERROR + 3] = rng.normal(0.0, own.velocity, shape)[joints.seen]
+    pressure_error = rng.normal(0.0, own.pressure, (len(transmitters.positions), 6))
+    drawn[:, chain.PRESSURE_ERROR :] = pressure_error[transmitters.seen]
+    return drawn
+
+
+def depth(drawn: Array) -> int:
+    """How many ticks back the oldest value is read that is shown, and the tick itself."""
+    late = np.arange(len(drawn))[:, None] - np.floor(drawn[:, : len(ECUS)])
+    return int(late.max()) + 1
+
+
+def _bus(machine: Machine, samples: int, rate_hz: float, rng: np.random.Generator) -> list[can.Frames]:
+    """Frames of each of `ECUS`, with random numbers of their own."""
+    own, instance = machine.sensors, instance_of(machine)
+    bus = can.Bus(own.can_period, own.can_latency, own.can_jitter, own.can_loss)
+    # A generator each: what one ECU draws does not move the noise of the others.
+    each = zip(instance.phase, instance.latency_s, rng.spawn(len(ECUS)), strict=True)
+    return [can.frames(samples, rate_hz, bus, phase, latency, child) for phase, latency, child in each]
+
+
+def pack_sensors(machine: Machine, rate_hz: float, noisy: bool) -> tuple[Array, Array, Array]:
+    """Numbers of the chain, and `axes` and `plant` of the machine as built: payload and oil change the plant's own.
+
+    Args:
+        machine: whose ``[sensors]`` holds.
+        rate_hz: rate of the log.
+        noisy: False for the truth.
+    """
+    own, step_s = machine.sensors, 1.0 / rate_hz
+    numbers = np.zeros(chain.SENSOR_NUMBERS)
+    numbers[chain.NOISY], numbers[chain.STEP_S], numbers[chain.PILOT_FULL] = (
+        noisy,
+        step_s,
+        machine.valves.pilot_pressure,
+    )
+    numbers[chain.DERIVATIVE : chain.DERIVATIVE + 5] = filters.derivative_numbers(own.acceleration_bandwidth, rate_hz)
+    numbers[chain.LAGGED] = own.pressure_lag > 0.0
+    numbers[chain.LAG : chain.LAG + 3] = transducers.lag(own.pressure_lag, step_s)
+    numbers[chain.RANGE], numbers[chain.DRIFT] = own.pressure_range, own.pressure_drift
+    numbers[chain.QUANTUM] = own.pressure_range / 2.0**own.pressure_bits if own.pressure_bits > 0 else 0.0
+    numbers[chain.ANGLE_QUANTUM] = np.deg2rad(own.angle_quantum_deg)
+    numbers[chain.LEVERED] = own.angle_quantum_deg > 0.0 or own.joint_rate_deg > 0.0 or own.joint_bias_walk_deg > 0.0
+    numbers[chain.PLAYING] = any(own.pin_backlash)
+    numbers[chain.PLAY : chain.PLAY + 3] = own.pin_backlash
+    numbers[chain.OFFSET : chain.OFFSET + 6] = instance_of(machine).pressure_offset
+    return numbers, *pack(machine)

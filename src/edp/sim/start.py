@@ -1,0 +1,47 @@
+"""How a scenario begins: its seeds, its ground, and where the machine stands."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.sim.machine.machine import Machine
+from edp.sim.machine.parameters import pack
+from edp.sim.physics import pose, soil
+from edp.sim.scenario import Scenario
+
+Array = NDArray[np.float64]
+START_CLEARANCE_M, START_TRIES = 0.3, 100
+"""Least height of the tip above ground at the start, and how often strokes are drawn for it."""
+
+
+def seeds_of(scenario: Scenario) -> list[np.random.SeedSequence]:
+    """Seeds of start, operator, sensors and soil, in this order."""
+    # The order is fixed: another one would give other recordings for the same seed.
+    return np.random.SeedSequence(scenario.seed).spawn(4)
+
+
+def start_of(scenario: Scenario, machine: Machine) -> tuple[soil.Ground | None, Array]:
+    """The ground, None in free air, and the strokes (shares of full, shape (3,)) to start from."""
+    start, _, _, course = seeds_of(scenario)
+    ground = None
+    if scenario.material:
+        material = soil.load_material(scenario.material)
+        ground = soil.Ground(material, machine, np.random.default_rng(course))
+    return ground, _start_strokes(scenario, machine, ground, np.random.default_rng(start))
+
+
+def _start_strokes(scenario: Scenario, machine: Machine, ground: soil.Ground | None, rng: np.random.Generator) -> Array:
+    """Strokes (shares of full) near the middle, and with the bucket clear of any ground."""
+    strokes = rng.uniform(*scenario.start_strokes, 3)
+    if ground is None:
+        return strokes
+    kinematics = pose.Kinematics(*pack(machine))
+    for _ in range(START_TRIES):
+        x, y, _ = kinematics.pose_at(strokes)
+        if y > ground.height(x) + START_CLEARANCE_M:
+            break
+        strokes = rng.uniform(*scenario.start_strokes, 3)
+        # A raised boom clears most grounds.
+        strokes[0] = rng.uniform(scenario.start_strokes[1], 0.9)
+    return strokes

@@ -1,0 +1,217 @@
+"""Closed loops of one controller on one task: a run folder with scores, recordings and a page."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edp import __version__
+from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
+from edp.control.base import interface_of
+from edp.control.controllers import CONTROLLERS
+from edp.control.loop import LoopResult, run_loop
+from edp.control.models import ControlModels
+from edp.control.plants import plant_of
+from edp.control.tasks import TASKS, ControlTask, draw_task
+from edp.control.valve_map import measure_valve_map
+from edp.logs import write_recording
+from edp.report import ControlFacts, write_control_page
+from edp.report.animation.page import scene_of
+from edp.sim.machine.machine_files import load_machine
+from edp.storage import make_folder, write_json
+from edp.storage.runs import RunFolder, command_line, run_key
+from edp.training.bundle import load_bundle
+from edp.training.twin_bundle import load_twin
+
+RESULTS, PAGE, LOOPS = "results.json", "control.html", "loops"
+
+
+@dataclass(frozen=True, eq=False)
+class ControlRun:
+    """What `control_loops` leaves.
+
+    Attributes:
+        content: of ``results.json``.
+        results: the loops, in the order of their seeds.
+        page: file of the page.
+    """
+
+    content: Mapping[str, Any]
+    results: Sequence[LoopResult]
+    page: Path
+
+
+@dataclass(frozen=True)
+class ControlSources:
+    """Run folders that closed loops read; None for none.
+
+    Attributes:
+        plant: of a twin that takes the place of the simulator.
+        twin: of a twin that the controller uses.
+        predictor: of a look-ahead predictor that the controller uses.
+    """
+
+    plant: Path | None = None
+    twin: Path | None = None
+    predictor: Path | None = None
+
+
+def control_loops(
+    experiment: ControlExperiment,
+    out: str | Path,
+    sources: ControlSources | None = None,
+    on_loop: Callable[[str, int, int], None] | None = None,
+) -> ControlRun:
+    """Run loops and write a run folder: ``results.json``, ``loops/NAME.parquet``, ``control.html``.
+
+    Args:
+        experiment: the settings.
+        out: run folder; loops of the same settings are run again.
+        sources: models and plant.
+        on_loop: called with the name of the loop that begins, how many are done, and their number.
+
+    Raises:
+        EdpError: settings, models or folder cannot be used.
+    """
+    chosen = sources or ControlSources()
+    with RunFolder(out) as run:
+        run.claim(run_key(CONTROL_SETTINGS.plain(experiment), repr(chosen)), control_toml(experiment))
+        run.write_status("running")
+        tasks, results = loops_of(experiment, chosen, on_loop)
+        folder = make_folder(run.file(LOOPS))
+        for result in results:
+            write_recording(result.recording, folder / f"{result.recording.name}.parquet")
+        content = _content(experiment, tasks, results)
+        write_json(run.file(RESULTS), content)
+        page = write_control_page(_facts(run.path.name, content, results, chosen), run.file(PAGE))
+        run.write_status("finished")
+    return ControlRun(content, results, page)
+
+
+def loops_of(
+    experiment: ControlExperiment,
+    sources: ControlSources,
+    on_loop: Callable[[str, int, int], None] | None = None,
+) -> tuple[list[ControlTask], list[LoopResult]]:
+    """The tasks of an experiment and their loops; nothing is written.
+
+    Raises:
+        EdpError: settings or models cannot be used.
+    """
+    seeds = range(experiment.seed, experiment.seed + experiment.loops)
+    load_machine(experiment.machine)
+    probe = plant_of(experiment.machine, 1.0, experiment.rate_hz, sources.plant)
+    interface = interface_of(probe)
+    tasks = [draw_task(experiment.task, interface.geometry, experiment.rate_hz, seed) for seed in seeds]
+    # One tick more than the longest: a loop steps the plant after its last row, too.
+    longest = max(task.reference.ticks for task in tasks) / experiment.rate_hz + 1.0 / experiment.rate_hz
+    env = plant_of(experiment.machine, longest, experiment.rate_hz, sources.plant)
+    models = _models(experiment, sources, env)
+    results = []
+    for number, task in enumerate(tasks):
+        if on_loop is not None:
+            on_loop(f"{task.name} {task.seed}", number, len(tasks))
+        controller = experiment.controller.build(interface_of(env), task.limits, models)
+        results.append(run_loop(env, controller, task, task.seed))
+    return tasks, results
+
+
+def _models(experiment: ControlExperiment, sources: ControlSources, env: Any) -> ControlModels:
+    """What the controller needs; the valve map is measured on the plant itself, before the loops."""
+    valve_map = None
+    if "valve_map" in experiment.controller.needs:
+        commissioned = plant_of(experiment.machine, 60.0, experiment.rate_hz, sources.plant)
+        valve_map = measure_valve_map(commissioned, interface_of(env), experiment.seed)
+    return ControlModels(
+        valve_map,
+        None if sources.twin is None else load_twin(sources.twin).twin,
+        None if sources.predictor is None else load_bundle(sources.predictor),
+    )
+
+
+def _content(
+    experiment: ControlExperiment, tasks: Sequence[ControlTask], results: Sequence[LoopResult]
+) -> dict[str, Any]:
+    scores = [result.score for result in results]
+    energies = [score.energy_kj for score in scores]
+    times = np.concatenate([result.solve_s for result in results]) * 1e6
+    summary = {
+        "position_rms_mm": _mean([score.position_rms_mm for score in scores]),
+        "position_worst_mm": max(score.position_rms_mm for score in scores),
+        "path_rms_mm": _mean([score.path_rms_mm for score in scores]),
+        "path_worst_mm": max(score.path_rms_mm for score in scores),
+        "attitude_rms_deg": _mean([score.attitude_rms_deg for score in scores]),
+        "lever_travel": _mean([score.lever_travel for score in scores]),
+        "energy_kj": None if None in energies else _mean([energy for energy in energies if energy is not None]),
+        "violations": sum(sum(score.violations.values()) for score in scores),
+        "missed": sum(score.missed for score in scores),
+        "solve_us_median": float(np.median(times)),
+    }
+    source = results[0].recording.source.removeprefix("loop:")
+    plain = CONTROL_SETTINGS.plain(experiment)
+    name = CONTROLLERS.name_of(experiment.controller)
+    content = {
+        "schema": 1,
+        "edp": __version__,
+        "task": plain["task"],
+        "controller": plain["controller"],
+        "machine": results[0].recording.meta["machine"],
+        "plant": source,
+        "summary": summary,
+        "loops": [_loop(task, result) for task, result in zip(tasks, results, strict=True)],
+    }
+    return {"sentence": sentence(content, name), **content}
+
+
+def sentence(content: Mapping[str, Any], controller: str) -> str:
+    """The score in one sentence."""
+    summary, count = content["summary"], len(content["loops"])
+    loops = f"{count} loops" if count > 1 else "one loop"
+    worst = f", {summary['position_worst_mm']:.1f} mm in the worst" if count > 1 else ""
+    return (
+        f"{controller} keeps the bucket tip {summary['position_rms_mm']:.1f} mm (rms) from its reference in {loops} of "
+        f"{TASKS.what} '{content['task']['kind']}'{worst}, and {summary['path_rms_mm']:.1f} mm from the path"
+    )
+
+
+def _loop(task: ControlTask, result: LoopResult) -> dict[str, Any]:
+    times = result.solve_s * 1e6
+    return {
+        "name": result.recording.name,
+        "seed": task.seed,
+        "seconds": task.reference.duration_s,
+        "score": result.score.plain(),
+        "solve_us": {
+            "median": float(np.median(times)),
+            "p99": float(np.percentile(times, 99.0)),
+            "max": float(times.max()),
+        },
+        "events": [{"tick": event.tick, "ticks": event.ticks, "text": event.text} for event in result.events],
+    }
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values))
+
+
+def _facts(
+    title: str, content: Mapping[str, Any], results: Sequence[LoopResult], sources: ControlSources
+) -> ControlFacts:
+    recordings = [result.recording for result in results]
+    rows = [
+        ("Machine", str(content["machine"])),
+        ("Plant", str(content["plant"] if sources.plant is None else sources.plant)),
+        ("Twin of the controller", str(sources.twin or "")),
+        ("Predictor of the controller", str(sources.predictor or "")),
+        ("Written", time.strftime("%Y-%m-%d %H:%M")),
+        ("Command", command_line()),
+        ("EDP", __version__),
+    ]
+    scene = scene_of(recordings[0], str(content["machine"]))
+    solve_us = [result.solve_s * 1e6 for result in results]
+    return ControlFacts(title, content, recordings, solve_us, scene, [row for row in rows if row[1]])
