@@ -44,11 +44,11 @@ class TipTable:
             Tip x, y (m) and attitude (rad), shape (..., 3), and their derivatives by the strokes (m/m, m/m, rad/m),
             shape (..., 3, 3).
         """
-        place_in_table = np.clip(strokes / self.full_m, 0.0, 1.0) * (NODES - 1)
-        low = np.minimum(place_in_table.astype(np.int64), NODES - 2)
+        nodes = np.clip(strokes / self.full_m, 0.0, 1.0) * (NODES - 1)
+        low = np.minimum(nodes.astype(np.int64), NODES - 2)
         axis = np.arange(AXES)
         first, second = self._angles[low, axis], self._angles[low + 1, axis]
-        turned = np.cumsum(first + (place_in_table - low) * (second - first), axis=-1)
+        turned = np.cumsum(first + (nodes - low) * (second - first), axis=-1)
         slope = (second - first) * (NODES - 1) / self.full_m
         along, up = self._lengths * np.cos(turned), self._lengths * np.sin(turned)
         tips = np.stack([along.sum(-1), up.sum(-1), turned[..., 2]], axis=-1)

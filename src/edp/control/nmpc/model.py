@@ -1,0 +1,125 @@
+"""A twin as the model of a controller: its memory follows what is measured, and its error is watched on the way."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.geometry import AXES
+from edp.control.plant import PILOTS, STROKES, VELOCITIES, PlantInterface
+from edp.errors import ConfigError, closest
+from edp.networks.twin import Twin
+from edp.networks.twin.base import TwinState
+
+Array = NDArray[np.float64]
+
+
+class TwinModel:
+    """Predictions of strokes and pressures for commands to come, corrected by what past predictions missed.
+
+    At each tick the twin reads what was measured. Beside that it is asked what it would have said `window` ticks ago of
+    now, told the commands that were given since. Per second of the window, that error is a speed: smoothed, it is the
+    disturbance that every prediction is corrected by, so that no offset stays where the model is wrong.
+
+    Args:
+        twin: commanded by pilot pressures of Table A.1; answers the strokes and velocities of three cylinders.
+        plant: that is controlled.
+        window: ticks over which predictions are compared with what was measured.
+        smoothing: share of an error that the disturbance takes over in a tick; 0: no disturbance.
+
+    Attributes:
+        reads: channels of the plant that it reads, in the order of the twin's answers.
+        disturbance: speeds (m/s), shape (3,), that the twin does not know of.
+
+    Raises:
+        ConfigError: another rate, other commands, or strokes or velocities that either does not have.
+    """
+
+    def __init__(self, twin: Twin, plant: PlantInterface, window: int, smoothing: float) -> None:
+        answers = [channel.name for channel in twin.channels.answers]
+        commands = [channel.name for channel in twin.channels.commands]
+        _check(twin, plant, answers, commands)
+        measured = {channel.name for channel in plant.channels}
+        self.twin, self.plant, self.window, self.smoothing = twin, plant, window, smoothing
+        self.reads = tuple(name for name in answers if name in measured)
+        self._ports = np.array([answers.index(name) for name in self.reads])
+        self._pilots = np.array([PILOTS.index(name) for name in commands])
+        self._strokes = np.array([answers.index(name) for name in STROKES])
+        self._pressures = np.array([n for n, name in enumerate(answers) if name.startswith("CylPressures_")])
+        self.disturbance = np.zeros(AXES)
+        self._state: TwinState = {}
+        self._past: deque[tuple[TwinState, NDArray[np.float32], NDArray[np.float32]]] = deque(maxlen=window)
+
+    def begin(self, measured: Array) -> None:
+        """Form the memory as if the machine had rested with this row of `reads` and neutral levers."""
+        ticks = max(1, self.twin.prefix_ticks)
+        command = np.asarray(self.plant.commands(np.zeros(AXES))[self._pilots], np.float32)
+        row = self.row(measured)
+        # What the plant does not measure starts at its mean.
+        row = np.where(np.isfinite(row), row, self.twin.scales.answer_offset).astype(np.float32)
+        rows = np.repeat(row[None, None], ticks, axis=1)
+        self._state = self.twin.reset(np.repeat(command[None, None], ticks, axis=1), rows)
+        self.disturbance = np.zeros(AXES)
+        self._past.clear()
+
+    def row(self, measured: Array) -> NDArray[np.float32]:
+        """A row of the twin's answers from one of `reads`, NaN where the plant measures nothing."""
+        row = np.full(len(self.twin.channels.answers), np.nan, np.float32)
+        row[self._ports] = measured
+        return row
+
+    def look_back(self, measured: Array) -> None:
+        """Bring the disturbance up to date with this row of `reads`."""
+        if len(self._past) < self.window or not self.smoothing:
+            return
+        state, row, _ = self._past[0]
+        commands = np.array([command for _, _, command in self._past])
+        answers = self.twin.branches(commands[None], state, row, np.zeros(1, np.int64))
+        missed = self.row(measured)[self._strokes] - answers[0, -1, self._strokes]
+        speed = missed * self.plant.rate_hz / self.window
+        self.disturbance = self.disturbance + self.smoothing * (speed - self.disturbance)
+
+    def predicted(self, levers: Array, measured: Array, first: NDArray[np.int64]) -> tuple[Array, Array]:
+        """What follows levers to come.
+
+        Args:
+            levers: shape (run, tick, 3); those of a run the first one's before it branches off.
+            measured: a row of `reads`, now.
+            first: tick at which each run branches off the first one, shape (run,), ascending.
+
+        Returns:
+            Strokes (m) after each tick, shape (run, tick, 3), and cylinder pressures (Pa), shape (run, tick, pressure).
+        """
+        commands = np.asarray(self.plant.commands(levers)[..., self._pilots], np.float32)
+        answers = self.twin.branches(commands, self._state, self.row(measured), first)
+        seconds = np.arange(1, levers.shape[1] + 1)[:, None] / self.plant.rate_hz
+        strokes = answers[..., self._strokes].astype(float) + seconds * self.disturbance
+        return strokes, answers[..., self._pressures].astype(float)
+
+    def advance(self, measured: Array | None, levers: Array) -> None:
+        """Let a tick pass with these levers; `measured` is None where nothing came, and all ports ran free."""
+        row = np.full(len(self.twin.channels.answers), np.nan, np.float32) if measured is None else self.row(measured)
+        command = np.asarray(self.plant.commands(levers)[self._pilots], np.float32)
+        self._past.append((self._state, row, command))
+        _, self._state = self.twin.step(command[None], self._state, row[None])
+
+
+def _check(twin: Twin, plant: PlantInterface, answers: list[str], commands: list[str]) -> None:
+    """Refuse a twin that is not one of this plant."""
+    if twin.channels.rate_hz != plant.rate_hz:
+        raise ConfigError(
+            f"the twin has {twin.channels.rate_hz:g} Hz, {plant.source} {plant.rate_hz:g} Hz; train one at the rate of "
+            "the loop"
+        )
+    for name in (*STROKES, *VELOCITIES):
+        if name not in answers:
+            raise ConfigError(
+                f"the twin does not answer '{name}'{closest(name, answers)}; a controller needs strokes and velocities "
+                "of boom, arm and bucket: train one on them"
+            )
+    for name in commands:
+        if name not in PILOTS:
+            raise ConfigError(f"the twin is commanded by '{name}', which no lever moves{closest(name, PILOTS)}")
+    plant.columns((*STROKES, *VELOCITIES))

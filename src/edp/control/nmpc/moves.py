@@ -1,0 +1,105 @@
+"""Moves of a horizon: speeds that are asked for, a few a lever, and the levers that the valve map makes of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edp.control.geometry import AXES
+from edp.control.limits import LoopLimits
+from edp.control.valve_map import SIDES, ValveMap
+
+Array = NDArray[np.float64]
+REST_M_S = 0.004
+"""Speeds below which the lever goes through the dead band in a straight line: a jump there would chatter."""
+
+
+class SpeedToLever:
+    """The inverse valve map for arrays, continuous through zero.
+
+    The dead band is thereby in front of the model, not in it: what is solved for acts everywhere.
+
+    Args:
+        valves: the map.
+        limits: of the levers.
+
+    Attributes:
+        slowest: least speed (m/s) that each lever's range gives, shape (3,), negative.
+        fastest: largest speed (m/s), shape (3,).
+    """
+
+    def __init__(self, valves: ValveMap, limits: LoopLimits) -> None:
+        self._tables: list[list[tuple[Array, Array]]] = []
+        ends = np.zeros((len(SIDES), AXES))
+        for axis in range(AXES):
+            sides = []
+            for side, end in enumerate((limits.lever_high[axis], limits.lever_low[axis])):
+                speeds, levers = valves.speeds[axis, side], valves.levers[axis, side]
+                knee = float(np.interp(REST_M_S, speeds, levers))
+                beyond = speeds > REST_M_S
+                table = np.concatenate(([0.0, REST_M_S], speeds[beyond])), np.concatenate(([0.0, knee], levers[beyond]))
+                sides.append(table)
+                ends[side, axis] = SIDES[side] * float(np.interp(abs(end), table[1], table[0]))
+            self._tables.append(sides)
+        self.fastest, self.slowest = ends
+
+    def levers(self, speeds: Array) -> Array:
+        """Levers for speeds (m/s), shape (..., 3) both."""
+        levers = np.empty_like(speeds)
+        for axis, (extend, retract) in enumerate(self._tables):
+            wanted_speed = speeds[..., axis]
+            out, back = np.interp(wanted_speed, *extend), np.interp(-wanted_speed, *retract)
+            levers[..., axis] = np.where(wanted_speed >= 0.0, out, -back)
+        return levers
+
+
+class Moves:
+    """A horizon in blocks of ticks, in each of which the asked speeds stay.
+
+    Args:
+        blocks: ticks of each block.
+
+    Attributes:
+        ticks: length of the horizon.
+        count: variables: an axis and block each, block by block.
+        first: tick at which a run branches off whose variable alone differs, shape (count + 1,), that of the base first.
+    """
+
+    def __init__(self, blocks: tuple[int, ...]) -> None:
+        self.blocks, self.ticks = len(blocks), sum(blocks)
+        self.count = AXES * self.blocks
+        starts = np.cumsum(blocks) - blocks
+        self._slices = [slice(int(start), int(start) + ticks) for start, ticks in zip(starts, blocks, strict=True)]
+        self._counts = np.concatenate([np.arange(1, ticks + 1) for ticks in blocks])
+        self.first = np.concatenate(([0], np.repeat(starts, AXES))).astype(np.int64)
+        self.last_ticks = np.cumsum(blocks) - 1
+        # Differences from block to block, the first from what was asked for last.
+        self.difference = np.eye(self.count) - np.eye(self.count, k=-AXES)
+
+    def runs(self, speeds: Array, step: float) -> Array:
+        """The base and, for each variable, a run in which it is `step` m/s larger, shape (count + 1, block, 3)."""
+        runs = np.repeat(speeds[None], self.count + 1, axis=0)
+        variables = runs.reshape(self.count + 1, self.count)
+        variables[1:][np.diag_indices(self.count)] += step
+        return runs
+
+    def levers(self, targets: Array, before: Array, step: Array) -> Array:
+        """Levers tick by tick that go to targets of each block at a bounded speed.
+
+        Args:
+            targets: shape (run, block, 3).
+            before: levers of the tick before, shape (3,).
+            step: most that a lever moves in a tick, shape (3,).
+
+        Returns:
+            Shape (run, tick, 3).
+        """
+        levers = np.empty((len(targets), self.ticks, AXES))
+        start = np.broadcast_to(before, targets[:, 0].shape)
+        for block, ticks in enumerate(self._slices):
+            # Within a block the target stays, so that a lever has moved by the smaller of way and time.
+            farthest = self._counts[ticks, None] * step
+            way = (targets[:, block] - start)[:, None]
+            levers[:, ticks] = start[:, None] + np.minimum(np.maximum(way, -farthest), farthest)
+            start = levers[:, ticks.stop - 1]
+        return levers
