@@ -67,7 +67,7 @@ INTERRUPTED = 130
 PATH_OPTIONS = frozenset(
     f"--{name}"
     for name in (
-        *("budget", "config", "data", "features", "further", "limit", "map", "out", "page", "scenario", "start"),
+        *("budget", "config", "data", "features", "further", "limit", "map", "on", "out", "page", "scenario", "start"),
         *("plant", "plots", "predictor", "run", "study", "teacher", "twin", "w8a16"),
     )
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,20 +10,32 @@ import typer
 
 from edp.cli.console import JsonFlag, Steps, counted, emit, out, progress, table
 
+TaskOption = Annotated[str, typer.Option("--task", help="What to follow: grade, corners, level, point or dig.")]
+MachineOption = Annotated[str, typer.Option("--machine", help="Machine name or file (.toml).")]
+ControllerOption = Annotated[str, typer.Option("--controller", help="What moves the levers, such as pi or inversion.")]
+SeedsOption = Annotated[
+    int, typer.Option("--seeds", min=0, help="Number of loops, each along a reference of its own; 0: as set (6).")
+]
+PlantOption = Annotated[Path | None, typer.Option("--plant", help="Run folder of a twin that is the plant instead.")]
+TwinOption = Annotated[Path | None, typer.Option("--twin", help="Run folder of a twin that the controller uses.")]
+PredictorOption = Annotated[
+    Path | None, typer.Option("--predictor", help="Run folder of edp train that the controller uses.")
+]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings (TOML).")]
+ChangesOption = Annotated[list[str], typer.Option("--set", help="One setting, for example task.slope_deg=45.")]
+
 
 def control(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder to write.")],
-    task: Annotated[str, typer.Option(help="What to follow: grade, corners, level, point or dig.")] = "",
-    machine: Annotated[str, typer.Option(help="Machine name or file (.toml).")] = "",
-    controller: Annotated[str, typer.Option(help="What moves the levers, for example pi or inversion.")] = "",
-    seeds: Annotated[
-        int, typer.Option(min=0, help="Number of loops, each along a reference of its own; 0: as set.")
-    ] = 0,
-    plant: Annotated[Path | None, typer.Option(help="Run folder of a twin that is the plant instead.")] = None,
-    twin: Annotated[Path | None, typer.Option(help="Run folder of a twin that the controller uses.")] = None,
-    predictor: Annotated[Path | None, typer.Option(help="Run folder of edp train that the controller uses.")] = None,
-    config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
-    changes: Annotated[list[str], typer.Option("--set", help="One setting, for example task.slope_deg=45.")] = [],  # noqa: B006
+    task: TaskOption = "",
+    machine: MachineOption = "",
+    controller: ControllerOption = "",
+    seeds: SeedsOption = 0,
+    plant: PlantOption = None,
+    twin: TwinOption = None,
+    predictor: PredictorOption = None,
+    config: ConfigOption = None,
+    changes: ChangesOption = [],  # noqa: B006
     as_json: JsonFlag = False,
 ) -> None:
     """Run a controller in closed loop: scores, a recording a loop, and a page with paths, errors and levers.
@@ -33,14 +46,9 @@ def control(
     Example: `edp control runs/grade --task grade --machine M22 --controller pi --seeds 6`
     """
     from edp.config.control import load_control_experiment
-    from edp.workflows.control import control_loops
-    from edp.workflows.control.run_control import ControlSources
+    from edp.workflows.control import ControlSources, control_loops
 
-    options: dict[str, Any] = {"machine": machine} if machine else {}
-    options |= {"loops": seeds} if seeds else {}
-    options |= {"task": {"kind": task}} if task else {}
-    options |= {"controller": {"kind": controller}} if controller else {}
-    experiment = load_control_experiment(config, changes, options)
+    experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
     with progress(as_json) as shown:
         on_loop = counted(shown, Steps(as_json), "control", "loops run")
         run = control_loops(experiment, folder, ControlSources(plant, twin, predictor), on_loop)
@@ -53,7 +61,59 @@ def control(
     emit(as_json, {"run": str(folder), "page": str(run.page), **run.content}, show)
 
 
-def score_table(content: dict[str, Any] | Any) -> None:
+def tune(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder to write.")],
+    task: TaskOption = "",
+    machine: MachineOption = "",
+    controller: ControllerOption = "",
+    seeds: SeedsOption = 0,
+    on: Annotated[Path | None, typer.Option("--on", help="Run folder of a twin on which to tune.")] = None,
+    plant: PlantOption = None,
+    twin: TwinOption = None,
+    predictor: PredictorOption = None,
+    trials: Annotated[int, typer.Option(min=1, help="Settings of the gains to try.")] = 40,
+    loops: Annotated[int, typer.Option(min=1, help="References that each of them is run along.")] = 4,
+    config: ConfigOption = None,
+    changes: ChangesOption = [],  # noqa: B006
+    as_json: JsonFlag = False,
+) -> None:
+    """Tune a controller's gains on the simulator, or on a twin with --on, and judge them on the plant.
+
+    References of the tuning are never those of the judgement. The tuned settings are for `edp control --config`.
+
+    Example: `edp tune runs/tuned --task grade --controller pi --on runs/twin`
+    """
+    from edp.config.control import load_control_experiment
+    from edp.workflows.control import ControlSources, TuningSpec, tune_gains
+    from edp.workflows.control.tune_gains import TUNED
+
+    experiment = load_control_experiment(config, changes, _options(task, machine, controller, seeds))
+    with progress(as_json) as shown:
+        on_trial = counted(shown, Steps(as_json), "tune", "trials run")
+        tuned_on, judged_on = (ControlSources(where, twin, predictor) for where in (on, plant))
+        tuning = tune_gains(experiment, folder, tuned_on, judged_on, TuningSpec(trials=trials, loops=loops), on_trial)
+    judged = tuning.content["judged_mm"]
+
+    def show() -> None:
+        gains = ", ".join(f"{name} {value:.3g}" for name, value in tuning.content["gains"].items())
+        out.print(
+            f"position error of the tip on the plant: {judged['after']:.1f} mm (rms), {judged['before']:.1f} mm before"
+        )
+        out.print(f"gains: {gains}")
+        out.print(f"next: edp control RUN --config {folder / TUNED}")
+
+    emit(as_json, {"run": str(folder), "settings": str(folder / TUNED), **tuning.content}, show)
+
+
+def _options(task: str, machine: str, controller: str, seeds: int) -> dict[str, Any]:
+    """Settings of the options that were given."""
+    options: dict[str, Any] = {"machine": machine} if machine else {}
+    options |= {"loops": seeds} if seeds else {}
+    options |= {"task": {"kind": task}} if task else {}
+    return options | ({"controller": {"kind": controller}} if controller else {})
+
+
+def score_table(content: Mapping[str, Any]) -> None:
     """Print a row a loop."""
     rows = []
     for loop in content["loops"]:

@@ -139,7 +139,7 @@ class TwinAhead(VelocityModel):
     def ahead(self, measured: Array, commands: Array) -> Array:
         """Candidates are lanes; the first tick reads what is measured, the others run free."""
         count = len(commands)
-        lasting = np.repeat(commands[:, None, self._pilots], self.ticks, axis=1)
+        lasting = np.repeat(commands[:, None, self._pilots], self.ticks, axis=1).astype(np.float32)
         ports = np.full((count, self.ticks, len(self.reads)), np.nan, np.float32)
         ports[:, 0] = measured
         lanes = {name: np.repeat(values, count, axis=0) for name, values in self._state.items()}
@@ -148,5 +148,5 @@ class TwinAhead(VelocityModel):
 
     def advance(self, measured: Array, command: Array) -> None:
         """One tick that reads what was measured."""
-        rows = np.asarray(measured, np.float32)[None]
-        _, self._state = self.twin.step(command[None, self._pilots], self._state, rows)
+        row, pilots = (np.asarray(values, np.float32)[None] for values in (measured, command[self._pilots]))
+        _, self._state = self.twin.step(pilots, self._state, row)

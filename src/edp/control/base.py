@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -172,6 +173,8 @@ class ControllerSpec(Protocol):
 
     needs: ClassVar[tuple[str, ...]]
     """Attributes of `ControlModels` without which it cannot be built."""
+    space: ClassVar[Mapping[str, tuple[float, float]]]
+    """Lowest and highest value worth trying, by option: what a tuning varies."""
 
     def build(self, plant: PlantInterface, limits: LoopLimits, models: ControlModels) -> Controller:
         """The controller for a plant.

@@ -44,8 +44,7 @@ class TipGeometry:
         strokes = np.asarray(strokes_m, float)
         if not np.isfinite(strokes).all():
             raise ConfigError("a tip pose was asked for at a stroke that is not finite; give measured strokes in m")
-        shares = np.clip(strokes / self.full_m, 0.0, 1.0).reshape(-1, AXES)
-        return np.array([self._kinematics.pose_at(row) for row in shares]).reshape(strokes.shape)
+        return self._kinematics.poses(np.clip(strokes, 0.0, self.full_m))
 
     def strokes(self, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Strokes (m) that put the tip at poses, and which of the poses can be reached.
@@ -54,13 +53,7 @@ class TipGeometry:
             poses: tip x, y (m) and attitude (rad), shape (..., 3).
 
         Returns:
-            Strokes of the shape of `poses`, those of the nearest joint angles where a pose is out of reach; and
-            whether each pose can be reached, shape (...).
+            Strokes of the shape of `poses`, NaN where a pose is out of reach; and whether each can be reached, (...).
         """
-        poses = np.asarray(poses, float)
-        kinematics, rows = self._kinematics, poses.reshape(-1, AXES)
-        reached = np.empty((len(rows), pose.REACHED_VALUES))
-        for row, (x, y, attitude) in zip(reached, rows.tolist(), strict=True):
-            pose.reach(x, y, attitude, kinematics.axes, kinematics.plant, kinematics.limits, row)
-        strokes = (reached[:, :AXES] * self.full_m).reshape(poses.shape)
-        return strokes, (reached[:, pose.REACHABLE] > 0.5).reshape(poses.shape[:-1])
+        strokes = self._kinematics.strokes(poses)
+        return strokes, np.asarray(np.isfinite(strokes).all(axis=-1))

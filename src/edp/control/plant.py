@@ -12,11 +12,6 @@ from numpy.typing import NDArray
 from edp.control.geometry import TipGeometry
 from edp.errors import ConfigError, closest
 from edp.signals import TABLE_A1, Channel, Kind
-from edp.sim.machine import layout as at
-from edp.sim.machine.machine import Machine
-from edp.sim.machine.parameters import pack
-from edp.sim.physics import valve
-from edp.sim.sensors.sensors import pilot_demands
 
 Array = NDArray[np.float64]
 STROKES = ("CylStroke_1", "CylStroke_2", "CylStroke_3")
@@ -69,19 +64,3 @@ def interface_of(env: Any) -> PlantInterface:
     commands = tuple(TABLE_A1[name] for name in PILOTS)
     geometry = TipGeometry(plain.machine)
     return PlantInterface(tuple(plain.channels), float(plain.rate_hz), geometry, commands, plain.commands, source)
-
-
-def nominal_commands(machine: Machine) -> Callable[[Array], Array]:
-    """How levers become pilot pressures: a function of levers, shape (..., 3), to Pa, shape (..., 12), as `PILOTS`."""
-    axes, plant = pack(machine)
-
-    def commands(levers: Array) -> Array:
-        positions = np.asarray(levers, float)
-        rows = np.ascontiguousarray(positions.reshape(-1, at.AXES))
-        demands = np.empty((len(rows), at.SPOOLS))
-        for row, demand in zip(rows, demands, strict=True):
-            valve.shape_demand(row, axes, plant, demand)
-        pressures = pilot_demands(demands, machine.valves.pilot_pressure)
-        return np.asarray(pressures.reshape(*positions.shape[:-1], len(PILOTS)))
-
-    return commands

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edp.control.geometry import AXES, TipGeometry
-from edp.control.plant import PILOTS, STROKES, VELOCITIES, nominal_commands
+from edp.control.plant import PILOTS, STROKES, VELOCITIES
 from edp.errors import ConfigError, closest
 from edp.networks.twin import Twin
+from edp.signals import Channel
 from edp.sim.environment import EnvironmentSpec, ExcavatorEnv
 from edp.sim.environment.library import gymnasium
 from edp.sim.machine.machine_files import load_machine
-from edp.signals import Channel
 
 Array = NDArray[np.float64]
 OPTIONS = ("strokes", "material")
@@ -61,7 +61,6 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.twin, self.machine = twin, load_machine(machine)
         self.rate_hz, self.render_mode = channels.rate_hz, None
         self.channels: tuple[Channel, ...] = (*channels.answers, *channels.commands)
-        self.commands = nominal_commands(self.machine)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(self.channels),), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (AXES,), np.float32)
         self._geometry = TipGeometry(self.machine)
@@ -78,6 +77,7 @@ class TwinEnvironment(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 observed=tuple(channel.name for channel in self.channels),
             )
         )
+        self.commands = self._rest.commands
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -42,7 +42,7 @@ def test_standing_still_is_no_error_of_the_path_but_one_of_the_position():
 
 def test_a_tip_beside_the_path_has_that_distance_and_a_late_one_has_none_of_it():
     reference = straight()
-    beside = reference.tip + [0.0, 0.02, 0.0]
+    beside = reference.tip + np.array([0.0, 0.02, 0.0])
     score = scored(trace(beside), reference, LoopLimits())
     assert score.path_rms_mm == pytest.approx(20.0)
     assert score.position_rms_mm == pytest.approx(20.0)
@@ -55,7 +55,7 @@ def test_a_tip_beside_the_path_has_that_distance_and_a_late_one_has_none_of_it()
 
 def test_attitude_errors_do_not_depend_on_the_turn_they_are_counted_in():
     reference = straight()
-    turned = reference.tip + [0.0, 0.0, 2 * np.pi + np.radians(3.0)]
+    turned = reference.tip + np.array([0.0, 0.0, 2 * np.pi + np.radians(3.0)])
     assert scored(trace(turned), reference, LoopLimits()).attitude_rms_deg == pytest.approx(3.0)
 
 

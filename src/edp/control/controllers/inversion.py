@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -38,6 +39,11 @@ class ModelInversion:
     """
 
     needs: ClassVar[tuple[str, ...]] = ("predictor or twin",)
+    space: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "proportional": (0.5, 10.0),
+        "integral": (0.0, 10.0),
+        "rest_m_s": (0.0, 0.01),
+    }
 
     lead_s: float = 0.2
     proportional: float = 3.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -34,6 +35,12 @@ class ProportionalIntegral:
     """
 
     needs: ClassVar[tuple[str, ...]] = ("valve_map",)
+    space: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "proportional": (0.5, 10.0),
+        "integral": (0.0, 10.0),
+        "lead_s": (0.05, 0.35),
+        "rest_m_s": (0.0, 0.01),
+    }
 
     proportional: float = 3.0
     integral: float = 1.0

@@ -1,5 +1,7 @@
-"""Closed loops: a controller on a plant along tasks, with a page."""
+"""Closed loops: a controller on a plant along tasks, with a page; gains tuned on one plant and judged on another."""
 
+from edp.workflows.control.bench import ControlBench, ControlSources
 from edp.workflows.control.run_control import ControlRun, control_loops
+from edp.workflows.control.tune_gains import Tuning, TuningSpec, tune_gains
 
-__all__ = ["ControlRun", "control_loops"]
+__all__ = ["ControlBench", "ControlRun", "ControlSources", "Tuning", "TuningSpec", "control_loops", "tune_gains"]

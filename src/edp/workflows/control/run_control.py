@@ -12,21 +12,15 @@ import numpy as np
 
 from edp import __version__
 from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
-from edp.control.base import interface_of
 from edp.control.controllers import CONTROLLERS
-from edp.control.loop import LoopResult, run_loop
-from edp.control.models import ControlModels
-from edp.control.plants import plant_of
-from edp.control.tasks import TASKS, ControlTask, draw_task
-from edp.control.valve_map import measure_valve_map
+from edp.control.loop import LoopResult
+from edp.control.tasks import TASKS, ControlTask
 from edp.logs import write_recording
 from edp.report import ControlFacts, write_control_page
 from edp.report.animation.page import scene_of
-from edp.sim.machine.machine_files import load_machine
 from edp.storage import make_folder, write_json
 from edp.storage.runs import RunFolder, command_line, run_key
-from edp.training.bundle import load_bundle
-from edp.training.twin_bundle import load_twin
+from edp.workflows.control.bench import ControlBench, ControlSources
 
 RESULTS, PAGE, LOOPS = "results.json", "control.html", "loops"
 
@@ -44,21 +38,6 @@ class ControlRun:
     content: Mapping[str, Any]
     results: Sequence[LoopResult]
     page: Path
-
-
-@dataclass(frozen=True)
-class ControlSources:
-    """Run folders that closed loops read; None for none.
-
-    Attributes:
-        plant: of a twin that takes the place of the simulator.
-        twin: of a twin that the controller uses.
-        predictor: of a look-ahead predictor that the controller uses.
-    """
-
-    plant: Path | None = None
-    twin: Path | None = None
-    predictor: Path | None = None
 
 
 def control_loops(
@@ -82,56 +61,16 @@ def control_loops(
     with RunFolder(out) as run:
         run.claim(run_key(CONTROL_SETTINGS.plain(experiment), repr(chosen)), control_toml(experiment))
         run.write_status("running")
-        tasks, results = loops_of(experiment, chosen, on_loop)
+        bench = ControlBench(experiment, chosen)
+        results = bench.results(on_loop=on_loop)
         folder = make_folder(run.file(LOOPS))
         for result in results:
             write_recording(result.recording, folder / f"{result.recording.name}.parquet")
-        content = _content(experiment, tasks, results)
+        content = _content(experiment, bench.tasks, results)
         write_json(run.file(RESULTS), content)
         page = write_control_page(_facts(run.path.name, content, results, chosen), run.file(PAGE))
         run.write_status("finished")
     return ControlRun(content, results, page)
-
-
-def loops_of(
-    experiment: ControlExperiment,
-    sources: ControlSources,
-    on_loop: Callable[[str, int, int], None] | None = None,
-) -> tuple[list[ControlTask], list[LoopResult]]:
-    """The tasks of an experiment and their loops; nothing is written.
-
-    Raises:
-        EdpError: settings or models cannot be used.
-    """
-    seeds = range(experiment.seed, experiment.seed + experiment.loops)
-    load_machine(experiment.machine)
-    probe = plant_of(experiment.machine, 1.0, experiment.rate_hz, sources.plant)
-    interface = interface_of(probe)
-    tasks = [draw_task(experiment.task, interface.geometry, experiment.rate_hz, seed) for seed in seeds]
-    # One tick more than the longest: a loop steps the plant after its last row, too.
-    longest = max(task.reference.ticks for task in tasks) / experiment.rate_hz + 1.0 / experiment.rate_hz
-    env = plant_of(experiment.machine, longest, experiment.rate_hz, sources.plant)
-    models = _models(experiment, sources, env)
-    results = []
-    for number, task in enumerate(tasks):
-        if on_loop is not None:
-            on_loop(f"{task.name} {task.seed}", number, len(tasks))
-        controller = experiment.controller.build(interface_of(env), task.limits, models)
-        results.append(run_loop(env, controller, task, task.seed))
-    return tasks, results
-
-
-def _models(experiment: ControlExperiment, sources: ControlSources, env: Any) -> ControlModels:
-    """What the controller needs; the valve map is measured on the plant itself, before the loops."""
-    valve_map = None
-    if "valve_map" in experiment.controller.needs:
-        commissioned = plant_of(experiment.machine, 60.0, experiment.rate_hz, sources.plant)
-        valve_map = measure_valve_map(commissioned, interface_of(env), experiment.seed)
-    return ControlModels(
-        valve_map,
-        None if sources.twin is None else load_twin(sources.twin).twin,
-        None if sources.predictor is None else load_bundle(sources.predictor),
-    )
 
 
 def _content(

@@ -278,5 +278,5 @@ def check(space: Space, candidate: Candidate) -> None:
 
 
 def names(space: Space) -> Sequence[str]:
-    """Dimensions in the order of the registry, so that a sampler always sees the same one."""
-    return [name for name in DIMENSIONS if name in space]
+    """Dimensions in the order of the registry, so that a sampler always sees the same one; others behind, in theirs."""
+    return [name for name in DIMENSIONS if name in space] + [name for name in space if name not in DIMENSIONS]

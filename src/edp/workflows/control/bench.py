@@ -1,0 +1,115 @@
+"""A plant with the tasks of an experiment: any controller is run on it, by any number of settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from edp.config.control import ControlExperiment
+from edp.control.controllers import ControllerSpec
+from edp.control.loop import LoopResult, run_loop
+from edp.control.models import ControlModels
+from edp.control.plant import interface_of
+from edp.control.plants import plant_of
+from edp.control.tasks import draw_task
+from edp.control.valve_map import RUN_S, ValveMap, measure_valve_map
+from edp.errors import ConfigError
+from edp.training.bundle import load_bundle
+from edp.training.twin_bundle import load_twin
+
+
+@dataclass(frozen=True)
+class ControlSources:
+    """Run folders that closed loops read; None for none.
+
+    Attributes:
+        plant: of a twin that takes the place of the simulator.
+        twin: of a twin that the controller uses.
+        predictor: of a look-ahead predictor that the controller uses.
+    """
+
+    plant: Path | None = None
+    twin: Path | None = None
+    predictor: Path | None = None
+
+
+class ControlBench:
+    """See above.
+
+    Args:
+        experiment: machine, task, seeds and controller.
+        sources: models and plant.
+
+    Attributes:
+        tasks: of the seeds, in their order.
+        models: what controllers know.
+
+    Raises:
+        EdpError: settings or models cannot be used.
+    """
+
+    def __init__(self, experiment: ControlExperiment, sources: ControlSources) -> None:
+        self.experiment = experiment
+        rate = experiment.rate_hz
+        probe = plant_of(experiment.machine, RUN_S + 1.0, rate, sources.plant)
+        geometry = interface_of(probe).geometry
+        seeds = range(experiment.seed, experiment.seed + experiment.loops)
+        self.tasks = [draw_task(experiment.task, geometry, rate, seed) for seed in seeds]
+        # A loop steps the plant after its last row, too.
+        longest = (max(task.reference.ticks for task in self.tasks) + 1) / rate
+        self._env = plant_of(experiment.machine, longest, rate, sources.plant)
+        self._interface = interface_of(self._env)
+        valve_map: ValveMap | None = None
+        if "valve_map" in experiment.controller.needs:
+            # Measured on the plant itself before the loops, as a commissioning does.
+            valve_map = measure_valve_map(probe, self._interface, experiment.seed)
+        twin = None if sources.twin is None else load_twin(sources.twin).twin
+        predictor = None if sources.predictor is None else load_bundle(_bundle_of(sources.predictor))
+        self.models = ControlModels(valve_map, twin, predictor)
+
+    def results(
+        self, spec: ControllerSpec | None = None, on_loop: Callable[[str, int, int], None] | None = None
+    ) -> list[LoopResult]:
+        """Every loop with a controller; that of the experiment by default.
+
+        Args:
+            spec: of the controller.
+            on_loop: called with the name of the loop that begins, how many are done, and their number.
+
+        Raises:
+            ConfigError: plant and controller do not fit.
+        """
+        chosen = spec or self.experiment.controller
+        results = []
+        for number, task in enumerate(self.tasks):
+            if on_loop is not None:
+                on_loop(f"{task.name} {task.seed}", number, len(self.tasks))
+            controller = chosen.build(self._interface, task.limits, self.models)
+            results.append(run_loop(self._env, controller, task, task.seed))
+        return results
+
+    def cost(self, spec: ControllerSpec) -> float:
+        """Position error of the tip, rms, mean over the loops, mm."""
+        return float(np.mean([result.score.position_rms_mm for result in self.results(spec)]))
+
+    def with_map(self, valve_map: ValveMap | None) -> ControlBench:
+        """The same bench, whose controllers know another valve map."""
+        other = object.__new__(ControlBench)
+        other.__dict__.update(self.__dict__)
+        other.models = replace(self.models, valve_map=valve_map)
+        return other
+
+
+def _bundle_of(run: Path) -> Path:
+    """The bundle of a run folder, or the folder itself where it is one.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
+    if not run.is_dir():
+        raise ConfigError(f"--predictor {run}: there is no such folder; give the run folder of edp train")
+    inner = run / "bundle"
+    return inner if inner.is_dir() else run

@@ -1,0 +1,133 @@
+"""Gains tuned on one plant, such as a twin, and judged on another: by a sampler, along references of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from edp.config.control import CONTROL_SETTINGS, ControlExperiment, control_toml
+from edp.control.controllers import CONTROLLERS, ControllerSpec
+from edp.errors import ConfigError
+from edp.settings.bounds import check_bounds, integer
+from edp.storage import write_bytes, write_json
+from edp.storage.runs import RunFolder, run_key
+from edp.workflows.control.bench import ControlBench, ControlSources
+from edp.workflows.search.space import Real
+from edp.workflows.search.study import SamplerSpec, Study
+
+TUNING_SEED = 1_000_000
+"""First seed of the references that gains are tuned on; those that judge begin at 0 and never come so far."""
+TUNED, RESULTS = "tuned.toml", "tuning.json"
+
+
+@dataclass(frozen=True)
+class TuningSpec:
+    """How gains are tuned.
+
+    Attributes:
+        trials: settings tried, the present ones first.
+        loops: references that each of them is run along.
+        sampler: see `edp.workflows.search.study.SamplerSpec`.
+        seed: of the sampler.
+    """
+
+    trials: int = 40
+    loops: int = 4
+    sampler: str = "gp"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds("tuning", self, trials=integer(1, 10_000), loops=integer(1, 1_000), seed=integer(0, 2**31))
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """What `tune_gains` leaves.
+
+    Attributes:
+        best: the controller with the least cost where it was tuned.
+        content: of ``tuning.json``.
+    """
+
+    best: ControllerSpec
+    content: Mapping[str, Any]
+
+
+def tune_gains(
+    experiment: ControlExperiment,
+    out: str | Path,
+    tuned_on: ControlSources,
+    judged_on: ControlSources,
+    tuning: TuningSpec | None = None,
+    on_trial: Callable[[str, int, int], None] | None = None,
+) -> Tuning:
+    """Tune a controller and write a run folder: ``tuning.json``, and ``tuned.toml`` for ``edp control --config``.
+
+    Args:
+        experiment: task, machine, the controller to begin with, and the seeds that judge.
+        out: run folder.
+        tuned_on: plant and models of the tuning.
+        judged_on: plant and models of the judgement.
+        tuning: how.
+        on_trial: called with what begins, how many trials are done, and their number.
+
+    Raises:
+        EdpError: settings, models or folder cannot be used.
+    """
+    chosen = tuning or TuningSpec()
+    space = dict(experiment.controller.space)
+    if not space:
+        name = CONTROLLERS.name_of(experiment.controller)
+        raise ConfigError(f"controller '{name}' has no gains to tune; give another one")
+    if experiment.seed + experiment.loops > TUNING_SEED:
+        raise ConfigError(
+            f"seed = {experiment.seed}: references from {TUNING_SEED} on are for tuning; choose lower ones"
+        )
+    key = run_key(CONTROL_SETTINGS.plain(experiment), repr((tuned_on, judged_on, chosen)))
+    with RunFolder(out) as run:
+        run.claim(key, control_toml(experiment))
+        run.write_status("running")
+        bench = ControlBench(replace(experiment, seed=TUNING_SEED, loops=chosen.loops), tuned_on)
+        study = Study(
+            {name: Real(*ends) for name, ends in space.items()}, chosen.seed, SamplerSpec(kind=chosen.sampler)
+        )
+        study.suggest({name: _within(getattr(experiment.controller, name), ends) for name, ends in space.items()})
+        rows: list[dict[str, Any]] = []
+        best = experiment.controller
+        for number in range(chosen.trials):
+            if on_trial is not None:
+                on_trial(f"trial {number + 1}", number, chosen.trials)
+            trial = study.ask(1)[0]
+            spec = with_gains(experiment.controller, trial.values)
+            cost = bench.cost(spec)
+            study.tell(trial.number, [cost])
+            best = spec if not rows or cost < min(row["cost_mm"] for row in rows) else best
+            rows.append({"gains": dict(trial.values), "cost_mm": cost})
+        judge = ControlBench(experiment, judged_on)
+        before, after = judge.cost(experiment.controller), judge.cost(best)
+        content = {
+            "schema": 1,
+            "controller": CONTROLLERS.name_of(best),
+            "gains": {name: getattr(best, name) for name in space},
+            "tuned_cost_mm": min(row["cost_mm"] for row in rows),
+            "judged_mm": {"before": before, "after": after},
+            "trials": rows,
+        }
+        write_json(run.file(RESULTS), content)
+        write_bytes(run.file(TUNED), control_toml(replace(experiment, controller=best)).encode())
+        run.write_status("finished")
+    return Tuning(best, content)
+
+
+def with_gains(spec: ControllerSpec, gains: Mapping[str, Any]) -> ControllerSpec:
+    """A controller with some of its options changed."""
+    values = {name: float(np.round(value, 6)) for name, value in gains.items()}
+    return cast(ControllerSpec, replace(cast(Any, spec), **values))
+
+
+def _within(value: float, ends: tuple[float, float]) -> float:
+    return float(min(max(value, ends[0]), ends[1]))
