@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -83,21 +85,21 @@ class PredictorAhead(VelocityModel):
     def begin(self, measured: Array, command: Array) -> None:
         """Fill the predictor's window with one row."""
         rows = self._rows(measured, command[None])
-        with torch.inference_mode():
+        with _one_thread():
             start = self._predictor.initial_state(1, rows)
             _, self._state = self._predictor.predict(rows.expand(1, self._predictor.window, self._width), start)
 
     def ahead(self, measured: Array, commands: Array) -> Array:
         """Every candidate is a lane of one step."""
         rows = self._rows(measured, commands)
-        with torch.inference_mode():
+        with _one_thread():
             lanes = map_state(lambda tensor: tensor.expand(len(rows), *tensor.shape[1:]).contiguous(), self._state)
             answers, _ = self._predictor.predict(rows, lanes)
         return np.asarray(answers[:, -1, self._horizon, self._targets].numpy(), float)
 
     def advance(self, measured: Array, command: Array) -> None:
         """One step with what was given."""
-        with torch.inference_mode():
+        with _one_thread():
             _, self._state = self._predictor.predict(self._rows(measured, command[None]), self._state)
 
     def _rows(self, measured: Array, commands: Array) -> torch.Tensor:
@@ -111,28 +113,34 @@ class PredictorAhead(VelocityModel):
 class TwinAhead(VelocityModel):
     """A twin: it is told the commands and runs on them alone from what is measured now.
 
+    What the plant does not measure, such as pump pressures, is a free port of the twin: it reads its own last answer.
+
     Args:
         twin: of the channels of Table A.1.
         ticks: how far ahead.
+        measured: names of the channels that the plant measures.
 
     Raises:
         ConfigError: it answers other velocities, or other commands drive it.
     """
 
-    def __init__(self, twin: Twin, ticks: int) -> None:
+    def __init__(self, twin: Twin, ticks: int, measured: Collection[str]) -> None:
         names = [channel.name for channel in twin.channels.answers]
         for name, options in [(v, names) for v in VELOCITIES] + [(c.name, PILOTS) for c in twin.channels.commands]:
             if name not in options:
                 raise ConfigError(f"the twin is not one of an excavator's levers: '{name}'{closest(name, options)}")
-        self.twin, self.ticks, self.reads = twin, ticks, tuple(names)
+        self.twin, self.ticks = twin, ticks
+        self.reads = tuple(name for name in names if name in measured)
+        self._ports = [names.index(name) for name in self.reads]
         self._velocities = [names.index(name) for name in VELOCITIES]
         self._pilots = [PILOTS.index(channel.name) for channel in twin.channels.commands]
         self._state: Any = None
 
     def begin(self, measured: Array, command: Array) -> None:
-        """Form the memory by a prefix at rest."""
+        """Form the memory by a prefix at rest; free ports start from the means of the training."""
         ticks = max(self.twin.prefix_ticks, 1)
-        rows = np.repeat(np.asarray(measured, np.float32)[None, None], ticks, axis=1)
+        rows = np.repeat(self._row(measured)[None, None], ticks, axis=1)
+        rows[0, 0] = np.where(np.isfinite(rows[0, 0]), rows[0, 0], self.twin.scales.answer_offset)
         commands = np.repeat(np.asarray(command[self._pilots], np.float32)[None, None], ticks, axis=1)
         self._state = self.twin.reset(commands, rows)
 
@@ -140,13 +148,31 @@ class TwinAhead(VelocityModel):
         """Candidates are lanes; the first tick reads what is measured, the others run free."""
         count = len(commands)
         lasting = np.repeat(commands[:, None, self._pilots], self.ticks, axis=1).astype(np.float32)
-        ports = np.full((count, self.ticks, len(self.reads)), np.nan, np.float32)
-        ports[:, 0] = measured
+        ports = np.full((count, self.ticks, len(self.twin.channels.answers)), np.nan, np.float32)
+        ports[:, 0] = self._row(measured)
         lanes = {name: np.repeat(values, count, axis=0) for name, values in self._state.items()}
         answers, _ = self.twin.rollout(lasting, lanes, ports)
         return np.asarray(answers[:, -1, self._velocities], float)
 
     def advance(self, measured: Array, command: Array) -> None:
         """One tick that reads what was measured."""
-        row, pilots = (np.asarray(values, np.float32)[None] for values in (measured, command[self._pilots]))
-        _, self._state = self.twin.step(pilots, self._state, row)
+        pilots = np.asarray(command[self._pilots], np.float32)
+        _, self._state = self.twin.step(pilots[None], self._state, self._row(measured)[None])
+
+    def _row(self, measured: Array) -> NDArray[np.float32]:
+        """Values of all ports, NaN where one is free."""
+        row = np.full(len(self.twin.channels.answers), np.nan, np.float32)
+        row[self._ports] = measured
+        return row
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """PyTorch on one thread, on which the few rows of a tick are fastest; the caller's number comes back."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.inference_mode():
+            yield
+    finally:
+        torch.set_num_threads(before)

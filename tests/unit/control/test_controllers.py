@@ -24,7 +24,11 @@ def plant():
     machine = load_machine("M22")
     channels = tuple(VOCABULARY[name] for name in NAMES)
     commands = tuple(TABLE_A1[name] for name in PILOTS)
-    return PlantInterface(channels, RATE, TipGeometry(machine), lambda levers: np.zeros((*levers.shape[:-1], 12)), "the bench")
+    return PlantInterface(channels, RATE, TipGeometry(machine), commands, pressures, "the bench")
+
+
+def pressures(levers):
+    return np.zeros((*levers.shape[:-1], len(PILOTS)))
 
 
 @pytest.fixture(scope="module")

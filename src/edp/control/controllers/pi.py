@@ -42,10 +42,10 @@ class ProportionalIntegral:
         "rest_m_s": (0.0, 0.01),
     }
 
-    proportional: float = 3.0
-    integral: float = 1.0
+    proportional: float = 3.6
+    integral: float = 4.0
     lead_s: float = 0.2
-    rest_m_s: float = 0.004
+    rest_m_s: float = 0.002
 
     def __post_init__(self) -> None:
         check_bounds(
