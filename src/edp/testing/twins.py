@@ -86,7 +86,7 @@ def check_twin(name: str, options: TwinSpec | None = None) -> None:
         prefix = twin.prefix_ticks
         state = twin.reset(commands[:, :prefix], measured[:, :prefix])
         case = (twin, commands[:, prefix:], measured[:, prefix:], state)
-        for check in (_chunks, _state_is_left, _causality, _ports, _lanes, _bounds, _refusals):
+        for check in (_chunks, _state_is_left, _causality, _ports, _lanes, _branches, _bounds, _refusals):
             check(*case, where)
         _arrays(spec, twin, commands[:, prefix:], state, where)
 
@@ -146,6 +146,26 @@ def _lanes(twin: Twin, commands: Array, measured: Array, state: TwinState, where
     scale = twin.scales.answer_width
     message = f"{where}: a lane depends on the lanes beside it"
     expect_near(alone[0] / scale, whole[1] / scale, message, rtol=0.0, atol=1e-3)
+
+
+def _branches(twin: Twin, commands: Array, measured: Array, state: TwinState, where: str) -> None:
+    """Runs that branch off one another are runs of their own from the same state."""
+    first = np.array([0, 0, 5, 9])
+    runs = np.repeat(commands[:1], len(first), axis=0)
+    for run, tick in enumerate(first[1:], start=1):
+        runs[run, tick:] = commands[1, tick:]
+    start = {key: values[:1] for key, values in state.items()}
+    row = measured[0, 0].copy()
+    row[-1] = np.nan
+    fed = np.full((len(first), *measured.shape[1:]), np.nan, np.float32)
+    fed[:, 0] = row
+    whole, _ = twin.rollout(runs, {key: np.repeat(values, len(first), 0) for key, values in start.items()}, fed)
+    before = {key: values.copy() for key, values in start.items()}
+    branched = twin.branches(runs, start, row, first)
+    scale = twin.scales.answer_width
+    expect_near(branched / scale, whole / scale, f"{where}: a branch differs from a run of its own", 0.0, 1e-3)
+    same = all(np.array_equal(start[key], before[key]) for key in before)
+    expect(same, f"{where}: branches change the state that they start from")
 
 
 def _bounds(twin: Twin, commands: Array, measured: Array, state: TwinState, where: str) -> None:

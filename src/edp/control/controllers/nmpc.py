@@ -8,6 +8,7 @@ and pressure limits are soft, so that it always has a solution.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -33,6 +34,8 @@ STEP_M_S = 0.01
 """By which a speed is changed to see its effect: far above single precision, far below what bends the valve curves."""
 NEAR_LIMIT = 0.1
 """Share of a range or pressure within which its limit takes part in the program; others cannot be met in a horizon."""
+NO_LIMIT = -1e30
+"""What DAQP takes for no limit."""
 SOFT = 8
 """DAQP's mark of a constraint that may be violated at a price."""
 FAST_TIP_M_S = 0.02
@@ -49,17 +52,27 @@ class PredictiveControl:
         along: weight of the tip error along the path, beside 1 across it.
         attitude_m: length of arm (m) by which an error of the attitude in rad counts like one of the tip.
         change: weight of changes of the asked speeds, from block to block and from tick to tick.
+        feedforward: weight of the asked speeds' distance from those of the reference: where the model says that a
+            speed has no effect, as into an end stop, the plan goes there.
+        trust_m_s: most by which a tick may change a speed of the plan: linear models hold near it only.
         window_s: time over which the twin's predictions are compared with what came, for the disturbance.
         smoothing: share of a new error that the disturbance takes over in a tick; 0: offsets stay.
         fallback: whether a PI loop answers where the program has no solution; otherwise the levers go to neutral.
     """
 
     needs: ClassVar[tuple[str, ...]] = ("twin", "valve_map")
+    space: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "along": (0.1, 2.0),
+        "change": (0.02, 2.0),
+        "smoothing": (0.02, 0.5),
+    }
 
     blocks: tuple[int, ...] = (2, 3, 4, 6, 10, 15)
     along: float = 0.5
     attitude_m: float = 1.0
     change: float = 0.2
+    feedforward: float = 0.01
+    trust_m_s: float = 0.1
     window_s: float = 0.2
     smoothing: float = 0.05
     fallback: bool = True
@@ -73,6 +86,8 @@ class PredictiveControl:
             along=above(0.0, 1e3),
             attitude_m=span(0.0, 1e3),
             change=above(0.0, 1e6),
+            feedforward=span(0.0, 1e6),
+            trust_m_s=above(0.0, 100.0),
             window_s=above(0.0, 10.0),
             smoothing=span(0.0, 1.0),
         )
@@ -152,46 +167,61 @@ class NmpcController(Controller):
     def _improve(self, measured: Array, tick: int) -> None:
         """One Gauss-Newton step on the plan, and its first speeds as those that are asked for."""
         moves, spec = self._moves, self.spec
-        targets = self._valves.levers(moves.runs(self._speeds, STEP_M_S))
-        levers = moves.levers(targets, self.before, self._slew)
+        # Away from the fastest speed, beyond which a lever has no more to give and a step would show no effect.
+        steps = np.where(self._speeds + STEP_M_S > self._valves.fastest, -STEP_M_S, STEP_M_S)
+        levers = moves.levers(self._valves.levers(moves.runs(self._speeds, steps)), self.before, self._slew)
         strokes, pressures = self.model.predicted(levers, measured, moves.first)
-        error, by_speeds = self._errors(strokes, tick)
+        by_stroke, by_pressure = (_slopes(values, steps) for values in (strokes, pressures))
+        error, by_speeds = self._errors(strokes[0], by_stroke, tick)
         turn = moves.difference.T @ moves.difference * spec.change
         begin = np.diff(np.concatenate((self._latest[None], self._speeds)), axis=0).ravel()
-        hessian = by_speeds.T @ by_speeds + turn
+        hessian = by_speeds.T @ by_speeds + turn + spec.feedforward * np.eye(moves.count)
         gradient = by_speeds.T @ error + spec.change * moves.difference.T @ begin
-        rows, low, high = self._limits(strokes, pressures)
+        gradient += spec.feedforward * (self._speeds - self._ahead(tick)).ravel()
+        rows, low, high = self._limits((strokes[0], pressures[0]), (by_stroke, by_pressure))
         solution, iterations = self._solved(hessian, gradient, rows, low, high)
         self._speeds += solution.reshape(self._speeds.shape)
         self._latest = self._speeds[0].copy()
         self.info = {"iterations": float(iterations), "constraints": float(len(rows))}
         self.info |= {f"disturbance_{i + 1}": float(v) for i, v in enumerate(self.model.disturbance)}
 
-    def _errors(self, strokes: Array, tick: int) -> tuple[Array, Array]:
+    def _ahead(self, tick: int) -> Array:
+        """Mean speeds of the reference's strokes in each block, m/s, shape (block, 3)."""
+        assert self._reference is not None  # noqa: S101  for the type checker: `begin` comes first
+        strokes, ends = self._reference.strokes, tick + 1 + self._moves.last_ticks
+        last = self._reference.ticks - 1
+        begins = np.concatenate(([tick], ends[:-1]))
+        moved = strokes[np.minimum(ends, last)] - strokes[np.minimum(begins, last)]
+        return np.asarray(moved * self.plant.rate_hz / (ends - begins)[:, None])
+
+    def _errors(self, strokes: Array, by_speed: Array, tick: int) -> tuple[Array, Array]:
         """Weighted tip errors of the base, shape (3 ticks,), and their derivatives by the variables."""
         assert self._reference is not None  # noqa: S101  for the type checker: `begin` comes first
         rows = self._reference.rows(tick + 1, self._moves.ticks)
-        tips, jacobians = self._table.poses(strokes[0])
+        tips, jacobians = self._table.poses(strokes)
         error = tips - self._reference.tip[rows]
         error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
         by_strokes = self._directions[rows] @ jacobians
-        changes = (strokes[1:] - strokes[0]) / STEP_M_S
-        by_speeds = np.einsum("tij,vtj->tiv", by_strokes, changes)
+        derivatives = np.einsum("tij,vtj->tiv", by_strokes, by_speed)
         weighted = np.einsum("tij,tj->ti", self._directions[rows], error)
-        return weighted.ravel(), by_speeds.reshape(-1, self._moves.count)
+        return weighted.ravel(), derivatives.reshape(-1, self._moves.count)
 
-    def _limits(self, strokes: Array, pressures: Array) -> tuple[Array, Array, Array]:
-        """Soft rows of the program at the ends of the blocks: strokes and pressures that come near a limit."""
+    def _limits(self, values: tuple[Array, Array], by_speed: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        """Soft rows of the program at the ends of the blocks: strokes and pressures that come near a limit.
+
+        Args:
+            values: strokes (m) and pressures (Pa) of the base, shape (tick, number).
+            by_speed: their derivatives by the variables, shape (variable, tick, number).
+        """
         ends, full = self._moves.last_ticks, self.plant.geometry.full_m
-        margin, most = self.limits.stroke_margin * full, self.limits.pressure_pa
-        values = np.concatenate((strokes[:, ends] / full, pressures[:, ends] / most), axis=2)
-        values = values.reshape(len(values), -1)
-        base = values[0]
-        least = np.tile(np.concatenate((margin / full, np.full(pressures.shape[2], -np.inf))), len(ends))
-        largest = np.tile(np.concatenate((1.0 - margin / full, np.ones(pressures.shape[2]))), len(ends))
+        pressures, margin = values[1].shape[1], self.limits.stroke_margin
+        unit = np.concatenate((full, np.full(pressures, self.limits.pressure_pa)))
+        base = (np.concatenate([part[ends] for part in values], axis=1) / unit).ravel()
+        slopes = np.concatenate([part[:, ends] for part in by_speed], axis=2) / unit
+        least = np.tile(np.concatenate((np.full(AXES, margin), np.full(pressures, NO_LIMIT))), len(ends))
+        largest = np.tile(np.concatenate((np.full(AXES, 1.0 - margin), np.ones(pressures))), len(ends))
         near = (base < least + NEAR_LIMIT) | (base > largest - NEAR_LIMIT)
-        slopes = (values[1:, near] - base[near]).T / STEP_M_S
-        return slopes, least[near] - base[near], largest[near] - base[near]
+        return slopes.reshape(self._moves.count, -1)[:, near].T, (least - base)[near], (largest - base)[near]
 
     def _solved(
         self, hessian: Array, gradient: Array, rows: Array, low: Array, high: Array
@@ -202,18 +232,23 @@ class NmpcController(Controller):
             ControlFault: the program has no solution, or a number in it is not finite.
         """
         now, blocks = self._speeds.ravel(), self._moves.blocks
-        upper = np.concatenate((np.tile(self._valves.fastest, blocks) - now, high))
-        lower = np.concatenate((np.tile(self._valves.slowest, blocks) - now, low))
+        reach = self.spec.trust_m_s
+        upper = np.concatenate((np.minimum(np.tile(self._valves.fastest, blocks) - now, reach), high))
+        lower = np.concatenate((np.maximum(np.tile(self._valves.slowest, blocks) - now, -reach), low))
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all() and np.isfinite(rows).all()):
             raise ControlFault("the model's predictions are not finite")
         sense = np.zeros(len(upper), np.int32)
         sense[self._moves.count :] = SOFT
-        lower = np.maximum(lower, -1e30)
         solution, _, flag, info = self._daqp.solve(hessian, gradient, np.ascontiguousarray(rows), upper, lower, sense)
         # 1: optimal; 2: optimal with soft constraints violated.
         if flag not in (1, 2) or not np.isfinite(solution).all():
             raise ControlFault(f"the quadratic program has no solution (DAQP says {flag})")
         return np.asarray(solution), int(info["iterations"])
+
+
+def _slopes(values: Array, steps: Array) -> Array:
+    """Derivatives by the variables, shape (variable, tick, number), from runs that differ by steps in one each."""
+    return np.asarray((values[1:] - values[0]) / steps.reshape(-1, 1, 1))
 
 
 def _directions(reference: TipReference, spec: PredictiveControl) -> Array:

@@ -76,11 +76,19 @@ class Moves:
         # Differences from block to block, the first from what was asked for last.
         self.difference = np.eye(self.count) - np.eye(self.count, k=-AXES)
 
-    def runs(self, speeds: Array, step: float) -> Array:
-        """The base and, for each variable, a run in which it is `step` m/s larger, shape (count + 1, block, 3)."""
+    def runs(self, speeds: Array, steps: Array) -> Array:
+        """The base and, for each variable, a run in which it differs by a step.
+
+        Args:
+            speeds: of the plan, m/s, shape (block, 3).
+            steps: m/s, shape (block, 3).
+
+        Returns:
+            Shape (count + 1, block, 3).
+        """
         runs = np.repeat(speeds[None], self.count + 1, axis=0)
         variables = runs.reshape(self.count + 1, self.count)
-        variables[1:][np.diag_indices(self.count)] += step
+        variables[1:][np.diag_indices(self.count)] += steps.ravel()
         return runs
 
     def levers(self, targets: Array, before: Array, step: Array) -> Array:
