@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -135,3 +135,16 @@ class EnvironmentSpec:
         if columns[name] >= at.LOG_GROUND and not self.material:
             raise ConfigError(f"environment: observed channel '{name}' is there only in soil; choose a material")
         return chain.MEASURED + columns[name]
+
+
+def settings_of(settings: EnvironmentSpec | None, changes: Mapping[str, Any]) -> EnvironmentSpec:
+    """Settings, the usual ones where None, with changes laid over them.
+
+    Raises:
+        ConfigError: a change names no setting (the closest is offered), or is out of range.
+    """
+    names = [entry.name for entry in fields(EnvironmentSpec)]
+    for name in changes:
+        if name not in names:
+            raise ConfigError(f"environment: setting '{name}' is unknown{closest(name, names)}")
+    return replace(settings or EnvironmentSpec(), **changes)
