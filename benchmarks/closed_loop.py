@@ -49,16 +49,17 @@ class Size:
     minutes: float
     recordings: int
     lines: int
+    variants: int
     settings: int
     o4_lines: int
     predictor: tuple[str, ...]
     twin: tuple[str, ...]
 
 
-FULL = Size(90.0, 45, 6, 80, 4, (), ("twin.kind=recurrent", "twin.units=48", "training.updates=[600,600,400,200]"))
+FULL = Size(90.0, 45, 6, 4, 80, 4, (), ("twin.kind=recurrent", "twin.units=48", "training.updates=[600,600,400,200]"))
 QUICK = Size(
-    *(6.0, 6, 1, 4, 1),
-    ("training.epochs=2", "training.updates=40"),
+    *(3.0, 6, 1, 2, 3, 1),
+    ("training.epochs=1", "training.updates=20"),
     ("twin.kind=recurrent", "twin.units=8", "training.lengths_s=[0.1,0.3]", "training.updates=[20,20]"),
 )
 
@@ -116,7 +117,7 @@ def lines(folder: Path, runs: Mapping[str, Path], size: Size) -> dict[str, dict[
         "noise five times as large": (MACHINE, {"sensors": {name: NOISE * sensors[name] for name in NOISY}}),
     }
     rows: dict[str, dict[str, Any]] = {}
-    for variant, (machine, options) in variants.items():
+    for variant, (machine, options) in list(variants.items())[: size.variants]:
         rows[variant] = {}
         for name, (spec, models) in contenders.items():
             bench = ControlBench(replace(experiment, machine=machine), ControlSources(), models, options)
