@@ -56,7 +56,7 @@ class Size:
     twin: tuple[str, ...]
 
 
-FULL = Size(90.0, 45, 6, 4, 80, 4, (), ("twin.kind=recurrent", "twin.units=48", "training.updates=[600,600,400,200]"))
+FULL = Size(90.0, 45, 6, 4, 40, 3, (), ("twin.kind=recurrent", "twin.units=48", "training.updates=[600,600,400,200]"))
 QUICK = Size(
     *(3.0, 6, 1, 2, 3, 1),
     ("training.epochs=1", "training.updates=20"),

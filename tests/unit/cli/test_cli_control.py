@@ -10,6 +10,7 @@ from edp.networks.twin import TWINS
 from edp.testing.control import sample_twin
 from edp.training.twin_bundle import TwinBundle, save_twin
 
+pytestmark = pytest.mark.training
 LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2", "--set", "task.lead_s=0.2")
 
 
