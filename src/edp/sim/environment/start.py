@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError, closest
+from edp.settings.bounds import shown
 from edp.sim.environment.spec import EnvironmentSpec
 from edp.sim.episodes.episodes import EpisodeStart
 from edp.sim.machine.machine import Machine
@@ -34,8 +35,6 @@ def episode_start(
     for name in options:
         if name not in (*OF_SPEC, *OWN):
             raise ConfigError(f"reset: option '{name}' is unknown{closest(str(name), [*OF_SPEC, *OWN])}")
-    if not seed >= 0:
-        raise ConfigError(f"reset: seed = {seed} must not be negative")
     overrides = {name: value for name, value in options.items() if name in OF_SPEC}
     if "machine" in overrides and spec.randomise is not False:
         raise ConfigError("reset: option 'machine' and an environment that draws machines (randomise); leave one out")
@@ -51,6 +50,19 @@ def episode_start(
     facts: dict[str, Any] = {"seed": seed, "machine": machine.name, "material": spec.material}
     mass_t = known_mass(machine.name)
     return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
+
+
+def checked_seed(seed: Any) -> int | None:
+    """A seed as Gymnasium takes it.
+
+    Raises:
+        ConfigError: it is no whole number, or negative.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ConfigError(f"reset: seed = {shown(seed)}; give a whole number that is not negative, or None")
+    return int(seed)
 
 
 def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:

@@ -15,7 +15,7 @@ from edp.sim.environment.library import gymnasium
 from edp.sim.environment.model import NominalMachine
 from edp.sim.environment.single import spaces
 from edp.sim.environment.spec import EnvironmentSpec, settings_of
-from edp.sim.environment.start import MOST_SEED, episode_start
+from edp.sim.environment.start import MOST_SEED, checked_seed, episode_start
 from edp.sim.environment.truth import Truth
 from edp.sim.episodes.episodes import Episodes, Moment
 from edp.sim.machine import layout as at
@@ -82,6 +82,9 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
         self._begun, self._in_soil = np.zeros(num_envs, dtype=np.bool_), False
         self._present = self._episodes.new_out()
+        for array in self._present[:2]:
+            # What has not begun shows nothing.
+            array[:] = np.nan
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -160,7 +163,7 @@ class VectorExcavatorEnv(gymnasium.vector.VectorEnv[NDArray[np.float32], NDArray
         """Begin the masked episodes; returns what began."""
         infos: dict[str, Any] = {}
         for index in np.flatnonzero(mask).tolist():
-            seed = seeds[index]
+            seed = checked_seed(seeds[index])
             if seed is not None:
                 self._generators[index] = gymnasium.utils.seeding.np_random(seed)[0]
             else:

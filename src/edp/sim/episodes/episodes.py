@@ -78,9 +78,8 @@ class Episodes:
 
     def new_out(self) -> tick.Out:
         """Arrays for what `begin` and `step` show: observations, rows of the log, and which episodes have ended."""
-        observations = np.full((self.count, len(self.columns)), np.nan, np.float32)
-        rows = np.full((self.count, tick.LOG_WIDTH), np.nan)
-        return observations, rows, np.zeros(self.count, dtype=np.bool_)
+        observations = np.empty((self.count, len(self.columns)), np.float32)
+        return observations, np.empty((self.count, tick.LOG_WIDTH)), np.zeros(self.count, dtype=np.bool_)
 
     def step(self, levers: Array, out: tick.Out, active: NDArray[np.bool_] | None = None) -> None:
         """One tick of the active episodes with lever positions of shape (count, 3); what is seen goes to `out`.
