@@ -23,7 +23,7 @@ from edp.sim import Scenario, load_machine
 from edp.sim.machine import layout as at
 from edp.sim.machine.parameters import pack
 from edp.sim.physics import linkage
-from edp.sim.sensors import sensors
+from edp.sim.sensors import filters
 from edp.sim.simulate import Simulation
 
 Array = NDArray[np.float64]
@@ -139,7 +139,7 @@ def _given_by(name: str, recordings: Sequence[Recording]) -> tuple[str, ...]:
         source = name.replace("Acc", "Vels")
         band = machine.sensors.acceleration_bandwidth
         made = [
-            sensors.filtered_derivative(r.select([source]).astype(float), band, r.rate_hz)[:, 0] for r in recordings
+            filters.filtered_derivative(r.select([source]).astype(float), band, r.rate_hz)[:, 0] for r in recordings
         ]
     elif name.endswith("Conf"):
         source = name.removesuffix("Conf")

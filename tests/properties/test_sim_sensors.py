@@ -12,7 +12,7 @@ from edp.sim.machine import layout as at
 from edp.sim.machine.layout import LOG_COLUMNS, LOG_VELOCITY
 from edp.sim.physics import dynamics, pins
 from edp.sim.physics.plant import Plant
-from edp.sim.sensors import can, sensors, transducers
+from edp.sim.sensors import can, draws, sensors, transducers
 
 BUS = can.Bus(period=0.010, latency=(0.002, 0.012), jitter=1.5e-3, loss=0.02)
 FULL = {
@@ -38,6 +38,10 @@ FULL = {
 def machine_with(**sizes):
     machine = load_machine("M22")
     return dataclasses.replace(machine, sensors=dataclasses.replace(machine.sensors, **sizes))
+
+
+def quantised(values, quantum):
+    return np.array([transducers.quantised(value, quantum) for value in values.ravel()]).reshape(values.shape)
 
 
 @pytest.fixture(scope="module")
@@ -67,33 +71,39 @@ def test_frames_arrive_in_order_within_their_latency_and_none_is_seen_early(phas
 def test_frames_are_lost_at_the_stated_share_and_the_last_value_holds():
     sent = can.frames(200_000, 100.0, BUS, 0.3, 0.006, np.random.default_rng(1))
     assert np.isinf(sent.arrivals).mean() == pytest.approx(BUS.loss, rel=0.1)
-    values = sent.hold(np.arange(len(sent.positions), dtype=float)[:, None])[:, 0]
+    values = np.arange(len(sent.positions))[sent.seen]
     assert (np.diff(values) == 0).mean() >= 0.8 * BUS.loss
     assert (np.diff(values) >= 0).all()
 
 
 def test_without_a_bus_every_sample_is_its_own():
     plain = can.frames(50, 100.0, dataclasses.replace(BUS, period=0.0), 0.5, 0.01, np.random.default_rng(0))
-    values = np.random.default_rng(1).normal(size=(50, 2))
-    np.testing.assert_array_equal(plain.hold(plain.take(values)), values)
+    np.testing.assert_array_equal(plain.positions[plain.seen], np.arange(50))
 
 
 def test_a_ramp_on_the_bus_is_late_by_latency_and_waiting():
-    ramp = np.arange(1000.0)[:, None]
-    bus = dataclasses.replace(BUS, jitter=0.0, loss=0.0)
-    sent = can.frames(1000, 100.0, bus, 0.25, 0.004, np.random.default_rng(0))
-    # taken at 2.5 ms, there at 6.5 ms, shown at 10 ms: 7.5 ms late
-    np.testing.assert_allclose((ramp - sent.hold(sent.take(ramp)))[5:], 0.75, atol=1e-9)
+    rows = np.zeros((1000, LOG_COLUMNS))
+    rows[:, LOG_VELOCITY : LOG_VELOCITY + 3] = rows[:, at.HEAD : at.HEAD + 6] = np.arange(1000.0)[:, None]
+    rows[:, at.LOG_DEMAND : at.LOG_DEMAND + 6] = np.arange(1000.0)[:, None] * [1, -1, 1, -1, 1, -1]
+    machine = machine_with(velocity=0.0, pressure=0.0, can_period=0.010, can_latency=(0.004, 0.004))
+    shown = sensors.measured_signals(rows, machine, 100.0, np.random.default_rng(0))
+    full = machine.valves.pilot_pressure
+    for columns, ecu, scale in ((slice(0, 3), 0, 1.0), (slice(6, 12), 1, 1.0), ([12, 15, 16, 19, 20, 23], 2, full)):
+        phase = draws.instance_of(machine).phase[ecu]
+        # taken at the phase, there 0.4 ticks later, shown at the next tick
+        late = np.ceil(phase + 0.4) - phase
+        ramp = np.arange(1000.0)[:, None] - shown[:, columns] / scale
+        np.testing.assert_allclose(ramp[5:], late, atol=1e-9)
 
 
 @settings(max_examples=25, deadline=None)
 @given(quantum=st.floats(1e-6, 1e3), seed=st.integers(0, 99))
 def test_quanta(quantum, seed):
     values = np.random.default_rng(seed).normal(0, 50 * quantum, (200, 3))
-    shown = transducers.quantised(values, quantum)
+    shown = quantised(values, quantum)
     assert np.abs(shown - values).max() <= quantum / 2 * (1 + 1e-9)
     np.testing.assert_allclose(shown / quantum, np.round(shown / quantum), atol=1e-6)
-    np.testing.assert_array_equal(transducers.quantised(values, 0.0), values)
+    np.testing.assert_array_equal(quantised(values, 0.0), values)
 
 
 def test_a_random_walk_grows_with_the_root_of_time_whatever_the_step():
@@ -103,12 +113,14 @@ def test_a_random_walk_grows_with_the_root_of_time_whatever_the_step():
         assert walks[-1].std() == pytest.approx(0.3 * np.sqrt(60), rel=0.06)
 
 
-def test_the_lag_is_that_of_a_ramp_and_of_a_sine():
-    time = np.arange(400) / 100
-    ramp = transducers.lagged(time[:, None], 0.02, 0.01)[:, 0]
-    np.testing.assert_allclose(ramp[50:], time[50:] - 0.02, atol=1e-9)
-    rest = transducers.lagged(np.full((10, 1), 7.0), 0.002, 0.01)
-    np.testing.assert_allclose(rest, 7.0, atol=1e-12)
+def test_the_lag_is_that_of_a_ramp_and_rests_at_the_first_value():
+    machine = machine_with(pressure=0.0, pressure_lag=0.02)
+    rows = np.zeros((400, LOG_COLUMNS))
+    rows[:, at.HEAD : at.HEAD + 3] = np.arange(400)[:, None] / 100
+    rows[:, at.ROD : at.ROD + 3] = 7.0
+    shown = sensors.measured_signals(rows, machine, 100.0, np.random.default_rng(0))[:, 6:12]
+    np.testing.assert_allclose(shown[50:, :3], rows[50:, at.HEAD : at.HEAD + 3] - 0.02, atol=1e-9)
+    np.testing.assert_allclose(shown[:, 3:], 7.0, atol=1e-12)
 
 
 @settings(max_examples=25, deadline=None)
@@ -149,7 +161,7 @@ def test_force_through_the_pins_holds_the_arms_at_rest():
 
 def test_transmitters_stay_in_range_on_the_grid_of_their_bits_with_the_offset_of_the_instance():
     machine = machine_with(**{**FULL, "can_period": 0.0, "pressure": 0.0, "pressure_drift": 0.0})
-    instance = sensors.instance_of(machine)
+    instance = draws.instance_of(machine)
     size = np.abs(instance.pressure_offset)
     assert ((size >= 0.0025) & (size <= 0.005)).all()
     rows = np.zeros((300, LOG_COLUMNS))
@@ -206,6 +218,6 @@ def test_full_sensors_stay_near_the_truth_and_the_instance_is_fixed(log):
     truth = log[:, at.HEAD : at.HEAD + 6]
     means = [(shown[:, 6:12] - truth).mean(axis=0) for shown in (first, other)]
     np.testing.assert_allclose(means[0], means[1], atol=0.2e5)
-    second = sensors.instance_of(machine_with(**{**FULL, "instance_seed": 2}))
-    assert (second.phase != sensors.instance_of(machine).phase).all()
+    second = draws.instance_of(machine_with(**{**FULL, "instance_seed": 2}))
+    assert (second.phase != draws.instance_of(machine).phase).all()
     assert np.isfinite(first).all()

@@ -26,7 +26,8 @@ def house(benchmark):
 
 def test_rooms_are_few_and_imports_go_down(house):
     assert len(house.siblings) <= 22, house.siblings
-    assert house.arrows <= 130
+    # 130 before the room of closed loops, which imports eight and is imported by three; testing simulates for it.
+    assert house.arrows <= 142
     assert house.circles == []
 
 

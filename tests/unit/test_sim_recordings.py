@@ -24,7 +24,7 @@ from edp.sim import (
 from edp.sim.machine.family import member_mass
 from edp.sim.machine.machine_files import parse_machine
 from edp.sim.plan import hand_out
-from edp.sim.sensors.sensors import filtered_derivative
+from edp.sim.sensors.filters import filtered_derivative
 
 SHORT = 4.0
 

@@ -207,8 +207,9 @@ def _play() -> None:
     simulate(digging)
     columns = np.arange(len(TABLE_A1))
     episodes = Episodes(1, columns)
-    episodes.begin(0, EpisodeStart(digging, digging.load()))
-    episodes.step(np.zeros((1, at.AXES)), np.empty((1, len(columns)), np.float32))
+    out = episodes.new_out()
+    episodes.begin(0, EpisodeStart(digging, digging.load()), out)
+    episodes.step(np.zeros((1, at.AXES)), out)
     kinematics = pose.Kinematics(*pack(digging.load()))
     kinematics.strokes(kinematics.poses(np.ones(at.AXES)))
     valve.fill_pilots(

@@ -18,7 +18,7 @@ COMMANDS = [command.name for command in app.registered_commands]
 EXPECTED = [
     *("demo", "simulate", "inspect", "screen", "animate", "train", "evaluate", "distil", "compress", "footprint"),
     *("quantise", "export", "parity", "pretrain", "finetune", "adapt", "replay", "report", "twin", "rollout"),
-    "identify",
+    *("identify", "control", "tune"),
 ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from edp.sim.environment.library import gymnasium
 from edp.sim.machine.machine_files import machine_names
 
-ENTRY = "edp.sim.environment:ExcavatorEnv"
+ENTRY, VECTOR_ENTRY = "edp.sim.environment:ExcavatorEnv", "edp.sim.environment:VectorExcavatorEnv"
 
 
 def register() -> None:
@@ -13,4 +13,4 @@ def register() -> None:
     for machine in machine_names():
         name = f"edp/Excavator-{machine}-v0"
         if name not in gymnasium.registry:
-            gymnasium.register(id=name, entry_point=ENTRY, kwargs={"machine": machine})
+            gymnasium.register(id=name, entry_point=ENTRY, vector_entry_point=VECTOR_ENTRY, kwargs={"machine": machine})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from edp.errors import ConfigError, closest
 from edp.settings.bounds import check_bounds, integer, shown, span
 from edp.signals import EXTRA_CHANNELS, GROUND_CHANNELS, TABLE_A1, Channel
 from edp.sim.machine import layout as at
-from edp.sim.machine.family import MASSES_T, WIDEST
+from edp.sim.machine.family import MASSES_T, WIDEST, member_mass
 from edp.sim.scenario import START_STROKES, Scenario
 from edp.sim.sensors import chain
 from edp.sim.sensors.sensors import truth_columns
@@ -53,7 +53,7 @@ class EnvironmentSpec:
     material: str = ""
     duration_s: float = 60.0
     rate_hz: float = 100.0
-    step_s: float = 1e-3
+    step_s: float = 2.5e-3
     sensor_noise: bool = True
     hand: bool = False
     loop_latency: int = 0
@@ -82,6 +82,9 @@ class EnvironmentSpec:
             raise ConfigError(
                 f"environment: randomise draws from the family of M22, and machine = {self.machine!r}; leave one out"
             )
+        if self.randomise is not False:
+            # For its refusal only.
+            member_mass(0, 0, *self.masses_t)
         if not 0.0 < self.spread <= WIDEST:
             raise ConfigError(f"environment: randomise = {self.randomise}; a spread is above 0 and at most {WIDEST:g}")
 
@@ -135,3 +138,16 @@ class EnvironmentSpec:
         if columns[name] >= at.LOG_GROUND and not self.material:
             raise ConfigError(f"environment: observed channel '{name}' is there only in soil; choose a material")
         return chain.MEASURED + columns[name]
+
+
+def settings_of(settings: EnvironmentSpec | None, changes: Mapping[str, Any]) -> EnvironmentSpec:
+    """Settings, the usual ones where None, with changes laid over them.
+
+    Raises:
+        ConfigError: a change names no setting (the closest is offered), or is out of range.
+    """
+    names = [entry.name for entry in fields(EnvironmentSpec)]
+    for name in changes:
+        if name not in names:
+            raise ConfigError(f"environment: setting '{name}' is unknown{closest(name, names)}")
+    return replace(settings or EnvironmentSpec(), **changes)

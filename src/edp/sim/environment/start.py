@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from edp.errors import ConfigError, closest
+from edp.settings.bounds import shown
 from edp.sim.environment.spec import EnvironmentSpec
 from edp.sim.episodes.episodes import EpisodeStart
-from edp.sim.machine.family import member_name
 from edp.sim.machine.machine import Machine
 from edp.sim.machine.machine_checks import check_machine
-from edp.sim.machine.machine_files import family_member
+from edp.sim.machine.machine_files import family_member, known_mass
 
 OF_SPEC = ("machine", "material", "sensor_noise", "hand", "loop_latency", "lost_frames", "start_strokes", "sensors")
 """Settings that the options of a reset may override for one episode."""
@@ -35,8 +35,6 @@ def episode_start(
     for name in options:
         if name not in (*OF_SPEC, *OWN):
             raise ConfigError(f"reset: option '{name}' is unknown{closest(str(name), [*OF_SPEC, *OWN])}")
-    if not seed >= 0:
-        raise ConfigError(f"reset: seed = {seed} must not be negative")
     overrides = {name: value for name, value in options.items() if name in OF_SPEC}
     if "machine" in overrides and spec.randomise is not False:
         raise ConfigError("reset: option 'machine' and an environment that draws machines (randomise); leave one out")
@@ -49,7 +47,22 @@ def episode_start(
     start = EpisodeStart(
         scenario, machine, spec.hand, spec.loop_latency, spec.lost_frames, _strokes(options.get("strokes"))
     )
-    return start, {"seed": seed, "machine": machine.name, "material": spec.material}
+    facts: dict[str, Any] = {"seed": seed, "machine": machine.name, "material": spec.material}
+    mass_t = known_mass(machine.name)
+    return start, facts if mass_t is None else {**facts, "mass_t": mass_t}
+
+
+def checked_seed(seed: Any) -> int | None:
+    """A seed as Gymnasium takes it.
+
+    Raises:
+        ConfigError: it is no whole number, or negative.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ConfigError(f"reset: seed = {shown(seed)}; give a whole number that is not negative, or None")
+    return int(seed)
 
 
 def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
@@ -57,8 +70,7 @@ def _drawn(spec: EnvironmentSpec, seed: int) -> Machine:
     low, high = spec.masses_t
     # A family of its own for each seed, so that its first member has any mass.
     family = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0]) % 10**9
-    machine = family_member(family, 0, low, high, spec.spread)
-    return replace(machine, name=member_name(family, 0, (low, high), spec.spread))
+    return family_member(family, 0, low, high, spec.spread)
 
 
 def _warmed(machine: Machine, celsius: Any) -> Machine:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ Array = NDArray[np.float64]
 
 
 @cache
-def _sources(width: int) -> Mapping[str, tuple[int, float]]:
-    """Column and sign of each name in a log of so many columns; 0 for those that are shown as they are."""
+def sources(in_soil: bool) -> Mapping[str, tuple[int, float]]:
+    """Column and sign of each name in a row of the log; sign 0 for those that are shown as they are."""
+    width = at.LOG_GROUND + (at.GROUND_POINTS if in_soil else 0)
     columns = {name: (column, 0.0) for name, column in truth_columns(width).items()}
     names = list(TABLE_A1)
     columns.update({name: (at.LOG_VELOCITY + i, 0.0) for i, name in enumerate(names[:3])})
@@ -27,28 +29,32 @@ def _sources(width: int) -> Mapping[str, tuple[int, float]]:
     return columns
 
 
-class Truth(Mapping[str, float]):
+class Truth(Mapping[str, Any]):
     """Noise-free channels in SI units: those of Table A.1 but accelerations, and those that `simulate` logs beside it.
 
     Args:
-        row: one row of the plant's log.
-        pilot_pressure: full pilot pressure, Pa.
+        rows: the present row of the plant's log, shape (columns,), or one for each of many machines.
+        pilot_pressure: full pilot pressure, Pa; for many machines shape (machine,).
+        in_soil: whether there is ground to name.
     """
 
-    __slots__ = ("_pilot_pressure", "_row")
+    __slots__ = ("_pilot_pressure", "_rows", "_sources")
 
-    def __init__(self, row: Array, pilot_pressure: float) -> None:
-        self._row, self._pilot_pressure = row, pilot_pressure
+    def __init__(self, rows: Array, pilot_pressure: float | Array, in_soil: bool) -> None:
+        self._rows, self._pilot_pressure, self._sources = rows, pilot_pressure, sources(in_soil)
 
-    def __getitem__(self, name: str) -> float:
-        column, sign = _sources(len(self._row))[name]
-        value = float(self._row[column])
+    def __getitem__(self, name: str) -> Any:
+        """A number, or an array of shape (machine,)."""
+        column, sign = self._sources[name]
+        value = self._rows[..., column]
         if sign != 0.0:
-            return self._pilot_pressure * max(sign * value, 0.0)
-        return value + KELVIN if name == OIL else value
+            value = self._pilot_pressure * np.maximum(sign * value, 0.0)
+        if name == OIL:
+            value = value + KELVIN
+        return float(value) if self._rows.ndim == 1 else value.copy()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(_sources(len(self._row)))
+        return iter(self._sources)
 
     def __len__(self) -> int:
-        return len(_sources(len(self._row)))
+        return len(self._sources)

@@ -46,6 +46,7 @@ class Moment:
     """One episode at one instant: its rows, which nothing that follows changes, and how it began."""
 
     start: EpisodeStart
+    columns: NDArray[np.int64]
     memory: Array
     drawn: Array
 
@@ -65,20 +66,23 @@ class Episodes:
         self._scratch = tick.new_scratch()
         self._all = np.ones(count, dtype=np.bool_)
 
-    def begin(self, index: int, start: EpisodeStart) -> NDArray[np.float32]:
-        """Begin an episode anew; its first observation, shape (column,).
+    def begin(self, index: int, start: EpisodeStart, out: tick.Out) -> None:
+        """Begin an episode anew; what is seen of it goes to `out`.
 
         Raises:
             ConfigError: the machine's dead times are too long.
         """
         memory, drawn = _rows(start, len(self.columns))
         self._put(index, start, memory, drawn)
-        out = np.empty(len(self.columns), np.float32)
-        tick.begin(self.memory[index], self.drawn[index], self.columns, self._scratch, out)
-        return out
+        tick.begin(self.memory[index], self.drawn[index], self.columns, self._scratch, index, out)
 
-    def step(self, levers: Array, out: NDArray[np.float32], active: NDArray[np.bool_] | None = None) -> None:
-        """One tick with lever positions of shape (count, 3); observations go to `out`, shape (count, column).
+    def new_out(self) -> tick.Out:
+        """Arrays for what `begin` and `step` show: observations, rows of the log, and which episodes have ended."""
+        observations = np.empty((self.count, len(self.columns)), np.float32)
+        return observations, np.empty((self.count, tick.LOG_WIDTH)), np.zeros(self.count, dtype=np.bool_)
+
+    def step(self, levers: Array, out: tick.Out, active: NDArray[np.bool_] | None = None) -> None:
+        """One tick of the active episodes with lever positions of shape (count, 3); what is seen goes to `out`.
 
         Raises:
             ConfigError: a lever is not a finite number; no episode has moved.
@@ -104,16 +108,10 @@ class Episodes:
         """Ticks done since an episode began."""
         return int(self.memory[index, blocks.BLOCKS * blocks.ENTRY + blocks.TICK])
 
-    def ended(self) -> NDArray[np.bool_]:
-        """Which episodes have all their ticks behind them, shape (count,)."""
+    def ended(self, index: int) -> bool:
+        """Whether an episode has all its ticks behind it."""
         first = blocks.BLOCKS * blocks.ENTRY
-        ended: NDArray[np.bool_] = self.memory[:, first + blocks.TICK] >= self.memory[:, first + blocks.SAMPLES] - 1.0
-        return ended
-
-    def row(self, index: int) -> Array:
-        """A copy of the present row of an episode's log, columns of `edp.sim.machine.layout`."""
-        row: Array = blocks.view(blocks.ROW, self.memory[index], self.drawn[index])[0].copy()
-        return row
+        return bool(self.memory[index, first + blocks.TICK] >= self.memory[index, first + blocks.SAMPLES] - 1.0)
 
     def measured(self, index: int) -> Array:
         """A copy of the 24 signals of Table A.1 as sensors show them at this tick."""
@@ -127,10 +125,18 @@ class Episodes:
             raise ConfigError(f"episode {index} has not begun; reset it first")
         # Of one episode the drawn row is replaced, never changed, so that it needs no copy.
         drawn = self.drawn[index] if self.count == 1 else self.drawn[index].copy()
-        return Moment(start, self.memory[index].copy(), drawn)
+        return Moment(start, self.columns, self.memory[index].copy(), drawn)
 
     def go_to(self, index: int, moment: Moment) -> None:
-        """Make an episode what it was at a moment, to the bit."""
+        """Make an episode what it was at a moment, to the bit.
+
+        Raises:
+            ConfigError: the moment is of episodes that show other channels.
+        """
+        if not np.array_equal(moment.columns, self.columns):
+            raise ConfigError(
+                "the snapshot is of an environment that shows other channels; give both the same 'observed'"
+            )
         self._put(index, moment.start, moment.memory.copy(), moment.drawn)
 
     def redraw(self, index: int, seed: np.random.SeedSequence) -> None:

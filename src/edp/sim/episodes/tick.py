@@ -10,17 +10,26 @@ from numpy.typing import NDArray
 from edp.sim.episodes import blocks
 from edp.sim.machine import layout as at
 from edp.sim.physics import integrator, plant, terramechanics
-from edp.sim.physics.jit import compiled, inlined, pasted
+from edp.sim.physics.jit import compiled, inlined, pasted, plainly_inlined
 from edp.sim.sensors import chain, logbook
 
 Array = NDArray[np.float64]
-SOURCES = chain.MEASURED + at.LOG_GROUND + at.GROUND_POINTS
+LOG_WIDTH = at.LOG_GROUND + at.GROUND_POINTS
+SOURCES = chain.MEASURED + LOG_WIDTH
 """What an observation may show: the measured signals, then every column of the log."""
+Out = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
+"""Observations, shape (episode, column); present rows of the log, shape (episode, LOG_WIDTH); which have ended."""
 KELVIN = 273.15
 
 # what `step_all` reports
 FINE, NOT_FINITE_LEVER, DIVERGED = 0, 1, 2
 Setup = tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]
+
+
+@plainly_inlined
+def finite(value: float) -> bool:
+    """Whether a number is finite; where sums may be reordered, a compiler takes the test of Python as passed."""
+    return math.isfinite(value)
 
 
 @pasted
@@ -117,8 +126,9 @@ def look(memory: Array, drawn: Array, setup: Setup, work: Array) -> None:
 
 
 @inlined
-def show(memory: Array, drawn: Array, columns: NDArray[np.int64], out: NDArray[np.float32]) -> None:
+def show(memory: Array, drawn: Array, columns: NDArray[np.int64], index: int, out: Out) -> None:
     """The observation of this tick: what was measured, `DELAY` ticks late, and the one before where one was lost."""
+    observation, log_row = out[0][index], out[1][index]
     numbers, shown = blocks.line(blocks.NUMBER, memory, memory), blocks.table(blocks.SHOWN, memory, memory)
     measured, row = blocks.line(blocks.MEASURED, memory, memory), blocks.line(blocks.ROW, memory, memory)
     tick, ring = int(numbers[blocks.TICK]), shown.shape[0] - 1
@@ -136,7 +146,11 @@ def show(memory: Array, drawn: Array, columns: NDArray[np.int64], out: NDArray[n
         for c in range(columns.shape[0]):
             last[c] = visible[c]
     for c in range(columns.shape[0]):
-        out[c] = last[c]
+        observation[c] = last[c]
+    for n in range(LOG_WIDTH):
+        # In free air there is no ground to show.
+        log_row[n] = row[n] if n < row.shape[0] else math.nan
+    out[2][index] = numbers[blocks.TICK] >= numbers[blocks.SAMPLES] - 1.0
 
 
 @compiled
@@ -147,7 +161,7 @@ def step_all(
     active: NDArray[np.bool_],
     columns: NDArray[np.int64],
     scratch: Array,
-    out: NDArray[np.float32],
+    out: Out,
 ) -> tuple[int, int]:
     """A tick of every active episode; the first that failed, and how.
 
@@ -158,11 +172,11 @@ def step_all(
         active: episodes to step, shape (episode,).
         columns: what is shown, see `SOURCES`.
         scratch: at least `SCRATCH` and ``6 (MOST_PAST + 2) + 9`` values.
-        out: observations, shape (episode, column), of the active ones.
+        out: filled for the active ones.
     """
     for e in range(memory.shape[0]):
         # Before any episode has moved: a bad lever must leave all as they are.
-        if active[e] and not math.isfinite(levers[e, 0] + levers[e, 1] + levers[e, 2]):
+        if active[e] and not finite(levers[e, 0] + levers[e, 1] + levers[e, 2]):
             return e, NOT_FINITE_LEVER
     lever, work = scratch[:3].reshape(1, 3), scratch[3:9].reshape(2, 3)
     room = scratch[9 : 9 + at.SPOOLS * (MOST_PAST + 2)]
@@ -178,23 +192,23 @@ def step_all(
         numbers[blocks.CLAMPS] += move(memory[e], lever, setup, room)
         numbers[blocks.TICK] += 1.0
         look(memory[e], drawn[e], setup, work)
-        show(memory[e], drawn[e], columns, out[e])
+        show(memory[e], drawn[e], columns, e, out)
         total = 0.0
         for n in range(at.STATES):
             total += blocks.line(blocks.STATE, memory[e], memory[e])[n]
         # What once is not finite stays so, and one sum shows it.
-        if not math.isfinite(total) and failed < 0:
+        if not finite(total) and failed < 0:
             failed, how = e, DIVERGED
     return failed, how
 
 
 @compiled
-def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Array, out: NDArray[np.float32]) -> None:
-    """The first observation of one episode, shape (column,)."""
+def begin(memory: Array, drawn: Array, columns: NDArray[np.int64], scratch: Array, index: int, out: Out) -> None:
+    """What is seen of episode `index` before its first tick; `memory` and `drawn` are its rows."""
     rest, work = scratch[9 + at.SPOOLS * (MOST_PAST + 2) :], scratch[3:9].reshape(2, 3)
     setup = setup_of(memory, drawn, rest)
     look(memory, drawn, setup, work)
-    show(memory, drawn, columns, out)
+    show(memory, drawn, columns, index, out)
 
 
 def new_scratch() -> Array:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +43,8 @@ class ControlBench:
     Args:
         experiment: machine, task, seeds and controller.
         sources: models and plant.
+        models: what controllers know; None measures a valve map on the plant and loads the models of the sources.
+        options: further options of the environment's reset, such as ``oil_temperature``.
 
     Attributes:
         tasks: of the seeds, in their order.
@@ -51,8 +54,14 @@ class ControlBench:
         EdpError: settings or models cannot be used.
     """
 
-    def __init__(self, experiment: ControlExperiment, sources: ControlSources) -> None:
-        self.experiment = experiment
+    def __init__(
+        self,
+        experiment: ControlExperiment,
+        sources: ControlSources,
+        models: ControlModels | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.experiment, self._options = experiment, options
         rate = experiment.rate_hz
         probe = plant_of(experiment.machine, RUN_S + 1.0, rate, sources.plant)
         geometry = interface_of(probe).geometry
@@ -62,13 +71,16 @@ class ControlBench:
         longest = (max(task.reference.ticks for task in self.tasks) + 1) / rate
         self._env = plant_of(experiment.machine, longest, rate, sources.plant)
         self._interface = interface_of(self._env)
+        self.models = models or self._commissioned(probe, sources)
+
+    def _commissioned(self, probe: Any, sources: ControlSources) -> ControlModels:
+        """Models of the sources, and a valve map where one is needed: measured before the loops, on the plant."""
         valve_map: ValveMap | None = None
-        if "valve_map" in experiment.controller.needs:
-            # Measured on the plant itself before the loops, as a commissioning does.
-            valve_map = measure_valve_map(probe, self._interface, experiment.seed)
+        if "valve_map" in self.experiment.controller.needs:
+            valve_map = measure_valve_map(probe, self._interface, self.experiment.seed)
         twin = None if sources.twin is None else load_twin(sources.twin).twin
         predictor = None if sources.predictor is None else load_bundle(_bundle_of(sources.predictor))
-        self.models = ControlModels(valve_map, twin, predictor)
+        return ControlModels(valve_map, twin, predictor)
 
     def results(
         self, spec: ControllerSpec | None = None, on_loop: Callable[[str, int, int], None] | None = None
@@ -88,19 +100,12 @@ class ControlBench:
             if on_loop is not None:
                 on_loop(f"{task.name} {task.seed}", number, len(self.tasks))
             controller = chosen.build(self._interface, task.limits, self.models)
-            results.append(run_loop(self._env, controller, task, task.seed))
+            results.append(run_loop(self._env, controller, task, task.seed, self._options))
         return results
 
     def cost(self, spec: ControllerSpec) -> float:
         """Position error of the tip, rms, mean over the loops, mm."""
         return float(np.mean([result.score.position_rms_mm for result in self.results(spec)]))
-
-    def with_map(self, valve_map: ValveMap | None) -> ControlBench:
-        """The same bench, whose controllers know another valve map."""
-        other = object.__new__(ControlBench)
-        other.__dict__.update(self.__dict__)
-        other.models = replace(self.models, valve_map=valve_map)
-        return other
 
 
 def _bundle_of(run: Path) -> Path:

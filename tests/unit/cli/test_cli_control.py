@@ -1,0 +1,111 @@
+"""``edp control`` and ``edp tune``: run folders, pages, plants exchanged by one option, and what is refused."""
+
+import json
+
+import pytest
+
+from edp.config.control import load_control_experiment
+from edp.logs import read_recording
+from edp.networks.twin import TWINS
+from edp.testing.control import sample_twin
+from edp.training.twin_bundle import TwinBundle, save_twin
+
+pytestmark = pytest.mark.training
+LINE = ("--set", "task.length_m=[0.4,0.5]", "--set", "task.hold_s=0.2", "--set", "task.lead_s=0.2")
+
+
+@pytest.fixture(scope="module")
+def twin_run(tmp_path_factory):
+    run = tmp_path_factory.mktemp("twins") / "run"
+    save_twin(TwinBundle(TWINS["static"](), sample_twin()), run / "twin")
+    return run
+
+
+def test_a_run_says_its_score_first_and_leaves_results_recordings_and_a_page(edp, tmp_path):
+    run = tmp_path / "run"
+    ended = edp("control", run, "--task", "grade", "--machine", "M22", "--controller", "pi", "--seeds", 2, *LINE)
+    assert ended.code == 0
+    first = ended.out.splitlines()[0]
+    assert first.startswith("pi keeps the bucket tip")
+    assert "in 2 loops of task 'grade'" in first
+    results = json.loads((run / "results.json").read_text())
+    assert results["sentence"] == first
+    assert [loop["seed"] for loop in results["loops"]] == [0, 1]
+    score = results["loops"][0]["score"]
+    assert score["path_rms_mm"] <= score["position_rms_mm"]
+    recording = read_recording(run / "loops" / "grade_1.parquet")
+    assert {"Lever_1", "Reference_TipX", "TipX_true", "CylVels_1"} <= set(recording.channel_names)
+    page = (run / "control.html").read_text()
+    assert first.split(" from")[0] in " ".join(page.split())
+    assert json.loads((run / "status.json").read_text())["status"] == "finished"
+
+
+def test_a_twin_is_the_plant_with_one_option(edp, tmp_path, twin_run):
+    ended = edp("control", tmp_path / "run", "--seeds", 1, "--plant", twin_run, *LINE, "--json")
+    assert ended.code == 0
+    assert ended.json["plant"] == "the twin"
+    assert ended.json["summary"]["energy_kj"] is None
+
+
+def test_the_controller_may_use_a_twin(edp, tmp_path, twin_run):
+    ended = edp(
+        "control", tmp_path / "run", "--controller", "inversion", "--twin", twin_run, "--seeds", 1, *LINE, "--json"
+    )
+    assert ended.code == 0
+    assert ended.json["controller"]["kind"] == "inversion"
+
+
+def test_gains_are_tuned_on_a_twin_and_judged_on_the_simulator(edp, tmp_path, twin_run):
+    run = tmp_path / "tuned"
+    words = ("--on", twin_run, "--trials", 3, "--loops", 1, "--seeds", 1)
+    ended = edp("tune", run, "--controller", "pi", *words, *LINE, "--json")
+    assert ended.code == 0
+    costs = [trial["cost_mm"] for trial in ended.json["trials"]]
+    assert len(costs) == 3
+    assert ended.json["tuned_cost_mm"] == min(costs)
+    best = ended.json["trials"][costs.index(min(costs))]["gains"]
+    tuned = load_control_experiment(run / "tuned.toml")
+    assert tuned.controller.proportional == pytest.approx(best["proportional"], abs=1e-6)
+    # The present gains are the first ones that are tried.
+    assert ended.json["trials"][0]["gains"]["proportional"] == load_control_experiment().controller.proportional
+    again = edp("control", tmp_path / "run", "--config", run / "tuned.toml", "--json")
+    assert again.json["summary"]["position_rms_mm"] == pytest.approx(ended.json["judged_mm"]["after"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--task", "grad"), "unknown task 'grad'; did you mean 'grade'?"),
+        (("--controller", "pid"), "unknown controller 'pid'"),
+        (("--machine", "M2"), "M2"),
+        (("--controller", "inversion"), "needs a look-ahead predictor or a twin"),
+        (("--controller", "inversion", "--predictor", "nowhere"), "there is no such folder"),
+        (("--set", "task.slope=3"), "unknown key 'task.slope'"),
+        (("--set", "task.limits.lever_low=[0,0,0]", "--set", "task.limits.lever_high=[0,1,1]"), "boom are both 0"),
+        (("--set", "controller.proportional=-1"), "0 <= proportional <= 100 must hold"),
+        (("--set", "task.length_m=[20,30]"), "none of 200 draws can be done"),
+        (("--plant", "nowhere"), "nowhere"),
+    ],
+)
+def test_mistakes_end_in_one_message(edp, tmp_path, words, message):
+    ended = edp("control", tmp_path / "run", "--seeds", 1, *words)
+    assert ended.code == 1
+    assert ended.err.count("error:") == 1
+    assert message in " ".join(ended.err.split())
+
+
+def test_a_twin_of_another_rate_or_a_soil_is_refused(edp, tmp_path, twin_run):
+    ended = edp("control", tmp_path / "a", "--plant", twin_run, "--seeds", 1, "--set", "rate_hz=50")
+    assert "100 Hz" in ended.err
+    ended = edp("control", tmp_path / "b", "--plant", twin_run, "--seeds", 1, "--task", "dig")
+    assert "a twin knows no soil" in " ".join(ended.err.split())
+
+
+def test_a_folder_of_other_settings_is_left_as_it_is(edp, tmp_path):
+    run = tmp_path / "run"
+    assert edp("control", run, "--seeds", 1, *LINE).code == 0
+    before = (run / "results.json").read_bytes()
+    ended = edp("control", run, "--seeds", 2, *LINE)
+    assert ended.code == 1
+    assert "another run" in ended.err
+    assert (run / "results.json").read_bytes() == before
